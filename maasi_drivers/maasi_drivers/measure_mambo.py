@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -42,53 +43,29 @@ class MeasurementError(RuntimeError):
 
 @dataclass(frozen=True)
 class MeasuredSpeed:
-    """Result of a measuring flight.
+    """Result of a measuring flight."""
 
-    Attributes
-    ----------
-    full_speed : float
-        Steady speed at the largest tilt [m/s].
-    delay : float
-        From a command until the position shows it [s].
-    doubt : float
-        Standard deviation of `full_speed`, as a share of it [1].
-    misfit : float
-        Root mean square of what the fit leaves [m].
-    """
-
-    full_speed: float
-    delay: float
-    doubt: float
-    misfit: float
+    full_speed: float  # steady speed at the largest tilt [m/s]
+    delay: float  # from a command until the position shows it [s]
+    doubt: float  # standard deviation of `full_speed`, as a share of it [1]
 
 
 @dataclass
 class Leg:
     """One leg: from rest, one way and back.
 
-    Attributes
-    ----------
-    begin : float
-        Monotonic clock [s].
-    origin : float
-        Where it rested, forward of the take-off point [m].
-    tilts : list of (float, float)
-        Time of the command since `begin` [s], share of the largest tilt forward [1].
-    events : list of (float, float)
-        Time since `begin` [s], place forward of the take-off point [m].
+    `tilts` are time since `begin` [s] and share of the largest tilt forward, `events` time since
+    `begin` and place forward of the take-off point [m].
     """
 
-    begin: float
-    origin: float
+    begin: float  # monotonic clock [s]
+    origin: float  # where it rested, forward of the take-off point [m]
     tilts: list[tuple[float, float]] = field(default_factory=list)
     events: list[tuple[float, float]] = field(default_factory=list)
 
 
 class MeasuringFlight:
-    """Flies the legs.
-
-    Units: way [m].
-    """
+    """Flies the legs, each at most `way` [m] long."""
 
     def __init__(self, link: MamboLink, way: float, legs: int, clock: Callable[[], float]) -> None:
         self.link = link
@@ -180,10 +157,7 @@ class MeasuringFlight:
 
 
 def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
-    """Return speed and delay that explain the legs best, by least squares.
-
-    Units: tilt [rad].
-    """
+    """Return speed and delay that explain the legs best, under a tilt [rad]."""
     from scipy.optimize import least_squares
 
     if sum(len(leg.events) for leg in legs) < 6:
@@ -221,7 +195,7 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
             f'speed: known to {100.0 * doubt:.0f} per cent, allowed are {100.0 * _MOST_DOUBT:.0f}: '
             'fly more legs or a longer way'
         )
-    return MeasuredSpeed(9.81 * math.tan(tilt) / drag, delay, doubt, misfit)
+    return MeasuredSpeed(9.81 * math.tan(tilt) / drag, delay, doubt)
 
 
 def _way(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> float:
@@ -238,7 +212,6 @@ def _way(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> f
 _PERIOD = 0.05
 # Longest wait for it to land [s].
 _LANDING = 15.0
-_INTERRUPTED = 'interrupted'
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -248,32 +221,22 @@ def build_parser() -> argparse.ArgumentParser:
         description='Have a Mambo take off, tilt forward and backward some times, and land; print '
         'mambo.full_speed and mambo.delay for its driver. Ctrl-C lands it.',
     )
-    parser.add_argument(
-        '--fly', action='store_true', help='without it nothing takes off: it says what it would do'
+
+    def add(name: str, help: str, **options: Any) -> None:
+        parser.add_argument(f'--{name}', help=help, **options)
+
+    add('fly', 'without it nothing takes off: it says what it would do', action='store_true')
+    add('address', 'of the drone (default: %(default)s)', default='192.168.99.3')
+    add('bluetooth', 'instead of WiFi', action='store_true')
+    add('port', 'on which it is heard (default: %(default)s)', type=int, default=43210)
+    tilt = 'the largest, motion.tilt of its driver [rad] (default: %(default)s)'
+    add('tilt', tilt, type=float, default=0.1, metavar='RAD')
+    way = (
+        'it keeps within this forward and backward of where it stands, and needs half of it more '
+        'to be safe [m] (default: %(default)s)'
     )
-    parser.add_argument(
-        '--address', default='192.168.99.3', help='of the drone (default: %(default)s)'
-    )
-    parser.add_argument('--bluetooth', action='store_true', help='instead of WiFi')
-    parser.add_argument(
-        '--port', type=int, default=43210, help='on which it is heard (default: %(default)s)'
-    )
-    parser.add_argument(
-        '--tilt',
-        type=float,
-        default=0.1,
-        metavar='RAD',
-        help='the largest, motion.tilt of its driver [rad] (default: %(default)s)',
-    )
-    parser.add_argument(
-        '--way',
-        type=float,
-        default=1.0,
-        metavar='M',
-        help='it keeps within this forward and backward of where it stands, and needs half of it '
-        'more to be safe [m] (default: %(default)s)',
-    )
-    parser.add_argument('--legs', type=int, default=6, metavar='N', help='(default: %(default)s)')
+    add('way', way, type=float, default=1.0, metavar='M')
+    add('legs', '(default: %(default)s)', type=int, default=6, metavar='N')
     return parser
 
 
@@ -291,8 +254,8 @@ def _problem(options: argparse.Namespace) -> str:
     return ''
 
 
-def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Event) -> str:
-    """Fly and print the result; return what went wrong, or nothing."""
+def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Event) -> None:
+    """Fly, land, and print the result."""
     flight = MeasuringFlight(link, options.way, options.legs, time.monotonic)
     said = ''
     try:
@@ -301,21 +264,15 @@ def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Even
                 said = what
                 print(what, flush=True)
             if ended.wait(_PERIOD):
-                return _INTERRUPTED
-    except MeasurementError as error:
-        return str(error)
+                raise MeasurementError('interrupted')
     finally:
         _land(link)
-    try:
-        found = fit_speed(flight.legs, link.tilt)
-    except MeasurementError as error:
-        return str(error)
+    found = fit_speed(flight.legs, link.tilt)
     print(
         f'\nmotion.tilt: {link.tilt:g}\n'
         f'mambo.full_speed: {found.full_speed:.3g}    # m/s, to {100 * found.doubt:.1f} per cent\n'
         f'mambo.delay: {found.delay:.2f}    # s'
     )
-    return ''
 
 
 def _land(link: MamboLink) -> None:
@@ -331,8 +288,7 @@ def _land(link: MamboLink) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the measurement and return its exit code."""
     options = build_parser().parse_args(arguments)
-    problem = _problem(options)
-    if problem:
+    if problem := _problem(options):
         print(f'error: {problem}', file=sys.stderr)
         return 2
     if not options.fly:
@@ -350,14 +306,13 @@ def main(arguments: list[str] | None = None) -> int:
     )
     try:
         link.connect()
-        problem = _measure(link, options, ended)
-    except MamboLinkError as error:
-        problem = str(error)
+        _measure(link, options, ended)
+    except (MamboLinkError, MeasurementError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
     finally:
         link.close()
-    if problem:
-        print(f'error: {problem}', file=sys.stderr)
-    return 1 if problem else 0
+    return 0
 
 
 if __name__ == '__main__':

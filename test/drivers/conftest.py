@@ -127,3 +127,17 @@ def process(context, tmp_path):
         if item.poll() is None:
             item.kill()
         item.wait()
+
+
+@pytest.fixture
+def flights():
+    """Return a function that takes what is to be closed at the end."""
+    taken = []
+
+    def take(flight):
+        taken.append(flight)
+        return flight
+
+    yield take
+    for flight in taken:
+        flight.close()

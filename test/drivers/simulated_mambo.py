@@ -56,7 +56,6 @@ class Flight:
         self.time = self.heard_at = 0.0
         self._heard = 'landed', battery
         self.motion = make_motion(MOTION)
-        permitted = settings.pop('permitted', True)
         settings = MamboSettings(**{'full_speed': full_speed(drag), 'arm': True} | settings)
         self.pilot = MamboPilot(self, self.motion, settings, HOME, FENCE)
         self.pilot.update(self.time)

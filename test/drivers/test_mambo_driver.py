@@ -5,21 +5,18 @@ show.
 """
 
 import math
-import os
 import signal
-import subprocess
 from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-import yaml
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
+from linked_flight import LinkedFlight
 from numpy.testing import assert_allclose
-from rclpy.executors import SingleThreadedExecutor
-from robot_team import MAMBO, Team, image_message, parameters_of, rendered
+from robot_team import MAMBO, image_message, parameters_of, rendered
 from waiting import wait_until
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
@@ -30,7 +27,6 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
-from maasi_filter.ros.parameters import flatten
 from maasi_msgs.msg import AgentState
 from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState, MamboFirmware
@@ -43,11 +39,11 @@ FULL_SPEED = 9.81 * math.tan(MAMBO['motion']['tilt']) / FirmwareSettings().drag
 LATEST = 1.5
 
 
-class Flight:
-    """A fake Mambo, the settings of its driver, and the team around it."""
+class Flight(LinkedFlight):
+    """A fake Mambo behind its driver."""
 
-    def __init__(self, context, executor, mambo, **settings):
-        self.fake = FakeMambo(
+    def __init__(self, context, mambo, changes):
+        self.drone = FakeMambo(
             MamboFirmware(
                 Pose.from_yaw([*START[:2], 0.0], YAW),
                 FirmwareSettings(take_off_height=0.3, lost_link='land'),
@@ -55,103 +51,35 @@ class Flight:
             ),
             free_address(),
         )
-        link = {'arm': True, 'full_speed': FULL_SPEED, 'address': self.fake.address}
+        link = {'arm': True, 'full_speed': FULL_SPEED, 'address': self.drone.address}
         # The machine may be busy.
         link |= {'port': free_port(), 'link_timeout': 2.0} | mambo
-        self.settings = MAMBO | {
-            'start': START,
-            'yaw': YAW,
-            'link': 'mambo_wifi',
-            'mambo': link,
-            'odometry_timeout': 0.5,
-            'battery_minimum': 0.0,
-            **settings,
-        }
-        self.team = Team(context, self.settings, executor, deaf=True)
-        # It is not reached by topics.
-        self.team.used = [self.team.batches]
+        own = {'start': START, 'yaw': YAW, 'link': 'mambo_wifi', 'mambo': link}
+        own |= {'odometry_timeout': 0.5, 'battery_minimum': 0.0}
+        super().__init__(context, MAMBO | own | changes)
 
     @property
-    def flying_state(self):
-        return self.fake.firmware.flying_state
+    def doing(self):
+        return self.drone.firmware.flying_state
 
-    @property
-    def speed(self):
-        """Over the ground [m/s]."""
-        return float(np.linalg.norm(self.fake.state.velocity[:2]))
-
-    @property
-    def where(self):
-        return self.fake.state.pose.position
-
-    @property
-    def reason(self):
-        return self.team.state.reason if self.team.states else 'silent'
-
-    @property
-    def status(self):
-        return self.team.state.goal_status if self.team.states else None
-
-    def until(self, condition, what=''):
-        self.team.until(condition, what or f'{self.flying_state!r}, {self.reason!r}')
-
-    def permit(self):
-        while not self.team.call('arm', self.until).success:
-            pass
-        return self
-
-    def up(self):
-        """Let it take off, and wait until it takes goals."""
-        self.permit().until(lambda: self.status in (AgentState.IDLE, AgentState.ABORTED))
-        return self
+    def until_it_is(self, *states):
+        self.until(lambda: self.doing in states)
 
     def on_its_way(self):
         """Wait until it flies to a goal; return the goal's handle and result to come."""
-        handle, result = self.up().team.send_accepted(GOAL)
+        handle, result = self.arm().until_it_flies().team.send_accepted(GOAL)
         self.until(lambda: np.linalg.norm(self.where[:2] - START[:2]) > 0.1)
         return handle, result
 
-    def gives_up(self, result, reason):
-        """Check that the planner hears why the way has ended, and that it is not sent on."""
-        self.until(lambda: self.status == AgentState.UNAVAILABLE and reason in self.reason)
-        self.until(result.done)
-        assert result.result().status == GoalStatus.STATUS_ABORTED
-        assert self.team.refused(GOAL)
-
 
 @pytest.fixture
-def fly(context, tmp_path):
-    """Return a function that starts a driver, in this process or its own, and all around it."""
-    executor = SingleThreadedExecutor(context=context)
-    ends = [executor.shutdown]
+def fly(context, flights):
+    """Return a function that starts a driver in this process, and all around it."""
 
-    def start(mambo=None, own_process=False, **changes):
-        flight = Flight(context, executor, mambo or {}, **changes)
-        ends.append(lambda: flight.fake.close())
-        ends.append(flight.team.destroy_node)
-        if own_process:
-            file = tmp_path / 'parameters.yaml'
-            flat = flatten(DriverSettings.model_validate(flight.settings))
-            file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-            command = ['mambo_driver', '--ros-args', '--remap', '__ns:=/rover']
-            driver = subprocess.Popen([*command, '--params-file', str(file)], env=os.environ)
-            ends.extend([driver.wait, driver.kill])
-        else:
-            parameters = parameters_of(flight.settings)
-            driver = MamboDriver(
-                context=context, namespace='/rover', parameter_overrides=parameters
-            )
-            ends.extend([driver.destroy_node, driver.halt])
-            executor.add_node(driver)
-            assert driver.trigger_configure().name == 'SUCCESS'
-            assert driver.trigger_activate().name == 'SUCCESS'
-        flight.team.connect()
-        flight.driver = driver
-        return flight
+    def start(mambo=None, **changes):
+        return flights(Flight(context, mambo or {}, changes)).run_node(MamboDriver)
 
-    yield start
-    for end in reversed(ends):
-        end()
+    return start
 
 
 # ---- a flight --------------------------------------------------------------------------------
@@ -160,7 +88,7 @@ def fly(context, tmp_path):
 def test_it_takes_off_goes_where_it_is_sent_and_lands(fly, monkeypatch):
     flight = fly()
     flight.until(lambda: flight.status == AgentState.UNAVAILABLE)
-    team = flight.up().team
+    team = flight.arm().until_it_flies().team
     assert_allclose(flight.where, START, atol=0.15)
     for point in ([1.7, 0.8, 1.6], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5]):
         assert team.refused(point)
@@ -188,21 +116,21 @@ def test_it_takes_off_goes_where_it_is_sent_and_lands(fly, monkeypatch):
     assert_allclose([place.x, place.y, place.z], flight.where, atol=0.06)
     assert team.state.battery == pytest.approx(1.0, abs=0.02)
     flight.driver.trigger_deactivate()
-    assert flight.flying_state in (FlyingState.LANDING, FlyingState.LANDED)
-    flight.until(lambda: flight.flying_state == FlyingState.LANDED)
-    assert flight.fake.firmware.take_offs == 1 and flight.fake.refused == 0
+    assert flight.doing in (FlyingState.LANDING, FlyingState.LANDED)
+    flight.until_it_is(FlyingState.LANDED)
+    assert flight.drone.firmware.take_offs == 1 and flight.drone.refused == 0
 
 
 @pytest.mark.parametrize('source', ['pose', 'odometry'])
 def test_it_flies_by_another_system(fly, source):
     """Its own position events do not come at all."""
     flight = fly({'pose': source})
-    flight.fake.position_sent = 'none'
+    flight.drone.position_sent = 'none'
     team = flight.team
     publisher = team.create_publisher(PoseStamped, 'pose', 10)
 
     def tell():
-        stamp, state = team.get_clock().now().nanoseconds, flight.fake.state
+        stamp, state = team.get_clock().now().nanoseconds, flight.drone.state
         if source == 'pose':
             message = PoseStamped(pose=pose_to_ros(state.pose))
             message.header.frame_id = 'map'
@@ -216,45 +144,35 @@ def test_it_flies_by_another_system(fly, source):
             team.odometry.publish(message)
 
     team.create_timer(0.04, tell)
-    _, result = flight.up().team.send_accepted(GOAL)
+    _, result = flight.arm().until_it_flies().team.send_accepted(GOAL)
     flight.until(result.done)
     assert result.result().status == GoalStatus.STATUS_SUCCEEDED
     assert np.linalg.norm(flight.where - GOAL) < 0.1
 
 
-@pytest.mark.parametrize('source', ['topic', 'video'])
-def test_images_are_placed_where_the_drone_was(play, tmp_path, source):
-    pose, target = Pose.from_yaw(START, YAW), np.array([1.03, 1.24])
+def test_markers_in_a_video_are_placed_where_the_drone_was(play, tmp_path):
+    path, target = tmp_path / 'flight.avi', np.array([1.03, 1.24])
     robot = SimpleNamespace(settings=DriverSettings.model_validate(MAMBO))
-    message = rendered(robot, [target.tolist()], pose)
-    options = {}
-    if source == 'video':
-        path = tmp_path / 'flight.avi'
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 10.0, (160, 120))
-        image = np.asarray(message.data, dtype=np.uint8).reshape(120, 160, 3)
-        for _ in range(300):
-            writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        writer.release()
-        options = {'image_source': 'video', 'video': str(path)}
-    _, team = play('mambo', start=START, yaw=YAW, **options)
+    message = rendered(robot, [target.tolist()], Pose.from_yaw(START, YAW))
+    image = np.asarray(message.data, dtype=np.uint8).reshape(120, 160, 3)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 10.0, (160, 120))
+    for _ in range(300):
+        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    writer.release()
+    _, team = play('mambo', start=START, yaw=YAW, image_source='video', video=str(path))
 
     def say():
         now = team.get_clock().now().nanoseconds
         team.odometry.publish(team.odometry_message(now))
         return now
 
-    now = say()
     team.until(lambda: say() and team.states)
-    message.header.stamp = stamp_to_ros(say())
-    team.ask(now)
-    if source == 'topic':
-        team.images.publish(message)
+    team.ask(say())
     team.until(lambda: say() and team.detections)
     (seen,) = team.detections[0].detections
     there = team.detections[0].pose.pose.position
     angles = math.cos(seen.bearing), math.sin(seen.bearing)
-    place = [there.x, there.y] + seen.range * np.array(angles)
-    assert_allclose(place, target, atol=0.06)
+    assert_allclose([there.x, there.y] + seen.range * np.array(angles), target, atol=0.06)
 
 
 # ---- safety ----------------------------------------------------------------------------------
@@ -273,15 +191,15 @@ def test_what_is_waited_for_is_short_enough():
 def test_what_is_lost_has_it_hover_then_land(fly):
     flight = fly()
     _, result = flight.on_its_way()
-    flight.fake.cut()
+    flight.drone.cut()
     reason = 'link lost: nothing from the Mambo for'
     flight.gives_up(result, reason)
-    flight.until(lambda: flight.flying_state == FlyingState.LANDED)
+    flight.until_it_is(FlyingState.LANDED)
     # The drone may have landed by itself before its driver gives up.
     flight.until(lambda: flight.reason.startswith((f'landing: {reason}', f'landed: {reason}')))
-    flight.fake.cut(False)
+    flight.drone.cut(False)
     flight.until(lambda: flight.reason.startswith(f'landed: {reason}'))
-    assert flight.fake.firmware.take_offs == 1
+    assert flight.drone.firmware.take_offs == 1
 
 
 def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
@@ -298,16 +216,16 @@ def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
 
 def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
     flight = fly({'land_after': 1.0})
-    firmware = flight.fake.firmware
+    firmware = flight.drone.firmware
     # Not by its own watchdog: the last command would be flown for ever.
     firmware.settings = replace(firmware.settings, command_timeout=math.inf)
     flight.on_its_way()
     assert flight.speed > 0.1
     # Nothing spins the executor meanwhile.
-    wait_until(lambda: flight.speed < 0.05, what=lambda: flight.flying_state)
+    wait_until(lambda: flight.speed < 0.05, what=lambda: flight.doing)
     # It was told so before it lands.
-    assert flight.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
-    wait_until(lambda: flight.flying_state == FlyingState.LANDED, what=lambda: flight.flying_state)
+    assert flight.doing in (FlyingState.HOVERING, FlyingState.FLYING)
+    wait_until(lambda: flight.doing == FlyingState.LANDED, what=lambda: flight.doing)
     # Once it is looked after again, it is said why it does not go on.
     flight.until(lambda: flight.status == AgentState.UNAVAILABLE and 'Mambo is' in flight.reason)
 
@@ -319,8 +237,8 @@ def test_a_cancelled_goal_has_it_hover_then_land(fly):
     flight.until(result.done)
     assert result.result().status == GoalStatus.STATUS_CANCELED
     flight.until(lambda: flight.speed < 0.05)
-    assert flight.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
-    flight.until(lambda: flight.flying_state == FlyingState.LANDED)
+    assert flight.doing in (FlyingState.HOVERING, FlyingState.FLYING)
+    flight.until_it_is(FlyingState.LANDED)
     # The driver hears of it a little later.
     flight.until(lambda: UNTIL_ARM in flight.reason)
     assert UNTIL_ARM in flight.team.refused(GOAL)
@@ -343,28 +261,28 @@ def test_a_camera_that_repeats_itself_has_it_hover(fly):
     _, result = flight.on_its_way()
     hangs = True
     flight.gives_up(result, 'no new image for')
-    flight.until(lambda: flight.flying_state == FlyingState.HOVERING)
+    flight.until_it_is(FlyingState.HOVERING)
     hangs = False
     flight.until(lambda: flight.status == AgentState.ABORTED)
     assert flight.team.takes(GOAL)
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
-def test_a_driver_that_ends_or_is_killed(fly, number):
+def test_a_driver_that_ends_or_is_killed(context, flights, tmp_path, number):
     """With SIGKILL only the firmware is left."""
-    flight = fly(own_process=True)
+    flight = flights(Flight(context, {}, {})).run_process('mambo_driver', tmp_path)
     _, result = flight.on_its_way()
     flight.driver.send_signal(number)
     flight.until(lambda: flight.driver.poll() is not None)
     if number == signal.SIGINT:
         assert flight.driver.returncode == 0
         # It has waited for the drone to say so.
-        assert flight.flying_state in (FlyingState.LANDING, FlyingState.LANDED)
+        assert flight.doing in (FlyingState.LANDING, FlyingState.LANDED)
         flight.until(result.done)
         assert result.result().result.reason == 'the driver stops'
     else:
-        flight.until(lambda: flight.flying_state == FlyingState.HOVERING)
-    flight.until(lambda: flight.flying_state == FlyingState.LANDED)
+        flight.until_it_is(FlyingState.HOVERING)
+    flight.until_it_is(FlyingState.LANDED)
 
 
 # ---- what cannot be --------------------------------------------------------------------------
@@ -396,8 +314,8 @@ def test_a_drone_that_is_not_there_is_said_and_awaited(fly):
     flight = fly({'address': address})
     flight.until(lambda: f'no Mambo at {address}' in flight.reason)
     assert flight.status == AgentState.UNAVAILABLE
-    firmware = flight.fake.firmware
-    flight.fake.close()
-    flight.fake = FakeMambo(firmware, address)
-    flight.up()
+    firmware = flight.drone.firmware
+    flight.drone.close()
+    flight.drone = FakeMambo(firmware, address)
+    flight.arm().until_it_flies()
     assert firmware.take_offs == 1

@@ -5,10 +5,10 @@ import struct
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from linked_flight import LinkedFlight
 from numpy.testing import assert_allclose
 from onboard_program import AIR, GROUND, OnboardProgram
-from rclpy.executors import SingleThreadedExecutor
-from robot_team import MAMBO, Team, parameters_of
+from robot_team import MAMBO
 from waiting import wait_until
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
@@ -27,7 +27,6 @@ from maasi_drivers.vision.measurement_feed import (
     encode,
 )
 from maasi_filter.models.pose import Pose, compose
-from maasi_msgs.msg import AgentState
 from maasi_sim.emulators.mambo.fake_mambo import free_address, free_port
 
 START, YAW, GROUND_HEIGHT = [1.0, 1.2, 0.6], 0.6, 0.1
@@ -35,14 +34,14 @@ GOAL = [1.7, 0.8, 0.7]
 ORIGIN = Pose.from_yaw([*START[:2], GROUND_HEIGHT], YAW)
 
 
-class Flight:
-    """A driver in this process, the drone, and the team."""
+class Flight(LinkedFlight):
+    """A drone with its own program behind its driver."""
 
-    def __init__(self, context, executor, **mambo):
+    def __init__(self, context, mambo):
         port = free_port()
         self.drone = OnboardProgram(free_address(), ('127.0.0.1', port))
         link = {'arm': True, 'address': self.drone.address, 'order_port': self.drone.port}
-        settings = MAMBO | {
+        settings = {
             'start': START,
             'yaw': YAW,
             'link': 'mambo_feed',
@@ -52,63 +51,33 @@ class Flight:
             'odometry_timeout': 0.5,
             'mambo': link | {'ground': GROUND_HEIGHT, 'land_after': 1.0} | mambo,
         }
-        self.driver = MamboOnboardDriver(
-            context=context, namespace='/rover', parameter_overrides=parameters_of(settings)
-        )
-        executor.add_node(self.driver)
-        self.team = Team(context, settings, executor, deaf=True)
-        self.team.used = [self.team.batches]
-        assert self.driver.trigger_configure().name == 'SUCCESS', self.driver.problem
-        self.until(lambda: len(self.drone.kinds) > 5)
-        # Nothing moves before it is active.
-        assert set(self.drone.kinds) == {OrderKind.LAND} and self.drone.state == GROUND
-        assert self.driver.trigger_activate().name == 'SUCCESS'
-        self.team.connect()
+        super().__init__(context, MAMBO | settings)
 
     @property
     def where(self):
         return compose(ORIGIN, Pose(self.drone.model.position)).position
 
     @property
-    def reason(self):
-        return self.team.state.reason if self.team.states else ''
-
-    def until(self, condition, what=''):
-        self.team.until(condition, f'{what} {self.reason!r}, {self.drone.state}')
+    def doing(self):
+        return self.drone.state
 
     def up(self):
         self.until(lambda: UNTIL_ARM in self.reason)
         assert self.drone.take_offs == 0
-        while not self.team.call('arm', self.until).success:
-            pass
-        self.until(lambda: self.team.states and self.team.state.goal_status == AgentState.IDLE)
-        return self
+        return self.arm().until_it_flies()
 
     def on_its_way(self):
         _, result = self.up().team.send_accepted(GOAL)
         self.until(lambda: np.linalg.norm(self.where - START) > 0.2)
         return result
 
-    def close(self):
-        self.driver.halt()
-        self.driver.destroy_node()
-        self.team.destroy_node()
-        self.drone.close()
-
 
 @pytest.fixture
-def fly(context):
-    started = []
-    executor = SingleThreadedExecutor(context=context)
-
+def fly(context, flights):
     def start(**mambo):
-        started.append(Flight(context, executor, **mambo))
-        return started[-1]
+        return flights(Flight(context, mambo)).run_node(MamboOnboardDriver)
 
-    yield start
-    for flight in started:
-        flight.close()
-    executor.shutdown()
+    return start
 
 
 def test_it_takes_off_goes_where_it_is_sent_measures_and_lands(fly):
@@ -137,8 +106,9 @@ def test_it_takes_off_goes_where_it_is_sent_measures_and_lands(fly):
 
 def test_nothing_takes_off_without_arm(fly):
     flight = fly(arm=False)
+    assert flight.drone.state == GROUND
     flight.until(lambda: 'mambo.arm' in flight.reason)
-    assert 'mambo.arm' in flight.team.call('arm', flight.until).message
+    assert 'mambo.arm' in flight.call('arm').message
     assert flight.team.refused(GOAL)
     known = len(flight.drone.kinds)
     flight.until(lambda: len(flight.drone.kinds) > known + 10)
@@ -165,12 +135,12 @@ def test_the_service_stop_ends_a_take_off(fly):
     # A permission needs a drone that is heard.
     flight.drone.silent = True
     flight.until(lambda: 'no ' in flight.reason)
-    answer = flight.team.call('arm', flight.until)
+    answer = flight.call('arm')
     assert (answer.success, answer.message) == (False, 'it is in the air, or not heard')
     flight.drone.silent = False
-    flight.until(lambda: flight.team.call('arm', flight.until).success)
+    flight.arm()
     flight.until(lambda: flight.where[2] > GROUND_HEIGHT + 0.1)
-    assert flight.team.call('stop', flight.until).success
+    assert flight.call('stop').success
     flight.until(lambda: flight.drone.state == GROUND and 'landed: ' in flight.reason)
     assert f'landed: its take-off was stopped, {UNTIL_ARM}' in flight.reason
     assert flight.drone.take_offs == 1

@@ -8,29 +8,24 @@ import math
 import os
 import signal
 import socket
-import subprocess
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
+from linked_flight import LinkedFlight
 from numpy.testing import assert_allclose
-from rclpy.executors import SingleThreadedExecutor
-from robot_team import STEP, Team, parameters_of, rendered, stamped
+from robot_team import STEP, rendered, stamped
 
 from maasi_drivers.agent import watchdog
 from maasi_drivers.agent.agent_driver import STOPPED as STOPPED_BY_SERVICE
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.drivers import MavlinkCameraDriver, MavlinkDriver
 from maasi_drivers.links.mavlink.mavlink_robot_link import POLL_PERIOD
-from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose, compose
 from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
-from maasi_filter.ros.parameters import flatten
 from maasi_msgs.msg import AgentState
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import FakeVehicle
@@ -60,59 +55,30 @@ CAMERA = {
 FENCE = [[-3.0, 3.0], [-3.0, 3.0], [0.5, 3.0]]
 
 
-class Flight:
-    """A fake vehicle, the settings of its driver, and the team around them."""
+class Flight(LinkedFlight):
+    """A fake vehicle behind its driver."""
 
-    def __init__(self, context, executor, firmware, autopilot, link, changes):
+    def __init__(self, context, firmware, autopilot, link, changes):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(('127.0.0.1', 0))
             url = f'127.0.0.1:{probe.getsockname()[1]}'
         own = {'arm': True, 'link_timeout': 3.0, 'url': f'udpin:{url}'} | link
-        self.settings = COPTER | {'mavlink': own} | changes
         values = {'firmware': firmware, 'estimator_time': 0.2} | autopilot
-        self.vehicle = FakeVehicle(
+        self.drone = FakeVehicle(
             AutopilotSettings.model_validate(values),
             own['url'].replace('udpin', 'udpout'),
             Pose.from_yaw([*START[:2], 0.0], 0.0),
             np.random.default_rng(1),
         )
-        self.autopilot = self.vehicle.autopilot
-        self.team = Team(context, self.settings, executor, deaf=True)
-        self.team.used = [
-            self.team.batches,
-            self.team.images if 'camera' in changes else self.team.ranges,
-        ]
+        self.autopilot, self.lock = self.drone.autopilot, self.drone._lock
+        super().__init__(context, COPTER | {'mavlink': own} | changes)
 
     @property
-    def state(self):
-        return self.team.state
-
-    @property
-    def reason(self):
-        return self.state.reason if self.team.states else 'silent'
-
-    @property
-    def position(self):
-        return self.vehicle.state.pose.position
-
-    @property
-    def speed(self):
-        return float(np.linalg.norm(self.vehicle.state.velocity[:2]))
-
-    def until(self, condition, what=''):
-        self.team.until(condition, what or f'{self.autopilot.mode_name}, {self.team.states[-1:]}')
+    def doing(self):
+        return self.autopilot.mode_name
 
     def fly(self):
-        # Refused until the vehicle is heard.
-        self.until(lambda: self.team.call('arm').success)
-        return self.wait_for_flight()
-
-    def wait_for_flight(self):
-        self.until(
-            lambda: self.team.states and self.state.goal_status != AgentState.UNAVAILABLE,
-            'it does not fly',
-        )
-        return self
+        return self.arm().until_it_flies()
 
     def under_way(self, goal=FAR):
         _, result = self.team.send_accepted(goal)
@@ -121,52 +87,27 @@ class Flight:
 
     def until_stopped(self, since):
         self.until(lambda: self.speed < STOPPED)
-        assert np.linalg.norm((self.position - since)[:2]) < LONGEST_WAY
+        assert np.linalg.norm((self.where - since)[:2]) < LONGEST_WAY
 
     def gives_up(self, result, reason):
-        """Check that the goal ends, that the planner hears why, and that the vehicle stops."""
-        before = self.position
-        self.until(lambda: self.state.goal_status == AgentState.UNAVAILABLE)
-        assert reason in self.reason
-        self.until(result.done)
-        assert result.result().status == GoalStatus.STATUS_ABORTED
-        assert reason in result.result().result.reason
+        """Check that the vehicle stops as well."""
+        before = self.where
+        super().gives_up(result, reason)
         self.until_stopped(before)
-        assert self.team.refused([1.0, 1.0, 0.8])
 
 
 @pytest.fixture
-def fly(context, monkeypatch, tmp_path):
+def fly(context, flights, monkeypatch, tmp_path):
     """Return a function that starts a driver, in this process or its own, and its vehicle."""
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
-    executor = SingleThreadedExecutor(context=context)
-    ends = [executor.shutdown]
 
     def start(firmware='arducopter', autopilot=(), link=(), own_process=False, **changes):
-        flight = Flight(context, executor, firmware, dict(autopilot), dict(link), changes)
-        ends.extend([flight.vehicle.close, flight.team.destroy_node])
+        flight = flights(Flight(context, firmware, dict(autopilot), dict(link), changes))
         if own_process:
-            file = tmp_path / 'parameters.yaml'
-            flat = flatten(DriverSettings.model_validate(flight.settings))
-            file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-            command = ['mavlink_driver', '--ros-args', '--remap', '__ns:=/rover']
-            driver = subprocess.Popen([*command, '--params-file', str(file)], env=os.environ.copy())
-            ends.extend([driver.wait, driver.kill])
-        else:
-            kind = MavlinkCameraDriver if 'camera' in changes else MavlinkDriver
-            parameters = parameters_of(flight.settings)
-            driver = kind(context=context, namespace='/rover', parameter_overrides=parameters)
-            ends.extend([driver.destroy_node, driver.halt])
-            executor.add_node(driver)
-            assert driver.trigger_configure().name == 'SUCCESS'
-            assert driver.trigger_activate().name == 'SUCCESS'
-        flight.driver = driver
-        flight.team.connect()
-        return flight
+            return flight.run_process('mavlink_driver', tmp_path)
+        return flight.run_node(MavlinkCameraDriver if 'camera' in changes else MavlinkDriver)
 
-    yield start
-    for end in reversed(ends):
-        end()
+    return start
 
 
 def test_what_is_waited_for_is_short_enough():
@@ -187,7 +128,7 @@ def test_it_flies_to_its_waypoints_without_a_stop_and_lands_at_the_end(fly, monk
     # Without a geofence it is not sent into the ground.
     assert 'the geofence' in flight.driver.goals.problem(team.goal([0.0, 1.0, -0.1]))
     _, replaced = team.send_accepted([1.0, -3.0, height], number=1)
-    flight.until(lambda: flight.position[1] < -1.5)
+    flight.until(lambda: flight.where[1] < -1.5)
     leads = []
     send_target = flight.driver.link._send_target
 
@@ -199,7 +140,7 @@ def test_it_flies_to_its_waypoints_without_a_stop_and_lands_at_the_end(fly, monk
     monkeypatch.setattr(flight.driver.link, '_send_target', noting)
     _, result = team.send_accepted([3.0, -5.0, height], number=2)
     slowest = []
-    flight.until(lambda: slowest.append(flight.speed) or flight.position[0] > 2.0)
+    flight.until(lambda: slowest.append(flight.speed) or flight.where[0] > 2.0)
     assert replaced.done() and replaced.result().result.reason == 'replaced'
     # No set-point at its place, which would stop it; it flies on.
     assert len(leads) > 10 and min(leads) > 0.5 * SPEED
@@ -208,18 +149,18 @@ def test_it_flies_to_its_waypoints_without_a_stop_and_lands_at_the_end(fly, monk
     flight.until(result.done)
     assert result.result().result.reached
     flight.until(lambda: flight.speed < STOPPED)
-    assert_allclose(flight.position, [3.0, -5.0, height], atol=0.35)
-    assert_allclose(pose_from_ros(flight.state.pose.pose).position, flight.position, atol=0.35)
+    assert_allclose(flight.where, [3.0, -5.0, height], atol=0.35)
+    assert_allclose(pose_from_ros(flight.team.state.pose.pose).position, flight.where, atol=0.35)
     # A cancelled goal stops it.
     handle, result = team.send_accepted([3.0, 6.0, height])
     flight.until(lambda: flight.speed > 0.8 * SPEED)
-    before = flight.position
+    before = flight.where
     handle.cancel_goal_async()
     flight.until(result.done)
     flight.until_stopped(before)
-    assert flight.autopilot.mode_name == 'GUIDED'
+    assert flight.doing == 'GUIDED'
     flight.driver.halt()
-    assert flight.autopilot.mode_name == 'LAND'
+    assert flight.doing == 'LAND'
 
 
 def test_a_camera_in_a_map_that_is_turned_against_north(fly):
@@ -229,8 +170,11 @@ def test_a_camera_in_a_map_that_is_turned_against_north(fly):
     # The fake has its local frame at the start, with east along x.
     cosine, sine = math.cos(0.5), math.sin(0.5)
     east = [cosine * 1.0 - sine * -1.5, sine * 1.0 + cosine * -1.5]
-    assert_allclose(flight.position[:2] - START[:2], east, atol=0.35)
-    stamp, pose = stamp_from_ros(flight.state.header.stamp), pose_from_ros(flight.state.pose.pose)
+    assert_allclose(flight.where[:2] - START[:2], east, atol=0.35)
+    stamp, pose = (
+        stamp_from_ros(flight.team.state.header.stamp),
+        pose_from_ros(flight.team.state.pose.pose),
+    )
     assert pose.yaw == pytest.approx(-0.5, abs=0.05)
     target = pose.position[:2] + np.array([0.1, -0.05])
     image = rendered(flight.team, [target.tolist()], pose)
@@ -248,7 +192,7 @@ def test_a_localiser_says_where_the_frame_of_the_autopilot_is(fly):
     seen_from = Pose.from_yaw([0.7, -0.4, 0.1], 0.4)
 
     def say():
-        message = PoseStamped(pose=pose_to_ros(compose(seen_from, flight.vehicle.state.pose)))
+        message = PoseStamped(pose=pose_to_ros(compose(seen_from, flight.drone.state.pose)))
         message.header.frame_id = 'map'
         message.header.stamp = stamp_to_ros(flight.team.get_clock().now().nanoseconds)
         poses.publish(message)
@@ -257,13 +201,13 @@ def test_a_localiser_says_where_the_frame_of_the_autopilot_is(fly):
         flight.until(lambda: say() or condition())
 
     flight.until(lambda: UNTIL_ARM in flight.driver.health.text)
-    assert flight.team.call('arm').message == 'no pose'
-    until(lambda: flight.team.states and flight.team.call('arm').success)
-    until(lambda: flight.state.goal_status != AgentState.UNAVAILABLE)
+    assert flight.call('arm').message == 'no pose'
+    until(lambda: flight.team.states and flight.call('arm').success)
+    until(lambda: flight.status != AgentState.UNAVAILABLE)
     goal = [3.0, -1.0, 1.0]
     assert flight.team.takes(goal, live=say)
-    until(lambda: flight.state.goal_status == AgentState.REACHED)
-    there = compose(seen_from, flight.vehicle.state.pose).position
+    until(lambda: flight.status == AgentState.REACHED)
+    there = compose(seen_from, flight.drone.state.pose).position
     assert_allclose(there, goal, atol=0.35)
     # Without it the vehicle stays where it was sent last.
     flight.until(lambda: 'no pose for' in flight.reason)
@@ -277,7 +221,7 @@ def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
     flight = fly(start=[1.0, 2.0, 2.0])
     team, autopilot = flight.team, flight.autopilot
     flight.until(lambda: UNTIL_ARM in flight.reason)
-    assert flight.state.goal_status == AgentState.UNAVAILABLE
+    assert flight.status == AgentState.UNAVAILABLE
     assert flight.driver.link.status()['parameter FS_GCS_ENABLE'] == 5.0
     # The origin is kept for a driver that is started again.
     kept = Path(os.environ['ROS_HOME']) / 'maasi' / 'rover_flight_origin.json'
@@ -290,7 +234,7 @@ def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
     assert kept.exists()
     answer = team.call('arm')
     assert (answer.success, answer.message) == (False, 'it is in the air already')
-    with flight.vehicle._lock:
+    with flight.lock:
         autopilot.disarm('Crash: Disarming')
     reason = 'is disarmed: by the autopilot or the pilot ('
     flight.until(lambda: reason in flight.reason)
@@ -299,10 +243,10 @@ def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
     assert f'arm: refused: {STOPPED_BY_SERVICE}' in said and reason in said
     # It says by itself why it has no position.
     assert 'no LOCAL_POSITION_NED yet' not in said
-    with flight.vehicle._lock:
+    with flight.lock:
         autopilot.body.position[2] = 0.0
-    flight.until(lambda: team.call('arm').success)
-    flight.until(lambda: flight.position[2] > 0.3)
+    flight.arm()
+    flight.until(lambda: flight.where[2] > 0.3)
     # The service stop ends a take-off.
     assert team.call('stop').success
     flight.until(lambda: not autopilot.armed)
@@ -313,71 +257,57 @@ def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
 def test_a_vehicle_in_the_air_is_taken_over_and_the_answer_says_so(fly):
     flight = fly()
     flight.until(lambda: UNTIL_ARM in flight.reason)
-    with flight.vehicle._lock:
+    with flight.lock:
         # A pilot has brought it there.
         flight.autopilot.armed = True
         flight.autopilot.body.position[2] = 1.0
         flight.autopilot.take_mode('GUIDED')
     flight.until(lambda: flight.driver.link.status().get('in the air'))
     flight.until(lambda: 'it is armed in GUIDED' in flight.reason)
-    assert flight.team.call('arm').message == 'it is in the air: it is taken over where it is'
-    flight.wait_for_flight()
+    assert flight.call('arm').message == 'it is in the air: it is taken over where it is'
+    flight.until_it_flies()
 
 
 def test_blown_out_of_the_geofence_it_comes_back(fly):
     flight = fly(link={'geofence': FENCE}).fly()
     assert 'the geofence' in flight.driver.goals.problem(flight.team.goal([0.0, 3.5, 0.8]))
-    with flight.vehicle._lock:
+    with flight.lock:
         flight.autopilot.body.position = np.array([3.5, 0.0, 0.8])
     flight.until(lambda: 'm outside the geofence' in flight.reason)
-    flight.until(lambda: flight.position[0] < 3.1)
-    flight.until(lambda: flight.state.goal_status != AgentState.UNAVAILABLE)
+    flight.until(lambda: flight.where[0] < 3.1)
+    flight.until(lambda: flight.status != AgentState.UNAVAILABLE)
 
 
 @pytest.mark.parametrize(
-    ('firmware', 'fault', 'reason', 'logged'),
+    ('fault', 'reason'),
     [
-        ('arducopter', 'cut', 'link: nothing heard from system 1', ''),
-        ('arducopter', 'frozen', 'no LOCAL_POSITION_NED for', ''),
-        ('arducopter', 'restart', 'the autopilot has restarted', 'is disarmed: the autopilot has'),
-        (
-            'px4',
-            'pilot',
-            'the pilot has taken over: mode POSCTL',
-            'mode POSCTL; the driver lets go',
-        ),
+        ('cut', 'link: nothing heard from system 1'),
+        ('frozen', 'no LOCAL_POSITION_NED for'),
+        ('restart', 'the autopilot has restarted'),
     ],
 )
-def test_a_fault_ends_the_way_and_is_said(fly, capfd, firmware, fault, reason, logged):
+def test_a_fault_ends_the_way_and_is_said(fly, capfd, fault, reason):
     timeout = 0.5 if fault == 'frozen' else 5.0
-    parameters = {'FS_GCS_TIMEOUT': 60} if firmware == 'arducopter' else {}
-    flight = fly(
-        firmware, {'parameters': parameters}, {'link_timeout': 1.0}, odometry_timeout=timeout
-    )
-    vehicle, autopilot = flight.vehicle, flight.autopilot
+    settings = {'parameters': {'FS_GCS_TIMEOUT': 60}}
+    flight = fly(autopilot=settings, link={'link_timeout': 1.0}, odometry_timeout=timeout)
     result = flight.fly().under_way()
-    with vehicle._lock:
+    with flight.lock:
         if fault == 'cut':
-            vehicle.cut()
+            flight.drone.cut()
         elif fault == 'frozen':
-            autopilot.freeze()
-        elif fault == 'restart':
-            autopilot.restart()
-            # Nothing is left to stop it.
-            autopilot.body.velocity[:] = 0.0
+            flight.autopilot.freeze()
         else:
-            autopilot.take_mode('POSCTL')
+            flight.autopilot.restart()
+            # Nothing is left to stop it.
+            flight.autopilot.body.velocity[:] = 0.0
     flight.gives_up(result, reason)
-    assert logged in capfd.readouterr().err
     if fault == 'restart':
+        assert 'is disarmed: the autopilot has' in capfd.readouterr().err
         restarted = 'the autopilot has restarted: start the driver again'
-        assert flight.team.call('arm').message == restarted
-    elif fault == 'pilot':
-        flight.driver.halt()
-        assert autopilot.mode_name == 'POSCTL'
+        assert flight.call('arm').message == restarted
     elif fault == 'cut':
-        vehicle.cut(False)
-        flight.wait_for_flight()
+        flight.drone.cut(False)
+        flight.until_it_flies()
         assert flight.team.takes([1.0, 1.5, 0.8])
 
 
@@ -388,7 +318,7 @@ def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
     flight.until(result.done)
     assert result.result().result.reason == 'the time jumped back'
     flight.until(lambda: flight.speed < STOPPED)
-    flight.wait_for_flight()
+    flight.until_it_flies()
     _, result = flight.team.send_accepted([1.0, 1.5, 0.8])
     flight.until(result.done)
     assert result.result().result.reached
@@ -396,25 +326,27 @@ def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
 
 def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
     monkeypatch.setattr(watchdog, '_CHARGE_PATIENCE', 2.5)
-    flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
+    # High enough that it does not land before the pilot takes it.
+    high, far = [*START[:2], 4.0], [*FAR[:2], 4.0]
+    flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}, start=high).fly()
     autopilot = flight.autopilot
     # One that stays the same has been heard all the same.
     begin = time.monotonic()
     flight.until(lambda: time.monotonic() - begin > 4.0)
     assert 'battery_minimum cannot act' not in capfd.readouterr().err
-    result = flight.under_way()
-    with flight.vehicle._lock:
+    result = flight.under_way(far)
+    with flight.lock:
         autopilot.charge = 0.15
     flight.gives_up(result, 'battery at 0.15, below 0.20')
     flight.until(lambda: autopilot.mode_name == 'LAND')
     # It lands again once a pilot who took it over gives it back.
-    with flight.vehicle._lock:
+    with flight.lock:
         autopilot.take_mode('LOITER')
     flight.until(lambda: 'the pilot has taken over' in flight.reason)
     begin = time.monotonic()
     flight.until(lambda: time.monotonic() - begin > 0.5)
     assert autopilot.mode_name == 'LOITER' and 'battery at 0.15' in flight.reason
-    with flight.vehicle._lock:
+    with flight.lock:
         autopilot.take_mode('GUIDED')
     flight.until(lambda: autopilot.mode_name == 'LAND')
     flight.until(lambda: not autopilot.armed)
@@ -433,12 +365,12 @@ def test_a_driver_that_ends_or_is_killed(fly, number):
     """With SIGKILL only the failsafe of the autopilot is left."""
     flight = fly(autopilot={'parameters': {'FS_GCS_TIMEOUT': 3}}, own_process=True)
     result = flight.fly().under_way()
-    before = flight.position
+    before = flight.where
     flight.driver.send_signal(number)
     assert flight.driver.wait(timeout=30.0) == (0 if number == signal.SIGINT else -signal.SIGKILL)
     if number == signal.SIGINT:
-        assert flight.autopilot.mode_name == 'LAND'
+        assert flight.doing == 'LAND'
         flight.until(result.done)
         assert result.result().result.reason == 'the driver stops'
     flight.until_stopped(before)
-    flight.until(lambda: flight.autopilot.mode_name == 'LAND')
+    flight.until(lambda: flight.doing == 'LAND')

@@ -79,9 +79,3 @@ def test_three_vehicles_find_all_through_the_real_protocol(tmp_path):
         assert 'the autopilot has not said' not in log
         # Positions came, before the simulated time did.
         assert 'no LOCAL_POSITION_NED yet' not in log
-
-
-def test_a_link_in_real_time_is_not_run_in_lockstep(tmp_path):
-    run = run_scenario(short_search(tmp_path), tmp_path / 'run', '--lockstep')
-    assert run.code == 2
-    assert "robots.drone.link: read 'mavlink', which runs in real time" in run.output

@@ -39,6 +39,10 @@ from maasi_sim.world.odometry import OdometryModel, OdometrySettings
 from maasi_sim.world.robots import Battery, BatterySettings
 
 _GRAVITY = 9.81
+# Deceleration for each m/s while it hovers [1/s].
+_HOVER_GAIN = 2.0
+# Time constants of tilt, vertical speed and rotation rate [s].
+_TILT_TIME, _CLIMB_TIME, _TURN_TIME = 0.1, 0.2, 0.1
 
 
 @dataclass(frozen=True)
@@ -52,23 +56,17 @@ class FirmwareSettings:
     landing_timeout: float = 3.0  # without its controller until it lands, with `land` [s]
     critical_charge: float = 0.03  # at which it lands by itself [1]
     drag: float = 0.5  # deceleration for each m/s of speed [1/s]
-    tilt_time: float = 0.1  # time constants of tilt, vertical speed and rotation rate [s]
-    climb_time: float = 0.2
-    turn_time: float = 0.1
-    # Deceleration for each m/s while it hovers; 0: it only levels itself, as in the modes medium
-    # and difficult [1/s].
-    hover_gain: float = 2.0
 
 
 class TiltBody:
-    """A quadrotor under commanded tilts, without a floor.
+    """A quadrotor under commanded tilts and drag [1/s], without a floor.
 
     Position and velocity are in the map [m, m/s]; roll, pitch and yaw right-handed about forward,
     left and up [rad].
     """
 
-    def __init__(self, settings: FirmwareSettings, pose: Pose) -> None:
-        self.settings = settings
+    def __init__(self, drag: float, pose: Pose) -> None:
+        self.drag = drag
         self.rest_at(pose)
 
     def rest_at(self, pose: Pose) -> None:
@@ -91,21 +89,20 @@ class TiltBody:
         The command is the tilt that accelerates it forward, and to the right [rad], the vertical
         speed [m/s], and the rotation rate, anticlockwise [rad/s]; without tilt it hovers.
         """
-        settings = self.settings
         ahead, left = self.level_speed()
         pitch, roll, climb, turn_rate = command
         if pitch == roll == 0.0:
             pitch, roll = (
-                min(max(settings.hover_gain * speed / _GRAVITY, -most_tilt), most_tilt)
+                min(max(_HOVER_GAIN * speed / _GRAVITY, -most_tilt), most_tilt)
                 for speed in (-ahead, left)
             )
-        follow = 1.0 - math.exp(-h / settings.tilt_time)
+        follow = 1.0 - math.exp(-h / _TILT_TIME)
         pitch_step, roll_step = follow * (pitch - self.pitch), follow * (roll - self.roll)
         self.pitch += pitch_step
         self.roll += roll_step
-        forward = _GRAVITY * math.tan(self.pitch) - settings.drag * ahead
-        leftward = -_GRAVITY * math.tan(self.roll) - settings.drag * left
-        rising = (climb - self.velocity[2]) * (1.0 - math.exp(-h / settings.climb_time)) / h
+        forward = _GRAVITY * math.tan(self.pitch) - self.drag * ahead
+        leftward = -_GRAVITY * math.tan(self.roll) - self.drag * left
+        rising = (climb - self.velocity[2]) * (1.0 - math.exp(-h / _CLIMB_TIME)) / h
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         acceleration = np.array(
             [cosine * forward - sine * leftward, sine * forward + cosine * leftward, rising]
@@ -114,7 +111,7 @@ class TiltBody:
         self.velocity = before + h * acceleration
         self.position = self.position + 0.5 * h * (before + self.velocity)
         turn = self._rates[2]
-        turn += (1.0 - math.exp(-h / settings.turn_time)) * (turn_rate - turn)
+        turn += (1.0 - math.exp(-h / _TURN_TIME)) * (turn_rate - turn)
         self.yaw += h * turn
         self._rates = np.array([roll_step / h, pitch_step / h, turn])
 
@@ -187,7 +184,7 @@ class MamboFirmware:
         self.limits = {'tilt': 15.0 * _DEGREE, 'climb': 1.0, 'turn': 150.0 * _DEGREE}
         self.charge = Battery(self.battery)
         self.take_offs = 0
-        self.body = TiltBody(self.settings, self.start)
+        self.body = TiltBody(self.settings.drag, self.start)
         self._odometry = OdometryModel(self.odometry, self.start, self.seed, self.name)
         self._readings = 0
         # Piloting commands, and the time at which they take effect.
