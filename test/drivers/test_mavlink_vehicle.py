@@ -130,13 +130,16 @@ def test_nothing_is_armed(firmware, changes, parameters, text):
             assert f'{name} is {value}, which does not help' in play.said
     if text == NO_LINK_FAILSAFE:
         # A correction after the refusal does not take it off.
-        assert UNTIL_ARM in play.fault and NO_LINK_FAILSAFE in play.permit()
-        play.autopilot.parameters['FS_GCS_ENABLE'] = 5.0
+        assert UNTIL_ARM in play.fault
+        for value in (5.0, 0.0):
+            play.autopilot._sender.param_value_send(b'FS_GCS_ENABLE', value, 9, 1, 0)
+            play.run(20.0)
+            assert UNTIL_ARM in play.fault and not play.commands(ARM)
+        assert NO_LINK_FAILSAFE in play.permit()
         play.autopilot._sender.param_value_send(b'FS_GCS_ENABLE', 5.0, 9, 1, 0)
         play.run(20.0)
-        assert play.fault == f'vehicle: not armed: {UNTIL_ARM}' and not play.commands(ARM)
-        assert play.permit() == ''
-        play.fly()
+        assert not play.commands(ARM)
+        play.permitted().fly()
 
 
 @pytest.mark.parametrize('stopped', [False, True])
@@ -469,11 +472,13 @@ def test_a_permission_needs_a_vehicle_that_is_heard_and_ends_with_the_link():
     assert play.permit() == ''
     play.to_driver.cut = True
     play.run(2.0)
-    assert 'nothing heard' in play.permit()
     play.to_driver.cut = False
     play.run(25.0)
     assert play.fault == f'vehicle: not armed: {UNTIL_ARM}'
     assert not play.commands(ARM)
+    play.to_driver.cut = True
+    play.run(2.0)
+    assert 'nothing heard' in play.permit()
 
 
 def test_two_batteries_are_two():
@@ -589,6 +594,14 @@ def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
     assert play.vehicle.at_rest
     play.run(1.0)
     assert play.mode in ('POSCTL', 'ALT_HOLD')
+
+
+def test_a_pilot_can_take_the_mode_in_a_take_off():
+    play = Play()
+    play.until(lambda: play.phase is Phase.RISING)
+    play.autopilot.take_mode('LOITER')
+    play.run(2.0)
+    assert play.phase is Phase.RELEASED and play.mode == 'LOITER'
 
 
 def test_a_pilot_can_give_the_mode_back():
