@@ -99,28 +99,24 @@ class _User:
             self._executor.spin_once(timeout_sec=0.05)
         return True
 
-    def _missed(self, what: str) -> int:
-        """Return the exit code where something did not come, and say so after the timeout."""
-        if self._interrupted:
-            return INTERRUPTED
-        print(f'{what} for {self._options.timeout:g} s: is its driver there?')
-        return ABSENT
+    def _require(self, condition: Callable[[], object], what: str) -> None:
+        """Wait for something; end the command where it does not come."""
+        if self._wait(condition, self._options.timeout):
+            return
+        if not self._interrupted:
+            print(f'{what} for {self._options.timeout:g} s: is its driver there?')
+        raise SystemExit(INTERRUPTED if self._interrupted else ABSENT)
 
     def show(self) -> int:
         """Print the next state."""
-        state = self._next_state()
-        if isinstance(state, int):
-            return state
-        print(describe(state))
+        print(describe(self._next_state()))
         return DONE
 
-    def _next_state(self) -> AgentState | int:
-        """Return the next state, or the exit code where none comes."""
+    def _next_state(self) -> AgentState:
         heard: list[AgentState] = []
         topic = f'{self._top}/state'
         self._node.create_subscription(AgentState, topic, heard.append, SENSOR)
-        if not self._wait(lambda: heard, self._options.timeout):
-            return self._missed(f'nothing on {topic}')
+        self._require(lambda: heard, f'nothing on {topic}')
         return heard[-1]
 
     def go(self) -> int:
@@ -128,14 +124,10 @@ class _User:
         height = self._options.z
         if height is None:
             # One that flies is not sent into the ground.
-            state = self._next_state()
-            if isinstance(state, int):
-                return state
-            height = state.pose.pose.position.z
+            height = self._next_state().pose.pose.position.z
         topic = f'{self._top}/go_to'
         client = ActionClient(self._node, GoToWaypoint, topic)
-        if not self._wait(client.server_is_ready, self._options.timeout):
-            return self._missed(f'no {topic}')
+        self._require(client.server_is_ready, f'no {topic}')
         goal = GoToWaypoint.Goal(goal_id=1)
         goal.waypoint.header.frame_id = 'map'
         position = goal.waypoint.pose.position

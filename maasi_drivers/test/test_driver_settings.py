@@ -44,8 +44,8 @@ def test_camera_info_replaces_the_intrinsics_and_keeps_the_rest():
         ({'d': [float('inf')] * 5}, 'distortion'),
         ({'distortion_model': 'equidistant'}, "distortion_model: got 'equidistant'"),
         ({'width': 0}, 'width'),
-        ({'d': [1e308] * 4}, 'd .distortion.: got'),
-        ({'width': 2**32 - 1}, 'width, height: got'),
+        ({'d': [1e308] * 4}, 'distortion'),
+        ({'width': 2**32 - 1}, 'width'),
         ({'k': [1e300, *K[1:]]}, 'focal_length'),
     ],
 )

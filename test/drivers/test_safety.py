@@ -322,6 +322,7 @@ def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(start_gua
     team.until(lambda: guard.status()['driver lost'])
     assert not guard.active and not guard.status()['stopping']
     assert guard.trigger_activate().name == 'SUCCESS'
+    assert guard.status()['stopping']
     is_stopped(team)
 
 

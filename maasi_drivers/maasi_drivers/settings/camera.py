@@ -9,11 +9,12 @@ import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from maasi_filter.plugins import OwnSettings, PluginGroup
-from maasi_filter.settings import Finite, Settings, Vector2, Vector3
+from maasi_filter.settings import Finite, Settings, Vector3
 
-# Of a calibration: beyond these the camera cannot be one [px, px, -].
-_LARGEST_IMAGE, _LARGEST_INTRINSIC, _LARGEST_DISTORTION = 32_768, 1e6, 1e4
-
+# Beyond these limits a camera cannot be one.
+Focal = Annotated[Finite, Field(gt=0.0, le=1e6)]
+Pixel = Annotated[Finite, Field(ge=-1e6, le=1e6)]
+Coefficient = Annotated[Finite, Field(ge=-1e4, le=1e4)]
 
 DETECTORS = PluginGroup(
     'maasi.detectors',
@@ -133,17 +134,19 @@ class CameraSettings(Settings):
 
     width: int = Field(default=160, ge=8, le=16384, description='Image width [px]')
     height: int = Field(default=120, ge=8, le=16384, description='Image height [px]')
-    focal_length: Vector2 = Field(
+    focal_length: list[Focal] = Field(
         default=[260.0, 260.0],
+        min_length=2,
+        max_length=2,
         description='Focal length along image x and y (beta_x, beta_y of 001, eq. (18)) [px]',
     )
-    principal_point: list[Finite] | None = Field(
+    principal_point: list[Pixel] | None = Field(
         default=None,
         min_length=2,
         max_length=2,
         description="Optical centre, pixel centres at whole numbers; none: the image's centre [px]",
     )
-    distortion: list[Finite] = Field(
+    distortion: list[Coefficient] = Field(
         default_factory=list,
         description='Plumb-bob coefficients k1, k2, p1, p2[, k3]; none: none [-]',
     )
@@ -182,8 +185,6 @@ class CameraSettings(Settings):
 
     @model_validator(mode='after')
     def _consistent(self) -> CameraSettings:
-        if min(self.focal_length) <= 0:
-            raise ValueError(f'focal_length: got {self.focal_length}, allowed is more than 0')
         if len(self.distortion) not in (0, 4, 5):
             raise ValueError(
                 f'distortion: got {len(self.distortion)} coefficients, '
@@ -210,25 +211,16 @@ class CameraSettings(Settings):
         matrix = [float(value) for value in k]
         if any(matrix[i] != 0 for i in (1, 3, 6, 7)) or matrix[8] != 1:
             raise ValueError(f'k: got {matrix}, allowed [fx, 0, cx, 0, fy, cy, 0, 0, 1]')
-        for name, numbers, limit in (
-            ('width, height', (width, height), _LARGEST_IMAGE),
-            ('k (focal_length, principal_point)', matrix, _LARGEST_INTRINSIC),
-            ('d (distortion)', d, _LARGEST_DISTORTION),
-        ):
-            if not all(abs(number) <= limit for number in numbers):
-                raise ValueError(
-                    f'{name}: got {list(numbers)}, allowed are finite numbers up to {limit:g} in '
-                    'magnitude'
-                )
-        values = self.model_dump()
-        values.update(
-            width=width,
-            height=height,
-            focal_length=[matrix[0], matrix[4]],
-            principal_point=[matrix[2], matrix[5]],
-            distortion=[float(value) for value in d],
+        return CameraSettings.model_validate(
+            self.model_dump()
+            | {
+                'width': width,
+                'height': height,
+                'focal_length': [matrix[0], matrix[4]],
+                'principal_point': [matrix[2], matrix[5]],
+                'distortion': [float(value) for value in d],
+            }
         )
-        return CameraSettings.model_validate(values)
 
 
 def load_calibration(path: str | Path, settings: CameraSettings) -> CameraSettings:
