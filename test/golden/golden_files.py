@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import lzma
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,18 +30,9 @@ _BITS = 'bits'
 
 @dataclass(frozen=True)
 class Difference:
-    """A quantity of a run that is not as it was.
+    """A quantity of a run that is not as it was, and the step at which it differs first.
 
-    Attributes
-    ----------
-    run : str
-        Which.
-    step : int, optional
-        At which it differs first; None: at the end.
-    quantity : str
-        Which.
-    text : str
-        By how much.
+    Without a step it differs at the end.
     """
 
     run: str
@@ -104,79 +94,47 @@ def tolerance_for(difference: str) -> float:
 def differences(run: str, stored: Recording, now: Recording, tolerance: float) -> list[Difference]:
     """Return what differs between two recordings of a run: of each quantity the first place.
 
-    Parameters
-    ----------
-    run : str
-        Its name, for the messages.
-    stored, now : Recording
-        Before and now.
-    tolerance : float
-        See `tolerance_for`; 0 compares to the bit.
+    `run` is its name; see `tolerance_for`, 0 compares to the bit.
     """
-    found = []
-    for kind in [*stored, *(kind for kind in now if kind not in stored)]:
+    found, sizes = [], (stored['size'], now['size'])
+    if sizes[0] != sizes[1]:
+        text = f'{sizes[0]:g} m before, {sizes[1]:g} m now'
+        found.append(Difference(run, None, 'size', text))
+    for kind in dict.fromkeys(kind for kind in [*stored, *now] if kind != 'size'):
         before, after = stored.get(kind, {}), now.get(kind, {})
-        if kind == 'size':
-            if before != after:
-                found.append(Difference(run, None, 'size', f'{before:g} m before, {after:g} m now'))
-        elif kind == 'end':
-            found += _at_end(run, stored['size'], before, after, tolerance)
-        else:
-            found += _in_table(run, kind, stored['size'], before, after, tolerance)
+        steps: tuple[list[Any], ...] = before.get('step', []), after.get('step', [])
+        if kind == 'end':
+            # A table of one row.
+            names = dict.fromkeys([*before, *after])
+            before, after = ({name: [end.get(name)] for name in names} for end in (before, after))
+            steps = [None], [None]
+        for quantity in before or after:
+            rows = before.get(quantity, []), after.get(quantity, [])
+            # Stored recordings have no hashes.
+            if quantity == _BITS and not all(_BITS in table for table in (before, after) if table):
+                continue
+            scale = sizes[0] if quantity in LENGTHS else None
+            every = [_difference(old, new, scale, tolerance) for old, new in zip(*rows)]
+            wrong = [(step, item[1]) for step, item in zip(steps[0], every) if item is not None]
+            if wrong and kind == 'end':
+                found.append(Difference(run, None, quantity, wrong[0][1]))
+            elif wrong:
+                text = f'{wrong[0][1]}; so in {len(wrong)} of {len(every)}'
+                found.append(Difference(run, wrong[0][0], f'{kind}.{quantity}', text))
+        numbers = len(steps[0]), len(steps[1])
+        if numbers[0] != numbers[1]:
+            step = max(steps, key=len)[min(numbers)]
+            text = f'{numbers[0]} before, {numbers[1]} now'
+            found.append(Difference(run, step, f'number of {kind}', text))
     return sorted(found, key=lambda item: math.inf if item.step is None else item.step)
-
-
-def _at_end(
-    run: str, size: float, before: dict[str, Any], after: dict[str, Any], tolerance: float
-) -> Iterator[Difference]:
-    for quantity in [*before, *(name for name in after if name not in before)]:
-        scale = size if quantity in LENGTHS else None
-        wrong = _difference(before.get(quantity), after.get(quantity), scale, tolerance)
-        if wrong is not None:
-            yield Difference(run, None, quantity, wrong[1])
-
-
-def _in_table(
-    run: str,
-    kind: str,
-    size: float,
-    before: dict[str, list[Any]],
-    after: dict[str, list[Any]],
-    tolerance: float,
-) -> Iterator[Difference]:
-    steps = before.get('step', []), after.get('step', [])
-    for quantity in before or after:
-        rows = before.get(quantity, []), after.get(quantity, [])
-        # Stored recordings have no hashes.
-        if quantity == _BITS and not all(_BITS in table for table in (before, after) if table):
-            continue
-        scale = size if quantity in LENGTHS else None
-        every = [_difference(old, new, scale, tolerance) for old, new in zip(*rows)]
-        wrong = [(step, item[1]) for step, item in zip(steps[0], every) if item is not None]
-        if wrong:
-            step, text = wrong[0]
-            text += f'; so in {len(wrong)} of {len(every)}'
-            yield Difference(run, step, f'{kind}.{quantity}', text)
-    numbers = len(steps[0]), len(steps[1])
-    if numbers[0] != numbers[1]:
-        longer = max(steps, key=len)
-        text = f'{numbers[0]} before, {numbers[1]} now'
-        yield Difference(run, longer[min(numbers)], f'number of {kind}', text)
 
 
 def _difference(
     before: Any, after: Any, scale: float | None, tolerance: float
 ) -> tuple[float, str] | None:
-    """Return by how much two values differ, also in words; None if they do not.
+    """Return by how much two values, or lists of them, differ, also in words; None: they do not.
 
-    Parameters
-    ----------
-    before, after : number, text, or lists of them
-        The values.
-    scale : float, optional
-        Of lengths [m]; None: of numbers that are none.
-    tolerance : float
-        See `TOLERANCE`.
+    `scale` is that of lengths [m], None of other numbers.
     """
     if isinstance(before, list) and isinstance(after, list):
         if len(before) != len(after):

@@ -33,15 +33,7 @@ Recording = dict[str, Any]
 
 
 class Log:
-    """Notes what a run does.
-
-    Attributes
-    ----------
-    size : float
-        Longest side of the environment [m].
-    tables : dict
-        Rows by kind of event; 'bits' is a hash of all numbers of the row.
-    """
+    """Notes what a run does: rows by kind of event; 'bits' is a hash of all numbers of the row."""
 
     def __init__(self) -> None:
         self.size = 0.0
