@@ -121,13 +121,9 @@ def copy_node(tree: Tree, source: int) -> int:
     tree.closed[node] = tree.closed[source]
     tree.number[node] = tree.number[source]
     tree.dirty[node] = tree.dirty[source]
-    for i in range(tree.number[source]):
-        tree.visits[node, i] = tree.visits[source, i]
-    for a in range(3):
-        tree.cost[node, a] = tree.cost[source, a]
-        for k in range(tree.low.shape[2]):
-            tree.low[node, a, k] = tree.low[source, a, k]
-            tree.high[node, a, k] = tree.high[source, a, k]
-        for i in range(tree.values.shape[2]):
-            tree.values[node, a, i] = tree.values[source, a, i]
+    tree.visits[node] = tree.visits[source]
+    tree.cost[node] = tree.cost[source]
+    tree.low[node] = tree.low[source]
+    tree.high[node] = tree.high[source]
+    tree.values[node] = tree.values[source]
     return node
