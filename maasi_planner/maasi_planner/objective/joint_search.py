@@ -8,9 +8,8 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
-from maasi_planner.objective.information import InformationTerms, information_gain
-from maasi_planner.objective.paper import PaperTerms, left_by
 from maasi_planner.objective.predicted_measurements import Measurements
+from maasi_planner.objective.terms import Terms, exploration_given, refinement_given
 from maasi_planner.settings import PlannerSettings
 
 
@@ -18,6 +17,7 @@ class CandidateTable(NamedTuple):
     """The candidates of the planning robots, with the terms of the objective in use.
 
     G candidates of R robots, one robot after the other; robot r has start[r] to start[r + 1].
+    With `shared` what two see counts for the one with the shorter way only.
     """
 
     start: IntArray
@@ -30,19 +30,16 @@ class CandidateTable(NamedTuple):
     alpha: float
     beta: float
     control_weight: float
+    shared: bool
     planned: Measurements
-    is_paper: bool
-    paper: PaperTerms
-    information: InformationTerms
+    terms: Terms
 
 
 @njit(cache=True)
-def _counted_before(table: CandidateTable, g: int, chosen: IntArray) -> IntArray:
-    """Return the chosen candidates of others whose measurements g gets no credit for.
-
-    In `information` what two see counts for the one with the shorter way.
-    """
-    out = np.empty(chosen.shape[0], np.int64)
+def candidate_value(table: CandidateTable, g: int, chosen: IntArray) -> tuple[float, float, float]:
+    """Return T, E and J (17), (26) of g, given the others' choices (R,), -1 for none."""
+    # Chosen candidates whose measurements g gets no credit for.
+    others = np.empty(chosen.shape[0], np.int64)
     number = 0
     for r in range(chosen.shape[0]):
         other = chosen[r]
@@ -50,43 +47,13 @@ def _counted_before(table: CandidateTable, g: int, chosen: IntArray) -> IntArray
             continue
         shorter = table.norm[other] < table.norm[g]
         tie = table.norm[other] == table.norm[g] and r < table.robot[g]
-        if table.is_paper or shorter or tie:
-            out[number] = other
+        if shorter or tie or not table.shared:
+            others[number] = other
             number += 1
-    return out[:number]
-
-
-@njit(cache=True)
-def exploration_given(table: CandidateTable, g: int, others: IntArray) -> float:
-    """Return E of candidate g, given others that count before it."""
-    if table.is_paper:
-        left = table.paper.value[table.paper.start[g] : table.paper.start[g + 1]].copy()
-    else:
-        left = table.information.unseen * (1.0 - table.information.miss[g])
-    for other in others:
-        if table.is_paper:
-            factor = left_by(table.paper, table.planned, g, other)
-        else:
-            factor = table.information.miss[other]
-        for i in range(left.shape[0]):
-            left[i] *= factor[i]
-    total = 0.0
-    for i in range(left.shape[0]):
-        total += left[i]
-    return total
-
-
-@njit(cache=True)
-def candidate_value(
-    table: CandidateTable, g: int, chosen: IntArray, work: FloatArray
-) -> tuple[float, float, float]:
-    """Return T, E and J (17), (26) of g, given the others' choices (R,), -1 for none."""
-    others = _counted_before(table, g, chosen)
-    if table.is_paper:
-        refinement = table.paper.refinement[g]
-    else:
-        refinement = information_gain(table.information, g, others, work)
-    exploration = exploration_given(table, g, others) if table.beta > 0.0 else 0.0
+    others = others[:number]
+    refinement, exploration = refinement_given(table.terms, g, others), 0.0
+    if table.beta > 0.0:
+        exploration = exploration_given(table.terms, table.planned, g, others)
     value = -table.control_weight * table.control[g] + table.alpha * refinement
     return refinement, exploration, (value + table.beta * exploration) / table.norm[g]
 
@@ -109,12 +76,12 @@ def collides(table: CandidateTable, g: int, chosen: IntArray) -> bool:
 
 
 @njit(cache=True)
-def total_value(table: CandidateTable, chosen: IntArray, work: FloatArray) -> float:
+def total_value(table: CandidateTable, chosen: IntArray) -> float:
     """Return the sum of J over all chosen candidates (26)."""
     total = 0.0
     for r in range(chosen.shape[0]):
         if chosen[r] >= 0:
-            total += candidate_value(table, chosen[r], chosen, work)[2]
+            total += candidate_value(table, chosen[r], chosen)[2]
     return total
 
 
@@ -122,9 +89,8 @@ def total_value(table: CandidateTable, chosen: IntArray, work: FloatArray) -> fl
 def values_given(table: CandidateTable, first: int, last: int, chosen: IntArray) -> FloatArray:
     """Return T, E and J of the candidates `first` to `last`, given the others' choices, (n, 3)."""
     out = np.empty((last - first, 3))
-    work = np.zeros((3, 3, 3))
     for g in range(first, last):
-        refinement, exploration, value = candidate_value(table, g, chosen, work)
+        refinement, exploration, value = candidate_value(table, g, chosen)
         out[g - first, 0] = refinement
         out[g - first, 1] = exploration
         admissible = table.allowed[g] and not collides(table, g, chosen)
@@ -152,7 +118,6 @@ def _search_exactly(
     position = np.zeros(robots, np.int64)
     partial = np.zeros(robots + 1)
     chosen = np.full(robots, -1, np.int64)
-    work = np.zeros((3, 3, 3))
     evaluated = 0
     depth = 0
     position[0] = table.start[0]
@@ -169,7 +134,7 @@ def _search_exactly(
         if collides(table, g, chosen):
             continue
         chosen[depth] = g
-        value = total_value(table, chosen, work)
+        value = total_value(table, chosen)
         evaluated += 1
         if value + rest[depth + 1] <= best_value:
             continue
@@ -190,12 +155,11 @@ def _best_reply(
     alone: FloatArray,
     order: IntArray,
     chosen: IntArray,
-    work: FloatArray,
 ) -> tuple[int, float, int]:
     """Return the best candidate of one robot for the team, its total, and the work done."""
     previous = chosen[robot]
     chosen[robot] = -1
-    others = total_value(table, chosen, work)
+    others = total_value(table, chosen)
     best = -1
     best_value = -np.inf
     evaluated = 0
@@ -206,9 +170,9 @@ def _best_reply(
         if collides(table, g, chosen):
             continue
         chosen[robot] = g
-        own = candidate_value(table, g, chosen, work)[2]
+        own = candidate_value(table, g, chosen)[2]
         if others + own > best_value:
-            value = total_value(table, chosen, work)
+            value = total_value(table, chosen)
             if value > best_value:
                 best_value = value
                 best = g
@@ -232,13 +196,12 @@ def _search_in_turn(
     A robot that finds no admissible candidate keeps -1 in `chosen` (R,).
     """
     robots = table.radii.shape[0]
-    work = np.zeros((3, 3, 3))
     chosen[:] = -1
     evaluated = 0
     total = -np.inf
     for i in range(robots):
         r = robots - 1 - i if backwards else i
-        g, value, count = _best_reply(table, r, alone, order, chosen, work)
+        g, value, count = _best_reply(table, r, alone, order, chosen)
         evaluated += count
         if g >= 0:
             chosen[r] = g
@@ -248,7 +211,7 @@ def _search_in_turn(
         for r in range(robots):
             if chosen[r] < 0:
                 continue
-            g, value, count = _best_reply(table, r, alone, order, chosen, work)
+            g, value, count = _best_reply(table, r, alone, order, chosen)
             evaluated += count
             if g >= 0 and g != chosen[r] and value > total + 1e-12 * abs(total):
                 chosen[r] = g
@@ -273,7 +236,6 @@ def _improve_in_pairs(
     One robot takes another candidate, the best alone first, and a second one its best reply.
     """
     robots = table.radii.shape[0]
-    work = np.zeros((3, 3, 3))
     trial = np.zeros(robots, np.int64)
     evaluated = 0
     improved = True
@@ -296,7 +258,7 @@ def _improve_in_pairs(
                     if collides(table, g, trial):
                         continue
                     trial[r] = g
-                    reply, value, count = _best_reply(table, s, alone, order, trial, work)
+                    reply, value, count = _best_reply(table, s, alone, order, trial)
                     evaluated += count + 1
                     if reply >= 0 and value > total + 1e-12 * abs(total):
                         chosen[r] = g

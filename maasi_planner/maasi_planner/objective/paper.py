@@ -2,67 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_filter.models.detection import fill_probabilities
-from maasi_planner.objective.predicted_measurements import Measurements, apply_misses
+from maasi_planner.objective.predicted_measurements import Measurements, apply_misses, chances
+from maasi_planner.objective.terms import CACHE_ROWS, Terms
 
 Grid = tuple[FloatArray, FloatArray, FloatArray]
-CACHE_ROWS = 8000
-
-
-class PaperTerms(NamedTuple):
-    """T of the candidates (G,), and what their E consists of.
-
-    (22) interpolates e between grid nodes: candidate g has the nodes start[g] to start[g + 1], of
-    each value (n,) its weight times what is unseen, place (3, n) [m], in 2D with z = 0, and time
-    (n,) of the measurement [steps from now]. What the measurements of another candidate leave there
-    is kept: slot (G, G) is a row of cache (S, longest), filled on first use; used (1,) counts rows.
-    """
-
-    refinement: FloatArray
-    start: IntArray
-    value: FloatArray
-    place: FloatArray
-    time: IntArray
-    slot: IntArray
-    cache: FloatArray
-    used: IntArray
-
-
-# Of the objective `information`.
-NO_PAPER = PaperTerms(
-    refinement=np.zeros(0),
-    start=np.zeros(1, np.int64),
-    value=np.zeros(0),
-    place=np.zeros((3, 0)),
-    time=np.zeros(0, np.int64),
-    slot=np.zeros((0, 0), np.int64),
-    cache=np.zeros((0, 0)),
-    used=np.zeros(1, np.int64),
-)
-
-
-@njit(cache=True)
-def centre_sum(planned: Measurements, first: int, centres: FloatArray) -> FloatArray:
-    """Return T of each candidate: the sum of pi at cluster centres (000, (19), (31))."""
-    out = np.zeros(planned.own.shape[0])
-    number = centres.shape[0]
-    chance = np.empty(number)
-    for g in range(out.shape[0]):
-        robot = planned.robot[g]
-        kind, parameters = planned.kind[robot], planned.parameters[robot]
-        for e in range(planned.start[g] + first, planned.start[g] + planned.own[g]):
-            x, y, z = (centres - planned.places[e]).T.copy()
-            cosine, sine = planned.turns[e]
-            fill_probabilities(kind, parameters, x, y, z, number, cosine, sine, chance)
-            for c in range(number):
-                out[g] += chance[c]
-    return out
 
 
 @njit(cache=True, error_model='numpy')
@@ -103,29 +50,29 @@ def _nodes_around(
 def _unseen_nodes(
     planned: Measurements, settled: Measurements, first: int, own_counts: bool, grid: Grid
 ) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
-    """Return start, value, place and time of `PaperTerms` without the other planning robots.
+    """Return count, value, place and time of `Terms`, without the other planning robots.
 
-    `own_counts`: whether a measurement itself is in its product (21).
+    (22) interpolates e between grid nodes: each has its weight times what is unseen there. With
+    `own_counts` a measurement itself is in its product (21).
     """
-    most = 8 * planned.own.sum()
-    start = np.zeros(planned.own.shape[0] + 1, np.int64)
-    value, place, time = np.empty(most), np.empty((3, most)), np.empty(most, np.int64)
-    number = 0
-    for g in range(planned.own.shape[0]):
-        for e in range(planned.start[g] + first, planned.start[g] + planned.own[g]):
+    total, most = planned.own.shape[0], 8 * max(planned.own) if planned.own.shape[0] else 0
+    count = np.zeros(total, np.int64)
+    value, time = np.empty((total, most)), np.empty((total, most), np.int64)
+    place = np.empty((total, 3, most))
+    for g in range(total):
+        number, worth, at, when = 0, value[g], place[g], time[g]
+        for e in range(first, planned.own[g]):
             before = number
-            number = _nodes_around(planned.places[e], grid, number, value, place)
-            time[before:number] = planned.times[e]
-        start[g + 1] = number
-        rows = slice(start[g], number)
-        where, when, left = place[:, rows], time[rows], np.ones(number - start[g])
+            number = _nodes_around(planned.places[g, e], grid, number, worth, at)
+            when[before:number] = planned.times[g, e]
+        count[g] = number
+        worth, at, when, left = worth[:number], at[:, :number], when[:number], np.ones(number)
         until = when if own_counts else when - 1
-        apply_misses(where, until, left, planned, g, 0, planned.own[g])
-        value[rows] *= left
+        apply_misses(at, until, left, planned, g, 0, planned.own[g])
+        worth *= left
         for s in range(settled.own.shape[0]):
-            total = settled.start[s + 1] - settled.start[s]
-            apply_misses(where, when, value[rows], settled, s, 0, total)
-    return start, value[:number], place[:, :number], time[:number]
+            apply_misses(at, when, worth, settled, s, 0, settled.number[s])
+    return count, value, place, time
 
 
 def paper_terms(
@@ -135,40 +82,25 @@ def paper_terms(
     own_counts: bool,
     centres: FloatArray,
     grid: Grid,
-) -> PaperTerms:
+) -> Terms:
     """Return the terms of candidates with their predicted measurements, from `first` on.
 
-    `settled` are the measurements of the robots that do not plan, `grid` the values, first node and
-    distances of e.
+    T is the sum of pi at cluster centres (000, (19), (31)). `settled` are the measurements of the
+    robots that do not plan, `grid` the values, first node and distances of e.
     """
-    nodes = _unseen_nodes(planned, settled, first, own_counts, grid)
+    count, value, place, time = _unseen_nodes(planned, settled, first, own_counts, grid)
     pairs = len(planned.own) if len(planned.kind) > 1 else 0
-    longest = int(np.diff(nodes[0]).max(initial=0))
-    return PaperTerms(
-        centre_sum(planned, first, centres),
-        *nodes,
+    return Terms(
+        refinement=chances(planned, first, centres).sum(axis=(1, 2)),
+        mass=np.zeros(0),
+        covariance=np.zeros((0, 0, 0)),
+        base=np.zeros((0, 0, 0)),
+        gain=np.zeros((0, 0, 0, 0)),
+        count=count,
+        value=value,
+        place=place,
+        time=time,
         slot=np.full((pairs, pairs), -1),
-        cache=np.empty((min(CACHE_ROWS, pairs * pairs), longest)),
+        cache=np.empty((min(CACHE_ROWS, pairs * pairs), value.shape[1])),
         used=np.zeros(1, np.int64),
     )
-
-
-@njit(cache=True)
-def left_by(terms: PaperTerms, planned: Measurements, g: int, other: int) -> FloatArray:
-    """Return what the measurements of candidate `other` leave at the nodes of g."""
-    begin, end = terms.start[g], terms.start[g + 1]
-    slot = terms.slot[g, other]
-    if slot >= 0:
-        return terms.cache[slot, : end - begin]
-    if terms.used[0] < terms.cache.shape[0]:
-        slot = terms.used[0]
-        terms.used[0] += 1
-        terms.slot[g, other] = slot
-        out = terms.cache[slot, : end - begin]
-    else:
-        out = np.empty(end - begin)
-    out[:] = 1.0
-    total = planned.start[other + 1] - planned.start[other]
-    place, until = terms.place[:, begin:end], terms.time[begin:end]
-    apply_misses(place, until, out, planned, other, 0, total)
-    return out

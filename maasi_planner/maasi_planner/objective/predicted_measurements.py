@@ -19,7 +19,6 @@ from maasi_filter.models.detection import (
     detection_probability_at,
     fill_probabilities,
 )
-from maasi_planner.motion.base import Trajectories
 from maasi_planner.team import RobotView
 
 # After every measurement [steps].
@@ -27,17 +26,17 @@ NEVER = 1 << 60
 
 
 class Measurements(NamedTuple):
-    """Predicted measurements of R robots, one trajectory after the other, in order of time.
+    """Predicted measurements on G trajectories of R robots, in order of time.
 
-    Trajectory w has start[w] to start[w + 1], of which the first own[w] are planned and the others
-    only expected by other robots, and is of robot[w]. times (n,) [steps from now], places (n, 3)
-    [m], in 2D with z = 0, turns (n, 2) cosine and sine of the heading. Of each robot the kernel of
-    pi, kind (R,) and parameters (R, PARAMETERS), and its reach (R,), beyond which pi is 0 [m].
+    Trajectory g is of robot[g] and has number[g] of them: the first own[g] are planned, the others
+    only expected by other robots. times (G, n) [steps from now], places (G, n, 3) [m], in 2D with
+    z = 0, turns (G, n, 2): cosine and sine of the heading. Of each robot the kernel of pi, kind
+    (R,) and parameters (R, PARAMETERS), and its reach (R,), beyond which pi is 0 [m].
     """
 
-    start: IntArray
-    own: IntArray
     robot: IntArray
+    number: IntArray
+    own: IntArray
     times: IntArray
     places: FloatArray
     turns: FloatArray
@@ -46,143 +45,122 @@ class Measurements(NamedTuple):
     reach: FloatArray
 
 
-class Timing(NamedTuple):
-    """When a robot measures on a trajectory.
+class Ways(NamedTuple):
+    """Trajectories (W, K + 1) of a robot of `lengths` steps, and when it measures on them.
 
-    First after `phase` steps, then every `period` steps, and with `arrival` at the end; with
-    `extend` it continues there until `horizon` (000, section 6: appended constant states), which
-    others see in e but it does not count for itself.
+    First after `phase` steps, then in every period, and with `arrival` at the end.
     """
 
+    view: RobotView
+    positions: FloatArray
+    yaws: FloatArray
+    lengths: IntArray
     phase: int
-    period: int
-    horizon: int
     arrival: bool
-    extend: bool
 
 
-@njit(cache=True)
-def _fill(
-    positions: FloatArray, yaws: FloatArray, lengths: IntArray, timing: Timing, out: Measurements
-) -> None:
-    number = 0
-    for w in range(positions.shape[0]):
-        length = lengths[w]
-        out.start[w] = number
-        t = timing.phase
-        while t < length:
-            out.times[number] = t
-            number += 1
-            t += timing.period
-        if timing.arrival:
-            out.times[number] = length
-            number += 1
-            if t == length:
-                t += timing.period
-        out.own[w] = number - out.start[w]
-        while timing.extend and t <= timing.horizon:
-            out.times[number] = t
-            number += 1
-            t += timing.period
-        for i in range(out.start[w], number):
-            k = min(out.times[i], length)
-            for axis in range(3):
-                out.places[i, axis] = positions[w, k, axis]
-            out.turns[i, 0] = math.cos(yaws[w, k])
-            out.turns[i, 1] = math.sin(yaws[w, k])
-    out.start[-1] = number
-
-
-def predicted(
-    positions: FloatArray, yaws: FloatArray, lengths: IntArray, timing: Timing, view: RobotView
-) -> Measurements:
-    """Return the measurements of a robot along trajectories (W, K + 1, 3) [m]."""
-    number = len(positions)
-    longest = max(timing.horizon, int(lengths.max(initial=0)))
-    most = number * (max(0, longest - timing.phase) // timing.period + 3)
-    detection = view.sensor.detection
-    kind, parameters = detection.kernel()
-    out = Measurements(
-        start=np.zeros(number + 1, np.int64),
-        own=np.zeros(number, np.int64),
-        robot=np.zeros(number, np.int64),
-        times=np.empty(most, np.int64),
-        places=np.empty((most, 3)),
-        turns=np.empty((most, 2)),
-        kind=np.array([kind]),
-        parameters=parameters[None, :],
-        reach=np.array([reach_of(detection)]),
-    )
-    _fill(positions, yaws, lengths, timing, out)
-    filled = slice(int(out.start[-1]))
-    if view.sensor.dimension == 2:
-        out.places[:, 2] = 0.0
-    return out._replace(times=out.times[filled], places=out.places[filled], turns=out.turns[filled])
-
-
-def of_candidates(
-    ways: Trajectories, view: RobotView, horizon: int, arrival: bool, extend: bool
-) -> Measurements:
-    """Return the measurements of a robot that plans, on the way to each candidate."""
-    timing = Timing(0, view.period_steps, horizon, arrival, extend)
-    return predicted(ways.positions, ways.yaws, ways.lengths, timing, view)
-
-
-def of_remaining_path(view: RobotView, horizon: int, extend: bool) -> Measurements:
-    """Return the measurements of a robot that does not plan."""
+def remaining_way(view: RobotView) -> Ways:
+    """Return the trajectory of a robot that does not plan."""
     path, yaws = view.remaining_path, view.remaining_yaws
     if path is None or len(path) == 0:
         path, yaws = np.array(view.state.pose.position)[None, :], None
     if yaws is None:
         yaws = np.full(len(path), view.state.pose.yaw)
-    # Where its path ends the robot measures in any case: it plans there.
-    timing = Timing(max(0, view.phase), view.period_steps, horizon, len(path) > 1, extend)
     positions, yaws = np.ascontiguousarray(path, float), np.ascontiguousarray(yaws, float)
-    lengths = np.array([len(path) - 1], np.int64)
-    return predicted(positions[None], yaws[None], lengths, timing, view)
+    # Where its path ends the robot measures in any case: it plans there.
+    lengths, arrival = np.array([len(path) - 1]), len(path) > 1
+    return Ways(view, positions[None], yaws[None], lengths, max(0, view.phase), arrival)
+
+
+@njit(cache=True)
+def _fill(
+    positions: FloatArray,
+    yaws: FloatArray,
+    lengths: IntArray,
+    timing: tuple[int, int, int, bool],
+    out: Measurements,
+) -> None:
+    """Fill the rows of a robot; timing: phase, period, horizon, arrival."""
+    phase, period, horizon, arrival = timing
+    for w in range(lengths.shape[0]):
+        number, t = 0, phase
+        while t < lengths[w]:
+            out.times[w, number] = t
+            number += 1
+            t += period
+        if arrival:
+            out.times[w, number] = lengths[w]
+            number += 1
+            if t == lengths[w]:
+                t += period
+        out.own[w] = number
+        while t <= horizon:
+            out.times[w, number] = t
+            number += 1
+            t += period
+        out.number[w] = number
+        for i in range(number):
+            k = min(out.times[w, i], lengths[w])
+            for axis in range(3):
+                out.places[w, i, axis] = positions[w, k, axis]
+            out.turns[w, i, 0], out.turns[w, i, 1] = math.cos(yaws[w, k]), math.sin(yaws[w, k])
+
+
+def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurements:
+    """Return the measurements of robots on their trajectories.
+
+    With `extend` robots go on where they end until `horizon` (000, section 6: appended constant
+    states), which others see in e but it does not count for themselves.
+    """
+    counts = [len(ways.lengths) for ways in robots]
+    total, most = sum(counts), 1
+    for ways in robots:
+        longest = max(horizon, int(ways.lengths.max(initial=0)))
+        most = max(most, max(0, longest - ways.phase) // ways.view.period_steps + 3)
+    detections = [ways.view.sensor.detection for ways in robots]
+    out = Measurements(
+        robot=np.repeat(np.arange(len(robots)), counts),
+        number=np.zeros(total, np.int64),
+        own=np.zeros(total, np.int64),
+        times=np.empty((total, most), np.int64),
+        places=np.empty((total, most, 3)),
+        turns=np.empty((total, most, 2)),
+        kind=np.array([item.kernel()[0] for item in detections], np.int64),
+        parameters=np.array([item.kernel()[1] for item in detections]).reshape(-1, PARAMETERS),
+        reach=np.array([reach_of(item) for item in detections], float),
+    )
+    end = 0
+    for ways, count in zip(robots, counts):
+        begin, end = end, end + count
+        rows = Measurements(*(column[begin:end] for column in out[:6]), *out[6:])
+        timing = ways.phase, ways.view.period_steps, horizon if extend else -1, ways.arrival
+        _fill(ways.positions, ways.yaws, ways.lengths, timing, rows)
+        if ways.view.sensor.dimension == 2:
+            rows.places[..., 2] = 0.0
+    return out
 
 
 def first_of_each(measured: Measurements) -> Measurements:
     """Return of each robot the first planned measurement of its first trajectory, if any."""
-    _, chosen = np.unique(measured.robot, return_index=True)
-    chosen = chosen[measured.own[chosen] > 0]
-    rows = measured.start[chosen]
-    return measured._replace(
-        start=np.arange(len(rows) + 1),
-        own=np.ones(len(rows), np.int64),
-        robot=measured.robot[chosen],
-        times=measured.times[rows],
-        places=measured.places[rows],
-        turns=measured.turns[rows],
-    )
+    _, first = np.unique(measured.robot, return_index=True)
+    rows = Measurements(*(column[first] for column in measured[:6]), *measured[6:])
+    once = np.minimum(rows.own, 1)
+    return rows._replace(number=once, own=once)
 
 
-# Of no robot.
-NONE = Measurements(
-    start=np.zeros(1, np.int64),
-    own=np.zeros(0, np.int64),
-    robot=np.zeros(0, np.int64),
-    times=np.zeros(0, np.int64),
-    places=np.zeros((0, 3)),
-    turns=np.zeros((0, 2)),
-    kind=np.zeros(0, np.int64),
-    parameters=np.zeros((0, PARAMETERS)),
-    reach=np.zeros(0),
-)
-
-
-def joined(parts: Sequence[Measurements]) -> Measurements:
-    """Return the measurements of several robots as one."""
-    if len(parts) == 1:
-        return parts[0]
-    whole = [np.concatenate(column) for column in zip(NONE, *parts)]
-    before = np.cumsum([0, *(len(part.times) for part in parts)])
-    start = [part.start[1:] + offset for part, offset in zip(parts, before)]
-    robots = np.cumsum([0, *(len(part.kind) for part in parts)])
-    robot = [part.robot + offset for part, offset in zip(parts, robots)]
-    return Measurements(*whole)._replace(
-        start=np.concatenate([NONE.start, *start]), robot=np.concatenate([NONE.robot, *robot])
-    )
+@njit(cache=True)
+def chances(measured: Measurements, first: int, points: FloatArray) -> FloatArray:
+    """Return pi at points (C, 3) of the planned measurements from `first` on, (G, n, C)."""
+    number = points.shape[0]
+    out = np.zeros((measured.own.shape[0], measured.times.shape[1], number))
+    for g in range(out.shape[0]):
+        robot = measured.robot[g]
+        kind, parameters = measured.kind[robot], measured.parameters[robot]
+        for e in range(first, measured.own[g]):
+            x, y, z = (points - measured.places[g, e]).T.copy()
+            cosine, sine = measured.turns[g, e]
+            fill_probabilities(kind, parameters, x, y, z, number, cosine, sine, out[g, e])
+    return out
 
 
 def reach_of(detection: DetectionModel) -> float:
@@ -205,28 +183,28 @@ def apply_misses(
     until: IntArray,
     left: FloatArray,
     measured: Measurements,
-    w: int,
+    g: int,
     first: int,
     last: int,
 ) -> None:
-    """Multiply left (n,) at places (3, n) by 1 - pi of measurements of trajectory w.
+    """Multiply left (n,) at places (3, n) by 1 - pi of measurements of trajectory g.
 
     At a place those from `first` to before `last` count that are taken by its time in `until` (n,),
     which does not decrease.
     """
-    robot = measured.robot[w]
+    robot = measured.robot[g]
     kind, parameters = measured.kind[robot], measured.parameters[robot]
     reach = measured.reach[robot]
     number = left.shape[0]
     room = np.empty((4, number))
     begin = 0
-    for e in range(measured.start[w] + first, measured.start[w] + last):
-        while begin < number and until[begin] < measured.times[e]:
+    for e in range(first, last):
+        while begin < number and until[begin] < measured.times[g, e]:
             begin += 1
         if begin == number:
             return
-        x0, y0, z0 = measured.places[e]
-        cosine, sine = measured.turns[e]
+        x0, y0, z0 = measured.places[g, e]
+        cosine, sine = measured.turns[g, e]
         if reach < np.inf:
             for i in range(begin, number):
                 dx, dy = places[0, i] - x0, places[1, i] - y0

@@ -9,14 +9,10 @@ from numpy.typing import NDArray
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.motion.base import Trajectories
-from maasi_planner.objective.information import NO_INFORMATION, information_terms
+from maasi_planner.objective.information import information_terms
 from maasi_planner.objective.joint_search import CandidateTable, search, total_value, values_given
-from maasi_planner.objective.paper import NO_PAPER, paper_terms
-from maasi_planner.objective.predicted_measurements import (
-    joined,
-    of_candidates,
-    of_remaining_path,
-)
+from maasi_planner.objective.paper import paper_terms
+from maasi_planner.objective.predicted_measurements import Ways, predicted, remaining_way
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import TeamView
 
@@ -57,26 +53,29 @@ class TeamObjective:
         lengths = _all([way.lengths for way in ways], np.int64)
         horizon = int(lengths.max(initial=0))
         views = [team.robots[name] for name in names]
-        extend = weights.extend
-        planned = joined(
-            [of_candidates(*pair, horizon, weights.arrival, extend) for pair in zip(ways, views)]
-        )
         others = [team.robots[name] for name in team.names() if name not in names]
-        settled = joined([of_remaining_path(view, horizon, extend) for view in others])
+        arrival, extend = weights.arrival, weights.extend
+        planned = predicted(
+            [
+                Ways(view, way.positions, way.yaws, way.lengths, 0, arrival)
+                for view, way in zip(views, ways)
+            ],
+            horizon,
+            extend,
+        )
+        settled = predicted([remaining_way(view) for view in others], horizon, extend)
         self.measurements = planned.own
         centres = np.zeros((len(team.clusters), 3))
         for centre, cluster in zip(centres, team.clusters):
             centre[: team.dimension] = cluster.position[: team.dimension]
         # The first measurement that counts: the present one does not depend on the choice.
         first = 0 if weights.present else 1
-        grid = team.exploration.kernel()
-        paper, information = NO_PAPER, NO_INFORMATION
         if weights.information:
-            information = information_terms(
-                team, settings, (views, planned), (others, settled), first, centres
-            )
+            groups = (views, planned), (others, settled)
+            terms = information_terms(team, settings, *groups, first, centres)
         else:
-            paper = paper_terms(planned, settled, first, weights.own, centres, grid)
+            grid = team.exploration.kernel()
+            terms = paper_terms(planned, settled, first, weights.own, centres, grid)
         norm = lengths.astype(float)
         if weights.per_distance:
             norm = _all([way.distances() for way in ways], float)
@@ -91,10 +90,9 @@ class TeamObjective:
             alpha=float(weights.alpha),
             beta=float(weights.beta),
             control_weight=float(weights.control),
+            shared=weights.information,
             planned=planned,
-            is_paper=not weights.information,
-            paper=paper,
-            information=information,
+            terms=terms,
         )
         self._alone: FloatArray | None = None
 
@@ -121,7 +119,7 @@ class TeamObjective:
 
     def value(self, chosen: IntArray) -> float:
         """Return the sum of J of a joint choice (26); indices into all candidates."""
-        return float(total_value(self.table, chosen, np.zeros((3, 3, 3))))
+        return float(total_value(self.table, chosen))
 
     def search(self) -> tuple[IntArray, float, bool, int]:
         """Return the best joint choice, its value, whether it is exact, and the work done.

@@ -1,0 +1,114 @@
+"""Refinement T and exploration E of a candidate, given the choices of other robots."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from maasi_filter.arrays import FloatArray, IntArray
+from maasi_planner.objective.predicted_measurements import Measurements, apply_misses
+
+# Rows kept of what one candidate leaves of another.
+CACHE_ROWS = 8000
+
+
+class Terms(NamedTuple):
+    """What T and E of G candidates consist of.
+
+    T is refinement (G,), and of C clusters with mass (C,) and covariance (C, d, d) the information
+    that a candidate's gain (G, C, d, d) adds to base (C, d, d), both sums of pi H' R^-1 H.
+
+    E is what others leave of value (G, n), which has count[g] numbers: their product with what
+    each other candidate leaves. That is row slot (G, G) of cache (S, n), or where that is negative
+    comes from its measurements until time (G, n) [steps from now] at place (G, 3, n) [m], and is
+    kept, as the search needs it many times; used (1,) counts rows.
+    """
+
+    refinement: FloatArray
+    mass: FloatArray
+    covariance: FloatArray
+    base: FloatArray
+    gain: FloatArray
+    count: IntArray
+    value: FloatArray
+    place: FloatArray
+    time: IntArray
+    slot: IntArray
+    cache: FloatArray
+    used: IntArray
+
+
+@njit(cache=True)
+def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArray:
+    """Return what the measurements of candidate `other` leave of the value of g."""
+    count, slot = terms.count[g], terms.slot[g, other]
+    if slot >= 0:
+        return terms.cache[slot, :count]
+    out = np.ones(count)
+    until, number = terms.time[g, :count], planned.number[other]
+    apply_misses(terms.place[g, :, :count], until, out, planned, other, 0, number)
+    if terms.used[0] < terms.cache.shape[0]:
+        terms.cache[terms.used[0], :count] = out
+        terms.slot[g, other] = terms.used[0]
+        terms.used[0] += 1
+    return out
+
+
+@njit(cache=True)
+def exploration_given(terms: Terms, planned: Measurements, g: int, others: IntArray) -> float:
+    """Return E of candidate g, given others that count before it."""
+    left = terms.value[g, : terms.count[g]].copy()
+    for other in others:
+        factor = left_by(terms, planned, g, other)
+        for i in range(left.shape[0]):
+            left[i] *= factor[i]
+    total = 0.0
+    for i in range(left.shape[0]):
+        total += left[i]
+    return total
+
+
+@njit(cache=True)
+def _log_det(matrix: FloatArray) -> float:
+    """Return log det of a (2, 2) or (3, 3) matrix with determinant of at least 1."""
+    if matrix.shape[0] == 2:
+        det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+    else:
+        det = (
+            matrix[0, 0] * (matrix[1, 1] * matrix[2, 2] - matrix[1, 2] * matrix[2, 1])
+            - matrix[0, 1] * (matrix[1, 0] * matrix[2, 2] - matrix[1, 2] * matrix[2, 0])
+            + matrix[0, 2] * (matrix[1, 0] * matrix[2, 1] - matrix[1, 1] * matrix[2, 0])
+        )
+    return math.log(max(det, 1.0))
+
+
+@njit(cache=True)
+def refinement_given(terms: Terms, g: int, others: IntArray) -> float:
+    """Return T of candidate g, given the candidates `others` that count before it."""
+    total = terms.refinement[g]
+    clusters, d, _ = terms.covariance.shape
+    if clusters == 0:
+        return total
+    known, before, after = np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
+    for c in range(clusters):
+        helps = False
+        for a in range(d):
+            helps |= terms.gain[g, c, a, a] > 0.0
+        if not helps:
+            continue
+        known[:] = terms.base[c]
+        for other in others:
+            known += terms.gain[other, c]
+        for a in range(d):
+            for b in range(d):
+                before[a, b] = 1.0 if a == b else 0.0
+                extra = 0.0
+                for k in range(d):
+                    before[a, b] += terms.covariance[c, a, k] * known[k, b]
+                    extra += terms.covariance[c, a, k] * terms.gain[g, c, k, b]
+                after[a, b] = before[a, b] + extra
+        total += 0.5 * terms.mass[c] * max(0.0, _log_det(after) - _log_det(before))
+    return total
