@@ -32,7 +32,6 @@ from maasi_msgs.msg import AgentState, Candidate, FilterUpdate, PlanDecision
 from maasi_msgs.msg import RobotDecision as RobotDecisionMessage
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_planner.planners.base import check_clusters
 from maasi_planner.team import Decision, RobotDecision
 
 # J of an inadmissible candidate; messages contain finite numbers only.
@@ -198,7 +197,6 @@ def checked_update(
     strangers = {item.robot for item in message.members} - set(names)
     if strangers:
         raise ValueError(f'members: read {sorted(strangers)}, allowed are {names}')
-    check_clusters(clusters)
     limit = batch_id_limit(batch)
     if message.batch_id > limit:
         raise ValueError(f'batch_id: read {message.batch_id}, allowed is up to {limit}')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -59,6 +60,16 @@ class RobotView:
     radius: float = 0.0
     exploration: UnexploredMap | None = None
 
+    def __post_init__(self) -> None:
+        if self.period_steps < 1:
+            raise ValueError(f'period_steps: got {self.period_steps}, allowed are integers from 1')
+        if not 0.0 <= self.radius < math.inf:
+            raise ValueError(f'radius: got {self.radius}, allowed are finite numbers from 0 [m]')
+        for name in ('candidates', 'remaining_path'):
+            shape = np.shape(getattr(self, name))
+            if shape and (len(shape) != 2 or shape[1] != 3):
+                raise ValueError(f'{name}: got shape {shape}, allowed is (n, 3)')
+
 
 @dataclass
 class TeamView:
@@ -89,6 +100,10 @@ class TeamView:
     exploration: UnexploredMap
     obstacles: Obstacles | None = None
     taken: Sequence[tuple[FloatArray, float]] = ()
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.step_time < math.inf:
+            raise ValueError(f'step_time: got {self.step_time}, allowed are numbers above 0 [s]')
 
     @property
     def bounds(self) -> FloatArray:

@@ -56,18 +56,6 @@ def explore(robots, settings=PAPER):
     }
 
 
-def test_alone():
-    """Four steps from 0 to 2, measured at 0, 0.5, 1, 1.5: each place for the first time."""
-    result = explore({'a': robot(0.0, True, 1, [2.0])})
-    assert result['a'] == pytest.approx([4 * 0.5])
-
-
-def test_alone_with_a_longer_period():
-    """Period 3: measured at steps 0 and 3 only, M = ceil(4 / 3)."""
-    result = explore({'a': robot(0.0, True, 3, [2.0])})
-    assert result['a'] == pytest.approx([2 * 0.5])
-
-
 def test_tail_longer_than_the_horizon():
     """The other robot passes 1 at step 1 (in time) and 0.5 only after step 4 (too late)."""
     path = [1.5, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5]
@@ -100,13 +88,6 @@ def test_other_measurement_period_and_phase():
     assert result['a'] == pytest.approx([0.5 + 0.5 + 0.5 + 0.5 * 0.25])
 
 
-def test_idle_robot_measures_where_it_stands():
-    other = robot(1.0, False, 1)
-    result = explore({'a': robot(0.0, True, 1, [2.0]), 'b': other})
-    # Node 1 is halved at steps 0, 1, 2 by b and at 2 by a.
-    assert result['a'] == pytest.approx([0.5 + 0.5 + 0.5 * 0.125 + 0.5])
-
-
 def test_joint_decision_of_unequal_lengths():
     """a goes two steps, b four; a waits at 1 and measures on while b comes to it."""
     result = explore({'a': robot(0.0, True, 1, [1.0]), 'b': robot(3.0, True, 1, [1.0])})
@@ -118,25 +99,3 @@ def test_joint_decision_of_unequal_lengths():
     # b: 2, 1.5 at steps 0, 1; 1 at step 2, where a arrives and measures; 0.5 at step 3, which a
     # passed at step 1.
     assert result['b'] == pytest.approx([0.5 + 0.5 + 0.5 * 0.5 + 0.5 * 0.5])
-
-
-def test_joint_choice_spreads():
-    """Two robots at one place do not both go where the first one alone would."""
-    exploration = UnexploredMap([[0.0, 10.0], [0.0, 4.0]], 0.5)
-    robots = {
-        'a': robot(5.0, True, 1, [3.0, 7.0]),
-        'b': robot(5.0, True, 1, [3.0, 7.0]),
-    }
-    decision = make_planner('maasi', PAPER).decide(TeamView(0, 1.0, robots, [], exploration))
-    assert {decision.robots[name].chosen for name in 'ab'} == {0, 1}
-
-
-def test_one_of_two_plans_and_keeps_away_from_the_other_ones_way():
-    exploration = UnexploredMap([[0.0, 10.0], [0.0, 4.0]], 0.5)
-    robots = {
-        'a': robot(5.0, True, 1, [3.0, 7.0]),
-        'b': robot(5.0, False, 1, remaining_path=[5.0, 4.5, 4.0, 3.5, 3.0]),
-    }
-    decision = make_planner('maasi', PAPER).decide(TeamView(0, 1.0, robots, [], exploration))
-    assert list(decision.robots) == ['a']
-    assert decision.robots['a'].chosen == 1

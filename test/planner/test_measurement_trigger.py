@@ -30,13 +30,6 @@ def test_left_side_is_the_formula():
         assert use == pytest.approx(expected, rel=1e-12)
 
 
-def test_periodic_always_measures():
-    team, view, positions, _ = situation()
-    trigger = MeasurementTrigger(PlannerSettings(measurement='periodic', threshold=1e9))
-    pose = Pose.from_yaw(positions[0], 0.0)
-    assert trigger.measures('r', 3, view.sensor, pose, team.clusters, team.exploration)
-
-
 def test_waypoint_always_measures_and_threshold_decides_after():
     team, view, positions, _ = situation()
     uses = [
@@ -66,9 +59,3 @@ def test_relative_compares_with_the_mean_along_the_way():
         pose = Pose.from_yaw(position, 0.0)
         measured = trigger.measures('r', 2, view.sensor, pose, team.clusters, team.exploration)
         assert measured == (use > 0.8 * np.mean(uses))
-
-
-def test_bad_numbers_are_refused():
-    for bad in ({'gamma': -1.0}, {'threshold': float('nan')}, {'measurement': 'sometimes'}):
-        with pytest.raises(ValueError, match=next(iter(bad))):
-            PlannerSettings(**bad)

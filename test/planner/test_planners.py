@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
 import numpy as np
 import pytest
-from planner_helpers import CUBE, FLOOR, SmallSearch, drone, floor_members, random_team
+from planner_helpers import random_team
 
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
@@ -23,6 +24,8 @@ from maasi_planner import (
 )
 from maasi_planner.planners.lawnmower import lanes
 from maasi_planner.planners.mutual_information import intensity, mutual_information
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.search import search
 
 NAMES = ('maasi', 'asi', 'maas', 'as', 'mutual_information', 'nearest_widest', 'lawnmower')
 
@@ -35,77 +38,6 @@ def test_unknown_planner_is_refused():
 def test_aliases_are_the_same_planner():
     for one, other in (('maasi', 'asi'), ('maas', 'as')):
         assert type(make_planner(one)) is type(make_planner(other))
-
-
-# Coverage
-
-
-@pytest.mark.parametrize('names', [('mambo', 'turtlebot'), ('mambo',), ('turtlebot',)])
-def test_no_target_covers_the_floor(names):
-    """With certain views and no target the whole floor is seen and the search ends by itself."""
-    search = SmallSearch(make_planner('maasi'), floor_members(names), FLOOR, 0.05, 0.05)
-    reason = search.run(9000)
-    assert reason is not None
-    assert search.exploration.explored_fraction() >= 0.95
-    axis = np.arange(-0.2, 2.3001, 0.02)
-    places = np.array([[x, y] for x in axis for y in axis])
-    seen = np.zeros(len(places), dtype=bool)
-    for _, name, pose in search.measured:
-        seen |= search.members[name].sensor.detection.probability(places, pose) > 0.0
-    # Targets are at least 0.1 m from the edge: next to everywhere they may be was seen.
-    assert seen.mean() >= 0.998
-
-
-def test_no_target_covers_the_cube():
-    members = {'one': drone([1.0, 1.0, 1.0], 12.0), 'two': drone([250.0, 250.0, 250.0], 12.0)}
-    for member in members.values():
-        member.period = 10
-    settings = PlannerSettings(explored_threshold=0.95)
-    search = SmallSearch(make_planner('maasi', settings), members, CUBE, 10.0, 0.1)
-    reason = search.run(6000)
-    assert reason is not None
-    assert 'explored' in reason
-    assert search.exploration.explored_fraction() >= 0.95
-
-
-def test_paper_objective_covers_the_cube():
-    members = {'one': drone([1.0, 1.0, 1.0], 12.0)}
-    members['one'].period = 10
-    settings = PlannerSettings(objective='paper', control_weight=1e-4, explored_threshold=0.95)
-    search = SmallSearch(make_planner('maasi', settings), members, CUBE, 10.0, 0.1)
-    assert search.run(9000) is not None
-    assert search.exploration.explored_fraction() >= 0.95
-
-
-def test_obstacles_are_kept_clear_in_a_whole_search():
-    obstacles = Obstacles(
-        np.array([[0.5, 0.6, 0.0], [1.5, 0.4, 0.0], [0.8, 1.7, 0.0], [1.7, 1.5, 0.0]]),
-        np.array([0.1, 0.15, 0.12, 0.08]),
-        np.zeros(4, dtype=bool),
-    )
-    members = floor_members(obstacles=obstacles)
-    search = SmallSearch(make_planner('maasi'), members, FLOOR, 0.1, 0.05, obstacles)
-    search.run(4000)
-    assert search.exploration.explored_fraction() >= 0.9
-    for member, radius in ((members['mambo'], 0.07), (members['turtlebot'], 0.1)):
-        for position in member.path:
-            assert obstacles.distances(position).min() >= radius
-
-
-@pytest.mark.parametrize('name', NAMES)
-def test_same_search_twice(name):
-    """A search is the same to the bit when it is repeated."""
-    runs = []
-    for _ in range(2):
-        settings = PlannerSettings(objective='paper' if name == 'asi' else 'information')
-        search = SmallSearch(make_planner(name, settings), floor_members(), FLOOR, 0.2, 0.05)
-        search.clusters = [Cluster(np.array([1.5, 0.5]), 0.01 * np.eye(2), 0.1, 0.7)]
-        search.run(400)
-        runs.append(
-            [(d.step, n, tuple(r.waypoint)) for d in search.decisions for n, r in d.robots.items()]
-        )
-    assert runs[0] == runs[1]
-    assert len(runs[0]) >= 2
 
 
 # Finishing
@@ -386,8 +318,9 @@ def test_nearest_widest_explores_without_clusters():
 # Lawnmower
 
 
-@pytest.mark.parametrize('bounds', [FLOOR, CUBE])
+@pytest.mark.parametrize('bounds', [[[-0.3, 2.4]] * 2, [[0.0, 260.0]] * 3])
 def test_lanes_cover_everything_within_half_a_spacing(bounds):
+    bounds = np.array(bounds)
     spacing = float((bounds[:, 1] - bounds[:, 0]).max()) / 6.5
     found = lanes(bounds, spacing, spacing, 0.5 * spacing)
     rng = np.random.default_rng(0)
@@ -404,44 +337,23 @@ def test_lanes_cover_everything_within_half_a_spacing(bounds):
         assert (np.abs(after - before) > 1e-9).sum() == 1
 
 
-@pytest.mark.parametrize('names', [('mambo',), ('mambo', 'turtlebot')])
-def test_lawnmower_covers_and_ends(names):
-    search = SmallSearch(
-        make_planner('lawnmower', PlannerSettings(lane_spacing=0.25)),
-        floor_members(names),
-        FLOOR,
-        0.1,
-        0.05,
-    )
-    reason = search.run(12000)
-    assert reason is not None
-    assert search.exploration.explored_fraction() >= 0.9
-    # With two robots each has done a share, and they did not do it twice.
-    lengths = {name: len(member.path) for name, member in search.members.items()}
-    assert min(lengths.values()) > 0
-
-
-def test_lawnmowers_meet_in_the_middle():
-    search = SmallSearch(
-        make_planner('lawnmower', PlannerSettings(lane_spacing=0.25)),
-        floor_members(),
-        FLOOR,
-        0.1,
-        0.05,
-    )
-    search.run(12000)
+def test_lawnmowers_cover_the_floor_and_meet_in_the_middle():
+    result = search(load_scenario('no_targets'), 1, planner='lawnmower')
+    assert result.end_reason == 'planner_done'
     rows = {
         name: [
-            r.waypoint[1]
-            for d in search.decisions
-            for n, r in d.robots.items()
-            if n == name and not r.stays
+            robot.waypoint[1]
+            for decision in result.decisions
+            for own, robot in decision.robots.items()
+            if own == name and not robot.stays
         ]
         for name in ('mambo', 'turtlebot')
     }
     assert rows['mambo'][0] > 1.8
     assert rows['turtlebot'][0] < 0.3
     assert min(rows['mambo']) > max(rows['turtlebot']) - 1e-6
+    # Lanes are no further apart than the turtlebot sees.
+    assert np.diff(sorted({*rows['mambo'], *rows['turtlebot']})).max() < 0.31
 
 
 # Waypoints of several robots
@@ -530,15 +442,6 @@ def test_waypoints_outside_are_never_chosen(name):
     assert 'outside the bounds' in decision.reason
 
 
-@pytest.mark.parametrize('name', NAMES)
-def test_state_that_is_not_finite_means_stay(name):
-    team, robot = one_robot()
-    team.robots[robot].state.velocity = np.array([0.0, np.nan, 0.0])
-    decision = make_planner(name).decide(team).robots[robot]
-    assert decision.stays
-    assert 'not finite' in decision.reason
-
-
 def test_only_candidate_is_where_the_robot_is():
     team, robot = one_robot()
     team.clusters = []
@@ -578,25 +481,17 @@ def test_bad_weights_are_refused(bad):
 
 
 def test_wrong_team_is_refused():
-    for change, word in (
-        ({'period_steps': 0}, 'period_steps'),
-        ({'radius': math.nan}, 'radius'),
-        ({'remaining_path': np.array([[np.nan, 0.0, 0.0]])}, 'remaining_path'),
-        ({'candidates': np.zeros((3, 2))}, 'candidates'),
+    team, robot = one_robot()
+    for change in (
+        {'period_steps': 0},
+        {'radius': math.nan},
+        {'remaining_path': np.array([[0.0, 0.0]])},
+        {'candidates': np.zeros((3, 2))},
     ):
-        team, robot = one_robot()
-        for field, value in change.items():
-            setattr(team.robots[robot], field, value)
-        with pytest.raises(ValueError, match=word):
-            make_planner('maasi').decide(team)
-    team, robot = one_robot()
-    team.step_time = 0.0
+        with pytest.raises(ValueError, match=next(iter(change))):
+            dataclasses.replace(team.robots[robot], **change)
     with pytest.raises(ValueError, match='step_time'):
-        make_planner('maasi').decide(team)
-    team, robot = one_robot()
-    team.clusters[0].mass = math.nan
-    with pytest.raises(ValueError, match='clusters'):
-        make_planner('maasi').decide(team)
+        dataclasses.replace(team, step_time=0.0)
 
 
 def test_nobody_plans():

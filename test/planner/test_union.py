@@ -10,15 +10,15 @@ from plain_objective import all_choices, information, measurement_steps
 from planner_helpers import random_team
 
 from maasi_filter.models.pose import Pose
-from maasi_planner import PlannerSettings, RobotState, make_motion, make_planner
+from maasi_planner import PlannerSettings, make_motion
 from maasi_planner.objective.team_objective import TeamObjective
 
 SETTINGS = PlannerSettings(control_weight=0.0, exploration_nodes=1_000_000)
 WEIGHTS = SETTINGS.weights()
 
 
-def team_of(seed, planning, equal=False):
-    """Return a team on a floor of few nodes; with equal ways all K are the same."""
+def team_of(seed, planning):
+    """Return a team on a floor of few nodes."""
     rng = np.random.default_rng(seed)
     team = random_team(
         rng,
@@ -36,11 +36,6 @@ def team_of(seed, planning, equal=False):
         view.motion = make_motion(settings)
         # Two measurements at most on any way.
         view.period_steps = 20
-        if equal:
-            place = np.append(rng.uniform(0.7, 1.3, 2), 0.0)
-            view.state = RobotState.at_rest(place)
-            steps = 0.5 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-            view.candidates = place + steps
     return team
 
 
@@ -124,36 +119,3 @@ def test_terms_sum_to_the_union(planning):
             assert refinement == pytest.approx(expected_information(team, ways, choice), rel=1e-8)
             overlaps += float(alone[chosen, 1].sum()) > 1.02 * union
     assert overlaps > 0 or planning == 1
-
-
-@pytest.mark.parametrize('planning', [2, 3])
-def test_with_equal_ways_the_team_with_the_largest_union_is_sent(planning):
-    for seed in range(3):
-        team = team_of(10 + seed, planning, equal=True)
-        ways = predictions(team)
-        lengths = {int(k) for way in ways.values() for k in way.lengths}
-        assert len(lengths) == 1
-        decision = make_planner(
-            'maasi', SETTINGS.model_copy(update={'cluster_candidates': False})
-        ).decide(team)
-        best = max(
-            WEIGHTS.alpha * expected_information(team, ways, choice)
-            + WEIGHTS.beta * expected_new_targets(team, ways, choice)
-            for choice in all_choices({n: team.robots[n].candidates for n in team.planning()})
-        )
-        assert decision.exact
-        assert decision.objective == pytest.approx(best / lengths.pop(), rel=1e-9)
-
-
-def test_two_robots_at_one_place_expect_what_they_see_together():
-    """The sum of what each adds to the other leaves out what both see; the union has it once."""
-    team = team_of(3, 2, equal=True)
-    one, two = (team.robots[name] for name in team.planning())
-    two.state, two.candidates, two.sensor = one.state, one.candidates, one.sensor
-    ways = predictions(team)
-    decision = make_planner(
-        'maasi', SETTINGS.model_copy(update={'cluster_candidates': False})
-    ).decide(team)
-    choice = {name: robot.chosen for name, robot in decision.robots.items()}
-    expected = sum(float(robot.exploration[robot.chosen]) for robot in decision.robots.values())
-    assert expected == pytest.approx(expected_new_targets(team, ways, choice), rel=1e-9)

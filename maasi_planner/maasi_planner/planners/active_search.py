@@ -20,7 +20,6 @@ from maasi_planner.planners.base import (
     Planner,
     UsableCandidates,
     all_apart,
-    check_team,
     explain,
     in_bounds,
     options_of,
@@ -121,7 +120,6 @@ class ActiveSearch(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        check_team(team)
         settings = self.settings
         places = waiting_places(team)
         decision = Decision(step=team.step)

@@ -55,11 +55,6 @@ class Planner(ABC):
         """Return a decision for every robot in the team that plans.
 
         A robot for which nothing is admissible is told to stay, with the reason.
-
-        Raises
-        ------
-        ValueError
-            If the view of the team itself is wrong: not finite, no step time, periods below 1.
         """
 
     def finished(self, team: TeamView) -> str | None:
@@ -91,59 +86,6 @@ def finite(*arrays: FloatArray) -> bool:
     if math.isfinite(total):
         return True
     return all(all(map(math.isfinite, array.ravel().tolist())) for array in arrays)
-
-
-def check_team(team: TeamView) -> None:
-    """Refuse a team that cannot be planned for.
-
-    Raises
-    ------
-    ValueError
-        Naming the robot and field, what was read, and what is allowed.
-    """
-    if not (math.isfinite(team.step_time) and team.step_time > 0.0):
-        raise ValueError(f'step_time: got {team.step_time}, allowed are numbers above 0 [s]')
-    for name in team.names():
-        view = team.robots[name]
-        if view.period_steps < 1:
-            raise ValueError(
-                f'{name}: period_steps: got {view.period_steps}, allowed are integers from 1'
-            )
-        if not (math.isfinite(view.radius) and view.radius >= 0.0):
-            raise ValueError(
-                f'{name}: radius: got {view.radius}, allowed are finite numbers from 0 [m]'
-            )
-        for field in ('candidates', 'remaining_path'):
-            value = getattr(view, field)
-            if value is None:
-                continue
-            array = np.asarray(value, dtype=float)
-            if array.ndim != 2 or array.shape[1] != 3:
-                raise ValueError(f'{name}: {field}: got shape {array.shape}, allowed is (n, 3)')
-        if view.remaining_path is not None and not np.isfinite(view.remaining_path).all():
-            raise ValueError(f'{name}: remaining_path: got a number that is not finite')
-        if view.remaining_yaws is not None and (
-            view.remaining_path is None
-            or np.shape(view.remaining_yaws) != (len(view.remaining_path),)
-            or not np.isfinite(view.remaining_yaws).all()
-        ):
-            raise ValueError(
-                f'{name}: remaining_yaws: allowed is one finite heading per position of its path'
-            )
-    for place, radius in team.taken:
-        if not (np.isfinite(place).all() and math.isfinite(radius) and radius >= 0.0):
-            raise ValueError(
-                f'taken: got {np.asarray(place).tolist()} with radius {radius}, allowed are finite '
-                'numbers, the radius from 0 [m]'
-            )
-    check_clusters(team.clusters)
-
-
-def check_clusters(clusters: Sequence[Cluster]) -> None:
-    """Refuse clusters with numbers that are not finite."""
-    for index, cluster in enumerate(clusters):
-        if not (finite(cluster.position, cluster.covariance) and math.isfinite(cluster.mass)):
-            raise ValueError(f'clusters[{index}]: got a number that is not finite')
 
 
 def check_decision(planner: Planner, team: TeamView, decision: Decision) -> None:
@@ -183,16 +125,6 @@ def _problem_of(robot: RobotDecision, bounds: FloatArray) -> str:
     if not robot.stays and not in_bounds(robot.waypoint[None, :], bounds)[0].all():
         return f'waypoint: got {robot.waypoint.tolist()}, allowed is inside {bounds.tolist()} [m]'
     return ''
-
-
-def state_problem(view: RobotView) -> str | None:
-    """Return what is wrong with a robot's state, if anything."""
-    state = view.state
-    if not finite(
-        state.pose.position, state.pose.orientation, state.velocity, state.angular_velocity
-    ):
-        return 'the state of the robot is not finite'
-    return None
 
 
 @njit(cache=True)
@@ -302,9 +234,6 @@ def options_of(
 ) -> UsableCandidates | str:
     """Return the candidates of a robot, or why it has to stay."""
     view = team.robots[name]
-    problem = state_problem(view)
-    if problem is not None:
-        return problem
     if not len(view.candidates) and (extra is None or not len(extra)):
         return 'it has no candidates'
     points, dropped = usable_candidates(team, name, extra)

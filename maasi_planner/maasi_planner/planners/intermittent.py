@@ -10,7 +10,6 @@ from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import (
     Planner,
     centres_of,
-    check_team,
     explain,
     options_of,
     waiting_places,
@@ -33,7 +32,6 @@ class Intermittent(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        check_team(team)
         places = waiting_places(team)
         candidates: dict[str, FloatArray] = {}
         trajectories: dict[str, Trajectories] = {}

@@ -12,7 +12,7 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import BOX
-from maasi_planner.planners.base import Planner, check_team, explain, state_problem
+from maasi_planner.planners.base import Planner, explain
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 
@@ -147,16 +147,10 @@ class Lawnmower(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        check_team(team)
         decision = Decision(step=team.step)
         if not self._started:
             self._start(team)
         for name in team.planning():
-            view = team.robots[name]
-            problem = state_problem(view)
-            if problem is not None:
-                decision.robots[name] = stay(view, f'stays: {problem}')
-                continue
             decision.robots[name] = self._decide_one(team, name)
         return explain(decision)
 

@@ -23,7 +23,6 @@ from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
     Planner,
     UsableCandidates,
-    check_team,
     explain,
     options_of,
     search_jointly,
@@ -149,7 +148,6 @@ class MutualInformation(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        check_team(team)
         places = waiting_places(team)
         decision = Decision(step=team.step)
         options: dict[str, UsableCandidates] = {}

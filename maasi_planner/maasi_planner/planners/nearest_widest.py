@@ -13,7 +13,6 @@ from maasi_planner.planners.base import (
     Planner,
     apart,
     centres_of,
-    check_team,
     explain,
     options_of,
     waiting_places,
@@ -31,7 +30,6 @@ class NearestWidest(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        check_team(team)
         decision = Decision(step=team.step)
         taken = waiting_places(team)
         for name in team.planning():
