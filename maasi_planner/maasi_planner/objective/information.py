@@ -23,13 +23,16 @@ from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import RobotView, TeamView
 
 
-def _lower(covariance: FloatArray) -> FloatArray:
+def lower_factor(covariance: FloatArray) -> FloatArray:
     """Return Cholesky's factor in plain sums, which do not depend on a linear algebra library."""
     lower = np.zeros_like(covariance)
     for i in range(len(lower)):
         for j in range(i + 1):
             rest = float(covariance[i, j]) - sum(float(lower[i, k] * lower[j, k]) for k in range(j))
-            lower[i, j] = math.sqrt(rest) if i == j else rest / lower[j, j]
+            if i == j:
+                lower[i, i] = math.sqrt(max(rest, 0.0))
+            elif lower[j, j] > 0.0:
+                lower[i, j] = rest / lower[j, j]
     return lower
 
 
@@ -80,7 +83,7 @@ def _information(
         offsets = offsets * np.maximum(1.0, least / np.maximum(distance, 1e-12))[:, None]
         jacobian = sensor.measurement.jacobian(offsets, Pose(np.zeros(3)))
         seen = chance[owner, index, cluster]
-        _add_information(jacobian, _lower(sensor.covariance), seen, owner, cluster, out)
+        _add_information(jacobian, lower_factor(sensor.covariance), seen, owner, cluster, out)
     return out
 
 

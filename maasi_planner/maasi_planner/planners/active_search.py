@@ -22,9 +22,8 @@ from maasi_planner.planners.base import (
     all_apart,
     explain,
     in_bounds,
-    options_of,
     search_jointly,
-    waiting_places,
+    usable_options,
 )
 from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
@@ -120,40 +119,32 @@ class ActiveSearch(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        settings = self.settings
-        places = waiting_places(team)
         decision = Decision(step=team.step)
-        options: dict[str, UsableCandidates] = {}
-        sequences: dict[str, Sequences] = {}
-        informed = settings.refinement == 'mutual_information'
-        for name in team.planning():
-            found = options_of(team, name, places)
-            if isinstance(found, str):
-                decision.robots[name] = stay(team.robots[name], f'stays: {found}')
-                continue
-            options[name] = found
-            sequences[name] = Sequences(team, team.robots[name], found, settings.horizon, informed)
-        names = list(options)
+        options = usable_options(team, decision)
+        informed = self.settings.refinement == 'mutual_information'
+        sequences = {
+            name: Sequences(team, team.robots[name], option, self.settings.horizon, informed)
+            for name, option in options.items()
+        }
         chosen, decision.exact, decision.evaluated = self._search(team, options, sequences)
         decision.objective = self._value(sequences, chosen)
-        for name in names:
-            view, option = team.robots[name], options[name]
+        for name, option in options.items():
             if chosen[name] < 0:
+                view = team.robots[name]
                 decision.robots[name] = stay(view, 'stays: another robot takes its candidates')
-                continue
-            decision.robots[name] = self._report(name, option, sequences, chosen)
+            else:
+                decision.robots[name] = self._report(name, option, sequences, chosen)
         return explain(decision)
 
     def _value(self, sequences: dict[str, Sequences], chosen: dict[str, int]) -> float:
         """Return the joint objective (002, eq. (14))."""
-        going = [name for name in chosen if chosen[name] >= 0]
+        refinement, product = 0.0, np.ones(self.settings.horizon)
+        going = [(sequences[name], row) for name, row in chosen.items() if row >= 0]
+        for mine, row in going:
+            refinement += float(mine.refinement[row])
+            product = product * mine.explored[row]
         if not going:
             return 0.0
-        refinement = 0.0
-        product = np.ones(self.settings.horizon)
-        for name in going:
-            refinement += float(sequences[name].refinement[chosen[name]])
-            product = product * sequences[name].explored[chosen[name]]
         return refinement + self.settings.alpha * float(sum(product.tolist()))
 
     def _search(

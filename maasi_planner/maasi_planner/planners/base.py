@@ -18,7 +18,7 @@ from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, stay
 
 
 class Planner(ABC):
@@ -249,6 +249,19 @@ def options_of(
     if (prediction.lengths == 0).any():
         return 'it is at its only candidate already'
     return 'no candidate can be reached'
+
+
+def usable_options(team: TeamView, decision: Decision) -> dict[str, UsableCandidates]:
+    """Return the candidates of the robots that have some; the others stay in `decision`."""
+    places = waiting_places(team)
+    options = {}
+    for name in team.planning():
+        found = options_of(team, name, places)
+        if isinstance(found, str):
+            decision.robots[name] = stay(team.robots[name], f'stays: {found}')
+        else:
+            options[name] = found
+    return options
 
 
 def centres_of(team: TeamView, view: RobotView, clusters: Sequence[Cluster]) -> FloatArray:

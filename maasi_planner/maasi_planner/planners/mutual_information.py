@@ -20,16 +20,10 @@ from numba import njit
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.planners.base import (
-    Planner,
-    UsableCandidates,
-    explain,
-    options_of,
-    search_jointly,
-    waiting_places,
-)
+from maasi_planner.objective.information import lower_factor
+from maasi_planner.planners.base import Planner, explain, search_jointly, usable_options
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
+from maasi_planner.team import Decision, RobotView, TeamView, single_choice, stay
 
 EXACT_TERMS = 48
 DOUBLINGS = 40
@@ -107,17 +101,7 @@ def intensity(team: TeamView) -> tuple[FloatArray, FloatArray]:
     d = team.dimension
     points, weights = [np.zeros((0, d))], [np.zeros(0)]
     for cluster in team.clusters:
-        root = np.zeros((d, d))
-        covariance = np.asarray(cluster.covariance, dtype=float)[:d, :d]
-        for i in range(d):
-            for j in range(i + 1):
-                rest = float(covariance[i, j]) - sum(
-                    float(root[i, k] * root[j, k]) for k in range(j)
-                )
-                if i == j:
-                    root[i, i] = math.sqrt(max(rest, 0.0))
-                elif root[j, j] > 0.0:
-                    root[i, j] = rest / root[j, j]
+        root = lower_factor(np.asarray(cluster.covariance, dtype=float)[:d, :d])
         scale = math.sqrt(d + 0.5)
         offsets = np.vstack([np.zeros((1, d)), scale * root.T, -scale * root.T])
         points.append(np.asarray(cluster.position, dtype=float)[:d] + offsets)
@@ -148,35 +132,55 @@ class MutualInformation(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        places = waiting_places(team)
         decision = Decision(step=team.step)
-        options: dict[str, UsableCandidates] = {}
-        for name in team.planning():
-            found = options_of(team, name, places)
-            if isinstance(found, str):
-                decision.robots[name] = stay(team.robots[name], f'stays: {found}')
-            else:
-                options[name] = found
-        points, weights = intensity(team)
+        options = usable_options(team, decision)
+        particles, weights = intensity(team)
         missed = {
-            name: self._missed(team.robots[name], option.points, points)
+            name: self._missed(team.robots[name], option.points, particles)
             for name, option in options.items()
         }
-        chosen, value, exact, evaluated = self._search(team, options, missed, weights)
-        decision.objective = value
-        decision.exact = exact
-        decision.evaluated = evaluated
+
+        def value(joint: dict[str, int]) -> float:
+            product = np.ones(len(weights))
+            for name, row in joint.items():
+                if row >= 0:
+                    product = product * missed[name][row]
+            return float(mutual_information(product, weights))
+
+        indices = {}
         for name, option in options.items():
-            view = team.robots[name]
-            if chosen[name] < 0:
+            # Candidates that tell nothing are taken in the order of going straight on.
+            order = self._straight_on(team.robots[name], option.points, name)
+            rows = np.flatnonzero(option.allowed)
+            indices[name] = rows[np.argsort(-order[rows], kind='stable')].tolist()
+        points = {name: option.points for name, option in options.items()}
+        chosen, best, decision.exact, decision.evaluated = search_jointly(
+            team, self.settings, indices, points, value, 1e-12
+        )
+        decision.objective = max(best, 0.0)
+        for name, option in options.items():
+            view, row = team.robots[name], chosen[name]
+            if row < 0:
                 decision.robots[name] = stay(view, 'stays: another robot takes its candidates')
                 continue
-            decision.robots[name] = self._report(
-                name, options, missed, weights, chosen, view, option
-            )
+            values = np.array([value({**chosen, name: w}) for w in range(len(option.points))])
+            way = option.points[row] - view.state.pose.position
+            length = math.sqrt(float((way * way).sum()))
+            if length > 1e-9:
+                self._headings[name] = way / length
+            reason = 'no waypoint tells anything: straight on'
+            if values[row] > 0.0:
+                reason = f'mutual information {values[row]:.4g} nats'
+            result = single_choice(option.points, option.prediction, row, reason)
+            result.target_refinement = values
+            result.objective = np.where(option.allowed, values, -np.inf)
+            result.measurements = np.ones(len(option.points), np.int64)
+            decision.robots[name] = result
         return explain(decision)
 
-    def _missed(self, view: RobotView, places: FloatArray, points: FloatArray) -> FloatArray:
+    @staticmethod
+    def _missed(view: RobotView, places: FloatArray, points: FloatArray) -> FloatArray:
+        """Return 1 - pi of the points from each place."""
         here = np.array(view.state.pose.position)
         out = np.ones((len(places), len(points)))
         if len(points):
@@ -184,39 +188,6 @@ class MutualInformation(Planner):
                 pose = Pose.from_yaw(place, heading_to(view, here, place))
                 row[:] = 1.0 - view.sensor.detection.probability(points, pose)
         return out
-
-    def _joint(
-        self, missed: dict[str, FloatArray], chosen: dict[str, int], weights: FloatArray
-    ) -> float:
-        product = np.ones(len(weights))
-        for name, index in chosen.items():
-            if index >= 0:
-                product = product * missed[name][index]
-        return float(mutual_information(product, weights))
-
-    def _search(
-        self,
-        team: TeamView,
-        options: dict[str, UsableCandidates],
-        missed: dict[str, FloatArray],
-        weights: FloatArray,
-    ) -> tuple[dict[str, int], float, bool, int]:
-        names = list(options)
-        indices = {name: np.flatnonzero(options[name].allowed).tolist() for name in names}
-        # Candidates that tell nothing are taken in the order of going straight on.
-        for name in names:
-            order = self._straight_on(team.robots[name], options[name].points, name)
-            indices[name].sort(key=lambda w, order=order: -order[w])
-        points = {name: options[name].points for name in names}
-        best, value, exact, evaluated = search_jointly(
-            team,
-            self.settings,
-            indices,
-            points,
-            lambda joint: self._joint(missed, joint, weights),
-            1e-12,
-        )
-        return best, max(value, 0.0), exact, evaluated
 
     def _straight_on(self, view: RobotView, points: FloatArray, name: str) -> FloatArray:
         """Return how much each waypoint lies straight on, (W,)."""
@@ -226,31 +197,3 @@ class MutualInformation(Planner):
         if last is None:
             return np.zeros(len(points))
         return np.asarray((ways * last).sum(axis=1) / np.maximum(lengths, 1e-12))
-
-    def _report(
-        self,
-        name: str,
-        options: dict[str, UsableCandidates],
-        missed: dict[str, FloatArray],
-        weights: FloatArray,
-        chosen: dict[str, int],
-        view: RobotView,
-        option: UsableCandidates,
-    ) -> RobotDecision:
-        values = np.array(
-            [self._joint(missed, {**chosen, name: w}, weights) for w in range(len(option.points))]
-        )
-        index = chosen[name]
-        way = option.points[index] - view.state.pose.position
-        length = math.sqrt(float((way * way).sum()))
-        if length > 1e-9:
-            self._headings[name] = way / length
-        if values[index] > 0.0:
-            reason = f'mutual information {values[index]:.4g} nats'
-        else:
-            reason = 'no waypoint tells anything: straight on'
-        result = single_choice(option.points, option.prediction, index, reason)
-        result.target_refinement = values
-        result.objective = np.where(option.allowed, values, -np.inf)
-        result.measurements = np.ones(len(option.points), np.int64)
-        return result
