@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from maasi_filter.models.detection import PARAMETERS, detection_probability_at
 from maasi_planner.planners.base import (
     Planner,
-    check_team,
     explain,
     options_of,
     waiting_places,
@@ -153,7 +152,6 @@ class Clairvoyant(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        check_team(team)
         targets = self._missing()
         routes, stops = _best_routes(team, targets)
         places = waiting_places(team)

@@ -154,7 +154,7 @@ def information_terms(
         covariance=np.array([c.covariance[:d, :d] for c in clusters], float).reshape(-1, d, d),
         base=np.asarray(sum(_information(*group, 0, centres, d).sum(axis=0) for group in given)),
         gain=_information(*planned, first, centres, d),
-        count=np.full(total, len(kept)),
+        filled=np.full(total, len(kept)),
         value=left[kept] * (1.0 - miss),
         place=np.zeros((0, 3, 0)),
         time=np.zeros((0, 0), np.int64),

@@ -96,7 +96,7 @@ def paper_terms(
         covariance=np.zeros((0, 0, 0)),
         base=np.zeros((0, 0, 0)),
         gain=np.zeros((0, 0, 0, 0)),
-        count=count,
+        filled=count,
         value=value,
         place=place,
         time=time,

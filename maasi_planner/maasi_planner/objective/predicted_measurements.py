@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -106,6 +106,12 @@ def _fill(
             out.turns[w, i, 0], out.turns[w, i, 1] = math.cos(yaws[w, k]), math.sin(yaws[w, k])
 
 
+def _rows(measured: Measurements, rows: Any) -> Measurements:
+    """Return the measurements on some trajectories."""
+    columns: list[Any] = [column[rows] for column in measured[:6]]
+    return Measurements._make([*columns, *measured[6:]])
+
+
 def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurements:
     """Return the measurements of robots on their trajectories.
 
@@ -132,7 +138,7 @@ def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurement
     end = 0
     for ways, count in zip(robots, counts):
         begin, end = end, end + count
-        rows = Measurements(*(column[begin:end] for column in out[:6]), *out[6:])
+        rows = _rows(out, slice(begin, end))
         timing = ways.phase, ways.view.period_steps, horizon if extend else -1, ways.arrival
         _fill(ways.positions, ways.yaws, ways.lengths, timing, rows)
         if ways.view.sensor.dimension == 2:
@@ -143,7 +149,7 @@ def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurement
 def first_of_each(measured: Measurements) -> Measurements:
     """Return of each robot the first planned measurement of its first trajectory, if any."""
     _, first = np.unique(measured.robot, return_index=True)
-    rows = Measurements(*(column[first] for column in measured[:6]), *measured[6:])
+    rows = _rows(measured, first)
     once = np.minimum(rows.own, 1)
     return rows._replace(number=once, own=once)
 

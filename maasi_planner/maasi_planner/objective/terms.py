@@ -21,10 +21,10 @@ class Terms(NamedTuple):
     T is refinement (G,), and of C clusters with mass (C,) and covariance (C, d, d) the information
     that a candidate's gain (G, C, d, d) adds to base (C, d, d), both sums of pi H' R^-1 H.
 
-    E is what others leave of value (G, n), which has count[g] numbers: their product with what
-    each other candidate leaves. That is row slot (G, G) of cache (S, n), or where that is negative
-    comes from its measurements until time (G, n) [steps from now] at place (G, 3, n) [m], and is
-    kept, as the search needs it many times; used (1,) counts rows.
+    E is what others leave of value (G, n), of which filled[g] numbers are used: their product with
+    what each other candidate leaves. That is row slot (G, G) of cache (S, n), or where that is
+    negative comes from its measurements until time (G, n) [steps from now] at place (G, 3, n) [m],
+    and is kept, as the search needs it many times; used (1,) counts rows.
     """
 
     refinement: FloatArray
@@ -32,7 +32,7 @@ class Terms(NamedTuple):
     covariance: FloatArray
     base: FloatArray
     gain: FloatArray
-    count: IntArray
+    filled: IntArray
     value: FloatArray
     place: FloatArray
     time: IntArray
@@ -44,7 +44,7 @@ class Terms(NamedTuple):
 @njit(cache=True)
 def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArray:
     """Return what the measurements of candidate `other` leave of the value of g."""
-    count, slot = terms.count[g], terms.slot[g, other]
+    count, slot = terms.filled[g], terms.slot[g, other]
     if slot >= 0:
         return terms.cache[slot, :count]
     out = np.ones(count)
@@ -60,7 +60,7 @@ def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArr
 @njit(cache=True)
 def exploration_given(terms: Terms, planned: Measurements, g: int, others: IntArray) -> float:
     """Return E of candidate g, given others that count before it."""
-    left = terms.value[g, : terms.count[g]].copy()
+    left = terms.value[g, : terms.filled[g]].copy()
     for other in others:
         factor = left_by(terms, planned, g, other)
         for i in range(left.shape[0]):
