@@ -132,7 +132,6 @@ def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int)
     first = 3 * horizon - 1
     for k in range(begin, end + 1):
         for o in range(instance.obstacles.shape[0]):
-            clear = False
             for a in range(3):
                 near = _position(instance, tree, node, a, min(k, horizon))
                 low = near
@@ -153,9 +152,8 @@ def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int)
                     below = below and given <= instance.obstacles[o, a, 0] + GIVEN_TOLERANCE
                     above = above and given >= instance.obstacles[o, a, 1] - GIVEN_TOLERANCE
                 if below or above:
-                    clear = True
                     break
-            if not clear:
+            else:
                 return k, o
     return -1, -1
 
@@ -239,6 +237,20 @@ def _visit(instance: Instance, tree: Tree, node: int, q: int) -> None:
 
 
 @njit(cache=True)
+def _can_add(instance: Instance, tree: Tree, node: int, q: int) -> bool:
+    """Return whether a visit is of a new cuboid, inside the bounds of its step."""
+    for i in range(tree.number[node]):
+        if instance.visit_cuboid[tree.visits[node, i]] == instance.visit_cuboid[q]:
+            return False
+    k = instance.visit_step[q]
+    for a in range(3):
+        low, high = instance.visit_lower[q, a], instance.visit_upper[q, a]
+        if tree.low[node, a, k] > high or tree.high[node, a, k] < low:
+            return False
+    return True
+
+
+@njit(cache=True)
 def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
     """Add the nodes with one more visit."""
     number = tree.number[node]
@@ -249,23 +261,7 @@ def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
         bound = total - tree.reward[node] - instance.visit_reward[q] - instance.ahead[q]
         if bound >= tree.best[0] - GAP:
             continue
-        seen = False
-        for i in range(number):
-            if instance.visit_cuboid[tree.visits[node, i]] == instance.visit_cuboid[q]:
-                seen = True
-                break
-        if seen or number >= tree.visits.shape[1]:
-            continue
-        k = instance.visit_step[q]
-        meets = True
-        for a in range(3):
-            if (
-                tree.low[node, a, k] > instance.visit_upper[q, a]
-                or tree.high[node, a, k] < instance.visit_lower[q, a]
-            ):
-                meets = False
-                break
-        if not meets:
+        if number >= tree.visits.shape[1] or not _can_add(instance, tree, node, q):
             continue
         child = copy_node(tree, node)
         if child < 0:
@@ -358,15 +354,13 @@ def longest_chains(
             if visit_cuboid[p] == visit_cuboid[q]:
                 continue
             i, j = visit_step[p], visit_step[q]
-            near = True
             for a in range(3):
                 if (
                     lower[q, a] - upper[p, a] > climb[a, j] - climb[a, i] + 1e-9
                     or upper[q, a] - lower[p, a] < fall[a, j] - fall[a, i] - 1e-9
                 ):
-                    near = False
                     break
-            if near:
+            else:
                 follows[p, q] = True
                 ahead[p] = max(ahead[p], reward[q] + ahead[q])
     return follows, ahead

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +14,7 @@ from maasi_planner.buildings.settings import (
     FACES,
     BoxSettings,
     CuboidSettings,
+    Face,
     ObjectSettings,
     SearchCameraSettings,
 )
@@ -32,8 +33,6 @@ def detection_probability(distance: float, camera: SearchCameraSettings) -> floa
 
 def distance_for(probability: float, camera: SearchCameraSettings) -> float:
     """Return the largest distance [m] at which p_d is `probability`."""
-    if not 0.0 < probability <= 1.0:
-        raise ValueError(f'detection_probability: got {probability}, allowed is above 0, at most 1')
     span = camera.largest_distance - camera.least_distance
     return camera.least_distance + (1.0 - probability) * span
 
@@ -133,14 +132,13 @@ def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolA
 
 
 def plan_mission(settings: CuboidSettings, area: ArrayLike) -> CoveragePlan:
-    """Return the cuboids of a mission."""
+    """Return the cuboids of a mission in an area (3, 2) [m]."""
     bounds = np.asarray(area, dtype=float)
-    if bounds.shape != (3, 2) or not np.isfinite(bounds).all():
-        raise ValueError('area: allowed are three pairs of finite numbers, low and high [m]')
     if not settings.objects:
         raise ValueError('objects: got none, allowed is at least one object to search')
     objects = _boxes('objects', settings.objects, bounds)
     obstacles = _boxes('obstacles', settings.obstacles, bounds)
+    solids = np.concatenate([objects, obstacles])
     distance = distance_for(settings.detection_probability, settings.camera)
     side = footprint(distance, settings.camera)
     cells: list[Cell] = []
@@ -148,16 +146,16 @@ def plan_mission(settings: CuboidSettings, area: ArrayLike) -> CoveragePlan:
     seen = total = 0.0
     for index, item in enumerate(settings.objects):
         for face in item.faces:
-            made, share = _face_cells(index, face, objects[index], distance, side, settings)
-            for cell in made:
-                area_of_cell = float(np.prod(cell.size))
-                total += area_of_cell
-                box, reason = _usable(cell, bounds, np.concatenate([objects, obstacles]), settings)
+            for cell in _face_cells(index, face, objects[index], distance, side, settings):
+                size = float(np.prod(cell.size))
+                total += size
+                box, reason = _usable(cell, bounds, solids, settings)
                 if reason:
                     lost.append((cell, reason))
                     continue
-                seen += share * area_of_cell
-                cells.append(Cell(cell.target, cell.face, cell.centre, cell.normal, cell.size, box))
+                # The share of the cell that a snapshot covers.
+                seen += float(np.prod(np.minimum(side / cell.size, 1.0))) * size
+                cells.append(replace(cell, box=box))
     if not cells:
         reasons = '; '.join(sorted({reason for _, reason in lost}))
         raise ValueError(
@@ -188,11 +186,10 @@ def _boxes(key: str, items: Sequence[BoxSettings], area: FloatArray) -> FloatArr
 
 
 def _face_cells(
-    index: int, face: str, box: FloatArray, distance: float, side: float, settings: CuboidSettings
-) -> tuple[list[Cell], float]:
-    """Return the cells of a face, and the share of each that a snapshot covers."""
-    number = FACES.index(face)  # type: ignore[arg-type]
-    axis, upper = divmod(number, 2)
+    index: int, face: Face, box: FloatArray, distance: float, side: float, settings: CuboidSettings
+) -> Iterator[Cell]:
+    """Yield the cells of a face, their cuboids not cut yet."""
+    axis, upper = divmod(FACES.index(face), 2)
     others = [a for a in range(3) if a != axis]
     normal = np.zeros(3)
     normal[axis] = 1.0 if upper else -1.0
@@ -202,8 +199,6 @@ def _face_cells(
     else:
         counts = np.maximum(np.floor(lengths / side + 0.5).astype(int), 1)
     size = lengths / counts
-    share = float(np.prod(np.minimum(side / size, 1.0)))
-    cells = []
     half = 0.5 * settings.cuboid_size
     for j in range(counts[1]):
         for i in range(counts[0]):
@@ -212,8 +207,7 @@ def _face_cells(
             centre[others] = box[others, 0] + (np.array([i, j]) + 0.5) * size
             middle = centre + distance * normal
             corners = np.stack([middle - half, middle + half], axis=1)
-            cells.append(Cell(index, face, centre, normal, size, corners))
-    return cells, share
+            yield Cell(index, face, centre, normal, size, corners)
 
 
 def _usable(
