@@ -35,96 +35,6 @@ from maasi_sim.world.world import World
 MakePlanner = Callable[[PlannerSettings, Callable[[], FloatArray]], Planner]
 
 
-class _Robot:
-    """A simulated robot with the functions of its driver."""
-
-    def __init__(self, name: str, scenario: Scenario, seed: int, world: World) -> None:
-        settings = scenario.robots[name]
-        self.name = name
-        self.sensor = settings.sensor.build(name, scenario.dimension)
-        self.body = simulated_robot(name, scenario, world, seed)
-        obstacles = Obstacles.from_settings(scenario.environment.obstacles)
-        self.follower = WaypointFollower(make_motion(settings.motion, obstacles, settings.radius))
-        self.odometry = MapOdometry(Pose.from_yaw(settings.start, settings.yaw))
-        self.detector = (
-            None if settings.camera is None else MarkerDetector(settings.camera, scenario.dimension)
-        )
-        period = settings.sensor.period if settings.camera is None else 1.0 / settings.camera.rate
-        self.imaging_steps = steps_of(period, scenario.step) if period > 0.0 else 1
-        self.pose: StampedPose
-        self.state: RobotState
-        self.distance = 0.0
-
-    def observe(self, stamp: int) -> None:
-        """Take the odometry of a step."""
-        reading = self.body.odometry
-        self.pose = self.odometry.apply(
-            stamp,
-            reading.pose,
-            reading.covariance,
-            reading.velocity,
-            reading.angular_velocity,
-        )
-        self.state = RobotState(self.pose.pose, self.pose.velocity, self.pose.angular_velocity)
-
-    def move(self, command: FloatArray, step: int, dt: float) -> None:
-        """Advance by `dt` seconds under a velocity command."""
-        before = self.body.state.pose.position
-        self.body.command(command)
-        self.body.step(step, dt)
-        moved = self.body.state.pose.position - before
-        self.distance += float(np.sqrt((moved * moved).sum()))
-
-    def has_ended(self, goal: int) -> bool:
-        """Return whether the goal of this number has ended."""
-        now, status = self.follower.goal, self.follower.status
-        return now is not None and now.id == goal and status != GoalStatus.MOVING
-
-    def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
-        """Return the measurement of the robot at a step."""
-        if self.detector is None:
-            sweep = self.body.sweep(step)
-            reading = SensorReading.of_sweep(sweep, self.sensor, self.pose.pose)
-        else:
-            image = self.body.image(step, time)
-            reading = read_markers(image, self.pose, self.detector, self.sensor)
-        return AgentMeasurement(
-            self.name,
-            self.pose.pose,
-            self.sensor,
-            reading.values,
-            reading.covariances,
-            index,
-            self.pose.covariance[:3, :3],
-            reading.labels,
-        )
-
-
-@dataclass
-class _Group:
-    """Robots that share filter and planner: all, or a single one (002, section 4)."""
-
-    space: str
-    names: list[str]
-    coordinator: Coordinator
-    filter: SearchFilter
-    # Step of the last batch, and found targets at the end of the previous step, for other groups.
-    last_batch: int | None = None
-    shared: list[FoundTarget] = field(default_factory=list)
-
-
-def leaving(scenario: Scenario) -> dict[int, list[str]]:
-    """Return the robots that leave, by step."""
-    steps: dict[int, list[str]] = {}
-    for event in scenario.events:
-        if event.do != 'leave':
-            raise ValueError(
-                f"events: read '{event.do}' of {event.robot}, in one process robots only leave"
-            )
-        steps.setdefault(step_of_event(event.at, scenario.step), []).append(event.robot)
-    return steps
-
-
 def search(
     scenario: Scenario,
     seed: int,
@@ -346,3 +256,87 @@ class _Search:
         """Return the true targets that are not found yet, (n, 3) [m]."""
         matched = [j for _, j in self._state()[2].match.pairs]
         return np.delete(self.world.targets_3d_at(self.step), matched, axis=0)
+
+
+@dataclass
+class _Group:
+    """Robots that share filter and planner: all, or a single one (002, section 4)."""
+
+    space: str
+    names: list[str]
+    coordinator: Coordinator
+    filter: SearchFilter
+    # Step of the last batch, and found targets at the end of the previous step, for other groups.
+    last_batch: int | None = None
+    shared: list[FoundTarget] = field(default_factory=list)
+
+
+class _Robot:
+    """A simulated robot with the functions of its driver."""
+
+    def __init__(self, name: str, scenario: Scenario, seed: int, world: World) -> None:
+        settings = scenario.robots[name]
+        self.name = name
+        self.sensor = settings.sensor.build(name, scenario.dimension)
+        self.body = simulated_robot(name, scenario, world, seed)
+        obstacles = Obstacles.from_settings(scenario.environment.obstacles)
+        self.follower = WaypointFollower(make_motion(settings.motion, obstacles, settings.radius))
+        self.odometry = MapOdometry(Pose.from_yaw(settings.start, settings.yaw))
+        self.detector = (
+            None if settings.camera is None else MarkerDetector(settings.camera, scenario.dimension)
+        )
+        period = settings.sensor.period if settings.camera is None else 1.0 / settings.camera.rate
+        self.imaging_steps = steps_of(period, scenario.step) if period > 0.0 else 1
+        self.pose: StampedPose
+        self.state: RobotState
+        self.distance = 0.0
+
+    def observe(self, stamp: int) -> None:
+        """Take the odometry of a step."""
+        reading = self.body.odometry
+        motion = reading.velocity, reading.angular_velocity
+        self.pose = self.odometry.apply(stamp, reading.pose, reading.covariance, *motion)
+        self.state = RobotState(self.pose.pose, self.pose.velocity, self.pose.angular_velocity)
+
+    def move(self, command: FloatArray, step: int, dt: float) -> None:
+        """Advance by `dt` seconds under a velocity command."""
+        before = self.body.state.pose.position
+        self.body.command(command)
+        self.body.step(step, dt)
+        moved = self.body.state.pose.position - before
+        self.distance += float(np.sqrt((moved * moved).sum()))
+
+    def has_ended(self, goal: int) -> bool:
+        """Return whether the goal of this number has ended."""
+        now, status = self.follower.goal, self.follower.status
+        return now is not None and now.id == goal and status != GoalStatus.MOVING
+
+    def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
+        """Return the measurement of the robot at a step."""
+        if self.detector is None:
+            reading = SensorReading.of_sweep(self.body.sweep(step), self.sensor, self.pose.pose)
+        else:
+            image = self.body.image(step, time)
+            reading = read_markers(image, self.pose, self.detector, self.sensor)
+        return AgentMeasurement(
+            self.name,
+            self.pose.pose,
+            self.sensor,
+            reading.values,
+            reading.covariances,
+            index,
+            self.pose.covariance[:3, :3],
+            reading.labels,
+        )
+
+
+def leaving(scenario: Scenario) -> dict[int, list[str]]:
+    """Return the robots that leave, by step."""
+    steps: dict[int, list[str]] = {}
+    for event in scenario.events:
+        if event.do != 'leave':
+            raise ValueError(
+                f"events: read '{event.do}' of {event.robot}, in one process robots only leave"
+            )
+        steps.setdefault(step_of_event(event.at, scenario.step), []).append(event.robot)
+    return steps
