@@ -46,8 +46,8 @@ class TargetMission:
 
     def cameras(self) -> list[str]:
         """See `Mission.cameras`."""
-        robots = self.scenario.robots
-        return [name for name in self.scenario.names() if robots[name].camera is not None]
+        robots = sorted(self.scenario.robots.items())
+        return [name for name, robot in robots if robot.camera is not None]
 
     def taking_off(self) -> list[str]:
         """See `Mission.taking_off`."""
@@ -55,26 +55,23 @@ class TargetMission:
 
     def external(self) -> list[str]:
         """See `Mission.external`."""
-        return [
-            name
-            for name, robot in self.scenario.robots.items()
-            if robot.external and robot.link != 'topics'
-        ]
+        robots = self.scenario.robots.items()
+        return [name for name, robot in robots if robot.external and robot.link != 'topics']
 
     def warning(self) -> str:
         """See `Mission.warning`."""
         settings = self.scenario.filter
         lengths = unsuitable_lengths(settings, self.scenario.environment.array())
-        warnings = never_seen(self.scenario), lengths, unused_settings(settings)
-        return '\n'.join(filter(None, warnings))
+        return '\n'.join(
+            filter(None, (never_seen(self.scenario), lengths, unused_settings(settings)))
+        )
 
     def observer(self, types: Typestore) -> TargetObserver:
         """See `Mission.observer`."""
         return TargetObserver(self.name, self.scenario, self.scenario.seed, types)
 
-    def report(self, record: TargetRecord) -> dict[str, Any]:
-        """See `Mission.report`."""
-        return build_report(record)
+    report = staticmethod(build_report)
+    summary = staticmethod(summary)
 
     def tables(self, record: TargetRecord) -> dict[str, str]:
         """See `Mission.tables`."""
@@ -84,10 +81,6 @@ class TargetMission:
         if origin is not None:
             files['found_targets.geojson'] = geojson_text(rows)
         return files
-
-    def summary(self, report: dict[str, Any]) -> str:
-        """See `Mission.summary`."""
-        return summary(report)
 
     def figure(self, record: TargetRecord) -> Figure:
         """See `Mission.figure`."""

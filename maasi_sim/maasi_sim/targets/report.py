@@ -15,9 +15,6 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
     scores = record.scores()
     complete = _completion(record)
     true = dict(scores.match.pairs)
-    distances = {
-        name: _number(path_length(trajectory)) for name, trajectory in record.trajectories.items()
-    }
     return {
         **identity(record, 'targets'),
         'targets': [_numbers(position) for position in record.truth],
@@ -41,16 +38,14 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
         'false_found': scores.match.false_found,
         'rmse': _number(scores.match.rmse),
         'gospa': {
-            'total': scores.gospa.total,
-            'localisation': scores.gospa.localisation,
-            'missed': scores.gospa.missed,
-            'false': scores.gospa.false,
+            part: getattr(scores.gospa, part)
+            for part in ('total', 'localisation', 'missed', 'false')
         },
         'measurements': record.measurements,
         'measurements_to_find_all': complete.measurements if complete else None,
         'time_to_find_all': complete.time if complete else None,
         'decisions': record.decisions,
-        'distance': distances,
+        'distance': {n: _number(path_length(way)) for n, way in record.trajectories.items()},
         **ending(record),
         'scoring': {'radius': scores.radius, 'c': scores.radius, 'p': scores.order},
     }
@@ -80,12 +75,11 @@ def summary(report: dict[str, Any]) -> str:
 def _completion(record: TargetRecord) -> FoundCount | None:
     """Return when all targets were found and stayed so."""
     complete = None
-    for progress in record.progress:
+    for progress in reversed(record.progress if len(record.truth) else []):
         if progress.true_found < len(record.truth):
-            complete = None
-        elif complete is None:
-            complete = progress
-    return complete if len(record.truth) else None
+            break
+        complete = progress
+    return complete
 
 
 def _number(value: float) -> float | None:

@@ -62,10 +62,6 @@ class EventLog:
     scene: Scene = field(default_factory=dict)
     events: list[Event] = field(default_factory=list)
 
-    def text(self) -> str:
-        """Return the log as JSON lines."""
-        return '\n'.join([line(self.scene), *map(line, self.events)])
-
     @property
     def duration(self) -> float:
         """Time of the last event [s]."""
@@ -80,7 +76,8 @@ class EventLog:
         period = 0.0
         log = self
         while True:
-            packed = base64.b64encode(gzip.compress(log.text().encode(), 7, mtime=0)).decode()
+            text = '\n'.join([line(log.scene), *map(line, log.events)])
+            packed = base64.b64encode(gzip.compress(text.encode(), 7, mtime=0)).decode()
             if len(packed) <= largest or period > _LONGEST_PERIOD:
                 return packed
             period = max(2.0 * period, 2.0 * STATE_PERIOD)
@@ -106,17 +103,16 @@ class Thinning:
 
     def keeps(self, event: Event) -> bool:
         """Return whether an event is kept."""
-        if event[1] not in _THINNED or (event[1] == 'seen' and event[4]):
+        time, kind, owner = event[:3]
+        seen = (kind == 'seen' and event[4]) or (kind == 'cuboid' and event[8])
+        if kind not in _THINNED or seen:
             return True
-        if event[1] == 'cuboid' and event[8]:
+        last = self._last.get((kind, owner))
+        news = kind == 'robot' and last is not None and event[5:] != last[5:]
+        if last is None or news or time - last[0] >= self._period - 1e-6:
+            self._last[kind, owner] = event
             return True
-        key = event[1], event[2]
-        last = self._last.get(key)
-        news = last is None or (event[1] == 'robot' and event[5:] != last[5:])
-        if not news and last is not None and event[0] - last[0] < self._period - 1e-6:
-            return False
-        self._last[key] = event
-        return True
+        return False
 
 
 def thin(events: Iterable[Event], period: float) -> list[Event]:

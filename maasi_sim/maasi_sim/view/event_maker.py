@@ -19,6 +19,8 @@ from maasi_sim.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinn
 _NOT_ALLOWED = -1e29
 # Status of a robot: of AgentState, and what only those who watch know.
 MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
+# Of a `CuboidDecision`.
+_ACTIVITIES = ('searching', 'returning', 'recharging')
 # A robot is silent when others say where they are for so long without it [s].
 _SILENCE = 3.0
 # Points of a planned way that are shown.
@@ -31,6 +33,11 @@ def padded(values: ArrayLike) -> FloatArray:
     whole = np.zeros((3,) * given.ndim)
     whole[tuple(map(slice, given.shape))] = given
     return whole
+
+
+def point(item: Any) -> tuple[float, float, float]:
+    """Return the coordinates of a `geometry_msgs/Point`."""
+    return float(item.x), float(item.y), float(item.z)
 
 
 def significant(value: float) -> float:
@@ -262,29 +269,21 @@ class EventMaker:
         self._put(time, 'truth', '', [self._place(item) for item in now])
         self._score(time)
 
-    def cuboid(
-        self,
-        time: float,
-        robot: str,
-        choice: tuple[str, str, ArrayLike],
-        heard: Sequence[str],
-        planned: Sequence[int],
-        snapshots: Iterable[tuple[int, ArrayLike, float]],
-        done: bool,
-    ) -> None:
-        """Add a decision in a search of buildings; choice is activity, how, target."""
-        activity, how, target = choice
-        shots = [
-            [int(number), *self._place(position), round(float(chance), 3)]
-            for number, position, chance in snapshots
-        ]
-        before, self._activity[robot] = self._activity.get(robot), activity
-        if before not in (None, activity):
+    def cuboid(self, time: float, message: Any) -> None:
+        """Add a `CuboidDecision` of a search of buildings."""
+        robot = message.robot
+        activity = _ACTIVITIES[min(int(message.activity), len(_ACTIVITIES) - 1)]
+        shots = []
+        for shot in message.snapshots:
+            chance = round(float(shot.detection_probability), 3)
+            shots.append([int(shot.cuboid), *self._place(point(shot.position)), chance])
+            self.message(time, robot, 'found', f'snapshot of cuboid {shot.cuboid}')
+        before, self._activity[robot] = self._activity.get(robot, activity), activity
+        if before != activity:
             self.message(time, robot, 'team', activity)
-        for shot in shots:
-            self.message(time, robot, 'found', f'snapshot of cuboid {shot[0]}')
-        lists = list(heard), [int(item) for item in planned], shots
-        self._put(time, 'cuboid', robot, activity, how, self._place(target), *lists, bool(done))
+        lists = list(message.heard), [int(item) for item in message.planned], shots
+        target = self._place(point(message.target))
+        self._put(time, 'cuboid', robot, activity, message.how, target, *lists, bool(message.done))
 
     def add_to_scene(self, part: Scene) -> None:
         """Add to the scene what became known later."""

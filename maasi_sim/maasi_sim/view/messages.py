@@ -21,13 +21,12 @@ from maasi_sim.run.bag import Bag, BagError
 from maasi_sim.run.topics import STEP, seconds
 from maasi_sim.targets.tally import found_target
 from maasi_sim.view.event_log import Event, EventLog
-from maasi_sim.view.event_maker import EventMaker
+from maasi_sim.view.event_maker import EventMaker, point
 from maasi_sim.view.scene import empty_scene, scene_of_facts
 
 MARKERS = 'visualization_msgs/msg/MarkerArray'
 # Messages between two words on the progress.
 _PROGRESS = 1000
-_ACTIVITIES = ('searching', 'returning', 'recharging')
 # Of a candidate, besides its place and length.
 _TERMS = ('control_cost', 'target_refinement', 'exploration', 'objective', 'measurements')
 # Levels of rcl_interfaces/msg/Log and of diagnostic_msgs/msg/DiagnosticStatus.
@@ -124,7 +123,7 @@ class MessageEvents:
         yaw = math.atan2(
             2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
         )
-        place = (*_point(pose.position), yaw)
+        place = (*point(pose.position), yaw)
         if all(map(math.isfinite, place)):
             time = self._now(topic, message)
             # The driver of a robot that left may publish for a while.
@@ -147,13 +146,13 @@ class MessageEvents:
             usable = size in (2, 3) and size**2 == len(own)
             covariances.append(own.reshape(size, size) if usable else None)
             values.append((item.range, item.bearing, item.elevation))
-        place = _point(message.pose.pose.position)
+        place = point(message.pose.pose.position)
         self.maker.seen(self._time(message), message.robot, place, values, covariances)
 
     def _take_update(self, topic: str, message: Any) -> None:
         clusters = [
             Cluster(
-                np.array(_point(item.position)), _matrix(item.covariance), item.radius, item.mass
+                np.array(point(item.position)), _matrix(item.covariance), item.radius, item.mass
             )
             for item in message.clusters
         ]
@@ -171,11 +170,11 @@ class MessageEvents:
             rows = item.candidates
             robots[item.robot] = RobotDecision(
                 int(item.chosen),
-                np.array(_point(item.waypoint)),
+                np.array(point(item.waypoint)),
                 # Planned ways are messages of their own.
                 positions=np.zeros((0, 3)),
                 yaws=np.zeros(0),
-                candidates=np.array([_point(row.position) for row in rows]).reshape(-1, 3),
+                candidates=np.array([point(row.position) for row in rows]).reshape(-1, 3),
                 **{name: np.array([getattr(row, name) for row in rows]) for name in _TERMS},
                 lengths=np.array([row.length for row in rows]),
                 reason='',
@@ -186,30 +185,17 @@ class MessageEvents:
         self.maker.plan(time, space, message.planner, decision, indices, message.explored)
 
     def _take_cuboid(self, _: str, message: Any) -> None:
-        activity = min(int(message.activity), len(_ACTIVITIES) - 1)
-        shots = [
-            (int(shot.cuboid), _point(shot.position), shot.detection_probability)
-            for shot in message.snapshots
-        ]
-        self.maker.cuboid(
-            self._time(message),
-            message.robot,
-            (_ACTIVITIES[activity], message.how, _point(message.target)),
-            list(message.heard),
-            [int(item) for item in message.planned],
-            shots,
-            bool(message.done),
-        )
+        self.maker.cuboid(self._time(message), message)
 
     def _take_path(self, topic: str, message: Any) -> None:
-        points = [_point(item.pose.position) for item in message.poses]
+        points = [point(item.pose.position) for item in message.poses]
         self.maker.way(self._time(message), _space(topic).rpartition('/')[2], points)
 
     def _take_grid(self, topic: str, message: Any) -> None:
         info = message.info
         values = np.asarray(message.data, dtype=float).reshape(info.height, info.width).T / 100.0
         step = float(info.resolution)
-        corner = np.add(_point(info.origin.position), (0.5 * step, 0.5 * step, 0.0))
+        corner = np.add(point(info.origin.position), (0.5 * step, 0.5 * step, 0.0))
         self._learn_bounds(corner[:2], corner[:2] + step * (np.array(values.shape) - 1))
         self.maker.map(self._time(message), _space(topic), corner, [step, step], values)
 
@@ -232,14 +218,14 @@ class MessageEvents:
 
     def _take_truth(self, _: str, message: Any) -> None:
         size = len(self.maker.scene.get('bounds') or [0, 0, 0])
-        points = [_point(item.position) for item in message.poses]
+        points = [point(item.position) for item in message.poses]
         self.maker.truth(self.maker.latest, np.array(points).reshape(-1, 3)[:, :size])
 
     def _take_markers(self, topic: str, message: Any) -> None:
         """Take obstacles and buildings of a run without scenario."""
         parts: dict[str, list[Any]] = {}
         for item in message.markers:
-            place, size = np.array(_point(item.pose.position)), item.scale
+            place, size = np.array(point(item.pose.position)), item.scale
             box = np.stack([place, place], axis=1) + np.outer([size.x, size.y, size.z], [-0.5, 0.5])
             if topic.endswith('ground_truth/markers') and item.ns == 'obstacles':
                 circle = [*place[:2].tolist(), 0.5 * float(size.x)]
@@ -270,10 +256,6 @@ class MessageEvents:
                 word = 'fault' if level > 1 else 'warning' if level else 'team'
                 text = f'{_DIAGNOSTIC_WORDS[level]}: {status.message}'
                 self.maker.message(self.maker.latest, status.name, word, text)
-
-
-def _point(point: Any) -> tuple[float, float, float]:
-    return float(point.x), float(point.y), float(point.z)
 
 
 def _matrix(values: Any) -> FloatArray:

@@ -40,28 +40,19 @@ def empty_page() -> str:
     return _with('RUN', _page(), '')
 
 
-def replay_page(log: EventLog, largest: int = LARGEST) -> str:
-    """Return the page with a run inside, thinned to a size [characters]."""
-    return _with('RUN', _page(), log.packed(largest))
-
-
 def write_replay(log: EventLog, path: Path, largest: int = LARGEST) -> None:
     """Write the page with a run inside, thinned to a size [characters]."""
-    write_text(path, replay_page(log, largest))
+    write_text(path, _with('RUN', _page(), log.packed(largest)))
 
 
 @cache
 def _page() -> str:
     """Return the page with style and modules: browsers load no modules beside a local file."""
-    text = (FOLDER / 'index.html').read_text(encoding='utf-8')
-    style = (FOLDER / 'page.css').read_text(encoding='utf-8')
-    return _with('SCRIPT', _with('STYLE', text, style), '\n'.join(map(_module, _MODULES)))
-
-
-def _module(name: str) -> str:
-    """Return a module for one scope with the others."""
-    text = (FOLDER / f'{name}.js').read_text(encoding='utf-8')
-    return _EXPORT.sub('', _IMPORT.sub('', text))
+    names = ('index.html', 'page.css', *(f'{name}.js' for name in _MODULES))
+    text, style, *modules = ((FOLDER / name).read_text(encoding='utf-8') for name in names)
+    # In one scope nothing is imported.
+    script = '\n'.join(_EXPORT.sub('', _IMPORT.sub('', module)) for module in modules)
+    return _with('SCRIPT', _with('STYLE', text, style), script)
 
 
 def _with(place: str, text: str, content: str) -> str:

@@ -74,16 +74,9 @@ def _objective(settings: PlannerSettings) -> Scene:
     """Return what J is made of, for planners whose J is that of `PlannerSettings`."""
     if settings.name not in _WEIGHING:
         return {}
-    weights = settings.weights()
-    return {
-        'objective': settings.objective,
-        'weights': {
-            'control': weights.control,
-            'alpha': weights.alpha,
-            'beta': weights.beta,
-            'per_distance': weights.per_distance,
-        },
-    }
+    names = ('control', 'alpha', 'beta', 'per_distance')
+    weights = {name: getattr(settings.weights(), name) for name in names}
+    return {'objective': settings.objective, 'weights': weights}
 
 
 def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:

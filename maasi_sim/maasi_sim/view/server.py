@@ -17,7 +17,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -152,7 +152,9 @@ class ViewServer(ThreadingHTTPServer):
         self.hub = hub
         self.host = host
         self.commander = commander
-        self.is_private = host == 'localhost' or _is_loopback(host)
+        number = _number(host)
+        # Whether only this machine reaches it.
+        self.is_private = host == 'localhost' or (number is not None and number.is_loopback)
         self.token = '' if self.is_private and commander is None else secrets.token_urlsafe(16)
         self.wanted_port = PORT if port is None else port
         self.browsers = 0
@@ -225,17 +227,11 @@ class ViewServer(ThreadingHTTPServer):
         """Do nothing: a browser that breaks a connection is no error of the run."""
 
 
-def _is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address."""
-    return _is_number(host) and ipaddress.ip_address(host).is_loopback
-
-
-def _is_number(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
+def _number(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """Return the address that a host is given by, None where it is given by a name."""
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host)
+    return None
 
 
 def _own_address() -> str:
@@ -260,9 +256,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer with the page or the stream of events."""
         if not self._is_for_this_host():
             return
-        parts = urlsplit(self.path)
-        path = parts.path
-        given = parse_qs(parts.query).get('token', [''])[-1]
+        path = urlsplit(self.path).path
+        given = parse_qs(urlsplit(self.path).query).get('token', [''])[-1]
         if not (self.server.is_private or self._has_token(given)):
             self._refuse(HTTPStatus.FORBIDDEN, 'wrong token: use the whole link that was printed')
         elif path == '/':
@@ -290,12 +285,11 @@ class _Handler(BaseHTTPRequestHandler):
             command = self._read_command()
             if command is not None:
                 self.server.keep(self.connection)
-                done, text = commander(*command)
-                self._answer_json(HTTPStatus.OK, {'done': done, 'message': text})
+                self._report(HTTPStatus.OK, *commander(*command))
 
     def _read_command(self) -> tuple[str, str | None] | None:
         """Return command and robot; None: it was refused."""
-        length = self.headers.get('Content-Length', '')
+        length, body = self.headers.get('Content-Length', ''), None
         if not (length.isascii() and length.isdecimal()):
             self._refuse(HTTPStatus.LENGTH_REQUIRED, 'Content-Length: allowed is a number')
             return None
@@ -303,23 +297,20 @@ class _Handler(BaseHTTPRequestHandler):
             too_large = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
             self._refuse(too_large, f'allowed are {LARGEST_BODY} bytes at most')
             return None
-        try:
+        with contextlib.suppress(ValueError, RecursionError):
             body = json.loads(self.rfile.read(int(length)))
-        except (ValueError, RecursionError):
-            body = None
         given = body if isinstance(body, dict) else {}
         command, robot = given.get('command'), given.get('robot')
-        problem = ''
         if body is not given:
             problem = 'allowed is a JSON object'
         elif command not in COMMANDS:
             problem = f'command: allowed are {", ".join(COMMANDS)}'
         elif robot is not None and not (isinstance(robot, str) and robot.isidentifier()):
             problem = 'robot: allowed is the name of one, or null'
-        if problem:
-            self._refuse(HTTPStatus.BAD_REQUEST, problem)
-            return None
-        return str(command), robot
+        else:
+            return str(command), robot
+        self._refuse(HTTPStatus.BAD_REQUEST, problem)
+        return None
 
     def _has_token(self, given: str) -> bool:
         token = self.server.token
@@ -327,17 +318,15 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _is_for_this_host(self) -> bool:
         """Refuse what another page asks by a name that it made point here."""
-        host = self.server.host
+        host, own = self.server.host, socket.gethostname()
         name = urlsplit(f'//{self.headers.get("Host", "")}').hostname or ''
-        allowed = {host, 'localhost', '127.0.0.1', '::1'}
-        own = socket.gethostname()
+        allowed = name in (host, 'localhost', '127.0.0.1', '::1')
         # Where it listens on all addresses, each of them: another page has a name, no number.
-        if host in _EVERYWHERE and (name in (own, f'{own}.local') or _is_number(name)):
-            return True
-        if name not in allowed:
+        if host in _EVERYWHERE:
+            allowed = allowed or name in (own, f'{own}.local') or _number(name) is not None
+        if not allowed:
             self._refuse(HTTPStatus.FORBIDDEN, 'Host: allowed is the address that was printed')
-            return False
-        return True
+        return allowed
 
     def _stream(self) -> None:
         """Send events until the run or the browser ends."""
@@ -346,10 +335,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_BROWSERS} browsers are here')
             return
         try:
-            self.send_response(HTTPStatus.OK)
-            self.send_header('Content-Type', 'text/event-stream')
-            self.send_header('Cache-Control', 'no-store')
-            self.end_headers()
+            self._begin(HTTPStatus.OK, 'text/event-stream', {})
             self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             begin, closed = (-1, 0), False
             while not closed:
@@ -364,21 +350,24 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refuse(self, status: HTTPStatus, text: str) -> None:
         self.close_connection = True
-        self._answer_json(status, {'done': False, 'message': text})
+        self._report(status, False, text)
 
-    def _answer_json(self, status: HTTPStatus, content: dict[str, Any]) -> None:
-        self._answer(status, json.dumps(content).encode(), 'application/json')
+    def _report(self, status: HTTPStatus, done: bool, text: str) -> None:
+        content = json.dumps({'done': done, 'message': text})
+        self._answer(status, content.encode(), 'application/json')
 
     def _answer(self, status: HTTPStatus, content: bytes, kind: str) -> None:
         with contextlib.suppress(OSError):
-            self.send_response(status)
-            self.send_header('Content-Type', kind)
-            self.send_header('Content-Length', str(len(content)))
-            self.send_header('Cache-Control', 'no-store')
-            self.send_header('X-Content-Type-Options', 'nosniff')
-            self.send_header('Referrer-Policy', 'no-referrer')
-            self.end_headers()
+            self._begin(status, kind, {'Content-Length': str(len(content))})
             self.wfile.write(content)
+
+    def _begin(self, status: HTTPStatus, kind: str, headers: Mapping[str, str]) -> None:
+        self.send_response(status)
+        fixed = {'X-Content-Type-Options': 'nosniff', 'Referrer-Policy': 'no-referrer'}
+        fixed |= {'Content-Type': kind, 'Cache-Control': 'no-store'}
+        for name, value in {**fixed, **headers}.items():
+            self.send_header(name, value)
+        self.end_headers()
 
     def log_message(self, format: str, *arguments: Any) -> None:
         """Say nothing of requests."""

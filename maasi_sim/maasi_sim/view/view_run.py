@@ -50,9 +50,10 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--video: read '{options.video}', allowed are FILE.mp4 and FILE.gif")
     if not 0.0 < options.speed < 1e4:
         parser.error(f"--speed: read '{options.speed:g}', allowed are numbers above 0, below 1e4")
-    recording = options.recording or _newest()
-    if recording is None:
+    bags = sorted(Path('runs').glob('*/bag/metadata.yaml'), key=lambda item: item.stat().st_mtime)
+    if options.recording is None and not bags:
         parser.error('there is no run in runs: name a recording')
+    recording = options.recording or bags[-1].parents[1]
     try:
         log = read_events(recording)
         if options.video is not None:
@@ -62,7 +63,9 @@ def main(arguments: list[str] | None = None) -> int:
             write_video(log, options.video, options.speed)
             print(options.video)
             return DONE
-        file = options.out or _beside(recording)
+        # In the folder of its run, or beside the recording.
+        folder = recording if (recording / 'bag').is_dir() else recording.resolve().parent
+        file = options.out or folder / REPLAY
         write_replay(log, file)
     except BagError as error:
         print(f'error: {error}', file=sys.stderr)
@@ -74,20 +77,6 @@ def main(arguments: list[str] | None = None) -> int:
     if not options.no_open:
         open_browser(file.resolve().as_uri())
     return DONE
-
-
-def _newest() -> Path | None:
-    """Return the folder of the newest recorded run in the current folder."""
-    bags = Path('runs').glob('*/bag/metadata.yaml')
-    newest = max(bags, key=lambda item: item.stat().st_mtime, default=None)
-    return None if newest is None else newest.parents[1]
-
-
-def _beside(recording: Path) -> Path:
-    """Return the page of a recording: in the folder of its run, or beside it."""
-    if (recording / 'bag').is_dir():
-        return recording / REPLAY
-    return recording.resolve().parent / REPLAY
 
 
 if __name__ == '__main__':
