@@ -133,19 +133,16 @@ def test_yaml(block: Block, tmp_path: Path) -> None:
     check_yaml(block.text, tmp_path)
 
 
-@pytest.mark.parametrize(
-    'text',
-    [
+def test_wrong_yaml_is_found(tmp_path: Path) -> None:
+    for text in (
         'filter: {filters: pmb}',
         'planner: {name: fastest}',
         'camera.widht: 640',
         'filter_node: {ros__parameters: {environment.bounds: [0.0, 1.0, 0.0]}}',
         'driver: ranging_driver\nmotion: {speed: -1.0}',
-    ],
-)
-def test_wrong_yaml_is_found(text: str, tmp_path: Path) -> None:
-    with pytest.raises((ValueError, AssertionError)):
-        check_yaml(text, tmp_path)
+    ):
+        with pytest.raises((ValueError, AssertionError)):
+            check_yaml(text, tmp_path)
 
 
 def check_commands(text: str) -> None:
@@ -223,9 +220,8 @@ def test_commands(block: Block) -> None:
     check_commands(block.text)
 
 
-@pytest.mark.parametrize(
-    'line',
-    [
+def test_wrong_commands_are_found() -> None:
+    for line in (
         './scripts/run_scenario mambo --sed 1',
         './scripts/run_scenario mambo --seed 1.5',
         './scripts/gone',
@@ -234,8 +230,6 @@ def test_commands(block: Block) -> None:
         'ros2 run maasi_filter filter --ros-args',
         'ros2 run maasi_filter filter_node --fast',
         'ros2 launch maasi_sim scenario.launch.py scenarios:=mambo',
-    ],
-)
-def test_wrong_commands_are_found(line: str) -> None:
-    with pytest.raises((AssertionError, OSError)):
-        check_commands(line)
+    ):
+        with pytest.raises((AssertionError, OSError)):
+            check_commands(line)

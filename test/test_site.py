@@ -28,7 +28,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-def test_every_page_is_in_the_contents(site: Path) -> None:
+def test_every_page_is_in_the_contents_and_needs_no_network(site: Path) -> None:
+    loaded = r'<(?:script|link|img)\b[^>]*\b(?:src|href)="(?:https?:)?//'
+    assert [page.name for page in site.rglob('*.html') if re.search(loaded, page.read_text())] == []
     contents = (site / 'index.html').read_text()
     pages = [page.relative_to(ROOT / 'docs') for page in (ROOT / 'docs').rglob('*.md')]
     assert Path('tutorials/student.md') in pages
@@ -50,8 +52,3 @@ def test_reference_is_made_from_the_code(site: Path, page: str, words: list[str]
     text = re.sub(r'<[^>]+>', '', html)
     for word in words:
         assert word in text
-
-
-def test_pages_need_no_network(site: Path) -> None:
-    loaded = r'<(?:script|link|img)\b[^>]*\b(?:src|href)="(?:https?:)?//'
-    assert [page.name for page in site.rglob('*.html') if re.search(loaded, page.read_text())] == []

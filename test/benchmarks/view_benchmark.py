@@ -30,7 +30,7 @@ SECONDS, RUNS = 60.0, 3
 EVENTS, SEEKS = 100_000, 60
 
 
-def demo(folder: Path, watch: Callable[[str], Any] | None, seconds: float = SECONDS) -> float:
+def demo(folder: Path, watch: Callable[[str], Any] | None, seconds: float) -> float:
     """Run the demo, watched from its address; return its real-time factor."""
     if watch is None:
         return run_scenario('mambo_turtlebot', folder, seconds)
@@ -43,67 +43,46 @@ def demo(folder: Path, watch: Callable[[str], Any] | None, seconds: float = SECO
     return run_scenario('mambo_turtlebot', folder, seconds, *options, hear=hear)
 
 
-def read_stream(address: str) -> None:
-    """Read the events of a run until its end."""
-    with contextlib.suppress(OSError), urllib.request.urlopen(f'{address}events') as stream:
-        for _ in stream:
-            pass
-
-
 def streams(number: int) -> Callable[[str], None]:
     """Return what watches a run with so many readers that show nothing."""
 
+    def read(address: str) -> None:
+        with contextlib.suppress(OSError), urllib.request.urlopen(f'{address}events') as stream:
+            for _ in stream:
+                pass
+
     def watch(address: str) -> None:
         for _ in range(number):
-            threading.Thread(target=read_stream, args=(address,), daemon=True).start()
+            threading.Thread(target=read, args=(address,), daemon=True).start()
 
     return watch
 
 
-class BrowserWatch:
-    """Watches runs with a Chromium that runs already, in a thread of its own.
-
-    Its start is no part of a run; when a page was usable is noted.
-    """
-
-    def __init__(self) -> None:
-        self.usable: list[float] = []
-        self._addresses: queue.Queue[str] = queue.Queue()
-        self._started = threading.Event()
-        threading.Thread(target=self._work, daemon=True).start()
-        self._started.wait(60.0)
-
-    def __call__(self, address: str) -> None:
-        """Watch a run."""
-        self._addresses.put(address)
-
-    def _work(self) -> None:
-        with chromium() as shown:
-            self._started.set()
-            while True:
-                address = self._addresses.get()
-                with contextlib.suppress(Exception):
-                    begin = time.monotonic()
-                    shown.page.goto(address)
-                    shown.until('maasi.drawn > 0')
-                    self.usable.append(time.monotonic() - begin)
-                    # Asked rarely: questions to a page cost time as well.
-                    while shown.page.evaluate('document.body.dataset.connection') != 'ended':
-                        shown.page.wait_for_timeout(1000)
-                    shown.page.goto('about:blank')
+def browse(addresses: queue.Queue[str], usable: list[float], started: threading.Event) -> None:
+    """Watch runs with a Chromium that runs already, and note when each page was usable."""
+    with chromium() as shown:
+        started.set()
+        while True:
+            address = addresses.get()
+            with contextlib.suppress(Exception):
+                begin = time.monotonic()
+                shown.page.goto(address)
+                shown.until('maasi.drawn > 0')
+                usable.append(time.monotonic() - begin)
+                # Asked rarely: questions to a page cost time as well.
+                while shown.page.evaluate('document.body.dataset.connection') != 'ended':
+                    shown.page.wait_for_timeout(1000)
+                shown.page.goto('about:blank')
 
 
 def long_log() -> EventLog:
     """Return a run with many events of all kinds that grow with time."""
     rng = np.random.default_rng(1)
-    scene = scene_of('long', load_mission('mambo_turtlebot').scenario)
     events: list[Event] = []
     places = rng.normal(scale=0.02, size=(EVENTS, 2)).cumsum(axis=0) % 2.4
     found: list[Any] = []
-    for index in range(EVENTS):
-        now, name = index / 40.0, ('mambo', 'turtlebot')[index % 2]
-        x, y = (round(float(value), 4) for value in places[index])
-        kind = index % 10
+    for index, (x, y) in enumerate(places.round(4).tolist()):
+        now, name, kind = index / 40.0, ('mambo', 'turtlebot')[index % 2], index % 10
         if kind < 6:
             events.append([now, 'robot', name, [x, y, 0.5, 0.1], 0.9, 1, ''])
         elif kind < 8:
@@ -116,7 +95,7 @@ def long_log() -> EventLog:
         if index % 2000 == 0:
             found.append([len(found) + 1, x, y, 0.0, [1e-4, 0, 0, 1e-4, 0, 0], name, now])
             events.append([now, 'found', '', list(found)])
-    return EventLog(scene, events)
+    return EventLog(scene_of('long', load_mission('mambo_turtlebot').scenario), events)
 
 
 def seeks(folder: Path) -> Iterator[dict[str, Any]]:
@@ -148,36 +127,34 @@ def seeks(folder: Path) -> Iterator[dict[str, Any]]:
     yield entry('seek_largest', float(np.max(times)), 'ms')
 
 
-def factors(
-    folder: Path, kinds: dict[str, Callable[[str], Any] | None], seconds: float
-) -> dict[str, float]:
-    """Return the largest real-time factor of each kind of run; kinds take turns."""
-    best = dict.fromkeys(kinds, 0.0)
-    for turn in range(RUNS):
-        for kind, watch in kinds.items():
-            best[kind] = max(best[kind], demo(folder / f'{kind}_{turn}', watch, seconds))
-    return best
-
-
 def results(share: float) -> Iterator[dict[str, Any]]:
     """Yield the results; `share` of the simulated time."""
+    kinds: dict[str, Callable[[str], Any] | None] = {
+        'none': None,
+        'one': streams(1),
+        'ten': streams(10),
+    }
+    usable: list[float] = []
+    if CHROMIUM is not None:
+        addresses: queue.Queue[str] = queue.Queue()
+        started = threading.Event()
+        threading.Thread(target=browse, args=(addresses, usable, started), daemon=True).start()
+        started.wait(60.0)
+        kinds['chromium'] = addresses.put
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         demo(folder / 'cold', None, share * SECONDS)
-        browser = BrowserWatch()
-        kinds: dict[str, Callable[[str], Any] | None] = {
-            'none': None,
-            'one': streams(1),
-            'ten': streams(10),
-        }
-        if CHROMIUM is not None:
-            kinds['chromium'] = browser
-        best = factors(folder, kinds, share * SECONDS)
+        best = dict.fromkeys(kinds, 0.0)
+        # Kinds take turns.
+        for turn in range(RUNS):
+            for kind, watch in kinds.items():
+                factor = demo(folder / f'{kind}_{turn}', watch, share * SECONDS)
+                best[kind] = max(best[kind], factor)
         yield entry('demo_factor_without_view', best['none'], 'x')
         for kind in list(kinds)[1:]:
             yield entry(f'demo_slower_with_{kind}', 100.0 * (best['none'] / best[kind] - 1.0), '%')
-        if browser.usable:
-            yield entry('page_usable_after', max(browser.usable), 's')
+        if usable:
+            yield entry('page_usable_after', max(usable), 's')
         if CHROMIUM is not None:
             yield from seeks(folder)
 

@@ -53,14 +53,13 @@ class Run:
         self.batch = 0
 
     def send(self, topic, message, time):
-        if hasattr(message, 'header'):
-            message.header.stamp = stamp_to_ros(round(time * 1e9))
+        stamped = message.header if hasattr(message, 'header') else message
+        stamped.stamp = stamp_to_ros(round(time * 1e9))
         if hasattr(message, 'step'):
             message.step = round(time / self.scenario.step)
+        own = topic in ('/decisions', '/found_targets', '/filter_update')
+        topic = within(self.namespace, topic) if own else topic
         self.observer.add(topic, serialize_message(message))
-
-    def of_team(self, topic, message, time):
-        self.send(within(self.namespace, topic), message, time)
 
     def state(self, time, robot, position, status=1, reason=''):
         state = AgentState(robot=robot, goal_status=status, reason=reason)
@@ -73,37 +72,27 @@ class Run:
             RobotDecision(robot=name, chosen=-1 if place is None else 0, waypoint=point(place))
             for name, place in robots.items()
         ]
-        self.of_team('/decisions', PlanDecision(explored=explored, robots=made), time)
+        self.send('/decisions', PlanDecision(explored=explored, robots=made), time)
 
     def give_up(self, time):
         decision = PlanDecision(explored=0.99, reason=f'nothing left for {self.namespace}')
-        self.of_team('/decisions', decision, time)
+        self.send('/decisions', decision, time)
 
     def declare(self, time, position, robot='mambo', deviation=0.01):
         """Add a found target to what the next update publishes."""
         size = self.scenario.dimension
-        covariance = np.zeros((3, 3))
-        covariance[:size, :size] = deviation**2 * np.eye(size)
-        self.found.append(
-            FoundTarget(
-                id=len(self.found) + 1,
-                position=point(position),
-                covariance=covariance.reshape(-1),
-                robot=robot,
-                measurement=3,
-                batch_id=self.batch + 1,
-                stamp=stamp_to_ros(round(time * 1e9)),
-                class_id='cup',
-                score=0.8,
-                identity='tag_3',
-            )
-        )
+        found = FoundTarget(id=len(self.found) + 1, position=point(position), robot=robot)
+        found.covariance = deviation**2 * np.diag(np.arange(3) < size).reshape(-1)
+        found.measurement, found.batch_id = 3, self.batch + 1
+        found.stamp = stamp_to_ros(round(time * 1e9))
+        found.class_id, found.score, found.identity = 'cup', 0.8, 'tag_3'
+        self.found.append(found)
 
     def update(self, time, robots=('mambo',), latched=True):
         self.batch += 1
         if latched:
             array = FoundTargetArray(batch_id=self.batch, targets=self.found)
-            self.of_team('/found_targets', array, time)
+            self.send('/found_targets', array, time)
         update = FilterUpdate(
             batch_id=self.batch,
             members=[BatchMember(robot=name, measurement=self.batch) for name in robots],
@@ -111,12 +100,11 @@ class Run:
             found=len(self.found),
             newly_found=[item for item in self.found if item.batch_id == self.batch],
         )
-        self.of_team('/filter_update', update, time)
+        self.send('/filter_update', update, time)
         self.observer.settle()
 
     def step(self, time, robots):
-        message = LockstepStep(stamp=stamp_to_ros(round(time * 1e9)), robots=robots)
-        self.send('/lockstep/step', message, time)
+        self.send('/lockstep/step', LockstepStep(robots=robots), time)
 
     def record(self, reason='time_limit', time=1.0, wall=1.0, events=()):
         return self.observer.record(RunEnd(reason, time, wall, list(events)))
@@ -192,12 +180,8 @@ def test_report_of_a_complete_run(run, tmp_path):
     assert run.observer.completed.step == 18
     report = write(run.record('all_found', 1.0, 0.3), tmp_path)
     table = list(csv.DictReader((tmp_path / 'found_targets.csv').open()))
-    assert [(row['x'], row['target']) for row in table] == [
-        ('0.51', '0'),
-        ('1.5', '1'),
-        ('1.0', ''),
-        ('1.0', '2'),
-    ]
+    rows = [('0.51', '0'), ('1.5', '1'), ('1.0', ''), ('1.0', '2')]
+    assert [(row['x'], row['target']) for row in table] == rows
     assert not (tmp_path / 'found_targets.geojson').exists()
     expected = {
         'true_found': 3,
@@ -250,13 +234,9 @@ def test_targets_of_several_filters_count_once_whoever_speaks_first(two_filters,
     observer = one.observer
     assert observer.end_step == 18
     report = one.report('all_found', 1.0, 0.3)
-    assert [(item['id'], item['agent']) for item in report['found']] == [
-        (1, 'mambo'),
-        (2, 'second'),
-        (3, 'mambo'),
-    ]
-    assert report['true_found'] == 3
-    assert report['false_found'] == 0
+    found = [(item['id'], item['agent']) for item in report['found']]
+    assert found == [(1, 'mambo'), (2, 'second'), (3, 'mambo')]
+    assert (report['true_found'], report['false_found']) == (3, 0)
     assert report['time_to_find_all'] == pytest.approx(0.9)
     # Both measured at the last step.
     assert report['measurements'] == {'mambo': 2, 'second': 2}
@@ -264,12 +244,10 @@ def test_targets_of_several_filters_count_once_whoever_speaks_first(two_filters,
 
 
 def test_planners_of_several_robots_are_done_together(two_filters):
-    one, two = two_filters
-    for run, time in ((one, 1.0), (two, 1.5)):
+    for run, time in zip(two_filters, (1.0, 1.5)):
         assert run.observer.settled is None
         run.give_up(time)
-    assert one.observer.settled == 'nothing left for second'
-    assert one.observer.end_step == 30
+    assert (run.observer.settled, run.observer.end_step) == ('nothing left for second', 30)
 
 
 def test_updates_after_the_planner_is_done_do_not_count(run):
@@ -320,9 +298,8 @@ def test_what_comes_after_the_end_does_not_count(run):
     run.update(0.8)
     record = run.record('all_found', 5.0, 1.0)
     report = build_report(record)
-    assert len(report['found']) == 3
-    assert report['measurements']['mambo'] == 3
-    assert report['decisions'] == 3
+    numbers = len(report['found']), report['measurements']['mambo'], report['decisions']
+    assert numbers == (3, 3, 3)
     assert report['distance']['mambo'] == pytest.approx(0.2)
     assert record.end_time == pytest.approx(0.7)
 

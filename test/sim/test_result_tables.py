@@ -71,32 +71,24 @@ def test_geojson_has_longitude_first():
     assert first['properties']['class_id'] == 'cup' and second['properties']['target'] is None
 
 
-@pytest.fixture
-def field(tmp_path):
-    """Return a function that loads a small scenario with an origin."""
-
-    def load(**origin):
-        environment = {**SMALL_FIELD['environment'], 'origin': origin}
-        path = tmp_path / 'field.yaml'
-        path.write_text(yaml.safe_dump({**SMALL_FIELD, 'environment': environment}))
-        return load_scenario(path)
-
-    return load
+def field(folder, **origin):
+    """Return a small scenario with an origin."""
+    environment = {**SMALL_FIELD['environment'], 'origin': origin}
+    path = folder / 'field.yaml'
+    path.write_text(yaml.safe_dump({**SMALL_FIELD, 'environment': environment}))
+    return load_scenario(path)
 
 
-def test_nodes_are_not_told_the_origin(field):
-    scenario = field(latitude=46.0, longitude=23.5)
+def test_nodes_are_not_told_the_origin_and_a_wrong_one_is_refused(tmp_path):
+    scenario = field(tmp_path, latitude=46.0, longitude=23.5)
     plans = plan_nodes(scenario, RunSettings(1, True, None, True, Path('/s.yaml')))
     assert not any('environment.origin' in name for plan in plans for name in plan.parameters)
-
-
-def test_wrong_origin_is_refused(field):
     with pytest.raises(ScenarioError, match=r'field.yaml:.*environment.origin.latitude'):
-        field(latitude=146.0, longitude=23.5)
+        field(tmp_path, latitude=146.0, longitude=23.5)
 
 
-def test_data_frames_of_a_search(field):
-    result = search(field(latitude=46.0, longitude=23.5, altitude=350.0), 2)
+def test_data_frames_of_a_search(tmp_path, monkeypatch):
+    result = search(field(tmp_path, latitude=46.0, longitude=23.5, altitude=350.0), 2)
     frame = result.to_dataframe()
     assert len(frame) == len(result.found_targets) > 0
     found = result.found_targets[0]
@@ -110,10 +102,6 @@ def test_data_frames_of_a_search(field):
     assert math.isfinite(progress.drone_x.iloc[-1])
     with pytest.raises(ValueError, match="'progress'"):
         result.to_dataframe('decisions')
-
-
-def test_data_frame_without_pandas_says_what_is_missing(field, monkeypatch):
-    result = search(field(latitude=46.0, longitude=23.5), 2, most_measurements=1)
     monkeypatch.setitem(sys.modules, 'pandas', None)
     with pytest.raises(ImportError, match='pip install pandas'):
         result.to_dataframe()

@@ -1,6 +1,7 @@
 """The commands of a page: none waits for another one; the command line of the view node."""
 
 import threading
+from functools import partial
 
 import rclpy
 from browsers import chromium, needs_chromium
@@ -14,16 +15,16 @@ from maasi_sim.view.server import Hub, ViewServer
 from maasi_sim.view.view_node import main
 
 
-def serve(node, names, done):
+def serve(node, names, called):
     """Offer services, and note which of them were called."""
+
+    def answer(name, _, response):
+        called.append(name)
+        response.success, response.message = True, name
+        return response
+
     for name in names:
-
-        def answer(_, response, name=name):
-            done.append(name)
-            response.success, response.message = True, name
-            return response
-
-        node.create_service(Trigger, name, answer)
+        node.create_service(Trigger, name, partial(answer, name))
 
 
 def test_a_stop_of_all_does_not_wait_for_other_commands(domain, context, monkeypatch):
@@ -90,12 +91,9 @@ def test_a_stop_of_all_passes_what_waits_in_the_browser():
         server.close()
 
 
-def test_an_address_of_another_machine_is_refused(ros, capsys):
+def test_wrong_addresses_and_scenarios_are_refused(ros, capsys):
     rclpy.shutdown()
     assert main(['--host', '192.0.2.1']) == 2
     assert '192.0.2.1: Cannot assign' in capsys.readouterr().err
-
-
-def test_a_scenario_that_is_none_is_refused(capsys):
     assert main(['--scenario', 'no_such_scenario']) == 2
     assert 'no_such_scenario' in capsys.readouterr().err

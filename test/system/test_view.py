@@ -106,39 +106,7 @@ def test_a_browser_saw_the_run_while_it_went_on(watched):
 
 
 @needs_chromium
-def test_the_page_shows_the_bag(run, address):
-    with chromium() as shown:
-        shown.open(address)
-        shown.page.keyboard.press('End')
-        shown.settle()
-        assert shown.number() == len(run.report['found'])
-        last = shown.page.screenshot()
-        shown.seek(10.0)
-        for robot in ('mambo', 'turtlebot'):
-            when, *_, place = shown.page.evaluate(
-                f'maasi.log.at("robot", "{robot}", 10.0).slice(0, 4)'
-            )
-            # One state in a tenth of a second is shown.
-            assert 9.9 - 1e-6 < when <= 10.0
-            states = of_topic(run, f'/{robot}/state')
-            until = [item for item in states if seconds(item['header']['stamp']) <= when + 1e-6]
-            expected = until[-1]['pose']['pose']['position']
-            assert place[:2] == pytest.approx([expected['x'], expected['y']], abs=1e-3)
-        found = [item for item in run.report['found'] if item['time'] <= 10.0]
-        assert shown.number() == len(found)
-        assert shown.page.screenshot() != last
-        colours = shown.page.evaluate(
-            """() => {
-              const map = document.getElementById('map');
-              const data = map.getContext('2d').getImageData(0, 0, map.width, map.height).data;
-              return new Set(new Uint32Array(data.buffer)).size;
-            }"""
-        )
-        assert colours > 20
-
-
-@needs_chromium
-def test_the_page_says_how_many_targets_are_expected_to_be_left(run, address):
+def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run, address):
     log = read_events(run.folder)
     before = [event for event in log.events if event[0] <= 10.0]
     explored = [event for event in before if event[1] in ('map', 'plan')][-1]
@@ -147,10 +115,33 @@ def test_the_page_says_how_many_targets_are_expected_to_be_left(run, address):
     expected = potential + log.scene['expected_targets'] * (1.0 - share)
     assert expected > 1.0
     with chromium() as shown:
+        page = shown.page
         shown.open(address)
+        page.keyboard.press('End')
+        shown.settle()
+        assert shown.number() == len(run.report['found'])
+        last = page.screenshot()
         shown.seek(10.0)
-        shown_number = shown.page.inner_text('dt:text-is("expected left") + dd')
-        assert float(shown_number) == pytest.approx(expected, rel=0.01)
+        for robot in ('mambo', 'turtlebot'):
+            when, *_, pose = page.evaluate(f'maasi.log.at("robot", "{robot}", 10.0).slice(0, 4)')
+            # One state in a tenth of a second is shown.
+            assert 9.9 - 1e-6 < when <= 10.0
+            states = of_topic(run, f'/{robot}/state')
+            until = [item for item in states if seconds(item['header']['stamp']) <= when + 1e-6]
+            place = until[-1]['pose']['pose']['position']
+            assert pose[:2] == pytest.approx([place['x'], place['y']], abs=1e-3)
+        assert shown.number() == sum(item['time'] <= 10.0 for item in run.report['found'])
+        left = page.inner_text('dt:text-is("expected left") + dd')
+        assert float(left) == pytest.approx(expected, rel=0.01)
+        assert page.screenshot() != last
+        x, y = page.evaluate('maasi.camera.project(maasi.log.at("robot", "mambo", 10.0)[3])')[:2]
+        box = page.locator('#map').bounding_box()
+        page.mouse.click(box['x'] + x, box['y'] + y)
+        shown.settle()
+        assert 'mambo, decision' in page.inner_text('#why')
+        page.click('#robots tr[data-robot=turtlebot]')
+        shown.settle()
+        assert 'turtlebot, decision' in page.inner_text('#why')
 
 
 @needs_chromium
@@ -198,23 +189,6 @@ def test_a_click_on_a_decision_shows_its_candidates(run, address):
         assert shown.page.evaluate('maasi.time') == pytest.approx(
             seconds(later['header']['stamp']), abs=1e-3
         )
-
-
-@needs_chromium
-def test_a_click_on_a_robot_shows_why_it_goes_there(run, address):
-    with chromium() as shown:
-        shown.open(address)
-        shown.seek(5.0)
-        x, y = shown.page.evaluate(
-            'maasi.camera.project(maasi.log.at("robot", "mambo", 5.0)[3]).slice(0, 2)'
-        )
-        box = shown.page.locator('#map').bounding_box()
-        shown.page.mouse.click(box['x'] + x, box['y'] + y)
-        shown.settle()
-        assert 'mambo, decision' in shown.page.inner_text('#why')
-        shown.page.click('#robots tr[data-robot=turtlebot]')
-        shown.settle()
-        assert 'turtlebot, decision' in shown.page.inner_text('#why')
 
 
 @needs_chromium
