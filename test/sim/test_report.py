@@ -30,7 +30,7 @@ from maasi_sim.run.topics import within
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.targets.mission import TargetMission
 from maasi_sim.targets.observer import TargetObserver
-from maasi_sim.targets.report import build_report, summary
+from maasi_sim.targets.report import build_report, target_summary
 from maasi_sim.targets.report_figure import plot_report
 from maasi_sim.targets.scoring import matching_radius, score
 
@@ -307,10 +307,10 @@ def test_what_comes_after_the_end_does_not_count(run):
 def test_updates_alone_tell_what_was_found_and_refined_positions_win(run):
     run.declare(0.5, [0.6, 0.5])
     run.update(0.5, latched=False)
-    assert run.observer.found == 1 and run.record().scores().match.true_found == 1
+    assert run.observer.found == 1 and run.record().tally.scores().match.true_found == 1
     run.found[0].position.x = 0.501
     run.update(0.6)
-    (found,) = run.record().found
+    (found,) = run.record().tally.found
     assert found.position[0] == pytest.approx(0.501)
 
 
@@ -374,7 +374,7 @@ def test_written_files_can_be_read_and_the_summary_says_what_matters(run, tmp_pa
     # Something of every kind of mark is there: found (red) and false (violet).
     for colour in ((0x28, 0x27, 0xD6), (0x94, 0x32, 0x7B)):
         assert (np.abs(picture.astype(int) - colour).max(axis=2) < 12).sum() > 20
-    text = summary(report)
+    text = target_summary(report)
     assert '1 of 3 targets found, 1 false' in text
     assert END_REASONS['time_limit'] in text
     assert '2.0 times real time' in text

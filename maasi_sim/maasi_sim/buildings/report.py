@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from maasi_sim.buildings.observer import CuboidRecord
-from maasi_sim.run.report_files import END_REASONS, ending, identity, pace, path_length
+from maasi_sim.run.report_files import summary, whole_report
 
 
 def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
-    """Return the report of a run as plain values; nothing in it is infinite or not a number.
+    """Return the report of a run as plain values.
 
     There are no targets; visited cuboids count as found, `cuboids` in the report.
     """
@@ -25,8 +25,7 @@ def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
     )
     times = record.solve_times
     complete = record.completed
-    return {
-        **identity(record, 'buildings'),
+    content = {
         'cuboids': {
             'total': total,
             'visited': len(visited),
@@ -54,29 +53,17 @@ def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
         else None,
         'most_heard': record.most_heard,
         'collisions': int(cuts),
-        'distance': {name: path_length(path) for name, path in record.trajectories.items()},
-        **ending(record),
     }
-
-
-def reason_of_end(report: dict[str, Any]) -> str:
-    """Return in words why a search of buildings ended."""
-    if report['end_reason'] == 'all_found':
-        return 'all cuboids visited'
-    return END_REASONS.get(report['end_reason'], report['end_reason'])
+    return whole_report(record, 'buildings', content)
 
 
 def cuboid_summary(report: dict[str, Any]) -> str:
     """Return the report in a few lines."""
     cuboids = report['cuboids']
-    lines = [
-        f'{cuboids["visited"]} of {cuboids["total"]} cuboids visited '
-        f'(ended: {reason_of_end(report)})'
-    ]
-    lines.append(
+    counts = (
         f'{len(report["snapshots"])} snapshots, {report["decisions"]} decisions, '
         f'{report["collisions"]} collisions'
     )
     if report['time_to_find_all'] is not None:
-        lines[-1] += f'; all visited after {report["time_to_find_all"]:.1f} s'
-    return '\n'.join(lines + pace(report))
+        counts += f'; all visited after {report["time_to_find_all"]:.1f} s'
+    return summary(report, f'{cuboids["visited"]} of {cuboids["total"]} cuboids visited', counts)

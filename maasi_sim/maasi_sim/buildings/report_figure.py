@@ -11,7 +11,8 @@ from matplotlib.patches import Rectangle
 from maasi_filter.arrays import FloatArray
 from maasi_sim.buildings.observer import CuboidRecord
 from maasi_sim.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, colours_of
-from maasi_sim.buildings.report import build_cuboid_report, reason_of_end
+from maasi_sim.buildings.report import build_cuboid_report
+from maasi_sim.run.report_files import reason_of_end
 from maasi_sim.run.report_panels import MARGIN, MapView, Plot, draw_report
 
 

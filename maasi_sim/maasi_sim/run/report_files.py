@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,8 +46,12 @@ class StoredReport:
     problem: str = ''
 
 
-def identity(record: RunRecord, mission: str) -> dict[str, Any]:
-    """Return the first entries of a report: what was run; `mission` as in the schema."""
+def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> dict[str, Any]:
+    """Return a report: what was run, what came of it, and how it ended; `mission`: see the schema.
+
+    Nothing in it is infinite or not a number.
+    """
+    wall = record.wall_time
     return {
         'version': REPORT_VERSION,
         'mission': mission,
@@ -54,13 +59,8 @@ def identity(record: RunRecord, mission: str) -> dict[str, Any]:
         'seed': record.seed,
         'planner': record.scenario.planner.name,
         'agents': record.scenario.names(),
-    }
-
-
-def ending(record: RunRecord) -> dict[str, Any]:
-    """Return the last entries of a report: how the run ended."""
-    wall = record.wall_time
-    return {
+        **content,
+        'distance': {name: finite(_length(way)) for name, way in record.trajectories.items()},
         'end_reason': record.end_reason,
         'wall_time': wall,
         'real_time_factor': record.end_time / wall if wall > 0.0 else None,
@@ -69,19 +69,30 @@ def ending(record: RunRecord) -> dict[str, Any]:
     }
 
 
-def pace(report: dict[str, Any]) -> list[str]:
-    """Return the line of a summary on wall time, if it is known."""
-    if report['real_time_factor'] is None:
-        return []
-    return [
-        f'{report["wall_time"]:.1f} s of wall time, '
-        f'{report["real_time_factor"]:.1f} times real time'
-    ]
+def _length(way: FloatArray) -> float:
+    """Return the length of rows time, x, y, z [m]."""
+    return float(np.linalg.norm(np.diff(way[:, 1:], axis=0), axis=1).sum())
 
 
-def path_length(trajectory: FloatArray) -> float:
-    """Return the length of a trajectory of rows time, x, y, z [m]."""
-    return float(np.linalg.norm(np.diff(trajectory[:, 1:], axis=0), axis=1).sum())
+def finite(value: float) -> float | None:
+    """Return a number, None if it is infinite or not a number."""
+    return float(value) if math.isfinite(value) else None
+
+
+def reason_of_end(report: dict[str, Any]) -> str:
+    """Return in words why a run ended."""
+    if report['end_reason'] == 'all_found' and report['mission'] == 'buildings':
+        return 'all cuboids visited'
+    return END_REASONS.get(report['end_reason'], report['end_reason'])
+
+
+def summary(report: dict[str, Any], found: str, counts: str) -> str:
+    """Return a report in a few lines: what was found, what was counted, and the pace."""
+    lines = [f'{found} (ended: {reason_of_end(report)})', counts]
+    if report['real_time_factor'] is not None:
+        wall, factor = report['wall_time'], report['real_time_factor']
+        lines.append(f'{wall:.1f} s of wall time, {factor:.1f} times real time')
+    return '\n'.join(lines)
 
 
 def write_report(mission: Mission[Any], record: RunRecord, folder: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.schema import RobotSettings, Scenario, planner_settings
 from maasi_sim.scenario.visibility import never_seen
 from maasi_sim.targets.observer import TargetObserver
-from maasi_sim.targets.report import build_report, summary
+from maasi_sim.targets.report import build_report, target_summary
 from maasi_sim.targets.tables import csv_text, found_rows, geojson_text
 from maasi_sim.targets.tally import TargetRecord
 
@@ -71,12 +71,13 @@ class TargetMission:
         return TargetObserver(self.name, self.scenario, self.scenario.seed, types)
 
     report = staticmethod(build_report)
-    summary = staticmethod(summary)
+    summary = staticmethod(target_summary)
 
     def tables(self, record: TargetRecord) -> dict[str, str]:
         """See `Mission.tables`."""
         origin = self.scenario.environment.origin
-        rows = found_rows(record.found, record.truth, record.scores().match.pairs, origin)
+        tally = record.tally
+        rows = found_rows(tally.found, tally.truth, tally.scores().match.pairs, origin)
         files = {'found_targets.csv': csv_text(rows, record.scenario.dimension, origin)}
         if origin is not None:
             files['found_targets.geojson'] = geojson_text(rows)

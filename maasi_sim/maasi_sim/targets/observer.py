@@ -130,16 +130,7 @@ class TargetObserver(Observer):
                     break
                 tally.take(space, update, found)
         end_time = end.time if tally.completed is None else tally.completed.time
-        record = TargetRecord(
-            self.name,
-            self.scenario,
-            self.seed,
-            tally.truth,
-            found=tally.found,
-            progress=list(tally.progress),
-            measurements=dict(sorted(tally.measurements.items())),
-            end_time=end_time,
-        )
+        record = TargetRecord(self.name, self.scenario, self.seed, tally, end_time=end_time)
         waypoints: dict[str, list[Any]] = {name: [] for name in self.scenario.names()}
         for messages in self._decisions.values():
             for data in messages:
@@ -149,7 +140,6 @@ class TargetObserver(Observer):
                 for robot in decision.robots:
                     if robot.chosen >= 0:
                         waypoints.setdefault(robot.robot, []).append(_point(robot.waypoint))
-        record.decisions = sum(map(len, waypoints.values()))
         record.waypoints = {name: rows(points, 3) for name, points in waypoints.items()}
         for name, messages in zip(self.scenario.names(), self._detections.values()):
             arrays = self._until('DetectionArray', messages, end_time)

@@ -2,89 +2,80 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from maasi_filter.arrays import FloatArray
-from maasi_sim.run.report_files import END_REASONS, ending, identity, pace, path_length
-from maasi_sim.targets.tally import FoundCount, TargetRecord
+from maasi_sim.run.report_files import finite, summary, whole_report
+from maasi_sim.targets.tally import FoundCount, Tally, TargetRecord
 
 
 def build_report(record: TargetRecord) -> dict[str, Any]:
-    """Return the report of a run as plain values; nothing in it is infinite or not a number."""
-    scores = record.scores()
-    complete = _completion(record)
+    """Return the report of a run as plain values."""
+    tally = record.tally
+    scores, complete = tally.scores(), _completion(tally)
     true = dict(scores.match.pairs)
-    return {
-        **identity(record, 'targets'),
-        'targets': [_numbers(position) for position in record.truth],
-        'found': [
-            {
-                'id': target.id,
-                'position': _numbers(target.position),
-                'covariance': [_numbers(row) for row in target.covariance],
-                'agent': target.robot,
-                'measurement': target.measurement,
-                'time': target.time,
-                'class_id': target.label.class_id,
-                'score': target.label.score,
-                'identity': target.label.identity,
-                'target': true.get(index),
-            }
-            for index, target in enumerate(record.found)
-        ],
+    found = [
+        {
+            'id': target.id,
+            'position': _numbers(target.position),
+            'covariance': [_numbers(row) for row in target.covariance],
+            'agent': target.robot,
+            'measurement': target.measurement,
+            'time': target.time,
+            'class_id': target.label.class_id,
+            'score': target.label.score,
+            'identity': target.label.identity,
+            'target': true.get(index),
+        }
+        for index, target in enumerate(tally.found)
+    ]
+    parts = ('total', 'localisation', 'missed', 'false')
+    content = {
+        'targets': [_numbers(position) for position in tally.truth],
+        'found': found,
         'true_found': scores.match.true_found,
         'missed': scores.match.missed,
         'false_found': scores.match.false_found,
-        'rmse': _number(scores.match.rmse),
-        'gospa': {
-            part: getattr(scores.gospa, part)
-            for part in ('total', 'localisation', 'missed', 'false')
-        },
-        'measurements': record.measurements,
+        'rmse': finite(scores.match.rmse),
+        'gospa': {part: getattr(scores.gospa, part) for part in parts},
+        'measurements': dict(sorted(tally.measurements.items())),
         'measurements_to_find_all': complete.measurements if complete else None,
         'time_to_find_all': complete.time if complete else None,
-        'decisions': record.decisions,
-        'distance': {n: _number(path_length(way)) for n, way in record.trajectories.items()},
-        **ending(record),
+        'decisions': sum(map(len, record.waypoints.values())),
         'scoring': {'radius': scores.radius, 'c': scores.radius, 'p': scores.order},
     }
+    return whole_report(record, 'targets', content)
 
 
-def summary(report: dict[str, Any]) -> str:
+def target_summary(report: dict[str, Any]) -> str:
     """Return the report in a few lines."""
-    targets = len(report['targets'])
-    found = f'{report["true_found"]} of {targets} targets found'
+    found = f'{report["true_found"]} of {len(report["targets"])} targets found'
     if report['false_found']:
         found += f', {report["false_found"]} false'
     if report['rmse'] is not None:
         found += f', RMSE {report["rmse"]:.3g} m'
     measurements = sum(report['measurements'].values())
-    lines = [
-        f'{found} (ended: {END_REASONS.get(report["end_reason"], report["end_reason"])})',
-        f'{measurements} measurements, {report["decisions"]} decisions',
-    ]
-    if report['measurements_to_find_all'] is not None and targets:
-        lines[1] += (
-            f'; all found after {report["measurements_to_find_all"]} measurements and '
-            f'{report["time_to_find_all"]:.1f} s'
-        )
-    return '\n'.join(lines + pace(report))
+    counts = f'{measurements} measurements, {report["decisions"]} decisions'
+    if report['time_to_find_all'] is not None:
+        counts += f'; all found after {to_find_all(report)}'
+    return summary(report, found, counts)
 
 
-def _completion(record: TargetRecord) -> FoundCount | None:
+def to_find_all(report: dict[str, Any]) -> str:
+    """Return in words what it took to find all targets."""
+    time, measurements = report['time_to_find_all'], report['measurements_to_find_all']
+    return '-' if time is None else f'{measurements} measurements and {time:.1f} s'
+
+
+def _completion(tally: Tally) -> FoundCount | None:
     """Return when all targets were found and stayed so."""
     complete = None
-    for progress in reversed(record.progress if len(record.truth) else []):
-        if progress.true_found < len(record.truth):
+    for progress in reversed(tally.progress if len(tally.truth) else []):
+        if progress.true_found < len(tally.truth):
             break
         complete = progress
     return complete
 
 
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
 def _numbers(values: FloatArray) -> list[float | None]:
-    return [_number(value) for value in values]
+    return [finite(value) for value in values]

@@ -15,9 +15,9 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_sim.run.report_files import END_REASONS
+from maasi_sim.run.report_files import reason_of_end
 from maasi_sim.run.report_panels import COLOURS, MARGIN, PALE, UNSEEN, MapView, Plot, draw_report
-from maasi_sim.targets.report import build_report
+from maasi_sim.targets.report import build_report, to_find_all
 from maasi_sim.targets.tally import TargetRecord
 
 _TRUE, _FOUND, _MISSED, _FALSE = '#222222', '#D62728', '#D55E00', '#7B3294'
@@ -120,15 +120,15 @@ def _draw_field(
 
 
 def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> None:
-    axes, width = view.axes, record.scenario.dimension
-    positions = np.array([item.position for item in record.found], float).reshape(-1, width)
-    pairs = record.scores().match.pairs
-    right = [found for found, _ in pairs]
+    axes, width, found, truth = view.axes, len(bounds), record.tally.found, record.tally.truth
+    positions = np.array([item.position for item in found], float).reshape(-1, width)
+    pairs = record.tally.scores().match.pairs
+    right = [index for index, _ in pairs]
     wrong = np.setdiff1d(np.arange(len(positions)), right)
-    missed = np.setdiff1d(np.arange(len(record.truth)), [true for _, true in pairs])
+    missed = np.setdiff1d(np.arange(len(truth)), [true for _, true in pairs])
     least = _LEAST[width] * float(np.ptp(bounds, axis=1).max())
     enlarged = False
-    for number, target in enumerate(record.found):
+    for number, target in enumerate(found):
         plane = np.ix_(view.plane, view.plane)
         lengths, turn = _axes_of(target.covariance[plane])
         enlarged |= bool((lengths < least).any())
@@ -146,10 +146,10 @@ def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> No
         )
     sigmas = f'{_SIGMAS:g} sigma' + (f', drawn at least {least:.2g} m' if enlarged else '')
     marks: tuple[tuple[FloatArray, str, dict[str, Any], str], ...] = (
-        (record.truth, 'D', {'mfc': 'none', 'mec': _TRUE, 'ms': 11, 'mew': 1.2}, 'true target'),
+        (truth, 'D', {'mfc': 'none', 'mec': _TRUE, 'ms': 11, 'mew': 1.2}, 'true target'),
         (positions[right], 'D', {'color': _FOUND, 'ms': 3.5}, 'found target'),
         (positions[:0], 'o', {'mfc': 'none', 'mec': _FOUND, 'ms': 9}, sigmas),
-        (record.truth[missed], 'o', {'mfc': 'none', 'mec': _MISSED, 'ms': 20, 'mew': 3}, 'missed'),
+        (truth[missed], 'o', {'mfc': 'none', 'mec': _MISSED, 'ms': 20, 'mew': 3}, 'missed'),
         (positions[wrong], 'X', {'color': _FALSE, 'ms': 14, 'mec': 'white'}, 'false target'),
     )
     for places, marker, style, label in marks:
@@ -166,18 +166,18 @@ def _axes_of(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
     """Draw targets found over time, or over measurements."""
-    progress = record.progress
+    progress, number = record.tally.progress, len(record.tally.truth)
     places = [0.0, *(item.time if by_time else item.measurements for item in progress)]
     right = [0, *(item.true_found for item in progress)]
     every = [0, *(item.found for item in progress)]
     if by_time:
         places, right, every = [*places, record.end_time], [*right, right[-1]], [*every, every[-1]]
-    if any(number > true for number, true in zip(every, right)):
+    if any(found > true for found, true in zip(every, right)):
         axes.step(places, every, where='post', color=_FALSE, lw=1.0, label='with false ones')
     axes.step(places, right, where='post', color=_FOUND, lw=2.0, label='found')
-    axes.axhline(len(record.truth), color=_TRUE, lw=1.0, ls='--', label='true targets')
+    axes.axhline(number, color=_TRUE, lw=1.0, ls='--', label='true targets')
     axes.set_xlim(0.0, MARGIN * max(places[-1], 1.0))
-    axes.set_ylim(0.0, max(len(record.truth), max(every), 1) * 1.08)
+    axes.set_ylim(0.0, max(number, max(every), 1) * 1.08)
     axes.set_ylabel('targets')
     if by_time:
         # Beside the title: inside the axes it would cover curves.
@@ -193,22 +193,16 @@ def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
 def _rows(record: TargetRecord) -> list[tuple[str, str]]:
     report = build_report(record)
     rmse = '-' if report['rmse'] is None else f'{report["rmse"]:.3g} m'
-    complete = '-'
-    if report['measurements_to_find_all'] is not None:
-        complete = (
-            f'{report["measurements_to_find_all"]} measurements, {report["time_to_find_all"]:.1f} s'
-        )
     found = f'{report["true_found"]} of {len(report["targets"])}'
-    reason = END_REASONS.get(report['end_reason'], report['end_reason'])
     return [
         ('found', f'{found}, {report["missed"]} missed, {report["false_found"]} false'),
         ('RMSE', rmse),
         ('GOSPA', f'{report["gospa"]["total"]:.3g} m (c = {report["scoring"]["c"]:.3g} m)'),
-        ('all found after', complete),
+        ('all found after', to_find_all(report)),
         ('decisions', str(report['decisions'])),
         *(
             (name, f'{report["measurements"][name]} measurements, {report["distance"][name]:.1f} m')
             for name in report['agents'][:4]
         ),
-        ('ended', f'{reason}, at {record.end_time:.1f} s'),
+        ('ended', f'{reason_of_end(report)}, at {record.end_time:.1f} s'),
     ]

@@ -30,42 +30,6 @@ class FoundCount:
     true_found: int
 
 
-@dataclass
-class TargetRecord(RunRecord):
-    """The record of a search for targets.
-
-    Attributes
-    ----------
-    truth : (n, d) array
-        True targets [m].
-    found : list of FoundTarget
-        At the end.
-    progress : list of FoundCount
-        After each filter update.
-    measurements : dict
-        Number by robot.
-    decisions : int
-        Waypoints chosen, of all robots.
-    waypoints : dict
-        By robot: chosen ones in order, (n, 3) [m].
-    measured_from : dict
-        By robot: poses at which it measured, in order.
-    """
-
-    truth: FloatArray
-    found: list[FoundTarget] = field(default_factory=list)
-    progress: list[FoundCount] = field(default_factory=list)
-    measurements: dict[str, int] = field(default_factory=dict)
-    decisions: int = 0
-    waypoints: dict[str, FloatArray] = field(default_factory=dict)
-    measured_from: dict[str, list[Pose]] = field(default_factory=dict)
-
-    def scores(self) -> Scores:
-        """Return the scores at the end."""
-        radius = scoring_radius(self.scenario, self.truth)
-        return score(self.found, self.truth, radius, self.scenario.scoring.order)
-
-
 def numbered(found: Sequence[Sequence[FoundTarget]]) -> list[FoundTarget]:
     """Return the found targets of several filters as one list, numbered in the order of time."""
     if len(found) == 1:
@@ -113,6 +77,10 @@ class Tally:
         """Targets found so far."""
         return numbered([[of[key] for key in sorted(of)] for of in self._found.values()])
 
+    def scores(self) -> Scores:
+        """Return the scores so far."""
+        return score(self.found, self.truth, self._radius, self.scenario.scoring.order)
+
     def take(self, space: str, message: Any, every: Any) -> bool:
         """Count an update of a filter; return whether the number of found targets has changed.
 
@@ -132,8 +100,7 @@ class Tally:
             self.truth = self.world.targets_at(int(message.step))
             changed = True
         if changed or self._scores is None:
-            order = self.scenario.scoring.order
-            self._scores = score(self.found, self.truth, self._radius, order)
+            self._scores = self.scores()
         now = FoundCount(
             self._run.time(message.header.stamp),
             int(message.step),
@@ -156,3 +123,22 @@ class Tally:
             for item in targets
             if len(self._found) == 1 or item.robot == space
         }
+
+
+@dataclass
+class TargetRecord(RunRecord):
+    """The record of a search for targets.
+
+    Attributes
+    ----------
+    tally : Tally
+        At the end.
+    waypoints : dict
+        By robot: chosen ones in order, (n, 3) [m].
+    measured_from : dict
+        By robot: poses at which it measured, in order.
+    """
+
+    tally: Tally
+    waypoints: dict[str, FloatArray] = field(default_factory=dict)
+    measured_from: dict[str, list[Pose]] = field(default_factory=dict)
