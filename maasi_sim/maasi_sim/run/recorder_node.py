@@ -202,8 +202,9 @@ class Recorder:
     def take_ready(self) -> set[str]:
         """Return the names of the nodes that have reported ready."""
         for data in _queued(self._ready_subscription):
-            self._answered.add(deserialize_message(data, LockstepDone).node)
-        self.ready |= self._answered
+            name = deserialize_message(data, LockstepDone).node
+            self._answered.add(name)
+            self.ready.add(name)
         return self.ready
 
     def unanswered(self, nodes: Collection[str]) -> list[str]:

@@ -185,20 +185,22 @@ class Supervisor:
             self._display.say(f'{text}; it is restarted')
             return None
         self.events.append(event)
-        self.failed.add(name)
         if process.restarts:
             text += f', after {process.restarts} restarts'
-        return Ending('node_died', NODE_FAILED, text)
+        return self._failure('node_died', text, [name])
+
+    def _failure(self, reason: str, text: str, names: list[str]) -> Ending:
+        self.failed.update(names)
+        return Ending(reason, NODE_FAILED, text)
 
     def _check_start(self) -> Ending | None:
         """Return an ending if a restarted node takes too long to start."""
-        # Before the first step `Session` waits for the nodes.
+        # Before the first step `ScenarioRun` waits for the nodes.
         late = self.watch.late(self._checked) if self.running else []
         if not late:
             return None
-        self.failed.update(late)
         text = f'{", ".join(late)} not ready {self._limits.start:g} s after the start'
-        return Ending('not_ready', NODE_FAILED, text)
+        return self._failure('not_ready', text, late)
 
     def _check_heartbeats(self, recorder: Recorder) -> Ending | None:
         """Kill a node that hangs, or return the ending of the run."""
@@ -217,23 +219,20 @@ class Supervisor:
                 self._display.say(f'{text}; it is killed')
                 self.processes[name].signal(signal.SIGKILL)
                 continue
-            self.failed.add(name)
-            return Ending('node_hung', NODE_FAILED, text)
+            return self._failure('node_hung', text, [name])
         return None
 
     def standstill(self, recorder: Recorder) -> Ending:
         """Return the ending of a run whose time has stopped."""
         silence = f'for {self._limits.silence:g} s'
         if recorder.step is None:
-            return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
+            return self._failure('node_hung', f'the simulated time stands still {silence}', [])
         steps = recorder.done_steps()
         doers = [plan.full_name for plan in self.plans if plan.says_done]
         late = [name for name in doers if steps.get(name, -1) < recorder.step]
-        self.failed.update(late)
         who = ', '.join(late) or next(iter(self.clocks))
-        return Ending(
-            'node_hung', NODE_FAILED, f'step {recorder.step}: nothing from {who} {silence}'
-        )
+        text = f'step {recorder.step}: nothing from {who} {silence}'
+        return self._failure('node_hung', text, late)
 
     @property
     def restarting(self) -> bool:
