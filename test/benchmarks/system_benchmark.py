@@ -16,8 +16,7 @@ from timing import entry, run_scenario
 from maasi_sim.run.domain import Domain
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import NodeProcess, find_executable, stop
-from maasi_sim.run.replay import REPLAYED
-from maasi_sim.run.replay_node import FILTER, ReplayNode, read_recording
+from maasi_sim.run.replay_node import FILTER, REPLAYED, ReplayNode, read_recording
 
 SECONDS = 40.0
 # For an answer of the filter node [s].

@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
     gc.disable()
     from maasi_sim.run.bag import BagError, BagWriteError
     from maasi_sim.run.domain import DomainError
-    from maasi_sim.run.replay import replay
+    from maasi_sim.run.replay_node import replay
     from maasi_sim.run.run_folder import ResultsError
     from maasi_sim.run.scenario_run import ScenarioRun
     from maasi_sim.scenario.layering import ScenarioError

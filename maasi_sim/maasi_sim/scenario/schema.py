@@ -140,16 +140,17 @@ class Scenario(BaseScenario):
 
     def check_pace(self, lockstep: bool, rate: float | None) -> None:
         """Check that it can be run in lockstep, or at a rate (simulated over wall time)."""
+        if not lockstep and rate in (None, 1.0):
+            return
+        asked = 'lockstep' if lockstep else f'rate {rate:g}'
         for name in self.names():
-            link = self.robots[name].link
-            if link != 'topics' and (lockstep or rate not in (None, 1.0)):
-                asked = 'lockstep' if lockstep else f'rate {rate:g}'
+            robot = self.robots[name]
+            if robot.link != 'topics':
                 raise ScenarioError(
-                    f'robots.{name}.link: read {link!r}, which runs in real time, and {asked}; '
-                    'allowed is topics, or rate 1 without lockstep'
+                    f'robots.{name}.link: read {robot.link!r}, which runs in real time, and '
+                    f'{asked}; allowed is topics, or rate 1 without lockstep'
                 )
-            if self.robots[name].body == 'external' and (lockstep or rate not in (None, 1.0)):
-                asked = 'lockstep' if lockstep else f'rate {rate:g}'
+            if robot.body == 'external':
                 raise ScenarioError(
                     f"robots.{name}.body: read 'external', and {asked}; allowed is simulated, or "
                     'neither --lockstep nor --rate: the time is that of /clock'
