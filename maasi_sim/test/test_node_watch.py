@@ -59,10 +59,10 @@ def test_the_last_heartbeat_of_the_process_before_does_not_count():
 
 
 def test_time_in_the_queue_for_a_processor_does_not_count():
-    queued = {1: 0.0}
+    queued = {1: 2.0}
     made = watch(lambda pid: queued.get(pid, 0.0))
     made.beat('/filter_node', 1.0)
-    queued[1] = 3.0
+    queued[1] = 5.0
     assert look(made, 1.1, 8.4) is None
     assert look(made, 8.4, 9.0) is not None
 

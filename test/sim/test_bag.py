@@ -95,7 +95,9 @@ def test_images_come_back(types, tmp_path, encoding, kind, padding):
     assert np.abs(read.astype(int) - expected).mean() <= (0.0 if kind == 'png' else 3.0)
 
 
-@pytest.mark.parametrize('height, encoding', [(0, 'bgr8'), (12, 'bayer_rggb8'), (12, '32FC1')])
+@pytest.mark.parametrize(
+    'height, encoding', [(0, 'bgr8'), (12, 'bgr8'), (12, 'bayer_rggb8'), (12, '32FC1')]
+)
 def test_images_that_cannot_be_compressed_are_stored_as_they_are(types, tmp_path, height, encoding):
     message = image(types, np.zeros((height, 16), np.uint8), encoding)
     with BagWriter(tmp_path / 'bag', types, images='png') as writer:

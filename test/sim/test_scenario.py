@@ -372,12 +372,6 @@ def test_an_event_after_the_end_is_taken_with_a_warning(tmp_path):
     assert len(scenario.events) == 1
 
 
-def test_the_preset_of_earlier_files_is_refused_with_what_to_write(load):
-    words = r"filter\.preset: 'recommended' is gone, write method: pmb in its place"
-    with pytest.raises(ScenarioError, match=words):
-        load(changed(('filter', {'preset': 'recommended'})))
-
-
 @pytest.mark.parametrize(
     'robot',
     [
