@@ -163,6 +163,11 @@ WRONG = [
     ([('events', [{'at': 5.0, 'robot': 'mamba', 'do': 'leave'}])], 'events[0].robot', ["'mambo'"]),
     ([('events', [{'at': 5.0, 'robot': 'mambo', 'do': 'back'}])], 'events[0].do', ['is there']),
     ([('events', [{'at': 5.0, 'robot': 'mambo', 'do': 'go'}])], 'events[0].do', ['leave, back']),
+    (
+        [('events', [{'at': at, 'robot': 'mambo', 'do': 'leave'} for at in (5.0, 6.0)])],
+        'events[1].do',
+        ['mambo has left'],
+    ),
     ([('on_exit', 'restart')], 'on_exit', ['end, respawn']),
     ([('step', 'fast'), ('stopp', 1)], 'stopp', ["unknown key 'stopp'", "step: read 'fast'"]),
 ]  # fmt: skip
@@ -194,7 +199,7 @@ WRONG_LINKS = [
     ('drone', {'mavlink': {'arm': True, 'url': 'tcp:a:1'}}, 'drone.mavlink.url', 'udpin'),
     ('drone', {'mavlink': {'arm': True, 'map_yaw': 0.1}}, 'drone.mavlink.map_yaw', 'is 0'),
     ('drone', {'autopilot': {'firmware': 'ardusub'}}, 'drone.mavlink.vehicle', "'ardusub'"),
-    ('drone', {'start': [1.0, 1.0, -1.0]}, 'drone.start', 'above mavlink.ground'),
+    ('drone', {'start': [1.0, 1.0, 0.0]}, 'drone.start', 'above mavlink.ground'),
     ('rov', {'start': [1.0, 1.0, 1.0]}, 'rov.start', 'below mavlink.ground'),
     ('drone', {'guard': True}, 'drone.guard', 'its autopilot stops it'),
     ('rov', {'mavlink': {'arm': True, 'url': 'udpin:127.0.0.1:14550'}}, 'rov.mavlink.url', 'drone'),

@@ -248,10 +248,6 @@ def describe(error: ValidationError, model: type[BaseModel], layer: Layer) -> st
         problems.setdefault(_resolve(item['loc'], layer.data, item['type']), []).append(item)
     lines = []
     for key, items in problems.items():
-        if len(items) > 1:
-            # Of a union, report the alternative that matched deepest: probably the intended one.
-            depth = max(len(item['loc']) for item in items)
-            items = [item for item in items if len(item['loc']) == depth] or items
         texts = list(dict.fromkeys(_explain(item, key, model, layer.data) for item in items))
         read = f'read {_show(items[0]["input"])}, '
         texts[1:] = [text.removeprefix(read) for text in texts[1:]]
