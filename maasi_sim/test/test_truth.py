@@ -30,25 +30,16 @@ def true_sensor(**values):
     return SimulatedSettings(**values).sensor(SensorSettings(), 'drone', CUBE)
 
 
-def test_nothing_given_is_what_is_believed():
-    believed = SensorSettings().build('drone', 3)
-    true = true_sensor()
-    assert_array_equal(true.covariance, believed.covariance)
-    assert true.clutter == believed.clutter
-    assert_array_equal(
-        true.detection.probability(POSE.position[None] + 5.0, POSE),
-        believed.detection.probability(POSE.position[None] + 5.0, POSE),
-    )
-
-
-def test_true_noise_and_detection_differ_from_believed_ones():
-    believed = SensorSettings().build('drone', 3)
+def test_what_is_true_is_what_is_believed_unless_it_is_given():
+    believed, same = SensorSettings().build('drone', 3), true_sensor()
     true = true_sensor(noise_factor=1.5, probability_factor=0.7)
+    assert_array_equal(same.covariance, believed.covariance)
     assert_allclose(true.covariance, 2.25 * believed.covariance)
+    assert same.clutter == believed.clutter
     place = POSE.position[None] + 5.0
-    assert_allclose(
-        true.detection.probability(place, POSE), 0.7 * believed.detection.probability(place, POSE)
-    )
+    probability = believed.detection.probability(place, POSE)
+    assert_array_equal(same.detection.probability(place, POSE), probability)
+    assert_allclose(true.detection.probability(place, POSE), 0.7 * probability)
     given = true_sensor(noise={'range': 0.3, 'bearing': 0.1, 'elevation': 0.2})
     assert_allclose(np.diagonal(given.covariance), [0.09, 0.01, 0.04])
     assert true_sensor(probability_factor=50.0).detection.gain == 1.0
