@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.detection import PARAMETERS, detection_probability_at
 from maasi_planner.planners.base import (
     Planner,
@@ -24,8 +24,6 @@ from maasi_planner.planners.base import (
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Routes = list[list[int]]
 
 # A robot moves to its next target when the present one is found with this probability.
@@ -56,7 +54,7 @@ def _expected_end(
     robots: _Robots,
     routes: IntArray,
     targets: FloatArray,
-    detected: NDArray[np.bool_],
+    detected: BoolArray,
     dimension: int,
     stops: FloatArray,
 ) -> float:

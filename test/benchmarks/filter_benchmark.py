@@ -13,7 +13,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from timing import entry, median_time
 
 from maasi_filter import (
@@ -26,9 +25,9 @@ from maasi_filter import (
     SensorSettings,
     warm_up,
 )
+from maasi_filter.arrays import FloatArray
 from maasi_filter.ic_phd.corrector import make_scan, phd_correct
 
-FloatArray = NDArray[np.float64]
 BOUNDS = np.array([[0.0, 260.0]] * 3)
 TARGETS = 12
 DETECTED = 3

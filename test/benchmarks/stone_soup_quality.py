@@ -18,7 +18,6 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 from stonesoup.base import Property
 from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
 from stonesoup.dataassociator.probability import JPDA
@@ -39,13 +38,12 @@ from stonesoup.types.update import GaussianStateUpdate
 from stonesoup.updater.kalman import ExtendedKalmanUpdater
 
 from maasi_filter import AgentMeasurement, Pose, Sensor, make_filter
+from maasi_filter.arrays import FloatArray
 from maasi_filter.metrics import gospa
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_sim.experiments.statistics import mean_interval
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
-
-FloatArray = NDArray[np.float64]
 
 CUTOFF = 10.0
 START = datetime.datetime(2026, 1, 1)

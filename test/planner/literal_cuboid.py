@@ -215,21 +215,14 @@ class TightProblem(LiteralProblem):
             if len(visits) > 1:
                 self.row(visits, [1] * len(visits), -np.inf, 1)
         for k, betas in at_step.items():
-            # Cuboids may overlap: a row for each then, else one for all of a step.
-            boxes = [box for _, box in betas]
-            apart = not any(
-                ((one[:, 0] < other[:, 1]) & (other[:, 0] < one[:, 1])).all()
-                for i, one in enumerate(boxes)
-                for other in boxes[:i]
-            )
-            for group in [betas] if apart and betas else [[beta] for beta in betas]:
-                columns = [beta for beta, _ in group]
-                for a in range(3):
-                    low, high = self.reach[k, a]
-                    lifts = [max(box[a, 0] - low, 0.0) for _, box in group]
-                    drops = [max(high - box[a, 1], 0.0) for _, box in group]
-                    self.row([self.P[k, a], *columns], [1, *(-x for x in lifts)], low, np.inf)
-                    self.row([self.P[k, a], *columns], [1, *drops], -np.inf, high)
+            # A row for all cuboids of a step: those of missions are apart.
+            columns = [beta for beta, _ in betas]
+            for a in range(3):
+                low, high = self.reach[k, a]
+                lifts = [max(box[a, 0] - low, 0.0) for _, box in betas]
+                drops = [max(high - box[a, 1], 0.0) for _, box in betas]
+                self.row([self.P[k, a], *columns], [1, *(-x for x in lifts)], low, np.inf)
+                self.row([self.P[k, a], *columns], [1, *drops], -np.inf, high)
 
     def _obstacle_rows(self):
         T, p = self.settings.horizon, self.problem
