@@ -97,21 +97,16 @@ class CandidateSet:
         return complete
 
     def _directions(self) -> FloatArray:
-        distance = self.settings.distance or 0.0
-        half = math.sqrt(0.5)
         steps = [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)]
         if self.settings.ring == 6:
             if self.dimension == 2:
                 raise ValueError('ring: got 6, allowed in 2D are 4 and 8')
             steps += [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
         elif self.settings.ring == 8:
-            steps += [
-                (half, half, 0.0),
-                (-half, half, 0.0),
-                (-half, -half, 0.0),
-                (half, -half, 0.0),
-            ]
-        return distance * np.array(steps)
+            half = math.sqrt(0.5)
+            steps += [(x, y, 0.0) for x, y in ((half, half), (-half, half), (-half, -half))]
+            steps.append((half, -half, 0.0))
+        return (self.settings.distance or 0.0) * np.array(steps)
 
     def at(self, position: ArrayLike) -> FloatArray:
         """Return the candidates of a robot at `position` (3,), as a (W, 3) array.

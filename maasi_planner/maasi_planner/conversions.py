@@ -38,19 +38,7 @@ from maasi_planner.team import Decision, RobotDecision
 NOT_ALLOWED = -1e30
 
 
-def robot_state_from_ros(message: AgentState) -> RobotState:
-    """Return a robot's state."""
-    linear, angular = message.twist.linear, message.twist.angular
-    bounded('twist.linear', (linear.x, linear.y, linear.z), FASTEST)
-    bounded('twist.angular', (angular.x, angular.y, angular.z), FASTEST)
-    return RobotState(
-        pose_from_ros(message.pose.pose),
-        np.array([linear.x, linear.y, linear.z]),
-        np.array([angular.x, angular.y, angular.z]),
-    )
-
-
-def robot_decision_to_ros(name: str, index: int, decision: RobotDecision) -> RobotDecisionMessage:
+def _robot_to_ros(name: str, index: int, decision: RobotDecision) -> RobotDecisionMessage:
     """Return the decision of a robot with all its candidates."""
     objective = decision.objective.tolist()
     rows = zip(
@@ -103,7 +91,7 @@ def decision_to_ros(
         explored=explored,
         reason='; '.join(reasons) if decision.robots else decision.reason,
         robots=[
-            robot_decision_to_ros(name, indices[name], robot)
+            _robot_to_ros(name, indices[name], robot)
             for name, robot in sorted(decision.robots.items())
         ],
     )
@@ -176,7 +164,11 @@ def checked_state(name: str, message: AgentState, settings: PlannerNodeSettings)
     if message.robot != name:
         raise ValueError(f'robot: read {message.robot!r}, allowed is {name!r}')
     _check_frame(message.header, settings.frame)
-    state = robot_state_from_ros(message)
+    linear, angular = message.twist.linear, message.twist.angular
+    velocity, rates = (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z)
+    bounded('twist.linear', velocity, FASTEST)
+    bounded('twist.angular', rates, FASTEST)
+    state = RobotState(pose_from_ros(message.pose.pose), np.array(velocity), np.array(rates))
     if message.step * settings.step >= LAST_STAMP:
         raise ValueError(f'step: read {message.step}, allowed are steps whose time is a stamp')
     return state

@@ -24,7 +24,7 @@ from maasi_planner.node.batches import Batches
 from maasi_planner.node.filter_guard import FilterGuard, FoundKeeper
 from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
-from maasi_planner.node.search_action import SearchAction, SearchProgress, offer_services
+from maasi_planner.node.search_action import SearchAction, offer_services
 from maasi_planner.node.search_modes import Mode, SearchModes
 from maasi_planner.node.team_goals import HeardState
 from maasi_planner.node.views import PlannerViews
@@ -459,19 +459,18 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     # ---- the action --------------------------------------------------------------------------
 
     def _update_action(self) -> None:
+        update = self._batches.update
         self._action.update(
-            SearchProgress(
-                time=max(self._taken_step, 0) * self.settings.step,
-                feedback=SearchTargets.Feedback(
-                    found=self._batches.update.found,
-                    measurements=self._batches.measurements,
-                    decisions=self._decisions,
-                    expected_number=self._batches.update.expected_number,
-                    explored=self.coordinator.exploration.explored_fraction(),
-                ),
-                finished=self.coordinator.finished or '',
-                robots=not self._heard or len(self._away) < len(self.coordinator.names),
-            )
+            max(self._taken_step, 0) * self.settings.step,
+            SearchTargets.Feedback(
+                found=update.found,
+                measurements=self._batches.measurements,
+                decisions=self._decisions,
+                expected_number=update.expected_number,
+                explored=self.coordinator.exploration.explored_fraction(),
+            ),
+            self.coordinator.finished or '',
+            not self._heard or len(self._away) < len(self.coordinator.names),
         )
 
 

@@ -124,12 +124,6 @@ def test_every_waypoint_is_reached(name):
         assert gaps.max() <= settings.tolerance + 1e-12
 
 
-def test_waypoint_straight_behind():
-    motion = make_motion(MODELS['unicycle'])
-    prediction = motion.predict(RobotState.at_rest([0.0, 0.0, 0.0]), [[-1.0, 0.0, 0.0]], 0.05)
-    assert prediction.reached[0]
-
-
 @pytest.mark.parametrize('name', MODELS)
 def test_limits_hold_under_any_command(name):
     """Speed, acceleration, tilt and turn rate stay within the settings whatever is asked for."""

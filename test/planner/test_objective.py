@@ -8,8 +8,7 @@ from plain_objective import all_choices, plain_information_terms, plain_terms
 from planner_helpers import random_team
 
 from maasi_filter.models.detection import BoxDetection
-from maasi_filter.unexplored_map import UnexploredMap
-from maasi_planner import PlannerSettings, RobotState, make_planner
+from maasi_planner import PlannerSettings, make_planner
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import free_of_robots, waiting_places
 
@@ -207,18 +206,3 @@ def test_reported_terms_belong_to_the_choice():
         period = 1
         assert robot.measurements[robot.chosen] >= robot.length // (period * 100)
     assert decision.objective == pytest.approx(total, rel=1e-12)
-
-
-def test_unexplored_corner_draws_the_robot():
-    rng = np.random.default_rng(30)
-    team = random_team(rng, dimension=2, planning=1, waiting=0, candidates=2, kinds=('box',))
-    name = team.planning()[0]
-    team.clusters = []
-    team.exploration = UnexploredMap(team.bounds, 0.1)
-    team.exploration.values[...] = 0.0
-    team.exploration.values[-3:, -3:] = 1.0
-    view = team.robots[name]
-    view.state = RobotState.at_rest([1.0, 1.0, 0.0])
-    view.candidates = np.array([[0.1, 0.1, 0.0], [1.9, 1.9, 0.0]])
-    decision = make_planner('maasi').decide(team)
-    assert decision.robots[name].chosen == 1

@@ -199,18 +199,6 @@ def test_active_search_in_turn_is_close_to_the_optimum():
         assert exact.objective >= decision.objective >= 0.98 * exact.objective
 
 
-def test_active_search_with_mutual_information():
-    settings = PlannerSettings(name='as', alpha=0.0, refinement='mutual_information')
-    team = ring_team(np.random.default_rng(9), 1)
-    decision = make_planner('as', settings).decide(team)
-    other = make_planner('mutual_information').decide(team)
-    name = team.planning()[0]
-    assert decision.robots[name].chosen == other.robots[name].chosen
-    assert decision.robots[name].target_refinement == pytest.approx(
-        other.robots[name].target_refinement
-    )
-
-
 # Mutual information
 
 
@@ -461,23 +449,6 @@ def test_candidate_at_the_present_place_is_not_chosen():
         assert decision.chosen != 0
         assert decision.lengths[0] == 0
         assert decision.objective[0] == -np.inf
-
-
-@pytest.mark.parametrize(
-    'bad',
-    [
-        {'alpha': -0.1},
-        {'beta': float('nan')},
-        {'control_weight': -1.0},
-        {'alpha': float('inf')},
-        {'horizon': 4},
-        {'objective': 'best'},
-        {'weight': 1.0},
-    ],
-)
-def test_bad_weights_are_refused(bad):
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        PlannerSettings(**bad)
 
 
 def test_wrong_team_is_refused():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -17,20 +16,6 @@ from maasi_msgs.action import SearchTargets
 from maasi_planner.node.search_modes import COMMANDS
 
 Result: TypeAlias = SearchTargets.Result
-
-
-@dataclass
-class SearchProgress:
-    """Progress of a search.
-
-    time: time of the run [s]; feedback: for the client; finished: why no gain is left; empty
-    otherwise; robots: whether any robot is available, as far as is known.
-    """
-
-    time: float
-    feedback: SearchTargets.Feedback
-    finished: str
-    robots: bool
 
 
 class SearchAction:
@@ -79,24 +64,29 @@ class SearchAction:
         """Whether a client has a goal."""
         return self._goal is not None
 
-    def update(self, progress: SearchProgress) -> None:
-        """Publish feedback, and conclude the goal when the search has ended."""
+    def update(
+        self, time: float, feedback: SearchTargets.Feedback, finished: str, robots: bool
+    ) -> None:
+        """Publish feedback, and conclude the goal when the search has ended.
+
+        time: of the run [s]; finished: why no gain is left, or empty; robots: whether any is
+        available, as far as is known.
+        """
         goal = self._goal
         if goal is None:
             return
         if self._began is None:
-            self._began = progress.time
-        request, feedback = goal.request, progress.feedback
-        self._feedback = feedback
+            self._began = time
+        request, self._feedback = goal.request, feedback
         if goal.is_cancel_requested:
             self._end(Result.CANCELED, 'cancelled')
         elif request.targets and feedback.found >= request.targets:
             self._end(Result.TARGETS_FOUND, f'{feedback.found} targets are found')
-        elif progress.finished:
-            self._end(Result.DONE, progress.finished)
-        elif 0.0 < request.time_limit <= progress.time - self._began:
+        elif finished:
+            self._end(Result.DONE, finished)
+        elif 0.0 < request.time_limit <= time - self._began:
             self._end(Result.TIME_LIMIT, f'{request.time_limit:g} s are over')
-        elif not progress.robots:
+        elif not robots:
             self._end(Result.NO_ROBOT, 'no robot can go on')
         else:
             goal.publish_feedback(feedback)

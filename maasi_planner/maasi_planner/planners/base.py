@@ -77,17 +77,6 @@ class Planner(ABC):
         return [cluster for cluster in team.clusters if cluster.mass >= least]
 
 
-def finite(*arrays: FloatArray) -> bool:
-    """Return whether all numbers in some small arrays are finite."""
-    # Fast path: a finite sum means that every number is finite.
-    total = 0.0
-    for array in arrays:
-        total = sum(array.ravel().tolist(), total)
-    if math.isfinite(total):
-        return True
-    return all(all(map(math.isfinite, array.ravel().tolist())) for array in arrays)
-
-
 def check_decision(planner: Planner, team: TeamView, decision: Decision) -> None:
     """Refuse a decision that robots cannot follow."""
     origin = f'planner {type(planner).__module__}:{type(planner).__qualname__}'
@@ -118,7 +107,7 @@ def _problem_of(robot: RobotDecision, bounds: FloatArray) -> str:
             return f'{field}: got {value!r:.80}, allowed is an array of numbers'
         if value.shape != shape:
             return f'{field}: got shape {value.shape}, allowed is {shape}'
-        if field not in terms and not finite(value):
+        if field not in terms and not np.isfinite(value).all():
             return f'{field}: got a number that is not finite'
     if not (isinstance(robot.chosen, int | np.integer) and -1 <= robot.chosen < rows[0]):
         return f'chosen: got {robot.chosen!r:.80}, allowed are -1 (stay) to {rows[0] - 1}'
