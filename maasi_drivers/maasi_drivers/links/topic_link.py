@@ -9,7 +9,6 @@ from typing import Any
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 
 from maasi_drivers.agent.flight_rules import fence_problem, make_fence
 from maasi_drivers.agent.odometry import StampedPose
@@ -36,7 +35,8 @@ class CommandPublisher:
         self._node = node
         self._quality = RELIABLE if lockstep else COMMANDS
         self.topic = node.resolve_topic_name(topic)
-        self._publisher: Any = None
+        #: None where the type is not known yet.
+        self.publisher: Any = None
         self._kind: type = TwistStamped
         self._auto = kind == 'auto' and not lockstep
         if self._auto:
@@ -48,38 +48,17 @@ class CommandPublisher:
         # A process can have only one type under one name.
         self.destroy()
         self._kind = kind
-        self._publisher = self._node.create_publisher(kind, self.topic, self._quality)
+        self.publisher = self._node.create_publisher(kind, self.topic, self._quality)
 
-    def refresh(self) -> None:
-        """Follow the type that is subscribed to; call it repeatedly."""
-        if not self._auto or self.listeners():
-            return
-        for name in self.wanted():
-            kind = _TYPES.get(name)
-            if kind is not None:
-                if self._publisher is None or kind is not self._kind:
-                    self._use(kind)
-                return
-
-    def wanted(self) -> list[str]:
-        """Return the names of the types that are subscribed, the most frequent first."""
-        known = self._node.get_subscriptions_info_by_topic(self.topic)
-        return [name for name, _ in Counter(item.topic_type for item in known).most_common()]
-
-    @property
-    def publisher(self) -> Publisher | None:
-        """The present one; None where the type is not known yet."""
-        return self._publisher
-
-    def listeners(self) -> int:
-        """Return how many subscriptions are matched."""
-        return 0 if self._publisher is None else self._publisher.get_subscription_count()
-
-    def problem(self) -> str:
-        """Return why no command is received; empty where one is."""
-        if self.listeners():
+    def refresh(self) -> str:
+        """Follow the type that is subscribed to; return why no command is received, or nothing."""
+        if self.publisher is not None and self.publisher.get_subscription_count():
             return ''
-        wanted = self.wanted()
+        known = self._node.get_subscriptions_info_by_topic(self.topic)
+        wanted = [name for name, _ in Counter(item.topic_type for item in known).most_common()]
+        kind = next((_TYPES[name] for name in wanted if name in _TYPES), None)
+        if self._auto and kind is not None and (self.publisher is None or kind is not self._kind):
+            self._use(kind)
         if not wanted:
             return f'{self.topic}: no subscription; is the robot running?'
         return (
@@ -89,19 +68,19 @@ class CommandPublisher:
 
     def publish(self, command: TwistStamped) -> None:
         """Publish a command, without its header where that is subscribed to."""
-        if self._publisher is not None:
-            self._publisher.publish(command if self._kind is TwistStamped else command.twist)
+        if self.publisher is not None:
+            self.publisher.publish(command if self._kind is TwistStamped else command.twist)
 
     def wait(self, seconds: float) -> None:
         """Wait until all commands have arrived, for at most so many seconds."""
-        if self._publisher is not None:
-            self._publisher.wait_for_all_acked(Duration(nanoseconds=round(seconds * 1e9)))
+        if self.publisher is not None:
+            self.publisher.wait_for_all_acked(Duration(nanoseconds=round(seconds * 1e9)))
 
     def destroy(self) -> None:
         """Destroy the publisher."""
-        if self._publisher is not None:
-            self._node.destroy_publisher(self._publisher)
-            self._publisher = None
+        if self.publisher is not None:
+            self._node.destroy_publisher(self.publisher)
+            self.publisher = None
 
 
 _ZERO = (0.0, 0.0, 0.0, 0.0)
@@ -174,8 +153,7 @@ class TopicLink(RobotLink):
         """Follow the type that the robot subscribes to; warn where nothing does."""
         if self._publisher is None:
             return
-        self._publisher.refresh()
-        if problem := self._publisher.problem():
+        if problem := self._publisher.refresh():
             self.driver.warn_throttled('cmd_vel', problem)
         if self._polls % _GUARD_POLLS == 0:
             readers = self.driver.get_subscriptions_info_by_topic('state')

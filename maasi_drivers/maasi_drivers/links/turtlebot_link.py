@@ -24,10 +24,7 @@ from maasi_planner.obstacles import Obstacles
 
 
 class Nav2Navigation:
-    """Hands waypoints to Nav2's `navigate_to_pose` (nav2_msgs/NavigateToPose).
-
-    Units: timeout [s].
-    """
+    """Hands waypoints to Nav2's `navigate_to_pose` (nav2_msgs/NavigateToPose); timeout in s."""
 
     def __init__(
         self,
@@ -66,16 +63,13 @@ class Nav2Navigation:
         """Whether it has a goal of ours."""
         return self._goal is not None
 
-    def problem(self) -> str | None:
-        """Return what is wrong with Nav2 while it drives; None if nothing is."""
-        if not self.driving:
-            return None
-        if not self.available:
-            return 'Nav2 is gone'
+    def problem(self) -> str:
+        """Return what is wrong with Nav2 while it drives, or nothing."""
         silence = self._silence.length
-        if silence > self._timeout:
-            return f'no answer or feedback of Nav2 for {silence:.1f} s'
-        return None
+        if self.driving and not self.available:
+            return 'Nav2 is gone'
+        late = self.driving and silence > self._timeout
+        return f'no answer or feedback of Nav2 for {silence:.1f} s' if late else ''
 
     def go(self, goal: Goal, heading: float) -> None:
         """Send the robot to a waypoint, to face `heading` there [rad].
@@ -90,11 +84,9 @@ class Nav2Navigation:
         pose.pose.position = point_to_ros([goal.waypoint[0], goal.waypoint[1], 0.0])
         pose.pose.orientation.z = float(np.sin(0.5 * heading))
         pose.pose.orientation.w = float(np.cos(0.5 * heading))
-        future = self._client.send_goal_async(self._type.Goal(pose=pose), self._on_feedback)
+        request = self._type.Goal(pose=pose)
+        future = self._client.send_goal_async(request, lambda _: self._silence.end())
         future.add_done_callback(lambda answer: self._answered(goal, answer.result()))
-
-    def _on_feedback(self, _: Any) -> None:
-        self._silence.end()
 
     def _answered(self, goal: Goal, handle: Any) -> None:
         self._silence.end()
@@ -115,17 +107,13 @@ class Nav2Navigation:
         result.add_done_callback(lambda answer: self._finished(goal, answer.result()))
 
     def _finished(self, goal: Goal, answer: Any) -> None:
-        if answer.status == ActionStatus.STATUS_SUCCEEDED:
-            self._ended(goal, True, '')
-            return
+        reached = answer.status == ActionStatus.STATUS_SUCCEEDED
         ended = 'cancelled it' if answer.status == ActionStatus.STATUS_CANCELED else 'gave it up'
         # Humble's result is empty, newer ones have code and text.
         code = getattr(answer.result, 'error_code', 0)
         text = getattr(answer.result, 'error_msg', '')
-        reason = (
-            f'Nav2 {ended}' + (f', error {code}' if code else '') + (f': {text}' if text else '')
-        )
-        self._ended(goal, False, reason)
+        reason = f'Nav2 {ended}{f", error {code}" if code else ""}{f": {text}" if text else ""}'
+        self._ended(goal, reached, '' if reached else reason)
 
     def _ended(self, goal: Goal, reached: bool, reason: str) -> None:
         if goal is self._goal:

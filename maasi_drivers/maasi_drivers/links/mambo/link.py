@@ -86,6 +86,8 @@ class MamboLink:
         self.land_after = land_after
         #: Fault of the link; while it is not connected it keeps trying.
         self.error = ''
+        #: Whether the drone has answered.
+        self.connected = False
         #: Of the drone, as pyparrot calls it: landed, takingoff, hovering, flying, ...
         self.flying_state = ''
         #: Charge, 0 to 1; negative: not received yet.
@@ -103,7 +105,6 @@ class MamboLink:
         self._fresh = False
         self._lock = threading.Lock()
         self._wake = threading.Event()
-        self._connected = threading.Event()
         self._closing = threading.Event()
         # Roll, pitch, yaw, climb of a command that was not sent yet.
         self._steering: list[int] | None = None
@@ -124,11 +125,6 @@ class MamboLink:
             target=self._work, args=(make,), name='Mambo link', daemon=True
         )
         self._thread.start()
-
-    @property
-    def connected(self) -> bool:
-        """Whether the drone has answered."""
-        return self._connected.is_set()
 
     @property
     def airborne(self) -> bool:
@@ -257,7 +253,7 @@ class MamboLink:
             drone.set_max_tilt(math.degrees(self.tilt))
             drone.set_max_vertical_speed(self.climb)
             drone.ask_for_state_update()
-            self._connected.set()
+            self.connected = True
             while not self._closing.is_set():
                 self._watch_caller()
                 self._ask_again()
@@ -273,7 +269,7 @@ class MamboLink:
         except Exception as error:
             self.error = f'the link to the Mambo broke: {error}'
         finally:
-            self._connected.clear()
+            self.connected = False
             self._leave(drone)
 
     def _watch_caller(self) -> None:

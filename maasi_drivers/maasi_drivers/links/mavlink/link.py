@@ -81,10 +81,10 @@ class VehicleLink:
         with self.lock:
             self.vehicle.finish(ending)
         deadline = time.monotonic() + patience
-        while time.monotonic() < deadline and self._thread.is_alive():
+        while time.monotonic() < deadline:
             with self.lock:
-                if self.vehicle.at_rest:
-                    return True
+                if self.vehicle.at_rest or not self._thread.is_alive():
+                    return self.vehicle.at_rest
             time.sleep(_PERIOD)
         return False
 

@@ -122,7 +122,7 @@ _SENSOR_PERIOD, _PING_PERIOD = 0.5, 1.0
 _RETRY_PERIOD, _RETRIES = 0.15, 5
 _STEP = 0.02
 # Longest time simulated at once after the host was suspended, and wait for a handshake [s].
-_CATCH_UP, _HANDSHAKE_TIME = 0.5, 0.5
+_CATCH_UP, _HANDSHAKE_TIME = 0.5, 2.0
 _TRIES = 100
 
 
