@@ -145,21 +145,18 @@ class RangingInput(SensorInput[Sweep]):
         limits = np.array([math.inf, math.pi, 0.5 * math.pi][: values.shape[1]]) + 1e-6
         good = np.isfinite(values).all(axis=1) & (values[:, 0] >= 0.0)
         good &= (np.abs(values) <= limits).all(axis=1)
-        if not good.all():
-            first = values[np.flatnonzero(~good)[0]].tolist()
-            self.driver.drop(
-                'range',
-                f'ranges: read {first}, allowed are a finite range from 0 [m], a bearing within pi '
-                'and an elevation within pi/2 [rad]',
-                int(np.count_nonzero(~good)),
-            )
-        labelled = np.array([label_problem(item) is None for item in message.ranges], dtype=bool)
-        if not labelled[good].all():
-            first = next(text for item in message.ranges if (text := label_problem(item)))
-            self.driver.drop('range', f'ranges: {first}', int(np.count_nonzero(~labelled[good])))
-            good &= labelled
-        labels = labels_of([item for item, kept in zip(message.ranges, good.tolist()) if kept])
-        sweep = Sweep(values[good], labels)
+        problems = [
+            label_problem(item)
+            if fine
+            else f'read {row}, allowed are a finite range from 0 [m], a bearing within pi and an '
+            'elevation within pi/2 [rad]'
+            for item, row, fine in zip(message.ranges, values.tolist(), good.tolist())
+        ]
+        if wrong := [text for text in problems if text is not None]:
+            self.driver.drop('range', f'ranges: {wrong[0]}', len(wrong))
+        kept = [text is None for text in problems]
+        labels = labels_of([item for item, good in zip(message.ranges, kept) if good])
+        sweep = Sweep(values[np.array(kept, dtype=bool)], labels)
         self.driver.take_frame('ranges', stamp_from_ros(message.header.stamp), sweep)
 
     def detect(self, data: Sweep, pose: StampedPose) -> SensorReading:
