@@ -34,6 +34,13 @@ def same(one, other):
         np.testing.assert_array_equal(first[name], second[name], err_msg=name)
 
 
+def play(search, measurements, first=0):
+    """Let a filter have measurements one by one; return it."""
+    for step, measurement in enumerate(measurements, start=first):
+        search.step([measurement], 1, float(step))
+    return search
+
+
 def cube_sensor(noise=DEGREES):
     """Return the papers' 3D sensor."""
     return SensorSettings(noise=noise).build('drone', 3)

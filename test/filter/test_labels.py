@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pmb_problems import plane_filter, plane_sensor
-from searches import floor_sensor, observe, same
+from searches import floor_sensor, observe, play, same
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose
 from maasi_filter.ic_phd.filter import IcPhdFilter
@@ -33,13 +33,6 @@ def pair_scans(number, identified=True):
             AgentMeasurement('robot', pose, sensor, np.concatenate(rows), None, step, labels=labels)
         )
     return scans
-
-
-def play(search, scans, first=0):
-    """Let a filter have scans one by one."""
-    for step, scan in enumerate(scans, start=first):
-        search.step([scan], 1, float(step))
-    return search
 
 
 def test_targets_closer_than_the_noise_are_told_apart_by_identity():
@@ -112,9 +105,3 @@ def test_the_class_is_that_of_the_largest_sum_of_scores():
 def test_scores_are_refused_that_are_no_probability(score):
     with pytest.raises(ValueError, match=r'score: got .*allowed is 0 to 1'):
         Label('cup', score)
-
-
-def test_a_wrong_number_of_labels_is_refused():
-    scan = replace(pair_scans(1)[0], labels=[Label()])
-    with pytest.raises(ValueError, match='labels: got 1, allowed are 2, or none'):
-        plane_filter().step([scan], 1, 0.0)

@@ -8,11 +8,10 @@ from maasi_filter import (
     DetectionSettings,
     EnvironmentSettings,
     FilterSettings,
-    IcPhdFilter,
     NoiseSettings,
     SensorSettings,
 )
-from maasi_filter.settings import PRESETS, unsuitable_lengths, unused_settings
+from maasi_filter.settings import unsuitable_lengths, unused_settings
 
 
 @pytest.mark.parametrize(
@@ -41,18 +40,6 @@ def test_wrong_settings_are_refused_by_name(model, values, word):
         model(**values)
 
 
-def test_every_setting_says_what_it_is():
-    for model in (
-        FilterSettings,
-        DetectionSettings,
-        NoiseSettings,
-        SensorSettings,
-        EnvironmentSettings,
-    ):
-        for name, field in model.model_fields.items():
-            assert field.description, f'{model.__name__}.{name}'
-
-
 def test_presets_fill_in_what_is_not_given():
     settings = FilterSettings(preset='paper_001', found_mass=0.9).resolved()
     assert settings.particles == 5000
@@ -62,24 +49,6 @@ def test_presets_fill_in_what_is_not_given():
     assert FilterSettings().resolved().particles == 10_000
     # The other filter derives its lengths from the sensor.
     assert FilterSettings(method='pmb').resolved().found_radius is None
-
-
-def test_papers_differ_where_they_differ():
-    assert PRESETS['paper_003']['removal'] == 'every'
-    assert PRESETS['paper_001']['removal'] == 'closest'
-    assert PRESETS['paper_003']['births'] == 'gaussian'
-    known = set(FilterSettings.model_fields)
-    assert all(set(values) <= known for values in PRESETS.values())
-
-
-def test_lengths_follow_the_environment():
-    large = IcPhdFilter(FilterSettings(), [[0.0, 260.0]] * 3, np.random.default_rng(0))
-    small = IcPhdFilter(FilterSettings(), [[0.0, 2.6]] * 3, np.random.default_rng(0))
-    assert large.exploration.values.shape == small.exploration.values.shape
-    own = IcPhdFilter(
-        FilterSettings(exploration_spacing=26.0), [[0.0, 260.0]] * 3, np.random.default_rng(0)
-    )
-    assert own.exploration.values.shape == (11, 11, 11)
 
 
 def test_three_dimensional_noise_needs_an_elevation():

@@ -68,28 +68,21 @@ def test_particles_of_a_target_that_another_one_found_are_deleted(new_filter):
     )
 
 
-@pytest.mark.parametrize('time, owner', [(0.5, 'other'), (100.0, 'own')])
-def test_a_target_of_two_belongs_to_who_was_first(new_filter, time, owner):
+@pytest.mark.parametrize(
+    ('robot', 'later', 'owner'),
+    [('other', -0.5, 'other'), ('other', 100.0, 'own'), ('a', 0.0, 'a'), ('z', 0.0, 'own')],
+)
+def test_a_target_of_two_belongs_to_who_was_first_or_is_by_name(new_filter, robot, later, owner):
     search = new_filter()
     look(search, 'own', 12)
-    number = search.found_targets[0].id
-    changed = search.take_over('other', [target(time=time)])
-    assert changed == (owner == 'other')
+    number, time = search.found_targets[0].id, search.found_targets[0].time
+    assert search.take_over(robot, [target(time=time + later)]) == (owner == robot)
     assert [item.robot for item in search.found_targets] == [owner]
     assert search.found_targets[0].id == number
     assert bool(search.own_found_targets()) == (owner == 'own')
 
 
-def test_at_the_same_time_the_first_by_name_has_it(new_filter):
-    search = new_filter()
-    look(search, 'own', 12)
-    time = search.found_targets[0].time
-    assert search.take_over('a', [target(time=time)])
-    assert [item.robot for item in search.found_targets] == ['a']
-    assert not search.take_over('z', [target(time=time)])
-
-
-def test_the_estimate_is_that_of_its_owner(new_filter):
+def test_the_estimate_is_that_of_its_owner(new_filter, tmp_path):
     search = new_filter()
     search.take_over('other', [target()])
     assert not search.take_over('other', [target()])
@@ -99,6 +92,10 @@ def test_the_estimate_is_that_of_its_owner(new_filter):
     assert search.found_targets[0].position == pytest.approx(moved)
     look(search, 'own', 5)
     assert search.found_targets[0].position == pytest.approx(moved)
+    search.save(tmp_path / 'state')
+    loaded = load_filter(tmp_path / 'state')
+    assert [item.origin for item in loaded.found_targets] == [1, 2]
+    assert not loaded.take_over('other', [target(moved)])
 
 
 def test_bad_targets_are_refused_and_change_nothing(new_filter):
@@ -112,13 +109,3 @@ def test_bad_targets_are_refused_and_change_nothing(new_filter):
     with pytest.raises(ValueError, match='different ones from 1'):
         search.keep_found([target(), target()])
     assert search.found_targets == []
-
-
-def test_a_saved_filter_knows_what_it_took_over(new_filter, tmp_path):
-    search = new_filter()
-    search.take_over('other', [target()])
-    look(search, 'own', 2)
-    search.save(tmp_path / 'state')
-    loaded = load_filter(tmp_path / 'state')
-    assert [(item.robot, item.origin) for item in loaded.found_targets] == [('other', 1)]
-    assert not loaded.take_over('other', [target()])

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
-from searches import CUBE, cube_sensor, observe, same, wander
+from searches import CUBE, cube_sensor, observe, play, same, wander
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, StateFileError, load_filter
 from maasi_filter.make_filter import make_filter
@@ -37,12 +37,6 @@ def searched(settings=PHD, steps=25, generator=None, labels=False):
     return search, measurements[steps:]
 
 
-def play(search, measurements):
-    """Let a filter have measurements one by one."""
-    for measurement in measurements:
-        search.step([measurement], 1, float(measurement.index))
-
-
 @pytest.mark.parametrize(
     ('settings', 'labels', 'steps'),
     [
@@ -61,8 +55,8 @@ def test_a_loaded_filter_continues_to_the_bit(tmp_path, settings, labels, steps)
     loaded = load_filter(tmp_path / 'state')
     assert loaded.settings == search.settings
     same(search, loaded)
-    play(search, rest)
-    play(loaded, rest)
+    play(search, rest, steps)
+    play(loaded, rest, steps)
     same(search, loaded)
     # The file is replaced.
     search.save(tmp_path / 'state')

@@ -261,11 +261,8 @@ def merge(components: list[Component]) -> list[Component]:
         item = components[i]
         for other in (components[k] for k in kept if near[i, k]):
             two = item.scan == other.scan or item.differs(other)
-            if (
-                not two
-                and other.existence + item.existence <= 1.0
-                and gap(other, item) < SAME_PLACE
-            ):
+            two |= other.existence + item.existence > 1.0
+            if not two and gap(other, item) < SAME_PLACE:
                 other.existence += item.existence
                 other.labels.merge(item.labels)
                 break
