@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import reduce
 from typing import Any, Generic, TypeVar
 
 from pydantic import ValidationError
@@ -93,18 +95,23 @@ class NodeParameters(Generic[SettingsT]):
 
     def _show(self, settings: SettingsT) -> None:
         """Set the other parameters to their resolved values."""
-        changes = []
-        for name, value in flatten(settings.resolved()).items():
-            if name in self._given:
-                continue
-            if not self._node.has_parameter(name) or self._node.get_parameter(name).value != value:
-                changes.append(Parameter(name, value=value))
+        changes = [
+            Parameter(name, value=value)
+            for name, value in flatten(settings.resolved()).items()
+            if name not in self._given
+            and self._node.get_parameter_or(name, Parameter(name)).value != value
+        ]
         if changes:
-            self._own_change = True
-            try:
+            with self._changing():
                 self._node.set_parameters_atomically(changes)
-            finally:
-                self._own_change = False
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        self._own_change = True
+        try:
+            yield
+        finally:
+            self._own_change = False
 
     def _is_foreign(self, name: str) -> bool:
         return name in self._foreign or name.startswith('qos_overrides.')
@@ -112,61 +119,46 @@ class NodeParameters(Generic[SettingsT]):
     def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
         """Return whether parameters may be set, and if not, why."""
         own = [item for item in parameters if not self._is_foreign(item.name)]
-        if self._own_change or not own:
-            return SetParametersResult(successful=True)
-        values = self._values()
-        for item in own:
-            values[item.name] = item.value
+        reason = '' if self._own_change else self._objection(own)
+        return SetParametersResult(successful=not reason, reason=reason)
+
+    def _objection(self, own: Sequence[Parameter]) -> str:
+        values = self._values() | {item.name: item.value for item in own}
         values = {name: value for name, value in values.items() if value is not None}
         known = {item.name for item in parameter_fields(self._model, values)}
         known |= {item.name for item in own if self._node.has_parameter(item.name)}
         _, problems = check(self._model, values)
         for item in own:
             if item.name not in known:
-                return _refused(f'parameter {item.name}: is not known')
+                return f'parameter {item.name}: is not known'
             if self._settings is not None and item.name not in self._model.live:
-                return _refused(
+                return (
                     f'parameter {item.name}: is read in configure; set it while the node is '
                     'unconfigured (deactivate and cleanup before)'
                 )
             # Errors of other parameters, or of several together, may still be corrected.
             wrong = [item.name] if self._settings is None else list(problems)
-            for name in wrong:
-                if name in problems and item.value is not None:
-                    return _refused(problems[name])
-        return SetParametersResult(successful=True)
+            found = [problems[name] for name in wrong if name in problems]
+            if found and item.value is not None:
+                return found[0]
+        return ''
 
     def _note(self, parameters: list[Parameter]) -> None:
         """Apply what was set, and declare dependent parameters, such as those of a new robot."""
         if self._own_change:
             return
-        for item in parameters:
-            if self._is_foreign(item.name):
-                continue
-            if item.value is None:
-                self._given.discard(item.name)
-            else:
-                self._given.add(item.name)
-        if self._settings is not None:
-            self._use([item.name for item in parameters if not self._is_foreign(item.name)])
+        own = [item for item in parameters if not self._is_foreign(item.name)]
+        self._given -= {item.name for item in own}
+        self._given |= {item.name for item in own if item.value is not None}
+        if self._settings is None:
+            with self._changing():
+                self._declare(self._values())
             return
-        self._own_change = True
-        try:
-            self._declare(self._values())
-        finally:
-            self._own_change = False
-
-    def _use(self, names: Collection[str]) -> None:
-        """Change settings in use in place."""
+        # Change settings in use in place.
         changed, _ = check(self._model, self._values())
-        for name in names:
-            source: Any = changed
-            target: Any = self._settings
-            *path, last = name.split('.')
-            for part in path:
-                source, target = getattr(source, part, None), getattr(target, part, None)
-            if source is not None and target is not None:
-                setattr(target, last, getattr(source, last))
+        for *path, last in (item.name.split('.') for item in own):
+            target, source = (reduce(getattr, path, item) for item in (self._settings, changed))
+            setattr(target, last, getattr(source, last))
 
     def _declare(self, given: Mapping[str, Any]) -> None:
         _, problems = check(self._model, given)
@@ -206,28 +198,19 @@ def check(
     return None, problems
 
 
-def _refused(reason: str) -> SetParametersResult:
-    return SetParametersResult(successful=False, reason=reason)
-
-
 def _descriptor(item: ParameterField, ranged: bool) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         description=item.description, additional_constraints=item.constraints, dynamic_typing=True
     )
     low, high = item.bound('ge', 'gt'), item.bound('le', 'lt')
-    if not ranged or low is high is None:
+    if not ranged or low is high is None or item.number is None:
         return descriptor
+    most = sys.float_info.max
     if item.number is float:
-        most = sys.float_info.max
-        ends = {'from_value': -most, 'to_value': most}
-        kind, name = FloatingPointRange, 'floating_point_range'
-    elif item.number is int:
-        ends = {'from_value': -(2**63), 'to_value': 2**63 - 1}
-        kind, name = IntegerRange, 'integer_range'
+        ends = -most if low is None else float(low), most if high is None else float(high)
+        span = FloatingPointRange(from_value=ends[0], to_value=ends[1])
+        descriptor.floating_point_range = [span]
     else:
-        return descriptor
-    for end, value in (('from_value', low), ('to_value', high)):
-        if value is not None:
-            ends[end] = item.number(value)
-    setattr(descriptor, name, [kind(**ends)])
+        ends = -(2**63) if low is None else int(low), 2**63 - 1 if high is None else int(high)
+        descriptor.integer_range = [IntegerRange(from_value=ends[0], to_value=ends[1])]
     return descriptor

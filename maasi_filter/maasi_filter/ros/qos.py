@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.qos import (
@@ -15,64 +16,49 @@ from rclpy.qos import (
 
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE
 
+
+def _reliable(depth: int | None, latched: bool = False, **options: Any) -> QoSProfile:
+    """Return a profile that keeps the last `depth` messages, or all; latched: for late joiners."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL if depth is None else HistoryPolicy.KEEP_LAST,
+        depth=depth or 1,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        **options,
+    )
+
+
 # Lossless topics: batches, detections, updates, states, decisions, lockstep.
-RELIABLE = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE
-)
-
-# For late joiners: found targets, the truth, the last update.
-LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
-# Updates of the filter: reliable, and a restarted planner receives the last ones.
-UPDATES = QoSProfile(
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
+RELIABLE = _reliable(None)
+# Found targets, the truth, the last update.
+LATCHED = _reliable(1, latched=True)
 # As LATCHED, for a reader of several publishers.
-LATCHED_ALL = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
+LATCHED_ALL = _reliable(None, latched=True)
+# Updates of the filter: a restarted planner receives the last ones.
+UPDATES = _reliable(100, latched=True)
 # States of robots. Liveliness is asserted by the executor thread: a process whose executor hangs
 # loses it, although the threads of its middleware still run.
-LIVELY = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
+LIVELY = _reliable(
+    None,
     liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
     liveliness_lease_duration=Duration(seconds=LIVELINESS_LEASE),
 )
 # Period of assertion [s].
 LIVELINESS_PERIOD = 0.1
-
 # Commands to a robot: a short queue, as old commands are useless after a link failure.
-COMMANDS = QoSProfile(depth=3, reliability=ReliabilityPolicy.RELIABLE)
-
+COMMANDS = _reliable(3)
 # Transforms, as in tf2.
-TRANSFORMS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE
-)
-
+TRANSFORMS = _reliable(100)
 # Sensor data: each message replaces the previous one.
-SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+SENSOR = _reliable(10)
 SENSOR_READER = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def liveliness_reader(lease: float) -> QoSProfile:
     """Return the QoS of a guard for states: liveliness is lost after `lease` seconds."""
-    return QoSProfile(
-        depth=1,
-        # Without data, liveliness is asserted by heartbeats, which only reliable readers get.
-        reliability=ReliabilityPolicy.RELIABLE,
+    # Without data, liveliness is asserted by heartbeats, which only reliable readers get.
+    return _reliable(
+        1,
         liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
         liveliness_lease_duration=Duration(seconds=lease),
     )
