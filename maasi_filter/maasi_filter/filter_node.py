@@ -18,7 +18,7 @@ from visualization_msgs.msg import MarkerArray
 from maasi_filter.make_filter import Progress, load_state, make_filter, warm_up
 from maasi_filter.measurement_check import FOUND, REPEATED
 from maasi_filter.node.batch_assembly import BatchAssembly, PendingBatch
-from maasi_filter.node.found_target_exchange import KeptFoundTargets, SharedFoundTargets
+from maasi_filter.node.found_target_exchange import SharedFoundTargets
 from maasi_filter.ros.conversions import (
     MarkerBoard,
     cluster_to_ros,
@@ -92,6 +92,8 @@ def _is_due(rate: float, now: float, last: float) -> bool:
 _TIMEOUT_PERIOD = 0.05
 # Upper bound on predicted steps: a day at 10 steps per second.
 _MOST_STEPS = 864_000
+# Longest wait for the latched message with kept targets [s].
+_KEPT_PATIENCE = 5.0
 # Longest wait for other filters to acknowledge found targets [s].
 _SHARING_PATIENCE = 0.5
 
@@ -131,7 +133,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._shared = SharedFoundTargets(self)
         self._views = FilterViews(self)
         self._begin_anew()
-        self._kept = KeptFoundTargets()
+        # Until when batches wait for the targets that the planner keeps for a restarted filter.
+        # Only the first message is used: later ones contain what this filter found itself.
+        self._kept_until, self._kept_taken = math.inf, False
         self._restored = b''
         if settings.save_file and Path(settings.save_file).exists():
             self._restore(Path(settings.save_file))
@@ -228,7 +232,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def start(self) -> None:
         """Republish the restored state: the latched messages of the dead process are lost."""
-        self._kept.begin(time.monotonic())
+        self._kept_until = min(self._kept_until, time.monotonic() + _KEPT_PATIENCE)
         if not self._restored:
             return
         update = deserialize_message(self._restored, FilterUpdate)
@@ -306,9 +310,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     def _process_complete(self) -> None:
         """Process the batches that are complete, in the order of their ids."""
         # New ids must differ from those of targets that were found before a restart.
-        if self._batches.pending and self._kept.is_awaited(
-            self.count_publishers(self._kept_topic), time.monotonic()
-        ):
+        awaited = not self._kept_taken and time.monotonic() < self._kept_until
+        if awaited and self._batches.pending and self.count_publishers(self._kept_topic):
             return
         while (batch := self._batches.next_complete()) is not None:
             self._process(batch)
@@ -401,8 +404,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def _on_kept(self, message: FoundTargetArray) -> None:
         """Restore targets found before a restart of this node without its state."""
-        if not self.active or not self._kept.take():
+        if not self.active or self._kept_taken:
             return
+        self._kept_taken = True
         try:
             if message.header.frame_id != self.settings.frame and message.targets:
                 raise ValueError(

@@ -3,8 +3,8 @@
 import pytest
 from test_filter_node import running, seen_from_a
 
+from maasi_filter import filter_node
 from maasi_filter.make_filter import load_state
-from maasi_filter.node.found_target_exchange import KeptFoundTargets
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import FoundTargetArray
 
@@ -134,12 +134,9 @@ def test_kept_targets_that_cannot_be_used_are_dropped(fault):
         seen_from_a(team, until, [1])
 
 
-def test_the_wait_for_kept_targets_has_a_bound():
-    kept = KeptFoundTargets()
-    kept.begin(100.0)
-    assert not kept.is_awaited(0, 100.0)
-    assert kept.is_awaited(1, 104.9)
-    assert not kept.is_awaited(1, 105.1)
-    assert kept.take()
-    assert not kept.take()
-    assert not kept.is_awaited(1, 100.0)
+def test_the_wait_for_kept_targets_has_a_bound(monkeypatch):
+    monkeypatch.setattr(filter_node, '_KEPT_PATIENCE', 0.5)
+    with running() as (node, team, until):
+        team.node.create_publisher(FoundTargetArray, 'found_targets/kept', LATCHED)
+        until(lambda: node.count_publishers('/found_targets/kept') == 1)
+        seen_from_a(team, until, [1, 2])

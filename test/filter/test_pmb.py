@@ -10,10 +10,12 @@ from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, 
 from maasi_filter import FilterSettings, Pose, UnexploredMap, wrap_angle
 from maasi_filter.measurement_check import check_measurements
 from maasi_filter.models.sensor import LEAST_PER_SCAN
+from maasi_filter.pmb.component import Component, is_known
+from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.pmb.learnt import PRIOR_SCANS, Learnt
 from maasi_filter.pmb.scan import make_scan
-from maasi_filter.records import Label
+from maasi_filter.records import FoundTarget, Label
 
 TARGET = np.array([[60.0, 45.0]])
 # Where the robot measures from, in turn.
@@ -228,7 +230,9 @@ def test_a_detection_that_comes_twice_is_one_by_the_resolution_of_the_sensor(
     assert plane_filter().step([member], 1, 0.0).dropped.get('repeated', 0) == repeated
 
 
-def test_found_target_that_is_missed_again_and_again_is_withdrawn():
+@pytest.mark.parametrize(('misses', 'existence'), [(37, None), (1, 0.6)])
+def test_found_target_that_is_missed_again_and_again_is_withdrawn(misses, existence):
+    """As a reflection, or as it hardly exists."""
     sensor = plane_sensor(range_noise=0.5, bearing=0.01)
     generator = np.random.default_rng(0)
     search = plane_filter(particles=300)
@@ -236,12 +240,33 @@ def test_found_target_that_is_missed_again_and_again_is_withdrawn():
         values = observe(generator, sensor, TARGET, PLACES[0])
         search.step([measured(sensor, PLACES[0], values, step)], 1, step)
     assert len(search.found_targets) == 1
+    search.components[0].existence = existence or search.components[0].existence
     changed = False
-    for step in range(3, 40):
+    for step in range(3, 3 + misses):
         result = search.step([measured(sensor, (58.0, 45.0), [], step)], 1, step)
         changed |= result.found_changed and not search.found_targets
     assert changed
     assert search.found_targets == []
+
+
+def test_one_detection_alone_is_no_found_target_however_precise():
+    sensor = plane_sensor(range_noise=0.02, bearing=0.0005)
+    search = plane_filter(particles=300, expected_targets=1000.0)
+    value = sensor.measurement.measure(TARGET, Pose(np.array(PLACES[0])))
+    for step, found in enumerate((0, 1)):
+        search.step([measured(sensor, PLACES[0], value, step)], 1, step)
+        assert search.components[0].existence > 0.99
+        assert len(search.found_targets) == found
+
+
+@pytest.mark.parametrize(('caused', 'known'), [(0.7, True), (0.8, False)])
+def test_two_that_cause_two_detections_of_a_scan_are_two_targets(caused, known):
+    frame = np.array([[-9.0, -9.0, 0.0], [9.0, 9.0, 0.0], [1.0, 1.0, 0.0]])
+    density = Density.normal(np.zeros(2), np.eye(2), 100, frame, np.random.default_rng(0))
+    target = FoundTarget(1, density.mean, density.covariance, 'robot', 0, 0.0)
+    found = Component(1.0, density, 5.0, 0, 0.0, 1.0, target=target)
+    other = Component(1.0, density, 5.0, 1, 0.0, 1.0)
+    assert is_known(1, [found, other], np.diag([caused, caused])) == known
 
 
 def answering(share, targets, scans=80, seed=0, later=None):

@@ -115,9 +115,15 @@ def test_the_excess_of_a_sum_is_that_of_chi_squared(freedom):
     assert norm.sf(excess(ratio, freedom)) == pytest.approx(norm.sf(BOUND), rel=0.5)
 
 
-def test_one_detection_of_something_else_is_no_misfit():
+def test_one_outlier_is_no_misfit_and_misfits_are_forgotten():
     learnt = Learnt()
-    for _ in range(30):
-        learnt.count_innovation(3.0, 3, 0.0)
-    learnt.count_innovation(1e6, 3, 0.0)
-    assert not learnt.misfit('drone')
+
+    def counted(square, number):
+        for _ in range(number):
+            learnt.count_innovation(square, 3, 0.0)
+        return bool(learnt.misfit('drone'))
+
+    assert not counted(3.0, 30)
+    assert not counted(1e6, 1)
+    assert counted(30.0, 60)
+    assert not counted(3.0, 200)

@@ -43,36 +43,18 @@ class PendingBatch:
 
 
 class BatchAssembly:
-    """Matches batches and detections; what is refused is dropped and counted by the node.
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        The filter node.
-    sensors : mapping of str to Sensor
-        By robot.
-
-    Attributes
-    ----------
-    pending : dict
-        Batches that have not been taken, by id.
-    last : int
-        Id of the last batch taken.
-    last_stamp : int
-        Its stamp [ns].
-    heard : dict
-        Batch, measurement and stamp [ns] of the last detections, by robot.
-    """
+    """Matches batches and detections; what is refused is dropped and counted by the node."""
 
     def __init__(
         self, node: LockstepLifecycleNode[FilterNodeSettings], sensors: Mapping[str, Sensor]
     ) -> None:
         self._node = node
         self._sensors = sensors
-        self._dimension = node.settings.environment.dimension
+        #: Batches that have not been taken, by id.
         self.pending: dict[int, PendingBatch] = {}
-        self.last = 0
-        self.last_stamp = -1
+        #: Id and stamp [ns] of the last batch taken.
+        self.last, self.last_stamp = 0, -1
+        #: Batch, measurement and stamp [ns] of the last detections, by robot.
         self.heard: dict[str, tuple[int, int, int]] = {}
         self._early: dict[tuple[int, str], DetectionArray] = {}
 
@@ -218,15 +200,12 @@ class BatchAssembly:
     def _measurement(self, message: DetectionArray) -> AgentMeasurement | None:
         name = message.robot
         try:
-            measurement, problems = measurement_from_ros(
-                message, self._sensors[name], self._dimension
-            )
+            measurement, left_out = measurement_from_ros(message, self._sensors[name])
         except ValueError as error:
             self._node.drop('bad detections', f'{name}/detections.pose.{error}')
             return None
-        for reason, texts in problems.items():
-            for text, number in texts.items():
-                self._node.drop(reason, f'{name}/detections.{text}', number)
+        for reason, text, number in left_out:
+            self._node.drop(reason, f'{name}/detections.{text}', number)
         return measurement
 
     def _take(self, pending: PendingBatch, message: DetectionArray) -> None:

@@ -1,4 +1,4 @@
-"""Found targets from elsewhere: filters of other robots (002, section 4), or before a restart."""
+"""Found targets of the filters of other robots (002, section 4)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.qos import LATCHED_ALL
 from maasi_filter.search_filter import SearchFilter
 from maasi_msgs.msg import FoundTargetArray
-
-# Longest wait for the latched message with kept targets [s].
-_PATIENCE = 5.0
 
 
 class SharedFoundTargets:
@@ -90,29 +87,3 @@ class SharedFoundTargets:
             )
             return
         self._waiting[name].append(message)
-
-
-class KeptFoundTargets:
-    """Takes the targets that the planner keeps for a filter restarted without its state, once.
-
-    Only the first message is used: later ones contain the targets that this filter found itself.
-    """
-
-    def __init__(self) -> None:
-        self._taken = False
-        self._since: float | None = None
-
-    def begin(self, now: float) -> None:
-        """Note that the node is active; wall time [s]."""
-        self._since = now if self._since is None else self._since
-
-    def take(self) -> bool:
-        """Return whether a message is the first one."""
-        first, self._taken = not self._taken, True
-        return first
-
-    def is_awaited(self, publishers: int, now: float) -> bool:
-        """Return whether batches have to wait for the message of any publisher; wall time [s]."""
-        if self._taken or not publishers or self._since is None:
-            return False
-        return now - self._since < _PATIENCE

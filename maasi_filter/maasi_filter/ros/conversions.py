@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import array
 import math
-from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -161,23 +160,19 @@ def detections_to_ros(
     values: FloatArray, covariances: FloatArray | None, labels: Sequence[Label] = ()
 ) -> list[Detection]:
     """Return detections."""
-    messages = []
-    for index, value in enumerate(values):
-        label = labels[index] if labels else UNLABELLED
-        messages.append(
-            Detection(
-                range=float(value[0]),
-                bearing=float(value[1]),
-                elevation=float(value[2]) if len(value) == 3 else 0.0,
-                covariance=[]
-                if covariances is None
-                else [float(item) for item in covariances[index].ravel()],
-                class_id=label.class_id,
-                score=label.score,
-                identity=label.identity,
-            )
+    names = labels or [UNLABELLED] * len(values)
+    return [
+        Detection(
+            range=float(value[0]),
+            bearing=float(value[1]),
+            elevation=float(value[2]) if len(value) == 3 else 0.0,
+            covariance=[] if covariances is None else covariances[index].ravel().tolist(),
+            class_id=label.class_id,
+            score=label.score,
+            identity=label.identity,
         )
-    return messages
+        for index, (value, label) in enumerate(zip(values, names))
+    ]
 
 
 def labels_of(messages: Sequence[Detection] | Sequence[RangeMeasurement]) -> tuple[Label, ...]:
@@ -222,83 +217,52 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
     return None
 
 
-def _usable(
-    detections: Sequence[Detection], dimension: int
-) -> tuple[list[Detection], dict[str, Counter[str]]]:
-    """Return usable detections, and reasons, texts and numbers of the others."""
-    kept: list[Detection] = []
-    problems: dict[str, Counter[str]] = {}
-
-    def leave_out(reason: str, text: str, number: int = 1) -> None:
-        problems.setdefault(reason, Counter())[text] += number
-
-    seen: set[tuple[float, ...]] = set()
-    for index, detection in enumerate(detections):
-        if len(kept) == MOST_DETECTIONS:
-            leave_out(
-                'too many detections',
-                f'detections: read {len(detections)}, allowed are {MOST_DETECTIONS} that can be '
-                'used',
-                len(detections) - index,
-            )
-            break
-        problem = detection_problem(detection, dimension)
-        if problem is not None:
-            leave_out('bad detection', f'detections[{index}].{problem}')
-            continue
-        key = (detection.range, detection.bearing, detection.elevation)
-        if key in seen:
-            leave_out(
-                'equal detection', f'detections[{index}]: read {key}, allowed is each one once'
-            )
-            continue
-        seen.add(key)
-        kept.append(detection)
-    return kept, problems
-
-
 def measurement_from_ros(
-    message: DetectionArray, sensor: Sensor, dimension: int
-) -> tuple[AgentMeasurement, dict[str, Counter[str]]]:
-    """Return the measurement of a robot, and why detections were left out.
+    message: DetectionArray, sensor: Sensor
+) -> tuple[AgentMeasurement, list[tuple[str, str, int]]]:
+    """Return the measurement of a robot, and what was left out: reason, text and number.
 
-    Invalid detections, duplicates, and those beyond `MOST_DETECTIONS` are left out: reason to texts
-    and their numbers.
+    Invalid detections, equal ones, and those beyond `MOST_DETECTIONS` are left out.
     """
     pose = pose_from_ros(message.pose.pose)
-    position_covariance = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
-    if not np.isfinite(position_covariance).all():
-        raise ValueError(f'pose.covariance: read {position_covariance.tolist()}, allowed is finite')
-    kept, problems = _usable(message.detections, dimension)
-    values = np.array(
-        [[item.range, item.bearing, item.elevation][:dimension] for item in kept], dtype=float
-    ).reshape(-1, dimension)
+    errors = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
+    if not np.isfinite(errors).all():
+        raise ValueError(f'pose.covariance: read {errors.tolist()}, allowed is finite')
+    d, total = sensor.dimension, len(message.detections)
+    kept: list[Detection] = []
+    left_out: list[tuple[str, str, int]] = []
+    seen: set[tuple[float, ...]] = set()
+    for index, item in enumerate(message.detections):
+        if len(kept) == MOST_DETECTIONS:
+            text = f'detections: read {total}, allowed are {MOST_DETECTIONS} that can be used'
+            left_out.append(('too many detections', text, total - index))
+            break
+        key = (item.range, item.bearing, item.elevation)
+        if problem := detection_problem(item, d):
+            left_out.append(('bad detection', f'detections[{index}].{problem}', 1))
+        elif key in seen:
+            text = f'detections[{index}]: read {key}, allowed is each one once'
+            left_out.append(('equal detection', text, 1))
+        else:
+            seen.add(key)
+            kept.append(item)
+    values = np.array([[item.range, item.bearing, item.elevation][:d] for item in kept], float)
     covariances = None
     if any(len(item.covariance) for item in kept):
-        covariances = np.array(
-            [
-                np.array(item.covariance).reshape(dimension, dimension)
-                if len(item.covariance)
-                else sensor.covariance
-                for item in kept
-            ]
-        )
-    return (
-        AgentMeasurement(
-            robot=message.robot,
-            pose=pose,
-            sensor=sensor,
-            values=values,
-            covariances=covariances,
-            index=int(message.measurement),
-            # A negative variance means that the error is unknown.
-            position_covariance=(
-                position_covariance if np.diagonal(position_covariance).min() >= 0.0 else None
-            ),
-            labels=labels_of(kept),
-        ),
-        problems,
+        given = [item.covariance if len(item.covariance) else sensor.covariance for item in kept]
+        covariances = np.array([np.reshape(item, (d, d)) for item in given])
+    measurement = AgentMeasurement(
+        robot=message.robot,
+        pose=pose,
+        sensor=sensor,
+        values=values.reshape(-1, d),
+        covariances=covariances,
+        index=int(message.measurement),
+        # A negative variance means that the error is unknown.
+        position_covariance=errors if np.diagonal(errors).min() >= 0.0 else None,
+        labels=labels_of(kept),
     )
+    return measurement, left_out
 
 
 def particles_to_ros(positions: FloatArray, weights: FloatArray, header: Header) -> PointCloud2:
@@ -352,22 +316,19 @@ def filter_markers(
     size: float,
 ) -> MarkerArray:
     """Return markers of clusters (orange, scaled by their width) and found targets (red)."""
-    markers = []
-    for number, cluster in enumerate(clusters, start=1):
-        markers.append(
-            sphere_marker(
-                header,
-                'clusters',
-                number,
-                cluster.position,
-                max(2.0 * cluster.radius, 0.5 * size),
-                colour(1.0, 0.6, 0.0, 0.2 + 0.6 * min(cluster.mass, 1.0)),
-            )
+    markers = [
+        sphere_marker(
+            header,
+            'clusters',
+            number,
+            cluster.position,
+            max(2.0 * cluster.radius, 0.5 * size),
+            colour(1.0, 0.6, 0.0, 0.2 + 0.6 * min(cluster.mass, 1.0)),
         )
-    for target in found:
-        markers.append(
-            sphere_marker(header, 'found', target.id, target.position, size, colour(0.8, 0.0, 0.1))
-        )
+        for number, cluster in enumerate(clusters, start=1)
+    ]
+    red = colour(0.8, 0.0, 0.1)
+    markers += [sphere_marker(header, 'found', t.id, t.position, size, red) for t in found]
     return MarkerArray(markers=markers)
 
 
