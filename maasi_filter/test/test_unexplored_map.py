@@ -18,6 +18,7 @@ def test_nodes_stand_on_both_bounds():
         assert np.diff(axis).max() <= 12.0 + 1e-9
     assert exploration.values.shape == (10, 7, 4)
     assert (exploration.values == 1.0).all()
+    assert exploration.cell_volumes().sum() == pytest.approx(100.0 * 70.0 * 30.0)
 
 
 def test_update_is_equation_20_at_every_node():

@@ -9,7 +9,7 @@ from searches import floor_sensor, observe, play, same
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose
 from maasi_filter.ic_phd.filter import IcPhdFilter
-from maasi_filter.pmb.labels import LabelTally
+from maasi_filter.pmb.labels import MISREAD, LabelTally, associate_by_identity
 from maasi_filter.records import Label
 
 PAIR = np.array([[50.0, 50.0], [51.0, 50.0]])
@@ -105,3 +105,15 @@ def test_the_class_is_that_of_the_largest_sum_of_scores():
 def test_scores_are_refused_that_are_no_probability(score):
     with pytest.raises(ValueError, match=r'score: got .*allowed is 0 to 1'):
         Label('cup', score)
+
+
+@pytest.mark.parametrize(
+    ('identity', 'odds', 'known'),
+    [('', [1.0, 2.0, 3.0], False), ('a', [1.0, 0.0, 0.0], True), ('c', [0.0, 0.0, 3.0], False)],
+)
+def test_a_detection_is_of_the_component_of_its_identity_or_of_one_without(identity, odds, known):
+    tallies = [LabelTally('a'), LabelTally('b'), LabelTally()]
+    table, other = np.array([[1.0], [2.0], [3.0]]), np.ones(1)
+    assert associate_by_identity([Label(identity=identity)], tallies, table, other) == [known]
+    assert table.ravel().tolist() == odds
+    assert other[0] == (MISREAD if known else 1.0)

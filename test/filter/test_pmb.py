@@ -7,7 +7,7 @@ import pytest
 from exact_pmbm import ExactPmbm
 from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, plane_sensor
 
-from maasi_filter import FilterSettings, Pose, UnexploredMap, wrap_angle
+from maasi_filter import AgentMeasurement, FilterSettings, Pose, UnexploredMap, wrap_angle
 from maasi_filter.measurement_check import check_measurements
 from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.pmb.component import Component, is_known
@@ -215,7 +215,8 @@ def test_two_targets_three_metres_apart_stay_two():
 
 
 @pytest.mark.parametrize(
-    ('resolution', 'identities', 'repeated'), [(1.0, 'aa', 1), (0.0, 'aa', 0), (1.0, 'ab', 0)]
+    ('resolution', 'identities', 'repeated'),
+    [(1.0, 'aac', 1), (0.0, 'aac', 0), (1.0, 'abc', 0), (3.0, 'aaa', 2)],
 )
 def test_a_detection_that_comes_twice_is_one_by_the_resolution_of_the_sensor(
     resolution, identities, repeated
@@ -226,7 +227,7 @@ def test_a_detection_that_comes_twice_is_one_by_the_resolution_of_the_sensor(
     # Bearings on both sides of the same direction.
     values[:, 1] = wrap_angle(values[:, 1])
     member = measured(sensor, (60.0, 50.0), values)
-    member.labels = [Label(identity=name) for name in (*identities, 'c')]
+    member.labels = [Label(identity=name) for name in identities]
     assert plane_filter().step([member], 1, 0.0).dropped.get('repeated', 0) == repeated
 
 
@@ -331,3 +332,16 @@ def test_walking_targets_widen_and_spread_what_is_unexplored():
     np.testing.assert_allclose(after - before, 0.25 * 10.0 * np.eye(2), atol=0.6)
     assert search.exploration.values.sum() == pytest.approx(total, rel=1e-12)
     assert search.exploration.values.min() > 0.0
+
+
+def test_noise_of_a_camera_is_cartesian_next_to_the_robot():
+    sensor, search = plane_sensor(range_noise=0.1), plane_filter()
+    pose, place = Pose([50.0, 50.0, 1.0]), np.array([[50.002, 50.003]])
+    jacobian = sensor.measurement.jacobian(place, pose)
+    covariances = 0.005**2 * jacobian @ jacobian.swapaxes(1, 2)
+    values = sensor.measurement.measure(place, pose)
+    member = AgentMeasurement('robot', pose, sensor, values, covariances)
+    (checked,) = check_measurements([member], 1, 0.0, search._numbers, 2)
+    scan = make_scan(checked, 1.0, search.exploration, 3.0, 20_000, np.random.default_rng(0))
+    np.testing.assert_allclose(scan.means, place, atol=2e-4)
+    np.testing.assert_allclose(scan.covariances[0], 0.005**2 * np.eye(2), atol=2e-6)

@@ -95,6 +95,17 @@ def test_errors_of_positions_that_nobody_tells_of_are_learnt(seed):
     assert 'drone: detections of found targets are' in result.misfits['drone']
 
 
+def test_a_scan_that_an_error_of_the_position_explains_does_not_tell_the_noise():
+    search, _ = searched(0, scans=30)
+    member = checked(drawn(np.random.default_rng(1), 1.0, 1))
+    caused = np.array([[float(item.target is not None)] for item in search.components])
+    for blurred in (True, False):
+        learnt = Learnt()
+        learnt.count_found(member, search.components, caused, blurred)
+        assert learnt.fit[1] == 3.0
+        assert learnt.detections == (0.0 if blurred else 1.0)
+
+
 @pytest.mark.parametrize('noise', [DEGREES, RADIANS])
 def test_what_is_as_believed_is_no_misfit_and_no_error(noise):
     for seed in range(5):

@@ -110,3 +110,13 @@ def test_targets_that_are_withdrawn_are_marginalised():
     offsets._keep(['a', 'b'])
     assert offsets.keys == ['a', 'b']
     np.testing.assert_array_equal(offsets.covariance, part)
+
+
+def test_what_a_robot_reports_of_its_error_is_not_counted_twice():
+    offsets = Offsets(OffsetSettings(deviation=2.0), 3)
+    settings = FilterSettings(method='pmb').resolved()
+    measurement = scan(np.random.default_rng(0), 'a', np.zeros(3))
+    measurement.position_covariance = 5.0 * np.eye(3)
+    (member,) = check_measurements([measurement], 1, 0.0, settings, 3)
+    assert member.pose_error == pytest.approx(np.sqrt(5.0))
+    assert offsets.localise(member, [], 1e-9, 1e-9).pose_error == pytest.approx(1.0)
