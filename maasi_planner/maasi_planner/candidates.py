@@ -11,8 +11,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.models.detection import detection_probability_at
-from maasi_filter.models.pose import Pose
+from maasi_filter.models.detection import BOX, CUSTOM, detection_probability_at
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.unexplored_map import UnexploredMap, check_bounds
 from maasi_planner.objective.predicted_measurements import reach_of
@@ -268,7 +267,7 @@ def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
     headings = np.broadcast_to(yaws[..., None], places.shape[:3]).ravel()
     flat = places.reshape(-1, 3)
     sectors = np.zeros(len(flat), np.int64)
-    if viewer.yaw is None and _turns(viewer, size):
+    if viewer.yaw is None and _turns(viewer.sensor):
         sectors = np.round(headings / (math.pi / 8.0)).astype(np.int64) % 16
     cells = np.round(flat / (size / 100.0)).astype(np.int64)
     cells -= cells.min(axis=0)
@@ -278,20 +277,20 @@ def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
     return np.ascontiguousarray(flat[first]), np.ascontiguousarray(headings[first])
 
 
-def _turns(viewer: Viewer, size: float) -> bool:
-    """Return whether what the sensor sees depends on the heading."""
-    probe = np.array([[0.1, 0.03, 0.0], [-0.07, 0.11, 0.0], [0.02, -0.1, 0.0]])
-    probe = probe[:, : viewer.sensor.dimension]
-    detection = viewer.sensor.detection
-    ahead = Pose.from_yaw(np.zeros(3), 0.0)
-    return any(
-        not np.allclose(
-            detection.probability(probe * scale, ahead),
-            detection.probability(probe * scale, Pose.from_yaw(np.zeros(3), yaw)),
-        )
-        for scale in size * np.array([1e-2, 0.1, 0.3, 1.0, 3.0, 10.0])
-        for yaw in (0.7, 2.0, -1.5)
-    )
+def _turns(sensor: Sensor) -> bool:
+    """Return whether what a sensor sees may depend on the heading."""
+    kind, parameters = sensor.detection.kernel()
+    return kind == CUSTOM or (kind == BOX and bool(parameters[8] > 0.5))
+
+
+def half_view(sensor: Sensor) -> float:
+    """Return how far a sensor sees level to each side [m]: half its box, or F."""
+    kind, parameters = sensor.detection.kernel()
+    if kind == BOX:
+        low, high = parameters[1:3], parameters[4:6]
+        return 0.5 * float((high - low).min())
+    scale = float(parameters[1:3].max())
+    return 1.0 / scale if scale > 0.0 else math.inf
 
 
 def _parts(grid: UnexploredMap, seen: BoolArray) -> Unseen:

@@ -5,19 +5,17 @@ Used by the planner node and the in-process search (000, algorithms 1 and 2).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.detection import BOX
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap, default_spacing
-from maasi_planner.candidates import CandidateSet
+from maasi_planner.candidates import CandidateSet, half_view
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
@@ -393,14 +391,4 @@ def arrival_radius(motion: MotionModel, sensor: Sensor, planner: Planner) -> flo
         return given
     if planner.settings.objective == 'paper' or not planner.measures_underway:
         return 0.0
-    return min(motion.braking_distance(), _view(sensor))
-
-
-def _view(sensor: Sensor) -> float:
-    """Return how far a sensor sees level to each side [m]: half its box, or F."""
-    kind, parameters = sensor.detection.kernel()
-    if kind == BOX:
-        low, high = parameters[1:3], parameters[4:6]
-        return 0.5 * float((high - low).min())
-    scale = float(parameters[1:3].max())
-    return 1.0 / scale if scale > 0.0 else math.inf
+    return min(motion.braking_distance(), half_view(sensor))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
@@ -122,6 +122,19 @@ class TeamView:
     def planning(self) -> list[str]:
         """Return the names of the robots that plan now, in order."""
         return [name for name in self.names() if self.robots[name].planning]
+
+
+@dataclass
+class UsableCandidates:
+    """Candidates of one planning robot.
+
+    points (W, 3): waypoints, moved out of obstacles, metres; prediction: to them; allowed (W,):
+    which are reachable, not the present place, and apart from where others will stand.
+    """
+
+    points: FloatArray
+    prediction: Trajectories
+    allowed: BoolArray
 
 
 @dataclass

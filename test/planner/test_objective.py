@@ -11,6 +11,7 @@ from maasi_filter.models.detection import BoxDetection
 from maasi_planner import PlannerSettings, make_planner
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import free_of_robots, waiting_places
+from maasi_planner.team import UsableCandidates
 
 
 def built(team, settings):
@@ -29,7 +30,11 @@ def built(team, settings):
         & (trajectories[name].lengths > 0)
         for name in candidates
     }
-    objective = TeamObjective(team, settings, candidates, trajectories, allowed)
+    options = {
+        name: UsableCandidates(points, trajectories[name], allowed[name])
+        for name, points in candidates.items()
+    }
+    objective = TeamObjective(team, settings, options)
     return objective, candidates, trajectories, allowed
 
 

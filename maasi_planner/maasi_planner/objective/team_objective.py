@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.arrays import BoolArray, FloatArray, IntArray
-from maasi_planner.motion.base import Trajectories
+from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.objective.information import information_terms
 from maasi_planner.objective.joint_search import CandidateTable, search, total_value, values_given
 from maasi_planner.objective.paper import paper_terms
 from maasi_planner.objective.predicted_measurements import Ways, predicted, remaining_way
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import TeamView
+from maasi_planner.team import TeamView, UsableCandidates
 
 # Above this number of pairs of a candidate and another robot, reported values of candidates that
 # were not chosen neglect the other planning robots.
@@ -30,25 +29,22 @@ class TeamObjective:
     """Objective of all joint candidates at one step.
 
     team: the team; robots that do not plan count with the rest of their trajectories; settings:
-    weights; candidates (W, 3): waypoints of each planning robot, metres; trajectories: predicted
-    trajectories to the candidates; allowed (W,): admissible candidates; names: planning robots with
-    candidates, in order; start (R + 1,): where the candidates of each begin among all; table: all
-    candidates; measurements (G,): M of each candidate.
+    weights; options: candidates of the planning robots that have some; names: these, in order;
+    start (R + 1,): where the candidates of each begin among all; table: all candidates;
+    measurements (G,): M of each candidate.
     """
 
     def __init__(
         self,
         team: TeamView,
         settings: PlannerSettings,
-        candidates: Mapping[str, FloatArray],
-        trajectories: Mapping[str, Trajectories],
-        allowed: Mapping[str, BoolArray],
+        options: Mapping[str, UsableCandidates],
     ) -> None:
         self.settings = settings
         self.weights = weights = settings.weights()
-        self.names = names = [name for name in team.planning() if len(candidates[name])]
-        ways = [trajectories[name] for name in names]
-        counts = [len(candidates[name]) for name in names]
+        self.names = names = [name for name in team.planning() if name in options]
+        ways = [options[name].prediction for name in names]
+        counts = [len(options[name].points) for name in names]
         self.start = np.array([0, *counts]).cumsum()
         lengths = _all([way.lengths for way in ways], np.int64)
         horizon = int(lengths.max(initial=0))
@@ -82,8 +78,8 @@ class TeamObjective:
         self.table = CandidateTable(
             start=self.start,
             robot=planned.robot,
-            allowed=_all([allowed[name] for name in names], bool) & (lengths > 0),
-            waypoints=np.concatenate([np.zeros((0, 3)), *(candidates[name] for name in names)]),
+            allowed=_all([options[name].allowed for name in names], bool),
+            waypoints=np.concatenate([np.zeros((0, 3)), *(options[name].points for name in names)]),
             radii=np.array([view.radius for view in views], float),
             control=_all([way.control_cost for way in ways], float),
             norm=np.maximum(norm, 1e-9),

@@ -18,7 +18,6 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
     Planner,
-    UsableCandidates,
     all_apart,
     explain,
     in_bounds,
@@ -26,7 +25,15 @@ from maasi_planner.planners.base import (
     usable_options,
 )
 from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
+from maasi_planner.team import (
+    Decision,
+    RobotDecision,
+    RobotView,
+    TeamView,
+    UsableCandidates,
+    single_choice,
+    stay,
+)
 
 
 class Sequences:

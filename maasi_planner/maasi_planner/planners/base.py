@@ -6,7 +6,6 @@ import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,9 +15,15 @@ from pydantic import BaseModel
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
-from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, stay
+from maasi_planner.team import (
+    Decision,
+    RobotDecision,
+    RobotView,
+    TeamView,
+    UsableCandidates,
+    stay,
+)
 
 
 class Planner(ABC):
@@ -202,19 +207,6 @@ def free_of_robots(
     return free
 
 
-@dataclass
-class UsableCandidates:
-    """Candidates of one planning robot.
-
-    points (W, 3): waypoints, moved out of obstacles, metres; prediction: to them; allowed (W,):
-    which are reachable, not the present place, and apart from where others will stand.
-    """
-
-    points: FloatArray
-    prediction: Trajectories
-    allowed: BoolArray
-
-
 def options_of(
     team: TeamView,
     name: str,
@@ -240,12 +232,19 @@ def options_of(
     return 'no candidate can be reached'
 
 
-def usable_options(team: TeamView, decision: Decision) -> dict[str, UsableCandidates]:
-    """Return the candidates of the robots that have some; the others stay in `decision`."""
+def usable_options(
+    team: TeamView,
+    decision: Decision,
+    extra: Callable[[str], FloatArray | None] = lambda _: None,
+) -> dict[str, UsableCandidates]:
+    """Return the candidates of the robots that have some; the others stay in `decision`.
+
+    extra: further waypoints (n, 3) of a robot.
+    """
     places = waiting_places(team)
     options = {}
     for name in team.planning():
-        found = options_of(team, name, places)
+        found = options_of(team, name, places, extra(name))
         if isinstance(found, str):
             decision.robots[name] = stay(team.robots[name], f'stays: {found}')
         else:

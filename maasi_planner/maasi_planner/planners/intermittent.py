@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from maasi_filter.arrays import BoolArray, FloatArray, IntArray
-from maasi_planner.motion.base import Trajectories
+from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import (
     Planner,
     centres_of,
     explain,
-    options_of,
-    waiting_places,
+    usable_options,
 )
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
+from maasi_planner.team import (
+    Decision,
+    RobotDecision,
+    TeamView,
+    UsableCandidates,
+    single_choice,
+    stay,
+)
 
 
 class Intermittent(Planner):
@@ -32,28 +35,16 @@ class Intermittent(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        places = waiting_places(team)
-        candidates: dict[str, FloatArray] = {}
-        trajectories: dict[str, Trajectories] = {}
-        allowed: dict[str, BoolArray] = {}
         decision = Decision(step=team.step)
-        for name in team.planning():
-            options = options_of(team, name, places, self._centres(team, name))
-            if isinstance(options, str):
-                candidates[name] = np.zeros((0, 3))
-                decision.robots[name] = stay(team.robots[name], f'stays: {options}')
-            else:
-                candidates[name] = options.points
-                trajectories[name] = options.prediction
-                allowed[name] = options.allowed
-        objective = TeamObjective(team, self.settings, candidates, trajectories, allowed)
+        options = usable_options(team, decision, lambda name: self._centres(team, name))
+        objective = TeamObjective(team, self.settings, options)
         chosen, value, exact, work = objective.search()
         decision.objective = value if len(chosen) else 0.0
         decision.exact = exact
         decision.evaluated = work
         for index, name in enumerate(objective.names):
             decision.robots[name] = self._robot_decision(
-                team, name, objective, index, chosen, candidates[name], trajectories[name]
+                team, name, objective, index, chosen, options[name]
             )
         return explain(decision)
 
@@ -64,25 +55,23 @@ class Intermittent(Planner):
         objective: TeamObjective,
         index: int,
         chosen: IntArray,
-        points: FloatArray,
-        prediction: Trajectories,
+        option: UsableCandidates,
     ) -> RobotDecision:
         rows = slice(int(objective.start[index]), int(objective.start[index + 1]))
         terms = objective.given(index, chosen)
         weights = objective.weights
         if weights.information:
             gains = weights.alpha * terms[:, 0] + weights.beta * terms[:, 1]
-            possible = objective.table.allowed[rows]
-            self._prospects[name] = float(gains[possible].max(initial=0.0))
+            self._prospects[name] = float(gains[option.allowed].max(initial=0.0))
         if chosen[index] < 0:
             return stay(team.robots[name], 'stays: another robot is sent to every candidate')
         best = int(chosen[index] - objective.start[index])
         refinement, exploration, value = terms[best]
         reason = (
             f'J = {value:.4g} with T = {refinement:.4g}, E = {exploration:.4g} over '
-            f'{prediction.lengths[best]} steps, the best of {len(points)}'
+            f'{option.prediction.lengths[best]} steps, the best of {len(option.points)}'
         )
-        result = single_choice(points, prediction, best, reason)
+        result = single_choice(option.points, option.prediction, best, reason)
         result.target_refinement, result.exploration, result.objective = terms.T
         result.measurements = objective.measurements[rows]
         return result

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.detection import BOX
+from maasi_planner.candidates import half_view
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
@@ -64,16 +64,7 @@ class Lawnmower(Planner):
     def _spacing(self, team: TeamView) -> float:
         if self.settings.lane_spacing is not None:
             return self.settings.lane_spacing
-        widths = []
-        for name in team.names():
-            kind, parameters = team.robots[name].sensor.detection.kernel()
-            if kind == BOX:
-                widths.append(
-                    float(min(parameters[4] - parameters[1], parameters[5] - parameters[2]))
-                )
-            else:
-                scale = parameters[1:3]
-                widths.append(2.0 / float(scale.max()) if scale.max() > 0.0 else math.inf)
+        widths = [2.0 * half_view(view.sensor) for view in team.robots.values()]
         finite = [width for width in widths if math.isfinite(width)]
         size = float((team.bounds[:, 1] - team.bounds[:, 0]).max())
         return max(min([*finite, size]), size / 1000.0)
