@@ -109,14 +109,8 @@ def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: 
         None,
     )
     names = sorted(result.measurements)
-    columns: dict[str, Any] = {
-        'step': [item.step for item in progress],
-        'time': [item.time for item in progress],
-        'measurements': [item.measurements for item in progress],
-        'found': [item.found for item in progress],
-        'true_found': [item.true_found for item in progress],
-        'rmse': [item.rmse for item in progress],
-    }
+    kinds = ('step', 'time', 'measurements', 'found', 'true_found', 'rmse')
+    columns: dict[str, Any] = {kind: [getattr(item, kind) for item in progress] for kind in kinds}
     for name in names:
         places = np.array([item.positions[name] for item in progress]).reshape(-1, 3)
         for axis, values in zip('xyz', places.T):
