@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,20 +20,12 @@ def distance(position: FloatArray, covariance: FloatArray, target: FoundTarget) 
     return float(squared_distance(position - target.position, covariance + target.covariance))
 
 
+@dataclass
 class FoundTargets:
-    """Found targets of a filter: its own, and those of the filters of other robots.
+    """Found targets of a filter: its own, and those of the filters of other robots."""
 
-    Attributes
-    ----------
-    targets : list of FoundTarget
-        In the order of being found.
-    last_id : int
-        Largest id given so far.
-    """
-
-    def __init__(self, targets: Sequence[FoundTarget] = (), last_id: int = 0) -> None:
-        self.targets = list(targets)
-        self.last_id = max([last_id, *(target.id for target in targets)])
+    targets: list[FoundTarget] = field(default_factory=list)  # In the order of being found
+    last_id: int = 0  # Largest id given so far
 
     def next_id(self) -> int:
         """Return the id of the next found target."""

@@ -54,24 +54,12 @@ def add_folders(folders: Iterable[str | Path]) -> list[str]:
 
 @dataclass(frozen=True)
 class PluginGroup:
-    """Classes of one kind: those of the suite, of installed packages, and `module:Class`.
+    """Classes of one kind: those of the suite, of installed packages, and `module:Class`."""
 
-    Parameters
-    ----------
-    group : str
-        Name of the group of entry points.
-    what : str
-        What one of them is called in messages.
-    base : str
-        Class that all are subclasses of, as `module:Class`.
-    own : mapping
-        Those of the suite: name to `module:Class`.
-    """
-
-    group: str
-    what: str
-    base: str
-    own: Mapping[str, str] = field(hash=False)
+    group: str  # Name of the group of entry points
+    what: str  # What one of them is called in messages
+    base: str  # Class that all are subclasses of, as `module:Class`
+    own: Mapping[str, str] = field(hash=False)  # Those of the suite: name to `module:Class`
 
     def names(self) -> list[str]:
         """Return all names: the suite's, then those of installed packages."""

@@ -181,7 +181,7 @@ def test_papers_remove_the_closest_and_003_every_detection():
 
 
 def test_targets_kept_over_a_restart_keep_their_ids_unless_taken():
-    known = FoundTargets(found_at([0.0, 0.0]))
+    known = FoundTargets(found_at([0.0, 0.0]), 1)
     same, other = found_at([0.1, 0.0], [40.0, 0.0])
     assert known.keep([same]) == []
     added = known.keep([other, FoundTarget(1, np.full(2, 80.0), np.eye(2), 'own', 0, 1.0)])

@@ -61,7 +61,7 @@ class IcPhdFilter(SearchFilter):
         'particles': FloatArray,
         'weights': FloatArray,
         '_centres': FloatArray,
-        'found_targets': list[FoundTarget],
+        '_found': FoundTargets,
     }
 
     def __init__(
@@ -80,10 +80,6 @@ class IcPhdFilter(SearchFilter):
     def found_targets(self) -> list[FoundTarget]:
         """Targets found so far, in the order of being found."""
         return self._found.targets
-
-    @found_targets.setter
-    def found_targets(self, targets: list[FoundTarget]) -> None:
-        self._found = FoundTargets(targets)
 
     @property
     def expected_number(self) -> float:
