@@ -17,8 +17,12 @@ POSE = Pose([4.0, -3.0, 12.0], [0.9, 0.05, -0.1, 0.42])
 TARGETS = np.array([[9.0, 1.0, 5.0], [-3.0, -9.0, 2.0], [4.5, -2.5, 30.0]])
 
 
+# Of the deviations of the attitude, along the axes of the map.
+AXES = np.array([1.5, 0.5, 1.0])
+
+
 def stamped(pose=POSE, attitude=0.0):
-    covariance = np.diag([0.0, 0.0, 0.0, *[attitude**2] * 3])
+    covariance = np.diag([0.0, 0.0, 0.0, *(attitude * AXES) ** 2])
     return StampedPose(0, pose, covariance)
 
 
@@ -59,7 +63,7 @@ def test_covariances_are_those_of_many_sweeps(dimension, attitude):
         values = []
         for _ in range(number // 20):
             # The sensor is turned a little more than its pose says.
-            error = rotation_from_rpy(*generator.normal(0.0, attitude or 1e-12, 3))
+            error = rotation_from_rpy(*attitude * AXES * generator.normal(size=3))
             turned = POSE.position + (TARGETS[[index]] - POSE.position) @ error
             noisy = sweep_of(turned) + generator.normal(size=(20, 3)) * sigma
             values.append(mounted.measurements(noisy, stamped())[0])

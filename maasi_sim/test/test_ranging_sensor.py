@@ -61,6 +61,9 @@ def test_the_order_tells_nothing_and_values_stay_in_their_ranges():
         60 < sum(causes.tolist().index(0) < causes.tolist().index(1) for _, causes in sweeps) < 240
     )
     in_range(np.concatenate([values for values, _ in sweeps]))
+    played.sensor.maximum_range = 15.0
+    short = RangingSensor(played.sensor, targets, 1, 'drone')
+    assert {cause for step in range(9) for cause in short.measure(POSE, step)[1]} == {0, 2, 3}
     empty = RangingSensor(sensor(), np.zeros((0, 3)), 1, 'drone')
     assert empty.measure(POSE, 0)[0].shape == (0, 3)
 

@@ -186,7 +186,7 @@ def test_bad_odometry_is_counted_and_nothing_else(play):
 
 
 def test_a_jump_of_the_stamps_begins_anew(play):
-    _, team = play()
+    driver, team = play()
     team.step = 99
     team.move()
     _, result = team.send_accepted([1.5, 1.5, 0.0])
@@ -197,6 +197,11 @@ def test_a_jump_of_the_stamps_begins_anew(play):
     team.until(result.done)
     assert result.result().status == GoalStatus.STATUS_ABORTED
     assert 'back' in result.result().result.reason
+    # Of a clock that jumps the driver hears without odometry: its pose is unknown until some comes.
+    driver.reset()
+    assert 'the robot cannot go on: no odometry' in team.refused([1.0, 1.0, 0.0])
+    team.move()
+    assert team.takes([1.0, 1.0, 0.0], live=team.move)
 
 
 # ---- measurements ----------------------------------------------------------------------------
