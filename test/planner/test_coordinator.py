@@ -69,6 +69,15 @@ def test_who_arrives_plans_alone_and_starts_its_period_anew():
     assert [item.robot for item in coordinator.measuring(10, robots)] == ['a']
 
 
+def test_a_planner_is_told_where_the_others_go_and_when_they_measure_next():
+    coordinator = make()
+    coordinator.plan(0, there(a=(1.0, 1.0), b=(9.0, 9.0)))
+    robots = {**there(a=(2.0, 2.0)), **there(free=False, b=(8.5, 8.5))}
+    view = coordinator._team(6, robots, ['a'], ()).robots['b']
+    assert view.phase == 2
+    assert view.remaining_path == pytest.approx(coordinator.path('b')[6:])
+
+
 def test_a_measurement_waits_for_an_image():
     coordinator = make()
     robots = there(a=(1.0, 1.0), b=(9.0, 9.0))
