@@ -48,9 +48,13 @@ class MeasurementModel:
         """
         x, y, z = self._offsets(positions, pose)
         level = np.hypot(x, y)
-        # atan2 is the arcsin of (9), and keeps its digits next to the vertical.
-        values = [np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)]
-        return np.stack(values[: self.dimension], axis=1)
+        values = np.empty((len(x), self.dimension))
+        values[:, 0] = np.hypot(level, z)
+        values[:, 1] = np.arctan2(y, x)
+        if self.dimension == 3:
+            # That is the arcsin of (9), and keeps its digits next to the vertical.
+            values[:, 2] = np.arctan2(z, level)
+        return values
 
     def inverse(self, z: ArrayLike, pose: Pose) -> FloatArray:
         """Return the positions (n, d) [m, map] that measurements (n, d) point at.
@@ -58,13 +62,15 @@ class MeasurementModel:
         A negative range, which noise can produce, points the opposite way.
         """
         values = self._array('z', z)
-        bearing, up = values[:, 1], np.zeros(len(values))
+        distance, bearing = values[:, 0], values[:, 1]
+        positions = np.empty(values.shape)
+        direction = 1.0
         if self.dimension == 3:
-            up = values[:, 2]
-        level = np.cos(up)
-        direction = [level * np.cos(bearing), level * np.sin(bearing), np.sin(up)]
-        offset = values[:, :1] * np.stack(direction[: self.dimension], axis=1)
-        return np.asarray(pose.position[: self.dimension] + offset)
+            direction = np.cos(values[:, 2])
+            positions[:, 2] = distance * np.sin(values[:, 2])
+        positions[:, 0] = distance * (direction * np.cos(bearing))
+        positions[:, 1] = distance * (direction * np.sin(bearing))
+        return positions + pose.position[: self.dimension]
 
     def jacobian(self, positions: ArrayLike, pose: Pose) -> FloatArray:
         """Return dg/dx, shape (n, d, d).
@@ -77,14 +83,15 @@ class MeasurementModel:
         distance = np.hypot(level, z)
         safe = np.where(distance > 0.0, distance, np.inf)
         safe_level = np.where(level > 0.0, level, np.inf)
-        zero = np.zeros(len(x))
-        rows = [
-            [x / safe, y / safe, z / safe],
-            [-y / safe_level**2, x / safe_level**2, zero],
-            [-x * z / (safe**2 * safe_level), -y * z / (safe**2 * safe_level), level / safe**2],
-        ]
-        d = self.dimension
-        return np.moveaxis(np.array([row[:d] for row in rows[:d]]), 2, 0).copy()
+        matrix = np.zeros((len(x), self.dimension, self.dimension))
+        matrix[:, 0, 0], matrix[:, 0, 1] = x / safe, y / safe
+        matrix[:, 1, 0], matrix[:, 1, 1] = -y / safe_level**2, x / safe_level**2
+        if self.dimension == 3:
+            matrix[:, 0, 2] = z / safe
+            matrix[:, 2, 0] = -x * z / (safe**2 * safe_level)
+            matrix[:, 2, 1] = -y * z / (safe**2 * safe_level)
+            matrix[:, 2, 2] = level / safe**2
+        return matrix
 
     def residual(self, z: ArrayLike, predicted: ArrayLike) -> FloatArray:
         """Return z - predicted with the bearing wrapped; shapes broadcast, last axis d."""

@@ -186,9 +186,10 @@ class PmbFilter(SearchFilter):
         count_unexplained(scan.centres[alone], self.bounds, result.dropped)
         # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
         radius = self._found_radius(blurred)
+        detected = (caused.sum(axis=1) > 0.5).tolist()
         for i, (item, view) in enumerate(zip(self.components, seen)):
             moved = item.update(view, missed[i], caused[i], scan, self.generator)
-            if caused[i].sum() > 0.5 and not item.foreign:
+            if detected[i] and not item.foreign:
                 item.pose_error, item.found_radius = blurred.pose_error, radius
             if item.target is not None:
                 self._keep_or_withdraw(item)
@@ -252,7 +253,8 @@ class PmbFilter(SearchFilter):
         if self._offsets.active:
             covariance += self._offsets.covariance_of(target.id)
         mean, label = item.density.mean.copy(), item.labels.label
-        return replace(target, position=mean, covariance=covariance, label=label)
+        by = target.robot, target.measurement, target.time
+        return FoundTarget(target.id, mean, covariance, *by, label=label)
 
     def _estimate_found(self) -> None:
         """Estimate the found targets whose densities have changed in this step."""

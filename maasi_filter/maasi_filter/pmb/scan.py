@@ -140,8 +140,9 @@ def make_scan(
     volume *= probability.reshape(count, number)
     weights = np.maximum(exploration.at(flat), LEAST_UNEXPLORED).reshape(count, number) * volume
     means, spreads = np.empty((count, d)), np.empty((count, d, d))
+    even = np.full(number, 1.0 / number)
     for j in range(count):
-        fill_moments(draws[j], np.full(number, 1.0 / number), means[j], spreads[j])
+        fill_moments(draws[j], even, means[j], spreads[j])
     return Scan(
         head,
         terms,
