@@ -250,12 +250,15 @@ def test_found_target_that_is_missed_again_and_again_is_withdrawn(misses, existe
     assert search.found_targets == []
 
 
-def test_one_detection_alone_is_no_found_target_however_precise():
-    sensor = plane_sensor(range_noise=0.02, bearing=0.0005)
-    search = plane_filter(particles=300, expected_targets=1000.0)
+def test_one_detection_alone_is_no_found_target_however_certain():
+    sensor = plane_sensor()
+    search = plane_filter(particles=300, expected_targets=1000.0, found_radius=50.0)
     value = sensor.measurement.measure(TARGET, Pose(np.array(PLACES[0])))
-    for step, found in enumerate((0, 1)):
-        search.step([measured(sensor, PLACES[0], value, step)], 1, step)
+    # The second scan, from far away, hardly tells anything.
+    for step, (place, values, found) in enumerate(
+        [(PLACES[0], value, 0), ((0.0, 99.0), [], 0), (PLACES[0], value, 1)]
+    ):
+        search.step([measured(sensor, place, values, step)], 1, step)
         assert search.components[0].existence > 0.99
         assert len(search.found_targets) == found
 

@@ -64,7 +64,7 @@ class MeasurementModel:
         values = self._array('z', z)
         distance, bearing = values[:, 0], values[:, 1]
         positions = np.empty(values.shape)
-        direction = 1.0
+        direction: FloatArray | float = 1.0
         if self.dimension == 3:
             direction = np.cos(values[:, 2])
             positions[:, 2] = distance * np.sin(values[:, 2])
