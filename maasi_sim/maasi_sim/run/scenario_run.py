@@ -89,8 +89,6 @@ class ScenarioRun:
                 'a robot of the scenario'
             )
         self.display = ProgressDisplay()
-        self._scenario = self.mission.scenario
-        self._limits = self._scenario.limits
         self._bag: BagWriter | None = None
         #: Errors of writing.
         self.unwritten: list[str] = []
@@ -110,6 +108,8 @@ class ScenarioRun:
             self.folder = make_folder(options.out)
             os.environ.update(domain.environment())
             self.mission.prepare()
+            self._scenario = self.mission.scenario
+            self._limits = self._scenario.limits
             self.supervisor = Supervisor(
                 self._plan(), self.mission.scenario, options, self.folder, self.display
             )
