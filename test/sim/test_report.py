@@ -312,6 +312,10 @@ def test_updates_alone_tell_what_was_found_and_refined_positions_win(run):
     run.update(0.6)
     (found,) = run.record().tally.found
     assert found.position[0] == pytest.approx(0.501)
+    # A filter that was restarted publishes its last update again.
+    run.batch -= 1
+    run.update(0.6)
+    assert run.observer.measurements == 2
 
 
 def test_completeness_that_is_lost_again_does_not_count(tmp_path):
