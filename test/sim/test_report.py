@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from geometry_msgs.msg import Point
+from matplotlib.colors import to_hex
 from rclpy.serialization import serialize_message
 from report_check import check_report
 
@@ -420,10 +421,10 @@ def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(ru
     (sigma,) = [label for label in labels if 'sigma' in label]
     assert 'drawn at least' in sigma
     world = figure.axes[0]
-    widths = sorted(
-        patch.width for patch in world.patches if hasattr(patch, 'angle') and 'Ell' in repr(patch)
-    )
-    assert widths == pytest.approx([2 * 0.012 * 2.0, 2 * 3 * 0.1])
+    drawn = [patch for patch in world.patches if 'Ell' in repr(patch)]
+    widths = {to_hex(patch.get_edgecolor()): patch.width for patch in drawn}
+    small, large = pytest.approx(2 * 0.012 * 2.0), pytest.approx(2 * 3 * 0.1)
+    assert widths == {'#d62728': small, '#7b3294': large}
     (missed,) = [line for line in world.lines if line.get_label() == 'missed']
     assert sorted(zip(*missed.get_data())) == [(1.0, 1.5), (1.5, 0.5)]
 
