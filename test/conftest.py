@@ -25,8 +25,7 @@ def domain(monkeypatch):
         for name, value in reserved.environment().items():
             monkeypatch.setenv(name, value)
         yield reserved
-        # The actions and the life cycle of a destroyed node are held by cycles; until they are
-        # collected, the next test in this domain sees them in the graph.
+        # See `own_context`.
         gc.collect()
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from own_context import own_context
 from rcl_interfaces.msg import Log
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -31,7 +31,6 @@ from maasi_msgs.msg import (
     FoundTargetArray,
     MeasurementBatch,
 )
-from maasi_sim.run.domain import Domain
 
 BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}
 NOISE = {'range': 0.01, 'bearing': 0.03}
@@ -96,9 +95,7 @@ class Team:
 @contextmanager
 def running(**changes):
     """Run a node with the team around it; yield both, and how to wait for something."""
-    with Domain(None) as domain:
-        context = Context()
-        rclpy.init(context=context, domain_id=domain.number)
+    with own_context() as context:
         settings = SETTINGS.model_copy(update=changes)
         node = FilterNode(context=context, parameter_overrides=overrides(settings))
         team = Team(context)
@@ -124,7 +121,6 @@ def running(**changes):
             other.shutdown()
             node.destroy_node()
             team.node.destroy_node()
-            rclpy.shutdown(context=context)
 
 
 @pytest.fixture

@@ -1,17 +1,17 @@
 """A planner, two real drivers and the robots that they drive, over real topics."""
 
+import gc
 import os
 import time
 from contextlib import contextmanager
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from own_context import own_context
 from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -30,7 +30,6 @@ from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import AgentState, FilterUpdate, PlanDecision
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planner_node import PlannerNode
-from maasi_sim.run.domain import Domain
 
 STEP = 0.05
 # Wall time of a step of the robots, where odometry is lost at most [s].
@@ -106,11 +105,9 @@ class Robot:
 class World:
     """The planner (`planner`), the robots (by name in `robots`), and a client of both."""
 
-    def __init__(self, domain, settings):
-        self.domain = domain
+    def __init__(self, context, settings):
+        self.context, self.domain = context, context.get_domain_id()
         self.environment = dict(os.environ)
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain)
         self.settings = settings
         self.node = Node('world', context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
@@ -160,7 +157,9 @@ class World:
     def end_planner(self):
         self.planner.destroy_node()
         self.own.shutdown()
-        self.planner = None
+        self.planner = self.own = None
+        # See `own_context`.
+        gc.collect()
 
     def _take_log(self, message):
         self.logs.append(message.msg)
@@ -248,15 +247,14 @@ class World:
         for driver in self.drivers:
             driver.destroy_node()
         self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
 
 
 @contextmanager
 def driven(**changes):
     """Run a planner with two drivers and their robots."""
-    with Domain(None) as domain:
+    with own_context() as context:
         settings = SETTINGS.model_copy(update={'others': {}, 'filter_timeout': 0.0, **changes})
-        world = World(domain.number, settings)
+        world = World(context, settings)
         try:
             yield world
         finally:

@@ -1,10 +1,9 @@
 """The planner of buildings moves its robot only after `start`, and stops it by the services."""
 
 import pytest
-import rclpy
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
+from own_context import own_context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -18,7 +17,6 @@ from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.msg import AgentState, CuboidDecision, SearchLink, SearchLinkArray
 from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
 from maasi_planner.buildings.settings import CuboidPlannerSettings
-from maasi_sim.run.domain import Domain
 
 SETTINGS = CuboidPlannerSettings.model_validate(
     {
@@ -117,16 +115,13 @@ class Flight:
 
 @pytest.fixture
 def flight():
-    with Domain(None) as domain:
-        context = Context()
-        rclpy.init(context=context, domain_id=domain.number)
+    with own_context() as context:
         flight = Flight(context)
         yield flight
         flight.own.shutdown()
         flight.executor.shutdown()
         flight.planner.destroy_node()
         flight.node.destroy_node()
-        rclpy.shutdown(context=context)
 
 
 def test_a_robot_among_buildings_moves_only_while_it_searches(flight):

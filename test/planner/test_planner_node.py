@@ -5,12 +5,11 @@ from contextlib import contextmanager
 from functools import partial
 
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped
+from own_context import own_context
 from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient, ActionServer, GoalResponse
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -32,7 +31,6 @@ from maasi_msgs.msg import (
 )
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
-from maasi_sim.run.domain import Domain
 
 ROBOTS = ('a', 'b')
 START = {'a': (0.5, 0.5), 'b': (1.5, 1.5)}
@@ -158,9 +156,7 @@ class Team:
 @contextmanager
 def running(**changes):
     """Run a node with the team around it; yield both, and how to wait for something."""
-    with Domain(None) as domain:
-        context = Context()
-        rclpy.init(context=context, domain_id=domain.number)
+    with own_context() as context:
         settings = SETTINGS.model_copy(update=changes)
         parameters = [Parameter(name, value=value) for name, value in flatten(settings).items()]
         node = PlannerNode(context=context, parameter_overrides=parameters)
@@ -186,7 +182,6 @@ def running(**changes):
             own.shutdown()
             other.shutdown()
             team.node.destroy_node()
-            rclpy.shutdown(context=context)
 
 
 @pytest.fixture
@@ -357,16 +352,11 @@ def test_a_search_of_no_finite_time_is_refused(world):
 )
 def test_wrong_parameters_are_refused_by_name(name, value):
     flat = {**flatten(SETTINGS), name: value}
-    with Domain(None) as domain:
-        context = Context()
-        rclpy.init(context=context, domain_id=domain.number)
-        try:
-            node = PlannerNode(
-                context=context,
-                parameter_overrides=[Parameter(key, value=item) for key, item in flat.items()],
-            )
-            assert node.trigger_configure().name == 'FAILURE'
-            assert f'parameter {name}' in node.problem
-            node.destroy_node()
-        finally:
-            rclpy.shutdown(context=context)
+    with own_context() as context:
+        node = PlannerNode(
+            context=context,
+            parameter_overrides=[Parameter(key, value=item) for key, item in flat.items()],
+        )
+        assert node.trigger_configure().name == 'FAILURE'
+        assert f'parameter {name}' in node.problem
+        node.destroy_node()
