@@ -83,7 +83,9 @@ class LinkedFlight:
         return self.team.state.goal_status if self.team.states else None
 
     def until(self, condition, what=''):
-        self.team.until(condition, what or f'{self.doing}, {self.status}, {self.reason!r}')
+        self.team.until(
+            condition, what or (lambda: f'{self.doing}, {self.status}, {self.reason!r}')
+        )
 
     def call(self, name):
         return self.team.call(name, self.until)

@@ -48,7 +48,7 @@ def drone_camera(**changes: object) -> CameraSettings:
 
 
 def hard_floor(seed: int) -> RenderSettings:
-    """Return light and distractors of one sequence, drawn anew for each seed."""
+    """Return light and distractors of one sequence, drawn for each seed."""
     generator = np.random.default_rng([seed, 77])
     return RenderSettings.model_validate(
         {

@@ -339,7 +339,9 @@ def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
     with flight.lock:
         autopilot.charge = 0.15
     flight.gives_up(result, 'battery at 0.15, below 0.20')
-    flight.until(lambda: autopilot.mode_name == 'LAND')
+    # Until then the driver asks for the mode again, over a pilot who takes another one.
+    flight.until(lambda: flight.driver.link._link.vehicle.at_rest)
+    assert autopilot.mode_name == 'LAND'
     # It lands again once a pilot who took it over gives it back.
     with flight.lock:
         autopilot.take_mode('LOITER')

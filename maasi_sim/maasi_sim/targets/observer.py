@@ -122,7 +122,7 @@ class TargetObserver(Observer):
         """See `Observer.record`."""
         tally = self._tally
         if self._history:
-            # Several filters in the order of steps and names, whoever spoke first.
+            # Several filters in the order of steps and names, not in that of arrival.
             tally = Tally(self.scenario, self.world, self)
             self._history.sort(key=lambda item: (item[1].step, item[0], item[1].batch_id))
             for space, update, found in self._history:

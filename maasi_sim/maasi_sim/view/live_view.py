@@ -1,4 +1,4 @@
-"""The page of a run that goes on, of its messages, and of a search in this process."""
+"""The page of a running run, of its messages, and of a search in this process."""
 
 from __future__ import annotations
 
