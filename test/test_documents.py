@@ -103,6 +103,15 @@ def test_names_of_the_glossary_stand_in_their_files() -> None:
             assert re.search(rf'\b{name}\b', sources), f'{name} is not in {files}'
 
 
+def test_tests_that_documents_name_exist() -> None:
+    files = [*ROOT.glob('test/**/*.py'), *ROOT.glob('maasi_*/test/*.py')]
+    known = {path.stem for path in files}
+    known |= {name for path in files for name in re.findall(r'def (test_\w+)', path.read_text())}
+    for document in DOCUMENTS:
+        named = set(re.findall(r'\btest_[a-z0-9_]+', document.read_text()))
+        assert named <= known, document
+
+
 def test_numbers_of_the_claims_are_those_of_the_experiments() -> None:
     whole = (ROOT / 'docs' / 'reproduction.md').read_text()
     lines = (ROOT / 'docs' / 'claims.md').read_text().splitlines()

@@ -193,6 +193,22 @@ def test_domains_that_do_not_exist_are_refused():
             Domain(number)
 
 
+def test_a_domain_is_locked_without_a_file():
+    """In a shared folder another user could have put a link in the place of one."""
+    code = (
+        'import os, sys\n'
+        'from maasi_sim.run.domain import Domain\n'
+        'def note(event, words):\n'
+        "    made = event == 'open' and isinstance(words[2], int) and words[2] & os.O_CREAT\n"
+        "    if made or event in ('os.mkdir', 'os.chmod', 'os.link', 'os.symlink'):\n"
+        '        print(event, *words)\n'
+        'sys.addaudithook(note)\nDomain().release()\n'
+    )
+    command = [sys.executable, '-B', '-c', code]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.stdout == ''
+
+
 def test_a_domain_with_other_nodes_is_left_to_them():
     with Domain() as domain:
         number = domain.number

@@ -20,6 +20,7 @@ from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.run_record import RunEnd
+from maasi_sim.run.topics import STEP
 
 RELIABLE = QoSProfile(
     history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE
@@ -137,6 +138,27 @@ def test_the_share_explored_is_that_of_the_planners_diagnostics(session):
         publisher.publish(DiagnosticArray(status=[status]))
         faults = {} if level == DiagnosticStatus.OK else {'/planner_node': 'refused'}
         session.until(lambda faults=faults: session.recorder.faults == faults)
+
+
+@pytest.mark.parametrize(
+    ('joined', 'first', 'gaps'),
+    [
+        (False, {'step': 0, 'state': 0}, []),
+        (False, {'step': 0, 'state': 6}, ['the recording lacks the first 6.0 s of /rover/state']),
+        (False, {'step': 0}, ['the recording lacks /rover/state']),
+        (True, {'step': 30, 'state': 31}, []),
+        (True, {'step': 30, 'state': 36}, ['the recording lacks the first 6.0 s of /rover/state']),
+        # Without any step its robots are unknown.
+        (True, {}, ['the recording lacks /lockstep/step']),
+    ],
+)
+def test_topics_of_each_step_that_are_missing_or_begin_late_are_gaps(session, joined, first, gaps):
+    recorder = session.recorder
+    topics = {'step': STEP, 'state': '/rover/state'}
+    recorder.first = {topics[name]: time * 10**9 for name, time in first.items()}
+    recorder.robots = ['rover'] if first else []
+    recorder.time = 40 * 10**9
+    assert recorder.gaps(joined, patience=5.0) == gaps
 
 
 def test_a_state_of_the_last_step_counts_also_after_the_end(session):

@@ -338,6 +338,30 @@ class Recorder:
             if not self.bag.failed:
                 raise
 
+    def gaps(self, joined: bool, patience: float) -> list[str]:
+        """
+        Return what the recording lacks of the topics with a message at each step.
+
+        Parameters
+        ----------
+        joined : bool
+            Whether the clock ran before the run.
+        patience : float
+            Longest time that a recorded topic may begin late [s].
+        """
+        topics = [STEP, *(f'/{name}/state' for name in self.robots)]
+        times = [self.first.get(topic, self.time) for topic in topics]
+        begin = min(times) if joined else 0
+        gaps = []
+        for topic, time_ in zip(topics, times):
+            missed = (time_ - begin) * 1e-9
+            # Without a step the robots and the beginning are unknown.
+            if topic not in self.first and (topic == STEP or missed > patience):
+                gaps.append(f'the recording lacks {topic}')
+            elif missed > patience:
+                gaps.append(f'the recording lacks the first {missed:.1f} s of {topic}')
+        return gaps
+
     def finish(self) -> None:
         """Keep only messages of the steps so far and of the shutdown from now on."""
         self._finished = True

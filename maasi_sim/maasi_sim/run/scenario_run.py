@@ -40,7 +40,6 @@ from maasi_sim.run.run_options import Options, ViewOptions
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
-from maasi_sim.run.topics import STEP
 from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning, to_yaml
 from maasi_sim.view.live_view import RunPage
 from maasi_sim.view.messages import read_events
@@ -199,16 +198,8 @@ class ScenarioRun:
         recorder, options = self.recorder, self.options
         if not options.record or self.ending.code not in (DONE, NOT_ALL_FOUND):
             return
-        topics = [STEP, *(f'/{name}/state' for name in recorder.robots)]
-        times = [recorder.first.get(topic, recorder.time) for topic in topics]
-        begin = min(times) if options.follow_clock or self._scenario.external_clock else 0
-        for topic, time_ in zip(topics, times):
-            missed = (time_ - begin) * 1e-9
-            if missed <= _CONNECTION_PATIENCE * (options.rate or 1.0):
-                continue
-            gap = f'the recording lacks the first {missed:.1f} s of {topic}'
-            if topic not in recorder.first:
-                gap = f'the recording lacks {topic}'
+        follows = options.follow_clock or self._scenario.external_clock
+        for gap in recorder.gaps(follows, _CONNECTION_PATIENCE * (options.rate or 1.0)):
             self.unwritten.append(gap)
             self.supervisor.events.append(
                 {'time': recorder.elapsed, 'node': 'recorder', 'event': 'gap', 'reason': gap}
