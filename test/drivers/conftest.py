@@ -114,9 +114,9 @@ def process(context, tmp_path):
     """Return a function that starts a driver as a process of its own."""
     running = []
 
-    def start(environment=None, program=('turtlebot_driver',), **changes):
+    def start(environment=None, program=('turtlebot_driver',), settings=TURTLEBOT, **changes):
         file = tmp_path / 'parameters.yaml'
-        flat = flatten(DriverSettings.model_validate(TURTLEBOT | changes))
+        flat = flatten(DriverSettings.model_validate(settings | changes))
         file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
         command = [*program, '--ros-args', '--remap', '__ns:=/rover', '--params-file', str(file)]
         running.append(subprocess.Popen(command, env=os.environ | (environment or {})))

@@ -23,15 +23,8 @@ _SERVICES = {
     'fd21': ('fd22', 'fd23', 'fd24'),
     'fd51': ('fd52', 'fd53', 'fd54'),
 }
+_HANDLES = {name: 10 + 3 * n for n, name in enumerate(sum(_SERVICES.values(), ()))}
 _STEP = 0.02
-
-
-class BTLEException(Exception):
-    pass
-
-
-class DefaultDelegate:
-    pass
 
 
 def part(name, **methods):
@@ -40,23 +33,20 @@ def part(name, **methods):
 
 
 class Peripheral:
-    """The radio, and a drone in real time at its other end: `firmware`, set by a test.
+    """The radio, and a drone in real time at its other end: `firmware`, set by `BluetoothMambo`.
 
-    While `cut` nothing gets through; a write without response then still succeeds. `heard` has
+    While `lost` nothing gets through; a write without response then still succeeds. `heard` has
     channel and command of what came through.
     """
 
     firmware = None
-    cut = False
+    lost = False
     heard: ClassVar[list] = []
 
     def __init__(self):
-        self._delegate = None
         self._waiting = queue.Queue()
         self._lock = threading.Lock()
         self._sequence = 0
-        names = [name for group in _SERVICES.values() for name in group]
-        self._handles = {name: 10 + 3 * number for number, name in enumerate(names)}
         self._said = None
         self._ended = threading.Event()
 
@@ -64,7 +54,6 @@ class Peripheral:
         threading.Thread(target=self._live, daemon=True).start()
 
     def disconnect(self):
-        self._delegate = None
         self._ended.set()
 
     def getServices(self):
@@ -74,7 +63,7 @@ class Peripheral:
         ]
 
     def _characteristic(self, name):
-        handle = self._handles[name]
+        handle = _HANDLES[name]
         return part(name, handle=handle, getHandle=lambda: handle, write=partial(self.hear, name))
 
     def writeCharacteristic(self, handle, data):
@@ -88,7 +77,7 @@ class Peripheral:
             name, data = self._waiting.get(timeout=timeout)
         except queue.Empty:
             return False
-        self._delegate.handleNotification(self._handles[name], data)
+        self._delegate.handleNotification(_HANDLES[name], data)
         return True
 
     # ---- the drone ---------------------------------------------------------------------------
@@ -110,12 +99,12 @@ class Peripheral:
             self._notify('fb0e', struct.pack('<BBHB', 0, 5, 1, said[1]))
 
     def _notify(self, name, content):
-        if not self.cut:
+        if not self.lost:
             self._sequence = (self._sequence + 1) % 256
             self._waiting.put((name, struct.pack('<BB', 4, self._sequence) + content))
 
     def hear(self, name, data):
-        if self.cut:
+        if self.lost:
             return
         with self._lock:
             self.firmware.hear()
@@ -131,23 +120,38 @@ class Peripheral:
                 self._notify('fb1b', data[1:2])
 
 
-def install(monkeypatch, firmware):
-    """Have pyparrot use it; returns the class of the radio."""
-    # Without it, as it will be for the next test.
-    from pyparrot import Minidrone
+class BluetoothMambo:
+    """A fake Mambo that pyparrot reaches by Bluetooth."""
 
-    bluepy, btle = ModuleType('bluepy'), ModuleType('bluepy.btle')
-    for item in (Peripheral, DefaultDelegate, BTLEException):
-        setattr(btle, item.__name__, item)
-    btle.UUID = str
-    bluepy.btle = btle
-    monkeypatch.setitem(sys.modules, 'bluepy', bluepy)
-    monkeypatch.setitem(sys.modules, 'bluepy.btle', btle)
-    monkeypatch.setattr(Peripheral, 'firmware', firmware)
-    monkeypatch.setattr(Peripheral, 'cut', False)
-    monkeypatch.setattr(Peripheral, 'heard', [])
-    from pyparrot.networking import bleConnection
+    address = 'e0:14:d0:63:3d:d0'
 
-    monkeypatch.setattr(Minidrone, 'BLEAvailable', True)
-    monkeypatch.setattr(Minidrone, 'BLEConnection', bleConnection.BLEConnection, raising=False)
-    return Peripheral
+    def __init__(self, monkeypatch, firmware):
+        # Without it, as it will be for the next test.
+        from pyparrot import Minidrone
+
+        self.firmware = firmware
+        btle = ModuleType('bluepy.btle')
+        btle.Peripheral, btle.UUID, btle.DefaultDelegate = Peripheral, str, object
+        btle.BTLEException = type('BTLEException', (Exception,), {})
+        monkeypatch.setitem(sys.modules, 'bluepy', ModuleType('bluepy'))
+        monkeypatch.setitem(sys.modules, 'bluepy.btle', btle)
+        for name, value in (('firmware', firmware), ('lost', False), ('heard', [])):
+            monkeypatch.setattr(Peripheral, name, value)
+        from pyparrot.networking import bleConnection
+
+        monkeypatch.setattr(Minidrone, 'BLEAvailable', True)
+        monkeypatch.setattr(Minidrone, 'BLEConnection', bleConnection.BLEConnection, raising=False)
+
+    @property
+    def state(self):
+        return self.firmware.state
+
+    @property
+    def heard(self):
+        return Peripheral.heard
+
+    def cut(self, cut=True):
+        Peripheral.lost = cut
+
+    def close(self):
+        pass

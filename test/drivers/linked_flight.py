@@ -1,16 +1,13 @@
 """A flying robot behind a link, its driver in this process or its own, and the team around it."""
 
-import os
 import subprocess
+from functools import partial
 
 import numpy as np
-import yaml
 from action_msgs.msg import GoalStatus
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import Team, parameters_of
 
-from maasi_drivers.settings.driver import DriverSettings
-from maasi_filter.ros.parameters import flatten
 from maasi_msgs.msg import AgentState
 
 
@@ -25,35 +22,26 @@ class LinkedFlight:
         self.team = team = Team(context, settings, self.executor, deaf=True)
         # It is not reached by topics.
         team.used = [item for item in team.used if item not in (team.odometry, team.battery)]
+        self.call = partial(team.call, until=self.until)
 
     def run_node(self, make):
         """Run the driver as a node of this process."""
-        self.driver = make(
-            context=self.context,
-            namespace='/rover',
-            parameter_overrides=parameters_of(self.settings),
-        )
+        overrides = parameters_of(self.settings)
+        self.driver = make(context=self.context, namespace='/rover', parameter_overrides=overrides)
         self.executor.add_node(self.driver)
         assert self.driver.trigger_configure().name == 'SUCCESS', self.driver.problem
         assert self.driver.trigger_activate().name == 'SUCCESS'
         self.team.connect()
         return self
 
-    def run_process(self, name, folder):
-        """Run the driver as a process of its own."""
-        file = folder / 'parameters.yaml'
-        flat = flatten(DriverSettings.model_validate(self.settings))
-        file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-        command = [name, '--ros-args', '--remap', '__ns:=/rover', '--params-file', str(file)]
-        self.driver = subprocess.Popen(command, env=os.environ.copy())
+    def run_process(self, process, name):
+        """Run the driver as a process of its own, by the fixture `process`."""
+        self.driver = process(program=(name,), settings=self.settings)
         self.team.connect()
         return self
 
     def close(self):
-        if isinstance(self.driver, subprocess.Popen):
-            self.driver.kill()
-            self.driver.wait()
-        elif self.driver is not None:
+        if self.driver is not None and not isinstance(self.driver, subprocess.Popen):
             self.driver.halt()
             self.driver.destroy_node()
         self.drone.close()
@@ -70,11 +58,6 @@ class LinkedFlight:
         return float(np.linalg.norm(self.drone.state.velocity[:2]))
 
     @property
-    def doing(self):
-        """What the drone does, for messages."""
-        return ''
-
-    @property
     def reason(self):
         return self.team.state.reason if self.team.states else 'silent'
 
@@ -83,12 +66,10 @@ class LinkedFlight:
         return self.team.state.goal_status if self.team.states else None
 
     def until(self, condition, what=''):
-        self.team.until(
-            condition, what or (lambda: f'{self.doing}, {self.status}, {self.reason!r}')
-        )
+        self.team.until(condition, what or (lambda: f'{self.status}, {self.reason!r}'))
 
-    def call(self, name):
-        return self.team.call(name, self.until)
+    def away(self, point):
+        return float(np.linalg.norm(self.where - point))
 
     def arm(self):
         # Refused until the drone is heard.
@@ -98,6 +79,29 @@ class LinkedFlight:
     def until_it_flies(self):
         self.until(lambda: self.status in (AgentState.IDLE, AgentState.ABORTED))
         return self
+
+    def slowest_past(self, first, second, near):
+        """Return the lowest speed from `near` one waypoint to near the next one, where it stops."""
+        _, replaced = self.team.send_accepted(first, number=1)
+        self.until(lambda: self.away(first) < near)
+        _, result = self.team.send_accepted(second, number=2)
+        speeds = []
+        self.until(lambda: speeds.append(self.speed) or self.away(second) < near)
+        assert replaced.done() and replaced.result().result.reason == 'replaced'
+        self.until(result.done)
+        assert result.result().result.reached
+        self.until(lambda: self.speed < 0.05)
+        return min(speeds)
+
+    def restarts_by_its_clock(self, result, set_back, goal):
+        """Check that a jump back of the clock stops it, and that it takes goals again."""
+        set_back(self.driver, 1000.0)
+        self.until(result.done)
+        assert result.result().result.reason == 'the time jumped back'
+        self.until(lambda: self.speed < 0.1)
+        _, result = self.until_it_flies().team.send_accepted(goal)
+        self.until(result.done)
+        assert result.result().result.reached
 
     def gives_up(self, result, reason):
         """Check that the goal ends, that the planner hears why, and that it is not sent on."""

@@ -10,7 +10,6 @@ from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.emulators.mavlink.fake_autopilot import FakeAutopilot
 
 PERIOD = 0.02
-FIRMWARES = ('arducopter', 'px4', 'ardusub')
 HEIGHTS = {'arducopter': 2.0, 'px4': 2.0, 'ardusub': -1.5}
 
 
@@ -35,36 +34,36 @@ class Wire:
 
 
 class Play:
-    """Both sides, and what went over the wire."""
+    """Both sides, and what went over the wire; `station` is a ground station on another link."""
 
     def __init__(
         self, firmware='arducopter', autopilot=None, permitted=True, memory=None, **changes
     ):
         kind = 'submarine' if firmware == 'ardusub' else 'copter'
-        settings = {'vehicle': kind, 'arm': True} | changes
+        self.settings = MavlinkSettings.model_validate({'vehicle': kind, 'arm': True} | changes)
+        self.height, self._memory = HEIGHTS[firmware], memory
         self.to_driver, self.to_autopilot = Wire(), Wire()
-        link = MavlinkSettings.model_validate(settings)
-        self._start, self.memory = [2.0, 3.0, HEIGHTS[firmware]], memory
-        self.vehicle = self._driver(link)
-        # System and component of a ground station on another link; None: there is none.
+        # System and component.
         self.station = None
         self._beat_at = 0.0
-        self.vehicle.active = True
         self.autopilot = FakeAutopilot(
             AutopilotSettings.model_validate({'firmware': firmware} | (autopilot or {})),
             mavlink.MAVLink(self.to_driver, 1, 1),
             0.3,
             np.random.default_rng(1),
         )
+        self.body = self.autopilot.body
         self.now = 100.0
-        self.driver_lives = True
-        self.reports = []
         self._permitted = permitted
+        self.start_driver()
 
-    def _driver(self, settings):
-        sender = make_sender(settings.own_system)
+    def start_driver(self):
+        """Start a driver, in the place of one that was killed."""
+        sender = make_sender(self.settings.own_system)
         sender.file = self.to_autopilot
-        return Vehicle(settings, self._start, sender, self.memory)
+        self.vehicle = Vehicle(self.settings, [2.0, 3.0, self.height], sender, self._memory)
+        self.vehicle.active = self.driver_lives = True
+        self.reports = []
 
     def permit(self):
         """Call the service `arm`."""
@@ -75,26 +74,15 @@ class Play:
         assert self.permit() == ''
         return self
 
-    def restart_driver(self):
-        """Start another driver in the place of the one before, which was killed."""
-        old = self.vehicle
-        self.vehicle = self._driver(old.settings)
-        self.vehicle.active = self.driver_lives = True
-        self.reports = []
-
-    def cut(self):
-        self.to_driver.cut = self.to_autopilot.cut = True
-
     def turn(self):
         self.now += PERIOD
         if self.station is not None and self.now - self._beat_at >= 1.0:
             self._beat_at = self.now
             wire = Wire()
-            sender = mavlink.MAVLink(wire, *self.station)
-            sender.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4)
+            mavlink.MAVLink(wire, *self.station).heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4)
             for message in wire.take():
                 self.autopilot.handle(message, link=1)
-        if self._permitted and self.vehicle.phase is not Phase.CONNECTING:
+        if self._permitted and self.phase is not Phase.CONNECTING:
             self._permitted = False
             self.permit()
         self.autopilot.advance(PERIOD)
@@ -107,32 +95,31 @@ class Play:
         for message in self.to_autopilot.take():
             self.autopilot.handle(message)
 
-    def run(self, seconds):
+    def run(self, seconds, before=lambda: None):
         for _ in range(round(seconds / PERIOD)):
+            before()
             self.turn()
 
     def until(self, condition, limit=60.0):
         end = self.now + limit
         while not condition():
-            assert self.now < end, (self.vehicle.fault, self.reports[-8:])
+            assert self.now < end, (self.fault, self.reports[-8:])
             self.turn()
+        return self
 
     def fly(self):
-        self.until(lambda: self.vehicle.flying)
+        return self.until(lambda: self.vehicle.flying)
+
+    def go(self):
+        """Fly for a while."""
+        self.run(2.0, self.lead)
         return self
 
-    def go(self, ahead=0.4, direction=(1.0, 0.0, 0.0), seconds=2.0):
-        """Fly with the setpoint so far ahead, as the driver has it."""
-        end = self.now + seconds
-        while self.now < end:
-            self.lead(ahead, direction)
-            self.turn()
-        return self
-
-    def lead(self, ahead, direction=(1.0, 0.0, 0.0)):
-        if self.vehicle.phase is Phase.FLYING:
-            position = self.vehicle.estimate.telemetry.position
-            self.vehicle.set_target(position + ahead * np.array(direction), 0.3)
+    def lead(self):
+        """Set the set-point a short way ahead, as the driver does."""
+        if self.phase is Phase.FLYING:
+            ahead = self.vehicle.estimate.telemetry.position + np.array([0.4, 0.0, 0.0])
+            self.vehicle.set_target(ahead, 0.3)
 
     @property
     def fault(self):
@@ -143,28 +130,13 @@ class Play:
         return self.vehicle.phase
 
     @property
-    def estimate(self):
-        return self.vehicle.estimate
-
-    @property
     def mode(self):
         return self.autopilot.mode_name
 
     @property
-    def armed(self):
-        return self.autopilot.armed
-
-    @property
-    def position(self):
-        return self.autopilot.body.position
-
-    @property
-    def level_speed(self):
-        return float(np.linalg.norm(self.autopilot.body.velocity[:2]))
-
-    @property
     def speed(self):
-        return float(np.linalg.norm(self.autopilot.body.velocity))
+        """Over the ground [m/s]."""
+        return float(np.linalg.norm(self.body.velocity[:2]))
 
     @property
     def said(self):

@@ -23,12 +23,12 @@ GROUND, AIR, LANDING = range(3)
 class OnboardProgram:
     """The drone; z is up from where it stands, x forward, y left.
 
-    `silent` and `deaf`: nothing of it gets through, and nothing to it. `blobs` are those of the
-    next images, as the feed has them; `kinds` the orders that it has heard.
+    `silent`: nothing of it gets through. `blobs` are those of the next images, as the feed has
+    them; `kinds` the orders that it has heard; `patience` is how long it flies without one [s].
     """
 
     def __init__(self, address, feed):
-        self.silent = self.deaf = False
+        self.silent, self.patience = False, 3.0
         self.charge = 1.0
         self.blobs, self.count = b'', 0
         self.kinds, self.take_offs = [], 0
@@ -69,7 +69,7 @@ class OnboardProgram:
                 return
             magic, version, kind, _, sequence, *numbers = struct.unpack('<4sBBHI4f', data[:28])
             good = data[28:] == struct.pack('<I', zlib.crc32(data[:28])) and version == 1
-            if self.deaf or magic != b'MSWO' or not good or sequence == self._last:
+            if magic != b'MSWO' or not good or sequence == self._last:
                 continue
             self._last, self._heard_at = sequence, now
             self._order, self._goal = kind, np.array(numbers[:3])
@@ -77,7 +77,7 @@ class OnboardProgram:
 
     def _fly(self, now):
         silence, order = now - self._heard_at, self._order
-        if silence > 3.0:
+        if silence > self.patience:
             order = 0
         elif silence > 0.5:
             order = min(order, 1)

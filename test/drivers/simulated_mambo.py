@@ -31,18 +31,10 @@ def full_speed(drag):
 class Flight:
     """A firmware, a link to it that loses nothing, and time: 20 steps a second."""
 
-    def __init__(
-        self,
-        battery=1.0,
-        drag=0.5,
-        firmware_delay=0.1,
-        lost_link='land',
-        permitted=True,
-        **settings,
-    ):
+    def __init__(self, battery=1.0, drag=0.5, firmware_delay=0.1, permitted=True, **settings):
         self.firmware = MamboFirmware(
             Pose.from_yaw([*HOME.position[:2], 0.0], HOME.yaw),
-            FirmwareSettings(delay=firmware_delay, lost_link=lost_link, drag=drag),
+            FirmwareSettings(delay=firmware_delay, lost_link='land', drag=drag),
             BatterySettings(charge=battery),
             OdometrySettings(position_noise=0.002, heading_noise=0.002),
         )
@@ -54,7 +46,7 @@ class Flight:
         self.cut_up = self.cut_down = False
         self.sent = 'true'
         self.time = self.heard_at = 0.0
-        self._heard = 'landed', battery
+        self.flying_state, self.battery = 'landed', battery
         self.motion = make_motion(MOTION)
         settings = MamboSettings(**{'full_speed': full_speed(drag), 'arm': True} | settings)
         self.pilot = MamboPilot(self, self.motion, settings, HOME, FENCE)
@@ -62,23 +54,6 @@ class Flight:
         if permitted:
             self.pilot.permit(self.time)
         self.goal = None
-
-    # ---- what the pilot sees of a link -------------------------------------------------------
-
-    @property
-    def heard(self):
-        if not self.cut_down:
-            name = self.firmware.flying_state.name.lower().replace('_', '')
-            self._heard = name, self.firmware.charge.charge
-        return self._heard
-
-    @property
-    def flying_state(self):
-        return self.heard[0]
-
-    @property
-    def battery(self):
-        return self.heard[1]
 
     def take_off(self):
         if not self.cut_up:
@@ -96,17 +71,18 @@ class Flight:
     def keep_alive(self):
         pass
 
-    # ---- time --------------------------------------------------------------------------------
-
     def step(self, number=1):
         for _ in range(number):
             self.time += STEP
             if not self.cut_up:
                 self.firmware.hear()
             self.firmware.advance(STEP)
-            if round(self.time / STEP) % 10 == 0 and not self.cut_down:
-                self.heard_at = self.time
-                self._send_position()
+            if not self.cut_down:
+                self.flying_state = self.firmware.flying_state.name.lower().replace('_', '')
+                self.battery = self.firmware.charge.charge
+                if round(self.time / STEP) % 10 == 0:
+                    self.heard_at = self.time
+                    self._send_position()
             self.pilot.update(self.time)
             if self.goal is not None and self.pilot.phase is Phase.FLYING:
                 self.pilot.fly(self.motion.command(self.pilot.ahead(), self.goal))

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from fake_bluepy import BluetoothMambo
 from geometry_msgs.msg import PoseStamped
 from linked_flight import LinkedFlight
 from numpy.testing import assert_allclose
@@ -26,7 +27,7 @@ from maasi_drivers.links.mambo.mambo_robot_link import POLL_PERIOD
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
-from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
+from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_to_ros
 from maasi_msgs.msg import AgentState
 from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState, MamboFirmware
@@ -39,19 +40,20 @@ FULL_SPEED = 9.81 * math.tan(MAMBO['motion']['tilt']) / FirmwareSettings().drag
 LATEST = 1.5
 
 
+def firmware(lost_link='land'):
+    return MamboFirmware(
+        Pose.from_yaw([*START[:2], 0.0], YAW),
+        FirmwareSettings(take_off_height=0.3, lost_link=lost_link),
+        odometry=OdometrySettings(position_noise=0.002, heading_noise=0.002),
+    )
+
+
 class Flight(LinkedFlight):
     """A fake Mambo behind its driver."""
 
-    def __init__(self, context, mambo, changes):
-        self.drone = FakeMambo(
-            MamboFirmware(
-                Pose.from_yaw([*START[:2], 0.0], YAW),
-                FirmwareSettings(take_off_height=0.3, lost_link='land'),
-                odometry=OdometrySettings(position_noise=0.002, heading_noise=0.002),
-            ),
-            free_address(),
-        )
-        link = {'arm': True, 'full_speed': FULL_SPEED, 'address': self.drone.address}
+    def __init__(self, context, drone, mambo, changes):
+        self.drone = drone
+        link = {'arm': True, 'full_speed': FULL_SPEED, 'address': drone.address}
         # The machine may be busy.
         link |= {'port': free_port(), 'link_timeout': 2.0} | mambo
         own = {'start': START, 'yaw': YAW, 'link': 'mambo_wifi', 'mambo': link}
@@ -68,16 +70,39 @@ class Flight(LinkedFlight):
     def on_its_way(self):
         """Wait until it flies to a goal; return the goal's handle and result to come."""
         handle, result = self.arm().until_it_flies().team.send_accepted(GOAL)
-        self.until(lambda: np.linalg.norm(self.where[:2] - START[:2]) > 0.1)
+        self.until(lambda: self.away(START) > 0.1)
         return handle, result
+
+    def seen_from_outside(self, source):
+        """Return itself, told where it is by another system."""
+        team = self.team
+        publisher = team.create_publisher(PoseStamped, 'pose', 10)
+
+        def tell():
+            stamp, state = team.get_clock().now().nanoseconds, self.drone.state
+            if source == 'pose':
+                message = PoseStamped(pose=pose_to_ros(state.pose))
+                message.header.frame_id = 'map'
+                message.header.stamp = stamp_to_ros(stamp)
+                publisher.publish(message)
+            else:
+                # The robot of the team is where the fake is.
+                team.body = team.motion.body(state)
+                message = team.odometry_message(stamp)
+                message.pose.pose.position.z += START[2] - team.start.position[2]
+                team.odometry.publish(message)
+
+        team.create_timer(0.04, tell)
+        return self
 
 
 @pytest.fixture
 def fly(context, flights):
     """Return a function that starts a driver in this process, and all around it."""
 
-    def start(mambo=None, **changes):
-        return flights(Flight(context, mambo or {}, changes)).run_node(MamboDriver)
+    def start(mambo=None, drone=None, **changes):
+        drone = drone or FakeMambo(firmware(), free_address())
+        return flights(Flight(context, drone, mambo or {}, changes)).run_node(MamboDriver)
 
     return start
 
@@ -85,69 +110,42 @@ def fly(context, flights):
 # ---- a flight --------------------------------------------------------------------------------
 
 
-def test_it_takes_off_goes_where_it_is_sent_and_lands(fly, monkeypatch):
-    flight = fly()
+def test_it_goes_where_it_is_sent_and_lands_where_its_goal_is_cancelled(fly):
+    flight = fly({'cancel_landing': 3.0})
     flight.until(lambda: flight.status == AgentState.UNAVAILABLE)
     team = flight.arm().until_it_flies().team
     assert_allclose(flight.where, START, atol=0.15)
     for point in ([1.7, 0.8, 1.6], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5]):
         assert team.refused(point)
     assert flight.driver.dropped['goal'] == 4
-    shares = []
-    link = flight.driver.link._link
-    steer = link.steer
-    monkeypatch.setattr(link, 'steer', lambda *item: (shares.append(item), steer(*item)))
-    _, replaced = team.send_accepted([1.0, 0.4, START[2]], number=1)
-    flight.until(lambda: flight.where[1] < 0.75)
-    shares.clear()
-    _, result = team.send_accepted([1.0, -0.1, START[2]], number=2)
-    slowest = []
-    flight.until(lambda: slowest.append(flight.speed) or flight.where[1] < 0.3)
-    assert replaced.done() and replaced.result().result.reason == 'replaced'
-    # It is never made to hover in between.
-    assert len(shares) > 5 and (0.0, 0.0, 0.0, 0.0) not in shares
-    assert min(slowest) > 0.1
-    # Nobody sends it further: it stops at its last waypoint.
-    flight.until(result.done)
-    assert result.result().result.reached
-    flight.until(lambda: flight.speed < 0.05)
-    assert_allclose(flight.where, [1.0, -0.1, START[2]], atol=0.1)
-    place = team.state.pose.pose.position
-    assert_allclose([place.x, place.y, place.z], flight.where, atol=0.06)
+    last = [1.0, -0.1, START[2]]
+    assert flight.slowest_past([1.0, 0.4, START[2]], last, 0.4) > 0.1
+    assert_allclose(flight.where, last, atol=0.1)
+    assert_allclose(pose_from_ros(team.state.pose.pose).position, flight.where, atol=0.06)
     assert team.state.battery == pytest.approx(1.0, abs=0.02)
-    flight.driver.trigger_deactivate()
-    assert flight.doing in (FlyingState.LANDING, FlyingState.LANDED)
+    handle, result = team.send_accepted(GOAL)
+    flight.until(lambda: flight.away(last) > 0.1)
+    handle.cancel_goal_async()
+    flight.until(result.done)
+    assert result.result().status == GoalStatus.STATUS_CANCELED
+    flight.until(lambda: flight.speed < 0.05)
+    assert flight.doing in (FlyingState.HOVERING, FlyingState.FLYING)
     flight.until_it_is(FlyingState.LANDED)
+    # The driver hears of it a little later.
+    flight.until(lambda: UNTIL_ARM in flight.reason)
+    assert UNTIL_ARM in team.refused(GOAL)
     assert flight.drone.firmware.take_offs == 1 and flight.drone.refused == 0
 
 
 @pytest.mark.parametrize('source', ['pose', 'odometry'])
 def test_it_flies_by_another_system(fly, source):
     """Its own position events do not come at all."""
-    flight = fly({'pose': source})
+    flight = fly({'pose': source}).seen_from_outside(source)
     flight.drone.position_sent = 'none'
-    team = flight.team
-    publisher = team.create_publisher(PoseStamped, 'pose', 10)
-
-    def tell():
-        stamp, state = team.get_clock().now().nanoseconds, flight.drone.state
-        if source == 'pose':
-            message = PoseStamped(pose=pose_to_ros(state.pose))
-            message.header.frame_id = 'map'
-            message.header.stamp = stamp_to_ros(stamp)
-            publisher.publish(message)
-        else:
-            # The robot of the team is where the fake is.
-            team.body = team.motion.body(state)
-            message = team.odometry_message(stamp)
-            message.pose.pose.position.z += START[2] - team.start.position[2]
-            team.odometry.publish(message)
-
-    team.create_timer(0.04, tell)
-    _, result = flight.arm().until_it_flies().team.send_accepted(GOAL)
+    _, result = flight.on_its_way()
     flight.until(result.done)
     assert result.result().status == GoalStatus.STATUS_SUCCEEDED
-    assert np.linalg.norm(flight.where - GOAL) < 0.1
+    assert flight.away(GOAL) < 0.1
 
 
 def test_markers_in_a_video_are_placed_where_the_drone_was(play, tmp_path):
@@ -202,23 +200,36 @@ def test_what_is_lost_has_it_hover_then_land(fly):
     assert flight.drone.firmware.take_offs == 1
 
 
+@pytest.mark.parametrize('lost_link', ['hover', 'land'])
+def test_it_flies_without_sensor_stamps_and_notices_a_lost_link(fly, monkeypatch, lost_link):
+    drone = BluetoothMambo(monkeypatch, firmware(lost_link))
+    settings = {'pose': 'pose', 'link_timeout': 1.5, 'land_after': 1.0}
+    flight = fly(settings, drone, link='mambo_ble').seen_from_outside('pose')
+    _, result = flight.on_its_way()
+    # One piloting command after the other, and what has to be acknowledged.
+    assert drone.heard.count(('fa0a', (2, 0, 2))) >= 5
+    assert ('fa0b', (2, 8, 1)) in drone.heard
+    drone.cut()
+    flight.gives_up(result, 'link lost: nothing from the Mambo')
+    flight.until(lambda: flight.reason.startswith('landing: link lost'))
+    if lost_link == 'hover':
+        assert flight.doing == FlyingState.HOVERING
+    drone.cut(False)
+    flight.until_it_is(FlyingState.LANDED)
+    assert drone.firmware.take_offs == 1
+
+
 def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
     flight = fly()
     _, result = flight.on_its_way()
-    set_back(flight.driver, 1000.0)
-    flight.until(result.done)
-    assert result.result().result.reason == 'the time jumped back'
-    flight.until(lambda: flight.speed < 0.05)
-    _, result = flight.team.send_accepted(GOAL)
-    flight.until(result.done)
-    assert result.result().result.reached
+    flight.restarts_by_its_clock(result, set_back, GOAL)
 
 
 def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
     flight = fly({'land_after': 1.0})
-    firmware = flight.drone.firmware
+    inside = flight.drone.firmware
     # Not by its own watchdog: the last command would be flown for ever.
-    firmware.settings = replace(firmware.settings, command_timeout=math.inf)
+    inside.settings = replace(inside.settings, command_timeout=math.inf)
     flight.on_its_way()
     assert flight.speed > 0.1
     # Nothing spins the executor meanwhile.
@@ -230,47 +241,30 @@ def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
     flight.until(lambda: flight.status == AgentState.UNAVAILABLE and 'Mambo is' in flight.reason)
 
 
-def test_a_cancelled_goal_has_it_hover_then_land(fly):
-    flight = fly({'cancel_landing': 3.0})
-    handle, result = flight.on_its_way()
-    handle.cancel_goal_async()
-    flight.until(result.done)
-    assert result.result().status == GoalStatus.STATUS_CANCELED
-    flight.until(lambda: flight.speed < 0.05)
-    assert flight.doing in (FlyingState.HOVERING, FlyingState.FLYING)
-    flight.until_it_is(FlyingState.LANDED)
-    # The driver hears of it a little later.
-    flight.until(lambda: UNTIL_ARM in flight.reason)
-    assert UNTIL_ARM in flight.team.refused(GOAL)
-
-
-def test_a_camera_that_repeats_itself_has_it_hover(fly):
+def test_a_camera_that_is_silent_has_it_hover(fly):
     flight = fly(sensor_timeout=None)
-    image, hangs = None, False
+    random = np.random.default_rng(1)
 
     def photograph():
-        nonlocal image
+        noise = random.integers(110, 130, (120, 160, 3), np.uint8)
         stamp = flight.team.get_clock().now().nanoseconds
-        if not hangs:
-            noise = np.random.default_rng(stamp % 2**32).integers(110, 130, (120, 160, 3))
-            image = image_message(noise.astype(np.uint8))
-        image.header.stamp = stamp_to_ros(stamp)
-        flight.team.images.publish(image)
+        flight.team.images.publish(image_message(noise, stamp))
 
-    flight.team.create_timer(0.1, photograph)
+    timer = flight.team.create_timer(0.1, photograph)
     _, result = flight.on_its_way()
-    hangs = True
+    timer.cancel()
     flight.gives_up(result, 'no new image for')
     flight.until_it_is(FlyingState.HOVERING)
-    hangs = False
+    timer.reset()
     flight.until(lambda: flight.status == AgentState.ABORTED)
     assert flight.team.takes(GOAL)
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
-def test_a_driver_that_ends_or_is_killed(context, flights, tmp_path, number):
+def test_a_driver_that_ends_or_is_killed(context, flights, process, number):
     """With SIGKILL only the firmware is left."""
-    flight = flights(Flight(context, {}, {})).run_process('mambo_driver', tmp_path)
+    drone = FakeMambo(firmware(), free_address())
+    flight = flights(Flight(context, drone, {}, {})).run_process(process, 'mambo_driver')
     _, result = flight.on_its_way()
     flight.driver.send_signal(number)
     flight.until(lambda: flight.driver.poll() is not None)
@@ -314,8 +308,7 @@ def test_a_drone_that_is_not_there_is_said_and_awaited(fly):
     flight = fly({'address': address})
     flight.until(lambda: f'no Mambo at {address}' in flight.reason)
     assert flight.status == AgentState.UNAVAILABLE
-    firmware = flight.drone.firmware
     flight.drone.close()
-    flight.drone = FakeMambo(firmware, address)
+    flight.drone = FakeMambo(flight.drone.firmware, address)
     flight.arm().until_it_flies()
-    assert firmware.take_offs == 1
+    assert flight.drone.firmware.take_offs == 1

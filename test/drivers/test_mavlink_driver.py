@@ -32,9 +32,6 @@ from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import FakeVehicle
 
 SPEED, STOPPED = 1.0, 0.1
 START = [1.0, 2.0, 0.8]
-FAR = [1.0, -6.0, 0.8]
-# Setpoints lead by a second; then it brakes, within half a second [m].
-LONGEST_WAY = 1.5 * SPEED
 COPTER = {
     'step': STEP,
     'environment': {'bounds': [[-8.0, 8.0], [-8.0, 8.0], [-5.0, 5.0]]},
@@ -47,25 +44,18 @@ COPTER = {
     'sensor': {'detection': {'kind': 'box', 'lower': [-4, -4, -6], 'upper': [4, 4, 6]}},
     'link': 'mavlink',
 }
-CAMERA = {
-    'environment': {'bounds': [[-2.0, 4.0], [-2.0, 4.0]]},
-    'sensor': {'detection': {'kind': 'box'}},
-    'camera': {'focal_length': [220.0, 220.0]},
-}
-FENCE = [[-3.0, 3.0], [-3.0, 3.0], [0.5, 3.0]]
 
 
 class Flight(LinkedFlight):
     """A fake vehicle behind its driver."""
 
-    def __init__(self, context, firmware, autopilot, link, changes):
+    def __init__(self, context, autopilot, link, changes):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(('127.0.0.1', 0))
             url = f'127.0.0.1:{probe.getsockname()[1]}'
         own = {'arm': True, 'link_timeout': 3.0, 'url': f'udpin:{url}'} | link
-        values = {'firmware': firmware, 'estimator_time': 0.2} | autopilot
         self.drone = FakeVehicle(
-            AutopilotSettings.model_validate(values),
+            AutopilotSettings.model_validate({'estimator_time': 0.2} | autopilot),
             own['url'].replace('udpin', 'udpout'),
             Pose.from_yaw([*START[:2], 0.0], 0.0),
             np.random.default_rng(1),
@@ -80,14 +70,15 @@ class Flight(LinkedFlight):
     def fly(self):
         return self.arm().until_it_flies()
 
-    def under_way(self, goal=FAR):
-        _, result = self.team.send_accepted(goal)
+    def under_way(self, height=START[2]):
+        _, result = self.team.send_accepted([1.0, -6.0, height])
         self.until(lambda: self.speed > 0.8 * SPEED)
         return result
 
     def until_stopped(self, since):
         self.until(lambda: self.speed < STOPPED)
-        assert np.linalg.norm((self.where - since)[:2]) < LONGEST_WAY
+        # Setpoints lead by a second; then it brakes, within half a second.
+        assert np.linalg.norm((self.where - since)[:2]) < 1.5 * SPEED
 
     def gives_up(self, result, reason):
         """Check that the vehicle stops as well."""
@@ -97,14 +88,14 @@ class Flight(LinkedFlight):
 
 
 @pytest.fixture
-def fly(context, flights, monkeypatch, tmp_path):
+def fly(context, flights, monkeypatch, tmp_path, process):
     """Return a function that starts a driver, in this process or its own, and its vehicle."""
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
 
-    def start(firmware='arducopter', autopilot=(), link=(), own_process=False, **changes):
-        flight = flights(Flight(context, firmware, dict(autopilot), dict(link), changes))
+    def start(autopilot=(), link=(), own_process=False, **changes):
+        flight = flights(Flight(context, dict(autopilot), dict(link), changes))
         if own_process:
-            return flight.run_process('mavlink_driver', tmp_path)
+            return flight.run_process(process, 'mavlink_driver')
         return flight.run_node(MavlinkCameraDriver if 'camera' in changes else MavlinkDriver)
 
     return start
@@ -119,38 +110,17 @@ def test_what_is_waited_for_is_short_enough():
     assert link.require_failsafe is True
 
 
-def test_it_flies_to_its_waypoints_without_a_stop_and_lands_at_the_end(fly, monkeypatch):
+def test_it_flies_to_its_waypoints_without_a_stop_and_lands_at_the_end(fly):
     flight = fly().fly()
     team, height = flight.team, START[2]
+    # Without a geofence it is not sent into the ground.
     for goal in ([math.nan, 0.0, height], [0.0, 0.0, math.inf], [0.0, 1.0, -0.1], [0.0, 9.0, 1.0]):
         assert team.refused(goal)
     assert flight.driver.dropped['goal'] == 4 and not flight.autopilot.crashed
-    # Without a geofence it is not sent into the ground.
-    assert 'the geofence' in flight.driver.goals.problem(team.goal([0.0, 1.0, -0.1]))
-    _, replaced = team.send_accepted([1.0, -3.0, height], number=1)
-    flight.until(lambda: flight.where[1] < -1.5)
-    leads = []
-    send_target = flight.driver.link._send_target
-
-    def noting(position, yaw):
-        here = flight.driver.history.latest.pose.position
-        leads.append(float(np.linalg.norm(position - here)))
-        send_target(position, yaw)
-
-    monkeypatch.setattr(flight.driver.link, '_send_target', noting)
-    _, result = team.send_accepted([3.0, -5.0, height], number=2)
-    slowest = []
-    flight.until(lambda: slowest.append(flight.speed) or flight.where[0] > 2.0)
-    assert replaced.done() and replaced.result().result.reason == 'replaced'
-    # No set-point at its place, which would stop it; it flies on.
-    assert len(leads) > 10 and min(leads) > 0.5 * SPEED
-    assert min(slowest) > 0.4 * SPEED
-    # Nobody sends it further: it stops at its last waypoint.
-    flight.until(result.done)
-    assert result.result().result.reached
-    flight.until(lambda: flight.speed < STOPPED)
-    assert_allclose(flight.where, [3.0, -5.0, height], atol=0.35)
-    assert_allclose(pose_from_ros(flight.team.state.pose.pose).position, flight.where, atol=0.35)
+    last = [3.0, -5.0, height]
+    assert flight.slowest_past([1.0, -3.0, height], last, 1.5) > 0.4 * SPEED
+    assert_allclose(flight.where, last, atol=0.35)
+    assert_allclose(pose_from_ros(team.state.pose.pose).position, flight.where, atol=0.35)
     # A cancelled goal stops it.
     handle, result = team.send_accepted([3.0, 6.0, height])
     flight.until(lambda: flight.speed > 0.8 * SPEED)
@@ -164,21 +134,24 @@ def test_it_flies_to_its_waypoints_without_a_stop_and_lands_at_the_end(fly, monk
 
 
 def test_a_camera_in_a_map_that_is_turned_against_north(fly):
-    flight = fly(link={'map_yaw': 0.5}, **CAMERA).fly()
-    _, result = flight.team.send_accepted([2.0, 0.5, 0.8])
+    flight = fly(
+        link={'map_yaw': 0.5},
+        environment={'bounds': [[-2.0, 4.0], [-2.0, 4.0]]},
+        sensor={'detection': {'kind': 'box'}},
+        camera={'focal_length': [220.0, 220.0]},
+    )
+    _, result = flight.fly().team.send_accepted([2.0, 0.5, 0.8])
     flight.until(result.done)
     # The fake has its local frame at the start, with east along x.
     cosine, sine = math.cos(0.5), math.sin(0.5)
     east = [cosine * 1.0 - sine * -1.5, sine * 1.0 + cosine * -1.5]
     assert_allclose(flight.where[:2] - START[:2], east, atol=0.35)
-    stamp, pose = (
-        stamp_from_ros(flight.team.state.header.stamp),
-        pose_from_ros(flight.team.state.pose.pose),
-    )
+    state = flight.team.state
+    stamp, pose = stamp_from_ros(state.header.stamp), pose_from_ros(state.pose.pose)
     assert pose.yaw == pytest.approx(-0.5, abs=0.05)
     target = pose.position[:2] + np.array([0.1, -0.05])
-    image = rendered(flight.team, [target.tolist()], pose)
     flight.team.ask(stamp)
+    image = rendered(flight.team, [target.tolist()], pose)
     flight.team.images.publish(stamped(image, stamp))
     (seen,) = flight.team.answer().detections
     angles = math.cos(seen.bearing), math.sin(seen.bearing)
@@ -217,59 +190,43 @@ def test_a_localiser_says_where_the_frame_of_the_autopilot_is(fly):
 # ---- safety ----------------------------------------------------------------------------------
 
 
-def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
+def test_it_takes_off_each_time_that_the_service_is_called(fly):
     flight = fly(start=[1.0, 2.0, 2.0])
-    team, autopilot = flight.team, flight.autopilot
     flight.until(lambda: UNTIL_ARM in flight.reason)
     assert flight.status == AgentState.UNAVAILABLE
     assert flight.driver.link.status()['parameter FS_GCS_ENABLE'] == 5.0
     # The origin is kept for a driver that is started again.
     kept = Path(os.environ['ROS_HOME']) / 'maasi' / 'rover_flight_origin.json'
     assert not kept.exists()
-    assert team.call('stop').success
-    answer = team.call('arm')
-    assert (answer.success, answer.message) == (False, STOPPED_BY_SERVICE)
-    assert team.call('release').success
-    flight.fly()
-    assert kept.exists()
-    answer = team.call('arm')
-    assert (answer.success, answer.message) == (False, 'it is in the air already')
-    with flight.lock:
-        autopilot.disarm('Crash: Disarming')
-    reason = 'is disarmed: by the autopilot or the pilot ('
-    flight.until(lambda: reason in flight.reason)
-    assert 'Crash: Disarming' in flight.reason
-    said = capfd.readouterr().err
-    assert f'arm: refused: {STOPPED_BY_SERVICE}' in said and reason in said
-    # It says by itself why it has no position.
-    assert 'no LOCAL_POSITION_NED yet' not in said
-    with flight.lock:
-        autopilot.body.position[2] = 0.0
     flight.arm()
     flight.until(lambda: flight.where[2] > 0.3)
     # The service stop ends a take-off.
-    assert team.call('stop').success
-    flight.until(lambda: not autopilot.armed)
-    assert autopilot.mode_name == 'LAND'
-    assert 'its take-off was stopped' in flight.reason
+    assert flight.call('stop').success
+    flight.until(lambda: not flight.autopilot.armed)
+    assert flight.doing == 'LAND' and 'its take-off was stopped' in flight.reason
+    assert flight.call('arm').message == STOPPED_BY_SERVICE
+    assert flight.call('release').success
+    flight.fly()
+    assert kept.exists()
+    assert flight.call('arm').message == 'it is in the air already'
 
 
 def test_a_vehicle_in_the_air_is_taken_over_and_the_answer_says_so(fly):
-    flight = fly()
-    flight.until(lambda: UNTIL_ARM in flight.reason)
+    flight = fly(link={'arm': False})
+    flight.until(lambda: 'arm is false' in flight.reason)
     with flight.lock:
         # A pilot has brought it there.
         flight.autopilot.armed = True
         flight.autopilot.body.position[2] = 1.0
         flight.autopilot.take_mode('GUIDED')
     flight.until(lambda: flight.driver.link.status().get('in the air'))
-    flight.until(lambda: 'it is armed in GUIDED' in flight.reason)
+    flight.until(lambda: 'it is armed in GUIDED, not by this driver' in flight.reason)
     assert flight.call('arm').message == 'it is in the air: it is taken over where it is'
     flight.until_it_flies()
 
 
 def test_blown_out_of_the_geofence_it_comes_back(fly):
-    flight = fly(link={'geofence': FENCE}).fly()
+    flight = fly(link={'geofence': [[-3.0, 3.0], [-3.0, 3.0], [0.5, 3.0]]}).fly()
     assert 'the geofence' in flight.driver.goals.problem(flight.team.goal([0.0, 3.5, 0.8]))
     with flight.lock:
         flight.autopilot.body.position = np.array([3.5, 0.0, 0.8])
@@ -278,80 +235,54 @@ def test_blown_out_of_the_geofence_it_comes_back(fly):
     flight.until(lambda: flight.status != AgentState.UNAVAILABLE)
 
 
-@pytest.mark.parametrize(
-    ('fault', 'reason'),
-    [
-        ('cut', 'link: nothing heard from system 1'),
-        ('frozen', 'no LOCAL_POSITION_NED for'),
-        # Whether its heartbeat or its clock is heard first is open.
-        ('restart', 'is disarmed: '),
-    ],
-)
-def test_a_fault_ends_the_way_and_is_said(fly, fault, reason):
-    timeout = 0.5 if fault == 'frozen' else 5.0
-    settings = {'parameters': {'FS_GCS_TIMEOUT': 60}}
-    flight = fly(autopilot=settings, link={'link_timeout': 1.0}, odometry_timeout=timeout)
+def test_a_fault_ends_the_way_and_is_said(fly, capfd):
+    flight = fly({'parameters': {'FS_GCS_TIMEOUT': 60}}, {'link_timeout': 1.0})
     result = flight.fly().under_way()
+    flight.drone.cut()
+    flight.gives_up(result, 'link: nothing heard from system 1')
+    flight.drone.cut(False)
+    result = flight.until_it_flies().under_way()
     with flight.lock:
-        if fault == 'cut':
-            flight.drone.cut()
-        elif fault == 'frozen':
-            flight.autopilot.freeze()
-        else:
-            flight.autopilot.restart()
-            # Nothing is left to stop it.
-            flight.autopilot.body.velocity[:] = 0.0
-    flight.gives_up(result, reason)
-    if fault == 'restart':
-        restarted = 'the autopilot has restarted: start the driver again'
-        flight.until(lambda: restarted in flight.reason)
-        assert flight.call('arm').message == restarted
-    elif fault == 'cut':
-        flight.drone.cut(False)
-        flight.until_it_flies()
-        assert flight.team.takes([1.0, 1.5, 0.8])
+        flight.autopilot.disarm('Crash: Disarming')
+    flight.gives_up(result, 'is disarmed: by the autopilot or the pilot (')
+    assert 'Crash: Disarming' in flight.reason
+    said = capfd.readouterr().err
+    assert 'is disarmed: by the autopilot or the pilot (' in said
+    # It says by itself why it has no position.
+    assert 'no LOCAL_POSITION_NED yet' not in said
 
 
 def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
     flight = fly(odometry_timeout=0.5).fly()
-    result = flight.under_way()
-    set_back(flight.driver, 1000.0)
-    flight.until(result.done)
-    assert result.result().result.reason == 'the time jumped back'
-    flight.until(lambda: flight.speed < STOPPED)
-    flight.until_it_flies()
-    _, result = flight.team.send_accepted([1.0, 1.5, 0.8])
-    flight.until(result.done)
-    assert result.result().result.reached
+    flight.restarts_by_its_clock(flight.under_way(), set_back, [1.0, 1.5, 0.8])
 
 
 def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
     monkeypatch.setattr(watchdog, '_CHARGE_PATIENCE', 2.5)
     # High enough that it does not land before the pilot takes it.
-    high, far = [*START[:2], 4.0], [*FAR[:2], 4.0]
-    flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}, start=high).fly()
+    flight = fly({'endurance': 1e9}, battery_minimum=0.2, start=[*START[:2], 4.0]).fly()
     autopilot = flight.autopilot
     # One that stays the same has been heard all the same.
     begin = time.monotonic()
     flight.until(lambda: time.monotonic() - begin > 4.0)
     assert 'battery_minimum cannot act' not in capfd.readouterr().err
-    result = flight.under_way(far)
+    result = flight.under_way(4.0)
     with flight.lock:
         autopilot.charge = 0.15
     flight.gives_up(result, 'battery at 0.15, below 0.20')
-    # Until then the driver asks for the mode again, over a pilot who takes another one.
+    # A request that is on its way would go over a pilot.
     flight.until(lambda: flight.driver.link._link.vehicle.at_rest)
-    assert autopilot.mode_name == 'LAND'
+    assert flight.doing == 'LAND'
     # It lands again once a pilot who took it over gives it back.
     with flight.lock:
         autopilot.take_mode('LOITER')
     flight.until(lambda: 'the pilot has taken over' in flight.reason)
     begin = time.monotonic()
     flight.until(lambda: time.monotonic() - begin > 0.5)
-    assert autopilot.mode_name == 'LOITER' and 'battery at 0.15' in flight.reason
+    assert flight.doing == 'LOITER' and 'battery at 0.15' in flight.reason
     with flight.lock:
         autopilot.take_mode('GUIDED')
-    flight.until(lambda: autopilot.mode_name == 'LAND')
+    flight.until(lambda: flight.doing == 'LAND')
     flight.until(lambda: not autopilot.armed)
 
 
@@ -366,7 +297,7 @@ def test_a_port_that_is_taken_is_tried_again(fly):
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
 def test_a_driver_that_ends_or_is_killed(fly, number):
     """With SIGKILL only the failsafe of the autopilot is left."""
-    flight = fly(autopilot={'parameters': {'FS_GCS_TIMEOUT': 3}}, own_process=True)
+    flight = fly({'parameters': {'FS_GCS_TIMEOUT': 3}}, own_process=True)
     result = flight.fly().under_way()
     before = flight.where
     flight.driver.send_signal(number)

@@ -1,6 +1,5 @@
 """The fake Mambo's firmware, and its wire under pyparrot as it is on PyPI."""
 
-import json
 import math
 import signal
 import socket
@@ -16,32 +15,28 @@ from waiting import PATIENCE, wait_until
 
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
 from maasi_filter.models.pose import Pose
-from maasi_sim.emulators.mambo.fake_mambo import (
-    FakeMambo,
-    Frame,
-    frames,
-    free_address,
-    free_port,
-    main,
-)
+from maasi_sim.emulators.linked_robots import linked_robot, with_addresses
+from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port, main
 from maasi_sim.emulators.mambo.firmware import (
     FirmwareSettings,
     FlyingState,
     MamboFirmware,
     Piloting,
 )
+from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.world.robots import BatterySettings
 
 START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
 
 
-def hovering(battery=None, **settings):
-    made = MamboFirmware(START, FirmwareSettings(**settings), battery or BatterySettings())
-    made.hear()
+def hovering(**settings):
+    made = MamboFirmware(START, FirmwareSettings(**settings))
+    made.limit('tilt', 10.0)
+    fly(made, 1.0, Piloting(climb=100))
+    assert made.flying_state == FlyingState.LANDED and made.height == 0.0
     made.take_off()
     while made.flying_state != FlyingState.HOVERING:
-        made.hear()
-        made.advance(0.1)
+        fly(made, 0.1)
         assert made.time < 10.0
     return made
 
@@ -58,39 +53,17 @@ def speed_of(made):
     return float(np.linalg.norm(made.state.velocity))
 
 
-# ---- firmware --------------------------------------------------------------------------------
-
-
-def test_it_takes_off_when_told_and_lands():
-    made = MamboFirmware(START)
-    fly(made, 2.0, Piloting(climb=100))
-    assert made.flying_state == FlyingState.LANDED and made.height == 0.0
-    made = hovering()
-    assert made.height >= made.settings.take_off_height
-    assert_allclose(made.state.pose.position[:2], START.position[:2], atol=1e-9)
-    made.land()
-    fly(made, 6.0)
-    assert made.flying_state == FlyingState.LANDED
-    assert made.height == 0.0 and not made.state.velocity.any()
-    made = hovering()
-    made.emergency()
-    assert made.flying_state == FlyingState.EMERGENCY and made.height == 0.0
-
-
 def test_piloting_moves_it_along_its_own_axes():
     made = hovering()
-    made.limit('tilt', 5.0)
-    before = made.state.pose.position
-    fly(made, 2.0, Piloting(pitch=50))
-    assert made.flying_state == FlyingState.FLYING
-    move = made.state.pose.position - before
     # It faces the map's y axis.
-    assert move[1] > 0.15 and abs(move[0]) < 1e-6
-    fly(made, 5.0)
-    before = made.state.pose.position
-    fly(made, 2.0, Piloting(roll=50))
-    move = made.state.pose.position - before
-    assert move[0] > 0.15 and abs(move[1]) < 2e-3
+    for piloting, axis in ((Piloting(pitch=25), [0.0, 1.0]), (Piloting(roll=25), [1.0, 0.0])):
+        before = made.state.pose.position
+        fly(made, 2.0, piloting)
+        assert made.flying_state == FlyingState.FLYING
+        fly(made, 5.0)
+        move = (made.state.pose.position - before)[:2]
+        assert move @ axis > 0.15
+        assert_allclose(move, (move @ axis) * np.array(axis), atol=2e-3)
     # Forward, left: from the take-off point.
     forward, left, _ = made.estimate().position
     assert forward > 0.15 and left < -0.15
@@ -101,7 +74,6 @@ def test_piloting_moves_it_along_its_own_axes():
 @pytest.mark.parametrize('drag', [0.3, 2.6])
 def test_a_tilt_accelerates_it_until_the_drag_holds_against_it(drag):
     made = hovering(delay=0.0, drag=drag)
-    made.limit('tilt', 10.0)
     acceleration = 9.81 * math.tan(0.6 * math.radians(10.0))
     fly(made, 0.5, Piloting(pitch=60))
     # The tilt is there 0.1 s late.
@@ -122,7 +94,6 @@ def test_a_tilt_accelerates_it_until_the_drag_holds_against_it(drag):
 def test_what_it_does_without_its_controller_is_a_setting(what, state):
     made = hovering(lost_link=what)
     settings = made.settings
-    assert FirmwareSettings().lost_link == 'hover'
     fly(made, 2.0, Piloting(pitch=60))
     silent = made.time
     # No piloting command is flown for ever.
@@ -136,65 +107,28 @@ def test_what_it_does_without_its_controller_is_a_setting(what, state):
     assert made.flying_state == state
 
 
-def test_an_empty_battery_lands_it_and_keeps_it_on_the_floor():
-    made = hovering(BatterySettings(capacity=100.0, idle_power=2.0))
-    charge = made.charge.charge
-    fly(made, 1.0)
-    assert made.charge.charge < charge
-    fly(made, 80.0)
-    assert made.flying_state == FlyingState.LANDED
-    made.take_off()
-    fly(made, 1.0)
-    assert made.flying_state == FlyingState.LANDED
-
-
-# ---- frames ----------------------------------------------------------------------------------
-
-
-def test_frames_are_read_as_they_are_written():
-    written = [Frame(4, 11, 255, b'\x02\x00\x01\x00'), Frame(1, 254, 0, b'\x07'), Frame(2, 0, 3)]
-    data = b''.join(frame.encode() for frame in written)
-    assert list(frames(data)) == written
-    assert data[:7] == struct.pack('<BBBI', 4, 11, 255, 11)
-    for bad in (b'\x01\x02', struct.pack('<BBBI', 2, 10, 0, 3), struct.pack('<BBBI', 2, 10, 0, 9)):
-        with pytest.raises(ValueError, match='frame'):
-            list(frames(bad))
-
-
 # ---- the wire, under pyparrot ----------------------------------------------------------------
 
 
 @pytest.fixture
 def pair():
-    """Return a function that starts a fake in real time, and a link to it."""
-    started = []
-
-    def start(connect=True, charge=1.0, **settings):
-        battery = BatterySettings(charge=charge)
-        fake = FakeMambo(
-            MamboFirmware(START, FirmwareSettings(**settings), battery), free_address()
-        )
-        link = MamboLink('wifi', fake.address, free_port(), tilt=0.1)
-        started.extend([link, fake])
-        if connect:
-            link.connect()
-            wait_until(lambda: link.error or (link.connected and link.position is not None))
-            assert not link.error
-        return fake, link
-
-    yield start
-    for item in started:
-        item.close()
+    """Return a fake in real time, and a link to it."""
+    battery = BatterySettings(charge=0.5)
+    fake = FakeMambo(MamboFirmware(START, FirmwareSettings(), battery), free_address())
+    link = MamboLink('wifi', fake.address, free_port(), tilt=0.1)
+    link.connect()
+    wait_until(lambda: link.error or (link.connected and link.position is not None))
+    assert not link.error
+    yield fake, link
+    link.close()
+    fake.close()
 
 
 def test_pyparrot_flies_it(pair):
-    fake, link = pair(charge=0.5)
-    firmware = fake.firmware
+    fake, link = pair
     wait_until(lambda: link.battery == 0.5 and link.flying_state == 'landed')
     assert_allclose(link.position.position, 0.0, atol=0.011)
-    assert fake.heard[(0, 4, 0)] >= 1
-    assert_allclose(firmware.limits['tilt'], 0.1, rtol=1e-5)
-    assert firmware.take_offs == 0
+    assert_allclose(fake.firmware.limits['tilt'], 0.1, rtol=1e-5)
     link.take_off()
     wait_until(lambda: link.flying_state == 'hovering')
 
@@ -210,7 +144,7 @@ def test_pyparrot_flies_it(pair):
     link.land()
     asked = link._asked_at
     wait_until(lambda: link._asked_at > asked)
-    assert firmware.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
+    assert fake.firmware.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
     fake.cut_up = False
     wait_until(lambda: link.flying_state == 'landed')
     assert fake.refused == 0
@@ -220,7 +154,7 @@ def test_pyparrot_flies_it(pair):
 
 
 def test_one_that_lands_by_itself_is_not_told_to_take_off_again(pair):
-    fake, link = pair()
+    fake, link = pair
     link.take_off()
     wait_until(lambda: link.flying_state == 'hovering')
     fake.firmware.land()
@@ -232,7 +166,7 @@ def test_one_that_lands_by_itself_is_not_told_to_take_off_again(pair):
 
 
 def test_a_packet_that_is_repeated_is_not_believed(pair):
-    fake, link = pair()
+    fake, link = pair
     handle = link._drone.drone_connection.handle_data
     packets = []
 
@@ -271,46 +205,30 @@ BAD_FRAMES = [
 
 
 def test_datagrams_that_are_not_the_drones_or_are_cut_short_do_not_end_the_link(pair):
-    fake, link = pair()
+    fake, link = pair
     # It is heard on the address that faces the drone alone.
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(('127.0.0.9', link.port))
-    receiver = link._drone.drone_connection.udp_receive_sock
+    dropped = link._drone.drone_connection.udp_receive_sock.dropped
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.bind((free_address(), 0))
         for data in BAD_FRAMES:
             stranger.sendto(data, ('127.0.0.1', link.port))
-        wait_until(lambda: receiver.dropped['foreign sender'] == len(BAD_FRAMES))
-        # The same from the drone's own address.
-        for data in BAD_FRAMES:
-            fake._air.sendto(data, ('127.0.0.1', link.port))
-    wait_until(lambda: receiver.dropped['bad frame'] + receiver.dropped['bad content'] >= 7)
+        wait_until(lambda: dropped['foreign sender'] == len(BAD_FRAMES))
+    # The same from the drone's own address.
+    for data in BAD_FRAMES:
+        fake._air.sendto(data, ('127.0.0.1', link.port))
+    wait_until(lambda: dropped['bad frame'] + dropped['bad content'] >= 7)
     received = link.position.received
     wait_until(lambda: link.position.received > received)
-    assert link.connected and not link.error
-    assert link.dropped == receiver.dropped
-
-
-@pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
-def test_a_listener_that_dies_is_started_again(pair):
-    _, link = pair()
-    connection = link._drone.drone_connection
-    handle, dead = connection.handle_data, connection.listener_thread
-
-    def die(data):
-        connection.handle_data = handle
-        # Ends a thread without a traceback.
-        raise SystemExit
-
-    connection.handle_data = die
-    wait_until(lambda: link.revived == 1)
-    assert not dead.is_alive()
-    received = link.position.received
-    wait_until(lambda: link.position.received > received)
+    assert link.connected and not link.error and link.dropped == dropped
+    other = MamboLink('wifi', fake.address, link.port)
+    with pytest.raises(MamboLinkError, match=f'UDP port {link.port}.*one Mambo per process'):
+        other.connect()
 
 
 def test_position_events_that_are_no_numbers_are_left_out(pair):
-    fake, link = pair()
+    fake, link = pair
     fake.position_sent = 'nan'
     wait_until(lambda: link.bad_events >= 2)
     assert np.isfinite(link.position.position).all()
@@ -318,29 +236,31 @@ def test_position_events_that_are_no_numbers_are_left_out(pair):
         link.steer(math.nan, 0.0, 0.0, 0.0)
 
 
-def test_no_drone_no_bluetooth_and_a_port_that_is_taken_are_said(pair):
-    fake, link = pair()
-    other = MamboLink('wifi', fake.address, link.port)
-    with pytest.raises(MamboLinkError, match=f'UDP port {link.port}.*one Mambo per process'):
-        other.connect()
-    with pytest.raises(MamboLinkError, match='bluepy is not installed'):
-        MamboLink('ble', 'e0:14:00:00:00:00').connect()
-    nobody = MamboLink('wifi', free_address(), free_port())
-    nobody.connect()
-    wait_until(lambda: nobody.error)
-    assert nobody.address in nobody.error and 'refused' in nobody.error.lower()
-    nobody.close()
-
-
-def test_the_fake_refuses_what_is_no_handshake(pair):
-    fake, _ = pair(connect=False)
-    for request, status in ((b'hello', -1), (b'{"d2c_port": 43210}', 0)):
-        with socket.create_connection((fake.address, 44444), timeout=PATIENCE) as client:
-            client.sendall(request)
-            answer = client.recv(4096)
-        assert answer[-1:] == b'\0'
-        assert json.loads(answer[:-1])['status'] == status
-    assert fake.refused == 1
+def test_that_of_a_scenario_stands_below_its_start_and_flies_as_its_link_says():
+    scenario = load_scenario('mambo_turtlebot_wifi')
+    robot = scenario.robots['mambo']
+    asked = robot.mambo.model_copy(update={'address': '127.0.0.9'})
+    robots = scenario.robots | {'other': robot.model_copy(update={'mambo': asked})}
+    robots = with_addresses(scenario.model_copy(update={'robots': robots})).robots
+    # An address that was asked for stays.
+    assert robots['other'].mambo == asked
+    drone = linked_robot('mambo', robots['mambo'], 1)
+    link = MamboLink('wifi', robots['mambo'].mambo.address, robots['mambo'].mambo.port)
+    link.connect()
+    try:
+        wait_until(lambda: link.connected)
+        assert_allclose(drone.state.pose.position, [1.9, 1.9, 0.0])
+        assert not drone.obeys
+        link.take_off()
+        wait_until(lambda: link.flying_state == 'hovering')
+        assert drone.obeys
+        assert_allclose(drone.state.pose.position, [1.9, 1.9, 0.8], atol=0.15)
+        link.land()
+        wait_until(lambda: link.flying_state == 'landed')
+        assert not drone.obeys
+    finally:
+        link.close()
+        drone.close()
 
 
 # ---- the command -----------------------------------------------------------------------------

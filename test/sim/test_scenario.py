@@ -204,15 +204,25 @@ WRONG_LINKS = [
     ('drone', {'guard': True}, 'drone.guard', 'its autopilot stops it'),
     ('rov', {'mavlink': {'arm': True, 'url': 'udpin:127.0.0.1:14550'}}, 'rov.mavlink.url', 'drone'),
     ('drone', {'driver': 'ranging_driver'}, 'drone.link', 'does not have it'),
+    ('mambo', {'mambo': {'arm': False}}, 'mambo.mambo.arm', 'read false, allowed is true'),
+    ('mambo', {'mambo': {'arm': True}}, 'mambo.mambo.full_speed', 'is missing'),
+    ('mambo', {'mambo': None}, 'mambo.mambo', r'is missing, .* at least \{arm: true'),
+    ('mambo', {'mambo': {'arm': True, 'pose': 'pose'}}, 'mambo.mambo.pose', "read 'pose'"),
+    ('mambo', {'start': [0.2, 0.6, 0.0]}, 'mambo.start', 'read height 0.0'),
+    ('mambo', {'guard': True}, 'mambo.guard', 'read true'),
+    ('mambo', {'driver': 'turtlebot_driver'}, 'mambo.link', "but driver 'turtlebot_driver'"),
+    ('mambo', {'motion': {'model': 'constant_speed'}}, 'mambo.motion.model', 'constant_speed'),
 ]
 
 
 @pytest.mark.parametrize('robot, changes, key, words', WRONG_LINKS)
 def test_links_that_cannot_work_are_refused(load, robot, changes, key, words):
-    content = yaml.safe_load(find_scenario('drone_rov').read_text())
-    content['robots']['drone'] |= LINKED
-    content['robots']['rov'] |= {'link': 'mavlink', 'mavlink': {'arm': True}}
-    assert load(content).robots['rov'].mavlink.system == 2
+    name = 'mambo_turtlebot_wifi' if robot == 'mambo' else 'drone_rov'
+    content = yaml.safe_load(find_scenario(name).read_text())
+    if robot != 'mambo':
+        content['robots']['drone'] |= LINKED
+        content['robots']['rov'] |= {'link': 'mavlink', 'mavlink': {'arm': True}}
+        assert load(content).robots['rov'].mavlink.system == 2
     for name, value in changes.items():
         content['robots'][robot][name] = value
     with pytest.raises(ScenarioError, match=words) as caught:

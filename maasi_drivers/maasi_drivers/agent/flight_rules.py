@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.arrays import FloatArray
 
 # Reason in `state` while a vehicle waits for it.
@@ -51,17 +52,17 @@ MARGIN = 0.5
 
 
 def make_fence(
-    given: list[list[float]] | None, bounds: FloatArray, radius: float, ground: float, start: float
+    bounds: FloatArray, radius: float, start: float, flight: FlightSettings
 ) -> FloatArray:
     """Return the lowest and highest x, y, z (3, 2) of goals [m, map].
 
-    Where none is given they are the bounds (2 or 3, 2) with the radius; in the plane from 1 m below
+    Without a geofence they are the bounds (2 or 3, 2) with the radius; in the plane from 1 m below
     the lower to 1 m above the higher one of ground and start. What starts above the ground is not
     sent below it.
     """
-    if given is not None:
-        return np.array(given)
-    fence = np.zeros((3, 2))
+    if flight.geofence is not None:
+        return np.array(flight.geofence)
+    ground, fence = flight.ground, np.zeros((3, 2))
     fence[2] = min(ground, start) - _HEIGHT, max(ground, start) + _HEIGHT
     fence[: len(bounds)] = bounds + np.array([-radius, radius])
     if start > ground:

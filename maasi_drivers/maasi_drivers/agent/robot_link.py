@@ -10,6 +10,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
+from maasi_drivers.agent.flight_rules import fence_problem
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
@@ -35,6 +38,8 @@ class RobotLink(ABC):
 
     def __init__(self, driver: RobotNode) -> None:
         self.driver = driver
+        #: Lowest and highest x, y, z of goals, (3, 2) [m, map], beside the driver's bounds.
+        self.fence: FloatArray = np.tile([-math.inf, math.inf], (3, 1))
 
     # ---- every link --------------------------------------------------------------------------
 
@@ -96,7 +101,7 @@ class RobotLink(ABC):
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Return why a waypoint (x, y, z) [m, map] is refused, or None."""
-        return None
+        return fence_problem(self.fence, position)
 
     def goal_taken(self, goal: Goal) -> None:
         """Take note of a new goal."""

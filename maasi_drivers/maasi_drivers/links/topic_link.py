@@ -10,12 +10,13 @@ from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from maasi_drivers.agent.flight_rules import fence_problem, make_fence
+from maasi_drivers.agent.flight_rules import make_fence
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.robot_topics import BatteryTopic, OdometryTopic
 from maasi_drivers.settings.driver import CommandType
+from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.qos import COMMANDS, RELIABLE
 
@@ -107,8 +108,10 @@ class TopicLink(RobotLink):
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
         settings = driver.settings
-        # In the plane the bounds of the environment have no heights.
-        self._fence = make_fence(None, driver.bounds, settings.radius, 0.0, settings.start[2])
+        if settings.motion.model != 'unicycle':
+            # In the plane the bounds of the environment have no heights.
+            height, flight = settings.start[2], FlightSettings()
+            self.fence = make_fence(driver.bounds, settings.radius, height, flight)
         self._publisher: CommandPublisher | None = None
         self._polls = 0
         # Whether it has a guard, and whether it had one.
@@ -168,12 +171,6 @@ class TopicLink(RobotLink):
     def status(self) -> dict[str, Any]:
         """Return whether there is a guard."""
         return {'guard': 'is there' if self._guarded else 'is not there'}
-
-    def goal_problem(self, position: Sequence[float]) -> str | None:
-        """Refuse heights far from that of the start; a ground robot has none."""
-        if self.driver.follower.on_ground:
-            return None
-        return fence_problem(self._fence, position)
 
     def begin_step(self, stamp: int) -> None:
         """Take the readings of the battery before this step."""

@@ -27,8 +27,8 @@ Fence = Annotated[list[Vector2], Field(min_length=3, max_length=3), AfterValidat
 LEAST_TILT, MOST_TILT = math.radians(5.0), math.radians(25.0)
 
 
-class MamboSettings(Settings):
-    """How the driver reaches a Mambo, and what it may have it do."""
+class FlightSettings(Settings):
+    """What a driver may have any vehicle do that takes off."""
 
     arm: bool = Field(
         default=False,
@@ -38,9 +38,27 @@ class MamboSettings(Settings):
     arm_timeout: float = Field(
         default=60.0,
         gt=0.0,
-        description='Time after the service arm in which it has to take off; then it is to be '
-        'called again [s]',
+        description='Time after the service arm in which it has to take off, or to be armed; then '
+        'it is to be called again [s]',
     )
+    ground: Finite = Field(
+        default=0.0,
+        description='Height in the map of the ground, or the surface, at its start [m]',
+    )
+    latency: float = Field(
+        default=0.0, ge=0.0, le=1.0, description='Age of a position when it arrives [s]'
+    )
+    geofence: Fence | None = Field(
+        default=None,
+        description='Lowest and highest x, y and z that it is sent to; none: the environment with '
+        'the radius around it, in the plane 1 m above and below its heights at the start; for what '
+        'starts above the ground, not below that [m, map]',
+    )
+
+
+class MamboSettings(FlightSettings):
+    """How the driver reaches a Mambo, and what it may have it do."""
+
     address: str = Field(
         default='192.168.99.3',
         min_length=1,
@@ -59,16 +77,10 @@ class MamboSettings(Settings):
         le=65535,
         description='UDP port on which the program on board hears orders, with link mambo_feed',
     )
-    ground: Finite = Field(
-        default=0.0, description='Height of the floor below its start in the map [m]'
-    )
     pose: Literal['events', 'odometry', 'pose'] = Field(
         default='events',
         description='Where its pose comes from: its own position events, or a topic of another '
         'system, odom (nav_msgs/Odometry) or pose (geometry_msgs/PoseStamped, in the map)',
-    )
-    latency: float = Field(
-        default=0.0, ge=0.0, le=1.0, description='Age of a position event when it arrives [s]'
     )
     position_noise: float = Field(
         default=0.01, ge=0.0, description="Deviation of a position event's numbers [m]"
@@ -121,12 +133,6 @@ class MamboSettings(Settings):
     battery_minimum: float = Field(
         default=0.1, ge=0.0, lt=1.0, description='Charge below which it lands [1]'
     )
-    geofence: Fence | None = Field(
-        default=None,
-        description='Lowest and highest x, y and z of goals, and of itself with half a metre to '
-        'spare; none: the environment with the radius around it, from the ground to 1 m above '
-        'the start [m, map]',
-    )
 
     def pose_covariance(self) -> FloatArray:
         """Return the covariance (6, 6) of a pose, by the settings' deviations [m^2, rad^2]."""
@@ -136,7 +142,7 @@ class MamboSettings(Settings):
 Ending = Literal['hold', 'land']
 
 
-class MavlinkSettings(Settings):
+class MavlinkSettings(FlightSettings):
     """How the driver reaches an autopilot, and what it may have it do."""
 
     url: str = Field(
@@ -157,17 +163,6 @@ class MavlinkSettings(Settings):
     vehicle: Literal['copter', 'submarine'] = Field(
         default='copter', description='What it is; another one is left alone'
     )
-    arm: bool = Field(
-        default=False,
-        description='Whether the driver may arm it and take off: each time the service arm is '
-        'called, and never without',
-    )
-    arm_timeout: float = Field(
-        default=60.0,
-        gt=0.0,
-        description='Time after the service arm in which it has to be armed; then it is to be '
-        'called again [s]',
-    )
     require_failsafe: bool = Field(
         default=True,
         description='Whether it is armed only if the autopilot acts by itself when the link is cut',
@@ -178,17 +173,8 @@ class MavlinkSettings(Settings):
         'autopilot, or the vehicle when the driver first hears its position, which is kept until '
         'the autopilot is restarted',
     )
-    ground: Finite = Field(
-        default=0.0, description='Height of that place in the map: the ground, the surface [m]'
-    )
     map_yaw: Finite = Field(
         default=0.0, description='Direction of the x axis of the map, from east to the left [rad]'
-    )
-    geofence: Fence | None = Field(
-        default=None,
-        description='Lowest and highest x, y and z that it is sent to; none: the environment with '
-        'the radius around it, in 2D 1 m above and below its heights at the start; for what '
-        'starts above the ground, not below that [m, map]',
     )
     lead: float = Field(
         default=1.0,
@@ -205,9 +191,6 @@ class MavlinkSettings(Settings):
     )
     link_timeout: float = Field(
         default=0.6, ge=0.3, le=10.0, description='Silence after which the link is lost [s]'
-    )
-    latency: float = Field(
-        default=0.0, ge=0.0, le=1.0, description='Age of a position when it arrives [s]'
     )
     rise_timeout: float = Field(
         default=15.0,

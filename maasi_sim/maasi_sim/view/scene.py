@@ -109,7 +109,7 @@ def _fence(robot: RobotSettings, scenario: Scenario) -> NDArray[np.float64] | No
     flies = robot.link == 'mambo_wifi'
     settings = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
     bounds = scenario.environment.array()
-    return make_fence(settings.geofence, bounds, robot.radius, settings.ground, robot.start[2])
+    return make_fence(bounds, robot.radius, robot.start[2], settings)
 
 
 def _buildings(scenario: CuboidScenario) -> Scene:

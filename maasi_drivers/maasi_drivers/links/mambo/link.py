@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from maasi_drivers.links.mambo.pyparrot import DroneSocket, ask_for_answer, guard, mend, revive
+from maasi_drivers.links.mambo.pyparrot import DroneSocket, ask_for_answer, guard, mend
 from maasi_filter.arrays import FloatArray
 
 HANDSHAKE_PORT = 44444
@@ -98,8 +98,6 @@ class MamboLink:
         self.position: PositionEvent | None = None
         #: Position events that could not be used.
         self.bad_events = 0
-        #: How often pyparrot's listener had died and was started again.
-        self.revived = 0
         self._drone: Any = None
         self._stamps: dict[str, Any] = {}
         self._fresh = False
@@ -263,7 +261,6 @@ class MamboLink:
                     self._probe(drone.drone_connection)
                     drone.smart_sleep(_ROUND)
                 else:
-                    self.revived += revive(drone.drone_connection)
                     self._wake.wait(_ROUND)
                 self._wake.clear()
         except Exception as error:

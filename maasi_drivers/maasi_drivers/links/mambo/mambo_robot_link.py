@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import fence_problem, make_fence
+from maasi_drivers.agent.flight_rules import make_fence
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
@@ -61,9 +61,7 @@ class MamboRobotLink(RobotLink):
     def prepare(self) -> None:
         """Make link and geofence; check that a connection is possible."""
         driver, mambo, settings = self.driver, self._mambo, self.driver.settings
-        self._fence = make_fence(
-            mambo.geofence, driver.bounds, settings.radius, mambo.ground, settings.start[2]
-        )
+        self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], mambo)
         if settings.motion.model == 'unicycle':
             raise SettingsError(
                 f"parameter motion.model: read 'unicycle', allowed with link {settings.link} "
@@ -104,7 +102,7 @@ class MamboRobotLink(RobotLink):
         if self._link is not None:
             self._phase = Phase.CONNECTING
             self._pilot = MamboPilot(
-                self._link, self._motion, self._mambo, self.driver.start_pose, self._fence
+                self._link, self._motion, self._mambo, self.driver.start_pose, self.fence
             )
 
     def _arm(self) -> str:
@@ -161,7 +159,6 @@ class MamboRobotLink(RobotLink):
             'flight': self._phase.value,
             'drone': link.flying_state,
             'bad position events': link.bad_events,
-            'listener started again': link.revived,
             **{f'datagrams dropped: {key}': number for key, number in link.dropped.items()},
         }
 
@@ -240,10 +237,6 @@ class MamboRobotLink(RobotLink):
         """Return whether pose and images must change: a command on the ground moves nothing."""
         grounded = self._pilot is not None and self._pilot.phase is not Phase.FLYING
         return not grounded and super().is_moving(placed, command)
-
-    def goal_problem(self, position: Sequence[float]) -> str | None:
-        """Refuse waypoints outside the geofence."""
-        return fence_problem(self._fence, position)
 
     def goal_taken(self, goal: Goal) -> None:
         """Keep the drone in the air."""

@@ -20,7 +20,6 @@ import numpy as np
 from maasi_drivers.agent.flight_rules import (
     UNTIL_ARM,
     ArmPermission,
-    fence_problem,
     make_fence,
     outside_fence,
 )
@@ -134,9 +133,7 @@ class OnboardLink(RobotLink):
                 'mambo_feed is feed'
             )
         driver.feed_peer = FeedPeer(mambo.address, self._take_feed_pose)
-        self._fence = make_fence(
-            mambo.geofence, driver.bounds, settings.radius, mambo.ground, settings.start[2]
-        )
+        self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], mambo)
         # Positions of the feed are relative to this.
         self._origin = Pose.from_yaw([*settings.start[:2], mambo.ground], settings.yaw)
 
@@ -181,6 +178,7 @@ class OnboardLink(RobotLink):
         """Have the drone hover."""
         if self._order is OrderKind.GO:
             self._order = OrderKind.HOLD
+            self._send_order()
 
     def stop(self) -> None:
         """Land: the order is sent some times, as datagrams may be lost."""
@@ -208,10 +206,6 @@ class OnboardLink(RobotLink):
             self._lost_since = self._lost_since or now
             if now - self._lost_since > self._mambo.land_after:
                 self._land('nothing heard from the drone')
-
-    def goal_problem(self, position: Sequence[float]) -> str | None:
-        """Refuse waypoints outside the geofence."""
-        return fence_problem(self._fence, position)
 
     def status(self) -> dict[str, Any]:
         """Return the present order."""
@@ -259,7 +253,7 @@ class OnboardLink(RobotLink):
             return NOT_ALLOWED
         if 0.0 <= pose.battery < mambo.battery_minimum:
             return self._land(f'battery at {pose.battery:.2f}, below {mambo.battery_minimum:.2f}')
-        if too_far := outside_fence(self._fence, place.position):
+        if too_far := outside_fence(self.fence, place.position):
             return self._land(too_far)
         if self._up:
             down = pose.state != FeedState.AIR

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 import socket
 import struct
-import threading
 from collections import Counter
 from typing import Any
 
@@ -93,7 +92,7 @@ class DroneSocket:
         """Return the next datagram; no bytes where none came, or one that must not be used."""
         try:
             data, sender = self._socket.recvfrom(size)
-        except TimeoutError:
+        except OSError:
             return b'', None
         foreign = sender[0] != self._drone
         if not foreign and has_whole_frames(data):
@@ -126,14 +125,3 @@ def guard(connection: Any, drone: str, port: int) -> None:
 
     connection._create_udp_connection = open_sockets
     connection.handle_data = handle_data
-
-
-def revive(connection: Any) -> bool:
-    """Restart a connection's listener if it has died; return whether it had."""
-    if not connection.is_listening or connection.listener_thread.is_alive():
-        return False
-    connection.listener_thread = threading.Thread(
-        target=connection._listen_socket, name='Mambo listener', daemon=True
-    )
-    connection.listener_thread.start()
-    return True

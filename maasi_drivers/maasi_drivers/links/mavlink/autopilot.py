@@ -9,10 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from maasi_drivers.links.mavlink.estimate import Estimate, FlightOrigin
+from maasi_drivers.links.mavlink.estimate import Estimate, FlightOrigin, swap_enu_ned, swap_yaw
 from maasi_drivers.links.mavlink.firmware import FailsafeCheck, Firmware, identify
 from maasi_drivers.links.mavlink.protocol import DEBUG, ERROR, INFO, WARNING, ReportLog, mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
+from maasi_filter.arrays import FloatArray
 
 _HEARTBEAT_PERIOD = 1.0
 # Without attitude, position or their status for so long the messages are requested again [s].
@@ -30,6 +31,8 @@ _MESSAGES = {
 }
 # Period and number of tries of a command that is not answered [s, 1].
 _ANSWER_PATIENCE, _TRIES = 0.5, 5
+# Position only, and yaw: no velocity, acceleration, yaw rate; and no yaw either.
+_POSITION_AND_YAW, _NO_YAW = 0x9F8, 0x400
 
 
 class ModeChange(NamedTuple):
@@ -73,7 +76,7 @@ class Autopilot:
         self._settings = settings
         self._sender = sender
         self._log = log
-        self._received_at = self._heartbeat_at = self._requested_at = -math.inf
+        self._received_at = self._heartbeat_at = self._requested_at = self._setpoint_at = -math.inf
 
     @property
     def mode_name(self) -> str:
@@ -264,3 +267,20 @@ class Autopilot:
         )
         command.sent = now
         command.tries += 1
+
+    def send_setpoint(self, position: FloatArray, yaw: float | None, now: float) -> None:
+        """Send where it is to be, (3,) [m], if that is due; without a yaw it keeps its own."""
+        if now - self._setpoint_at < 1.0 / self._settings.setpoint_rate - 1e-6:
+            return
+        self._setpoint_at = now
+        self._sender.set_position_target_local_ned_send(
+            int(now * 1000.0) & 0xFFFFFFFF,
+            self._settings.system,
+            mavlink.MAV_COMP_ID_AUTOPILOT1,
+            mavlink.MAV_FRAME_LOCAL_NED,
+            _POSITION_AND_YAW | (_NO_YAW if yaw is None else 0),
+            *swap_enu_ned(position).tolist(),
+            *[0.0] * 6,
+            0.0 if yaw is None else swap_yaw(yaw),
+            0.0,
+        )

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import MARGIN, fence_problem, make_fence
+from maasi_drivers.agent.flight_rules import MARGIN, make_fence
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, ArrivalClock, RobotNode
@@ -62,8 +62,7 @@ class MavlinkRobotLink(RobotLink):
         self._telemetry: Telemetry | None = None
         self._heading: float | None = None
         self._ending = False
-        ground, fence = self._mavlink.ground, self._mavlink.geofence
-        self._fence = make_fence(fence, driver.bounds, settings.radius, ground, settings.start[2])
+        self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], self._mavlink)
 
     # ---- link and life cycle -----------------------------------------------------------------
 
@@ -164,10 +163,6 @@ class MavlinkRobotLink(RobotLink):
                 **{f'parameter {key}': item for key, item in vehicle.parameters.items()},
                 **{f'ignored: {key}': number for key, number in vehicle.estimate.dropped.items()},
             }
-
-    def goal_problem(self, position: Sequence[float]) -> str | None:
-        """Refuse waypoints outside the geofence."""
-        return fence_problem(self._fence, position)
 
     def _send_target(self, position: FloatArray, yaw: float) -> None:
         if self._link is None:
@@ -278,4 +273,4 @@ class MavlinkRobotLink(RobotLink):
             self.driver.follower.stay()
 
     def _inside(self, position: FloatArray) -> FloatArray:
-        return np.clip(position, self._fence[:, 0], self._fence[:, 1])
+        return np.clip(position, self.fence[:, 0], self.fence[:, 1])

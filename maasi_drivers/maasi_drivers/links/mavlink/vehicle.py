@@ -16,7 +16,6 @@ from maasi_drivers.links.mavlink.autopilot import Autopilot, ModeChange
 from maasi_drivers.links.mavlink.estimate import FlightOrigin
 from maasi_drivers.links.mavlink.firmware import Firmware
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, ReportLog, mavlink
-from maasi_drivers.links.mavlink.setpoint import Setpoint, checked_target
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 from maasi_filter.arrays import FloatArray
 
@@ -73,7 +72,9 @@ class Vehicle:
         self._autopilot = Autopilot(settings, sender, self._log, self._place, self._on_restart)
         self.estimate = self._autopilot.estimate
         self._permission = ArmPermission(settings.arm_timeout)
-        self._setpoint = Setpoint(settings, sender)
+        # Where it is to be, and its yaw there; none: it keeps its own.
+        self._target: FloatArray | None = None
+        self._yaw: float | None = None
         # Smallest distance to its height so far [m], and the time at which it became less.
         self._least_left, self._nearer_at = math.inf, -math.inf
         self._take_off_accepted = False
@@ -108,11 +109,9 @@ class Vehicle:
     @property
     def at_rest(self) -> bool:
         """Whether nothing is left to command when the driver ends."""
-        autopilot = self._autopilot
-        if self.phase not in COMMANDED or not autopilot.armed:
+        if self.phase not in COMMANDED or not self._autopilot.armed:
             return True
-        accepted = self._ending_accepted or autopilot.mode == self._ending_mode
-        return self.phase is Phase.ENDING and accepted
+        return self.phase is Phase.ENDING and self._ending_accepted
 
     @property
     def fault(self) -> str:
@@ -152,9 +151,13 @@ class Vehicle:
 
     def set_target(self, position: ArrayLike, yaw: float) -> None:
         """Have it go to a position (3,) [m], with a yaw [rad], and stay there."""
-        target = checked_target(position, yaw)
+        target = np.array(position, dtype=float)
+        if not np.isfinite([*target, yaw]).all():
+            raise ValueError(
+                f'setpoint: got {target.tolist()}, {yaw}, allowed are finite numbers [m, rad]'
+            )
         if self.phase is Phase.FLYING:
-            self._setpoint.position, self._setpoint.yaw = target, float(yaw)
+            self._target, self._yaw = target, float(yaw)
 
     def permit(self, now: float) -> str:
         """Let it take off once, or be taken over where it flies; return why not, or nothing."""
@@ -228,6 +231,10 @@ class Vehicle:
             self._on_disarmed(now)
         elif mode not in self._own_modes(change.before):
             self._let_go(mode)
+        elif self.phase is Phase.ENDING:
+            self._ending_accepted = mode == self._ending_mode
+            if self._ending_accepted:
+                self._autopilot.commands.clear()
         elif self.phase is Phase.RELEASED:
             name = firmware.mode_name(mode)
             if mode == firmware.external and change.armed and not firmware.px4:
@@ -268,7 +275,7 @@ class Vehicle:
         )
         self._autopilot.commands.clear()
         self._permission.end()
-        self._setpoint.position = None
+        self._target = None
         self._enter(Phase.RELEASED, f'mode {name}')
 
     def _on_restart(self) -> None:
@@ -300,8 +307,8 @@ class Vehicle:
         autopilot.request_data(now)
         self._continue(now)
         autopilot.send_commands(now)
-        if self._streams_setpoints:
-            self._setpoint.send(now)
+        if self._target is not None and self._streams_setpoints:
+            autopilot.send_setpoint(self._target, self._yaw, now)
 
     @property
     def _streams_setpoints(self) -> bool:
@@ -378,7 +385,7 @@ class Vehicle:
             if problem:
                 self._permission.end()
             elif permitted:
-                self._setpoint.hold(self._position())
+                self._target, self._yaw = self._position(), None
                 self._enter(Phase.STARTING)
                 return
             self._detail = f'{problem}, {UNTIL_ARM}' if problem else UNTIL_ARM
@@ -400,10 +407,10 @@ class Vehicle:
             self._autopilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 
     def _begin_rising(self, now: float) -> None:
-        self._setpoint.position = self._position()
+        self._target = self._position()
         if self._firmware.kind == 'copter':
             # On the ground; the barometer may have drifted since the estimator started.
-            self.estimate.origin[2] = self._setpoint.position[2]
+            self.estimate.origin[2] = self._target[2]
             self._place.keep(self.estimate.origin, self.estimate.booted)
         self._least_left, self._nearer_at = math.inf, now
         self._take_off_accepted = False
@@ -411,7 +418,7 @@ class Vehicle:
 
     def _rise(self, now: float) -> None:
         estimate, top, timeout = self.estimate, self._top, self.settings.rise_timeout
-        assert self._setpoint.position is not None
+        assert self._target is not None
         height = float(self._position()[2])
         left = abs(height - top)
         if left < self._least_left - _PROGRESS:
@@ -427,7 +434,7 @@ class Vehicle:
             self._log.add(ERROR, f'{reason}: it lands')
             self.finish('land', reason)
         elif not by_command:
-            self._setpoint.position[2] = top
+            self._target[2] = top
         elif not self._take_off_accepted and self._is_due(now, _ARMING_PERIOD):
             take_off = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.height)
             self._autopilot.command(mavlink.MAV_CMD_NAV_TAKEOFF, take_off, self._on_take_off)
@@ -439,14 +446,15 @@ class Vehicle:
         position = self._position()
         if self.phase is Phase.RISING:
             position[2] = self._top
-        self._setpoint.hold(position)
+        self._target, self._yaw = position, None
         if self.phase is not Phase.FLYING:
             self._fix_needed = self.estimate.has_fix
         self._autopilot.commands.clear()
         self._enter(Phase.FLYING)
 
     def _end(self, now: float) -> None:
-        if self._autopilot.mode != self._ending_mode and self._is_due(now, _ENDING_PERIOD):
+        # Not again once accepted: a pilot may have taken another mode since the last heartbeat.
+        if not self._ending_accepted and self._is_due(now, _ENDING_PERIOD):
             self._autopilot.request_mode(self._ending_mode, self._on_ending_accepted)
 
     def _on_ending_accepted(self) -> None:

@@ -31,7 +31,6 @@ from maasi_planner.motion import RobotState
 from maasi_sim.arguments import whole
 from maasi_sim.emulators.mambo.firmware import (
     AIRBORNE,
-    LIMITS,
     FirmwareSettings,
     FlyingState,
     MamboFirmware,
@@ -75,9 +74,8 @@ def frames(data: bytes) -> Iterator[Frame]:
 
 ALL_STATES = (0, 4, 0)
 _TAKE_OFF, _PILOTING, _LAND, _EMERGENCY = (2, 0, 1), (2, 0, 2), (2, 0, 3), (2, 0, 4)
-# Commands that set a limit, and events that tell it.
+# Commands that set a limit.
 _LIMITS = {(2, 8, 1): 'tilt', (2, 1, 0): 'climb', (2, 1, 1): 'turn'}
-_LIMIT_EVENTS = {'tilt': (2, 9, 1), 'climb': (2, 5, 0), 'turn': (2, 5, 1)}
 
 
 def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) -> None:
@@ -284,9 +282,6 @@ class FakeMambo:
     def _tell_all(self) -> None:
         self._said = None
         self._tell_state()
-        for name, (most, unit) in LIMITS.items():
-            value = self.firmware.limits[name] / unit
-            self._event(_LIMIT_EVENTS[name], struct.pack('<fff', value, *most))
         self._event((0, 5, 0), b'')
 
     def _send_sensors(self, elapsed: float) -> None:
@@ -319,29 +314,19 @@ class FakeMambo:
         visitor, (host, _) = self._door.accept()
         with visitor:
             visitor.settimeout(_HANDSHAKE_TIME)
-            answer = self._shake_hands(host, visitor.recv(4096))
+            try:
+                port = int(json.loads(visitor.recv(4096).rstrip(b'\0'))['d2c_port'])
+            except (ValueError, KeyError, TypeError):
+                self.refused += 1
+                return
+            self._controller = (host, port)
+            self._unacked.clear()
+            self._done.clear()
+            self._sequences.clear()
+            self._said = None
+            self.firmware.hear()
+            answer = {'status': 0, 'c2d_port': self.command_port}
             visitor.sendall(json.dumps(answer).encode() + b'\0')
-
-    def _shake_hands(self, host: str, request: bytes) -> dict[str, int]:
-        try:
-            port = int(json.loads(request.rstrip(b'\0'))['d2c_port'])
-            if not 0 < port < 65536:
-                raise ValueError
-        except (ValueError, KeyError, TypeError):
-            self.refused += 1
-            return {'status': -1, 'c2d_port': 0}
-        self._controller = (host, port)
-        self._unacked.clear()
-        self._done.clear()
-        self._sequences.clear()
-        self._said = None
-        self.firmware.hear()
-        return {
-            'status': 0,
-            'c2d_port': self.command_port,
-            'c2d_update_port': 51,
-            'c2d_user_port': 21,
-        }
 
     def _listen(self) -> None:
         data, sender = self._air.recvfrom(65536)

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -48,19 +47,12 @@ _DISARM_DELAY = 10.0
 # PX4 wants setpoints for so long, and not so long ago, before OFFBOARD [s].
 _OFFBOARD_STREAM, _OFFBOARD_AGE = 1.0, 0.5
 _LANDING, _SURFACING = 0.5, 0.3
-_POSITION_IGNORED, _VELOCITY_IGNORED, _YAW_IGNORED = 0b111, 0b111 << 3, 1 << 10
+_POSITION_IGNORED, _YAW_IGNORED = 0b111, 1 << 10
 # Of EKF_STATUS_REPORT.
 _EKF_GOOD, _EKF_START = 1 | 2 | 4 | 8 | 16 | 32, 1 | 128
 # From the loss of GNSS to that of the position estimate [s].
 _DEAD_RECKONING = 8.0
 _ACCEPTED, _FAILED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED
-
-
-@dataclass
-class _Setpoint:
-    position: FloatArray
-    velocity: FloatArray | None = None
-    yaw: float | None = None
 
 
 class FakeAutopilot:
@@ -157,7 +149,8 @@ class FakeAutopilot:
         self.mode = mode
         # Height of a take-off [m].
         self._rising_to: float | None = None
-        self._setpoint: _Setpoint | None = _Setpoint(self.body.position.copy())
+        # Place and yaw of the last set-point.
+        self._setpoint: tuple[FloatArray, float | None] | None = (self.body.position.copy(), None)
 
     # ---- the clock ---------------------------------------------------------------------------
 
@@ -202,13 +195,11 @@ class FakeAutopilot:
             target = np.array([*body.position[:2], self._rising_to])
             body.fly_to(target, None, dt)
             if abs(body.position[2] - self._rising_to) < 0.1 * (self._rising_to - self._home):
-                self._setpoint, self._rising_to = _Setpoint(target), None
+                self._setpoint, self._rising_to = (target, None), None
         elif setpoint is None:
             body.fly(np.zeros(3), dt)
-        elif setpoint.velocity is None:
-            body.fly_to(setpoint.position, setpoint.yaw, dt)
         else:
-            body.fly(setpoint.velocity, dt)
+            body.fly_to(*setpoint, dt)
 
     def _lifts_off(self) -> bool:
         """Return whether a setpoint over the ground takes it off, as PX4 does."""
@@ -216,7 +207,7 @@ class FakeAutopilot:
             self.firmware.rise == 'setpoint'
             and self._setpoint is not None
             and self.mode == self.firmware.external
-            and bool(self._setpoint.position[2] > 0.1)
+            and bool(self._setpoint[0][2] > 0.1)
         )
 
     def disarm(self, text: str) -> None:
@@ -233,20 +224,14 @@ class FakeAutopilot:
         firmware, read = self.firmware, self.parameters.get
         silence = self.now - self._station_at
         if silence > read('FS_GCS_TIMEOUT', math.inf) and self._acts('GCS', 'FS_GCS_ENABLE'):
-            action = int(self.parameters['FS_GCS_ENABLE'])
-            if firmware is not ARDUSUB or action >= 3:
-                depth_hold = firmware is ARDUSUB and action == 3
-                self.take_mode(firmware.hold if depth_hold else firmware.land)
-            elif action == 2:
-                self.disarm('GCS failsafe: disarmed')
+            self.take_mode(firmware.land)
         elif (
             firmware is PX4_COPTER
             and self.mode == firmware.external
             and self.now - self._streamed_at > read('COM_OF_LOSS_T', 1.0)
         ):
             self.say(3, 'Failsafe: no offboard setpoints')
-            hold = self.parameters['COM_OBL_RC_ACT'] == 5
-            self.take_mode(firmware.hold if hold else firmware.land)
+            self.take_mode(firmware.land)
         if self.charge < 0.05 and self._acts('Battery', 'BATT_FS_LOW_ACT', 'COM_LOW_BAT_ACT'):
             self.take_mode(firmware.land)
 
@@ -411,11 +396,6 @@ class FakeAutopilot:
         return int(_ACCEPTED)
 
     def _arm(self, message: Any) -> int:
-        if message.param1 == 0.0:
-            if not self.body.grounded and not self.body.submarine and message.param2 != 21196.0:
-                return int(_FAILED)
-            self.disarm('Disarming motors')
-            return int(_ACCEPTED)
         if not self.ready or self.charge < 0.05:
             low = 'Battery below minimum arming capacity'
             self.say(2, f'PreArm: {low if self.ready else "Need Position Estimate"}')
@@ -440,13 +420,10 @@ class FakeAutopilot:
         return int(_ACCEPTED)
 
     def _on_setpoint(self, message: Any) -> None:
-        mask = message.type_mask
         position = (message.x, message.y, message.z)
-        velocity = (message.vx, message.vy, message.vz)
-        wants_position = not mask & _POSITION_IGNORED
-        wants_velocity = not mask & _VELOCITY_IGNORED
-        wants_yaw = not mask & _YAW_IGNORED
-        used = position * wants_position + velocity * wants_velocity + (message.yaw,) * wants_yaw
+        wants_position = not message.type_mask & _POSITION_IGNORED
+        wants_yaw = not message.type_mask & _YAW_IGNORED
+        used = position * wants_position + (message.yaw,) * wants_yaw
         if not all(map(math.isfinite, used)):
             self.crashed = f'SET_POSITION_TARGET_LOCAL_NED: {used} is not finite'
             self.armed = False
@@ -457,13 +434,9 @@ class FakeAutopilot:
         if self.now - self._streamed_at > _OFFBOARD_AGE:
             self._streaming_since = self.now
         self._streamed_at = self.now
-        obeys = self.mode == self.firmware.external and self._rising_to is None
-        if obeys and (wants_position or wants_velocity):
-            self._setpoint = _Setpoint(
-                swap_enu_ned(position) - self.offset,
-                None if wants_position else swap_enu_ned(velocity),
-                swap_yaw(message.yaw) if wants_yaw else None,
-            )
+        if wants_position and self.mode == self.firmware.external and self._rising_to is None:
+            yaw = swap_yaw(message.yaw) if wants_yaw else None
+            self._setpoint = swap_enu_ned(position) - self.offset, yaw
 
 
 _MESSAGES: dict[str, Callable[[FakeAutopilot], None]] = {
