@@ -46,8 +46,13 @@ class Member:
 
 
 @dataclass
-class _Plan:
-    """Present plan of a robot."""
+class RobotPlan:
+    """A robot, and its present plan.
+
+    decision: index of its last decision, -1 before the first; positions (K + 1, 3): predicted
+    trajectory [m]; staying: whether it has no goal: it never had one, refused it, or is commanded
+    to stay.
+    """
 
     motion: MotionModel
     sensor: Sensor
@@ -73,12 +78,99 @@ class _Plan:
     measurements: int = 0
     due: bool = False
 
+    @property
+    def destined(self) -> bool:
+        """Whether it has a plan, or has not measured since it had one."""
+        return self.decided_at is None or not self.staying or len(self.positions) > 0
+
+    def destination(self, state: RobotState) -> FloatArray:
+        """Return the final position of its plan at a state, (3,) [m]."""
+        if self.staying or not len(self.positions):
+            return np.array(state.pose.position)
+        return self.positions[-1].copy()
+
+    def leave(self) -> None:
+        """Discard its plan: it does not take part."""
+        self.decided_at = None
+        self.positions, self.yaws = np.zeros((0, 3)), np.zeros(0)
+        self.staying = True
+        self.passed = None
+        self.due = False
+
+    def lend(self, step: int) -> None:
+        """Note that it follows a goal of another client: it measures without a plan."""
+        began = self.decided_at
+        self.leave()
+        if began is None:
+            began = self.measured_from = step
+        self.decided_at = began
+        # Measurements need a decision index, which is not negative.
+        self.decision = max(self.decision, 0)
+
+    def nears(self, robot: PresentRobot) -> bool:
+        """Return whether it is on its way, near enough to turn to the next waypoint."""
+        if robot.free or self.staying or not self.turning_distance:
+            return False
+        left = self.motion.squared_distance(robot.state.pose.position, self.waypoint)
+        return left < self.turning_distance**2
+
+    def adopt(self, step: int, robot: PresentRobot, chosen: RobotDecision) -> None:
+        """Take over what was decided for it."""
+        here = robot.state.pose.position
+        # Of two waypoints passed in a row the first is measured now.
+        self.due = self.due or self.passed is not None
+        self.passed = None
+        if robot.free:
+            self.measured_from = step
+        else:
+            self.passed = self.waypoint
+            self.nearest = self.motion.squared_distance(here, self.passed)
+        self.decision += 1
+        self.decided_at = step
+        self.positions, self.yaws = chosen.positions, chosen.yaws
+        self.staying, self.waypoint = chosen.stays, chosen.waypoint
+        # A waypoint within the radius already is gone to until it is reached.
+        near = self.motion.squared_distance(here, chosen.waypoint) <= self.arrival_radius**2
+        self.turning_distance = 0.0 if near else self.arrival_radius
+
+    def pass_waypoint(self, step: int, robot: PresentRobot) -> None:
+        """Count the measurements from the closest point to a waypoint that is passed."""
+        if self.passed is None or step == self.decided_at:
+            return
+        distance = self.motion.squared_distance(robot.state.pose.position, self.passed)
+        if distance >= self.nearest:
+            self.passed = None
+            self.measured_from = step
+        else:
+            self.nearest = distance
+
+    def view(self, step: int, robot: PresentRobot, planning: bool) -> RobotView:
+        """Return what a planner sees of it."""
+        view = RobotView(
+            state=robot.state,
+            candidates=self.candidates.at(robot.state.pose.position),
+            motion=self.motion,
+            sensor=self.sensor,
+            period_steps=self.period,
+            planning=planning,
+            radius=self.radius,
+            exploration=self.exploration,
+        )
+        if not planning and self.decided_at is not None:
+            view.phase = (self.measured_from - step) % self.period
+            if len(self.positions):
+                first = min(step - self.decided_at, len(self.positions) - 1)
+                view.remaining_path = self.positions[first:]
+                view.remaining_yaws = self.yaws[first:]
+        return view
+
 
 class Coordinator:
     """Plans for a team of robots step by step.
 
-    settings: robots, planner and environment; exploration: e after the last measurements; clusters:
-    potential targets after the last measurements; finished: why no gain is left; None before.
+    settings: robots, planner and environment; plans: of the robots, in order of their names;
+    exploration: e after the last measurements; clusters: potential targets after the last
+    measurements; finished: why no gain is left; None before.
     """
 
     def __init__(self, settings: PlannerNodeSettings) -> None:
@@ -95,13 +187,13 @@ class Coordinator:
         self.finished: str | None = None
         self.planner = make_planner(settings.planner.name, settings.planner)
         self.trigger = MeasurementTrigger(settings.planner)
-        self._plans: dict[str, _Plan] = {}
+        self.plans: dict[str, RobotPlan] = {}
         own = settings.planner.own_explorations
         for name in sorted(settings.robots):
             robot = settings.robots[name]
             motion = make_motion(robot.motion, self.obstacles, robot.radius)
             sensor = robot.sensor.build(name, self.dimension)
-            self._plans[name] = _Plan(
+            self.plans[name] = RobotPlan(
                 motion=motion,
                 sensor=sensor,
                 candidates=CandidateSet(robot.candidates, bounds, height=robot.start[2]),
@@ -114,65 +206,7 @@ class Coordinator:
     @property
     def names(self) -> list[str]:
         """Names of all robots, in order."""
-        return list(self._plans)
-
-    def sensor(self, name: str) -> Sensor:
-        """Return a robot's sensor."""
-        return self._plans[name].sensor
-
-    def decision_index(self, name: str) -> int:
-        """Return the index of a robot's last decision, -1 before the first."""
-        return self._plans[name].decision
-
-    def path(self, name: str) -> FloatArray:
-        """Return a robot's predicted trajectory, (K + 1, 3) [m]."""
-        return self._plans[name].positions
-
-    def destination(self, name: str, state: RobotState) -> FloatArray:
-        """Return the final position of the plan of a robot at `state`, (3,) [m]."""
-        plan = self._plans[name]
-        if plan.staying or not len(plan.positions):
-            return np.array(state.pose.position)
-        return plan.positions[-1].copy()
-
-    def is_idle(self, name: str) -> bool:
-        """Return whether a robot has no goal: it never had one, or is commanded to stay."""
-        return self._plans[name].staying
-
-    def refuse(self, name: str) -> None:
-        """Note that a robot refused its goal; it replans at its next measurement."""
-        self._plans[name].staying = True
-
-    def skip_measurements(self, name: str, index: int) -> None:
-        """Continue the measurement indices of a robot from `index`, for example after a restart."""
-        plan = self._plans[name]
-        plan.measurements = max(plan.measurements, index)
-
-    def leave(self, name: str) -> None:
-        """Note that a robot does not take part; discard its plan."""
-        plan = self._plans[name]
-        plan.decided_at = None
-        plan.positions = np.zeros((0, 3))
-        plan.yaws = np.zeros(0)
-        plan.staying = True
-        plan.passed = None
-        plan.due = False
-
-    def destined(self, name: str) -> bool:
-        """Return whether a robot has a plan, or has not measured since it had one."""
-        plan = self._plans[name]
-        return plan.decided_at is None or not plan.staying or len(plan.positions) > 0
-
-    def lend(self, name: str, step: int) -> None:
-        """Note that a robot follows a goal of another client: it measures without a plan."""
-        plan = self._plans[name]
-        began = plan.decided_at
-        self.leave(name)
-        if began is None:
-            began = plan.measured_from = step
-        plan.decided_at = began
-        # Measurements need a decision index, which is not negative.
-        plan.decision = max(plan.decision, 0)
+        return list(self.plans)
 
     def begin_again(self) -> None:
         """Begin a new search with nothing explored; decision indices continue."""
@@ -180,14 +214,8 @@ class Coordinator:
         self.finished = None
         self.planner = make_planner(self.settings.planner.name, self.settings.planner)
         self.trigger.reset()
-        for name in self.names:
-            self.leave(name)
-
-    def next_number(self, name: str) -> int:
-        """Return the number of a goal without a decision of the planner."""
-        plan = self._plans[name]
-        plan.decision += 1
-        return plan.decision + 1
+        for plan in self.plans.values():
+            plan.leave()
 
     def planning(self, step: int, robots: Mapping[str, PresentRobot]) -> list[str]:
         """Return P_k, the robots that plan at a step, in order of their names.
@@ -199,19 +227,11 @@ class Coordinator:
             return []
         chosen = []
         for name in sorted(robots):
-            plan, robot = self._plans[name], robots[name]
+            plan, robot = self.plans[name], robots[name]
             waited = plan.decided_at is None or step - plan.decided_at >= plan.period
-            if self._nears(plan, robot) or (robot.free and (not plan.staying or waited)):
+            if plan.nears(robot) or (robot.free and (not plan.staying or waited)):
                 chosen.append(name)
         return chosen
-
-    @staticmethod
-    def _nears(plan: _Plan, robot: PresentRobot) -> bool:
-        """Return whether a robot on its way is near enough to its waypoint to turn to the next."""
-        if robot.free or plan.staying or not plan.turning_distance:
-            return False
-        left = plan.motion.squared_distance(robot.state.pose.position, plan.waypoint)
-        return left < plan.turning_distance**2
 
     def plan(
         self,
@@ -241,12 +261,12 @@ class Coordinator:
         finished = self.planner.finished(team)
         if finished is not None:
             for name in planning:
-                self._plans[name].turning_distance = 0.0
+                self.plans[name].turning_distance = 0.0
             if not arrived:
                 return None
             self.finished = finished
             for name in arrived:
-                plan = self._plans[name]
+                plan = self.plans[name]
                 plan.decision += 1
                 plan.decided_at = plan.measured_from = step
                 plan.staying = True
@@ -254,41 +274,16 @@ class Coordinator:
         decision = self.planner.decide(team)
         check_decision(self.planner, team, decision)
         for name in planning:
-            if name not in arrived and decision.robots[name].stays:
-                self._plans[name].turning_distance = 0.0
+            plan, chosen = self.plans[name], decision.robots[name]
+            if name not in arrived and chosen.stays:
+                plan.turning_distance = 0.0
                 del decision.robots[name]
-            else:
-                self._adopt(name, step, robots[name], decision.robots[name])
+                continue
+            plan.adopt(step, robots[name], chosen)
+            way = chosen.positions, chosen.yaws
+            knowledge = self.clusters, self.exploration
+            self.trigger.begin(name, plan.sensor, *way, plan.period, *knowledge)
         return decision if decision.robots else None
-
-    def _adopt(self, name: str, step: int, robot: PresentRobot, chosen: RobotDecision) -> None:
-        """Make what was decided for a robot its plan."""
-        plan = self._plans[name]
-        here = robot.state.pose.position
-        # Of two waypoints passed in a row the first is measured now.
-        plan.due = plan.due or plan.passed is not None
-        plan.passed = None
-        if robot.free:
-            plan.measured_from = step
-        else:
-            plan.passed = plan.waypoint
-            plan.nearest = plan.motion.squared_distance(here, plan.passed)
-        plan.decision += 1
-        plan.decided_at = step
-        plan.positions, plan.yaws = chosen.positions, chosen.yaws
-        plan.staying, plan.waypoint = chosen.stays, chosen.waypoint
-        # A waypoint within the radius already is gone to until it is reached.
-        near = plan.motion.squared_distance(here, chosen.waypoint) <= plan.arrival_radius**2
-        plan.turning_distance = 0.0 if near else plan.arrival_radius
-        self.trigger.begin(
-            name,
-            plan.sensor,
-            chosen.positions,
-            chosen.yaws,
-            plan.period,
-            self.clusters,
-            self.exploration,
-        )
 
     def _team(
         self,
@@ -297,32 +292,13 @@ class Coordinator:
         planning: Sequence[str],
         taken: Sequence[tuple[FloatArray, float]],
     ) -> TeamView:
-        views = {}
-        for name in sorted(robots):
-            plan = self._plans[name]
-            state = robots[name].state
-            view = RobotView(
-                state=state,
-                candidates=plan.candidates.at(state.pose.position),
-                motion=plan.motion,
-                sensor=plan.sensor,
-                period_steps=plan.period,
-                planning=name in planning,
-                radius=plan.radius,
-                exploration=plan.exploration,
-            )
-            if not view.planning and plan.decided_at is not None:
-                gone = step - plan.decided_at
-                view.phase = (plan.measured_from - step) % plan.period
-                if len(plan.positions):
-                    first = min(gone, len(plan.positions) - 1)
-                    view.remaining_path = plan.positions[first:]
-                    view.remaining_yaws = plan.yaws[first:]
-            views[name] = view
         return TeamView(
             step=step,
             step_time=self.settings.step,
-            robots=views,
+            robots={
+                name: self.plans[name].view(step, robots[name], name in planning)
+                for name in sorted(robots)
+            },
             clusters=self.clusters,
             exploration=self.exploration,
             obstacles=self.obstacles,
@@ -335,10 +311,10 @@ class Coordinator:
         """Return M_k, the robots that measure at a step, in order of their names."""
         members = []
         for name in sorted(robots):
-            plan = self._plans[name]
+            plan = self.plans[name]
             if plan.decided_at is None:
                 continue
-            self._pass(plan, step, robots[name])
+            plan.pass_waypoint(step, robots[name])
             gone = step - plan.measured_from
             # At index 0 the robot is at its last waypoint, or at the closest point.
             if gone == 0 or (self.planner.measures_underway and gone % plan.period == 0):
@@ -356,22 +332,10 @@ class Coordinator:
                 plan.measurements += 1
         return members
 
-    @staticmethod
-    def _pass(plan: _Plan, step: int, robot: PresentRobot) -> None:
-        """Count the measurements from the closest point to a waypoint that is passed."""
-        if plan.passed is None or step == plan.decided_at:
-            return
-        distance = plan.motion.squared_distance(robot.state.pose.position, plan.passed)
-        if distance >= plan.nearest:
-            plan.passed = None
-            plan.measured_from = step
-        else:
-            plan.nearest = distance
-
     def absorb(self, poses: Mapping[str, Pose], clusters: list[Cluster]) -> None:
         """Update with a batch that the filter has processed."""
         for name in sorted(poses):
-            plan = self._plans[name]
+            plan = self.plans[name]
             self.exploration.update(plan.sensor.detection, poses[name])
             if plan.exploration is not None:
                 plan.exploration.update(plan.sensor.detection, poses[name])

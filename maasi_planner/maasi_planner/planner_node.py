@@ -418,14 +418,16 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._others.publish(
             header,
             lambda name: (
-                self.coordinator.destination(name, robots[name].state) if name in robots else None
+                self.coordinator.plans[name].destination(robots[name].state)
+                if name in robots
+                else None
             ),
         )
 
     def _announce(self, decision: Any, header: Header) -> None:
         """Publish a decision and send the goals."""
         self._decisions += 1
-        indices = {name: self.coordinator.decision_index(name) for name in decision.robots}
+        indices = {name: self.coordinator.plans[name].decision for name in decision.robots}
         self._decision_publisher.publish(
             decision_to_ros(
                 decision,

@@ -18,7 +18,6 @@ from maasi_planner.motion.mambo import (
     mambo_parameters,
 )
 
-FLYING = ('constant_speed', 'mambo', 'quadrotor')
 MODELS = {
     'constant_speed': MotionSettings(model='constant_speed', speed=0.5, acceleration=0.8),
     'constant_speed_free': MotionSettings(model='constant_speed', speed=0.5),
@@ -88,17 +87,13 @@ def test_simulated_is_predicted(name):
     for w, goal in enumerate(goals):
         body = motion.body(state)
         length = int(prediction.lengths[w])
-        for k in range(length):
+        for k in range(length + 1):
             now = body.robot_state()
             assert now.pose.position == pytest.approx(prediction.positions[w, k], abs=1e-9)
-            assert not motion.arrived(now.pose.position, goal)
+            turn = math.remainder(now.pose.yaw - prediction.yaws[w, k], 2 * math.pi)
+            assert abs(turn) < 1e-9
+            assert motion.arrived(now.pose.position, goal) == (k == length)
             body.step(motion.command(now, goal), 0.05)
-        end = body.robot_state()
-        assert end.pose.position == pytest.approx(prediction.positions[w, length], abs=1e-9)
-        assert math.remainder(end.pose.yaw - prediction.yaws[w, length], 2 * math.pi) == (
-            pytest.approx(0.0, abs=1e-9)
-        )
-        assert motion.arrived(end.pose.position, goal)
         # Afterwards the trajectory stays where it is.
         assert (prediction.positions[w, length:] == prediction.positions[w, length]).all()
 
@@ -165,29 +160,21 @@ def test_tilt_and_acceleration_of_fast_flight(model, tilt):
         assert np.abs(np.arcsin(angles[:2])).max() <= tilt * 1.02
 
 
-def test_drone_keeps_its_height_and_heading():
-    motion = make_motion(MotionSettings(model='mambo', speed=0.4))
-    state = RobotState.at_rest([0.0, 0.0, 1.0], 0.7)
-    prediction = motion.predict(state, [[2.0, 1.0, 1.0]], 0.05)
+@pytest.mark.parametrize(('heading', 'yaw'), [('keep', -2.0), ('travel', math.pi / 4)])
+def test_drone_keeps_its_height_and_heading_or_faces_its_travel(heading, yaw):
+    motion = make_motion(MotionSettings(model='mambo', speed=0.4, heading=heading))
+    state = RobotState.at_rest([0.0, 0.0, 1.0], -2.0)
+    prediction = motion.predict(state, [[2.0, 2.0, 1.0]], 0.05)
     assert np.abs(prediction.positions[0, :, 2] - 1.0).max() < 1e-12
-    assert np.abs(prediction.yaws - 0.7).max() < 1e-9
+    assert prediction.yaws[0, prediction.lengths[0]] == pytest.approx(yaw, abs=0.05)
 
 
-def test_drone_faces_its_travel_if_wanted():
-    motion = make_motion(MotionSettings(model='mambo', speed=0.4, heading='travel'))
-    prediction = motion.predict(RobotState.at_rest([0.0, 0.0, 1.0], -2.0), [[2.0, 2.0, 1.0]], 0.05)
-    end = prediction.yaws[0, prediction.lengths[0]]
-    assert end == pytest.approx(math.pi / 4, abs=0.05)
-
-
-def test_length_zero_at_the_waypoint():
-    for settings in MODELS.values():
-        prediction = make_motion(settings).predict(
-            RobotState.at_rest([1.0, 1.0, 0.0]), [[1.0, 1.0, 0.0]], 0.05
-        )
-        assert prediction.lengths[0] == 0
-        assert prediction.reached[0]
-        assert prediction.control_cost[0] == 0.0
+@pytest.mark.parametrize('name', MODELS)
+def test_length_zero_at_the_waypoint(name):
+    state = RobotState.at_rest([1.0, 1.0, 0.0])
+    prediction = make_motion(MODELS[name]).predict(state, [[1.0, 1.0, 0.0]], 0.05)
+    assert (prediction.lengths[0], prediction.control_cost[0]) == (0, 0.0)
+    assert prediction.reached[0]
 
 
 def test_control_cost_counts_what_it_says():
@@ -215,29 +202,27 @@ def test_obstacle_term_of_the_paper(kind):
     far, near = RobotState.at_rest([0.6, 0.0, 1.0]), RobotState.at_rest([0.75, 0.0, 1.0])
     assert (term.command(far, goal) == plain.command(far, goal)).all()
     change = term.command(near, goal) - plain.command(near, goal)
-    if kind == 'printed':
-        assert change[0] * gains[0] == pytest.approx(-0.002)
-        assert change[1] * gains[3] == pytest.approx(-0.002)
-        assert change[2] * gains[6] == pytest.approx(-0.002)
-        assert change[3] * gains[7] == pytest.approx(-0.002)
-    else:
-        assert change[0] * gains[0] == pytest.approx(-0.002)
-        assert np.abs(change[1:]).max() < 1e-12
+    # Roll, which accelerates to the right, has a gain of the other sign.
+    inputs = change * gains[[0, 3, 6, 7]]
+    expected = [-0.002] * 4 if kind == 'printed' else [-0.002, 0.0, 0.0, 0.0]
+    assert inputs == pytest.approx(expected, abs=1e-12)
 
 
-def test_bad_states_and_commands_are_refused():
-    motion = make_motion(MODELS['mambo'])
-    with pytest.raises(ValueError, match='velocity'):
-        RobotState(RobotState.at_rest([0, 0, 0]).pose, np.array([0.0, np.nan, 0.0]))
-    with pytest.raises(ValueError, match='waypoints'):
-        motion.predict(RobotState.at_rest([0, 0, 0]), [[0.0, np.inf, 0.0]], 0.05)
-    with pytest.raises(ValueError, match='waypoints'):
-        motion.predict(RobotState.at_rest([0, 0, 0]), [[0.0, 1.0]], 0.05)
-    with pytest.raises(ValueError, match='command'):
-        motion.body(RobotState.at_rest([0, 0, 0])).step([0.0, 0.0, np.nan, 0.0], 0.05)
-    with pytest.raises(ValueError, match='step'):
-        motion.body(RobotState.at_rest([0, 0, 0])).step([0.0, 0.0, 0.0, 0.0], 0.0)
-    with pytest.raises(ValueError, match='speed'):
-        MotionSettings(speed=-1.0)
-    with pytest.raises(ValueError, match='finite'):
-        MotionSettings(speed=math.inf)
+REST = RobotState.at_rest([0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ('make', 'words'),
+    [
+        (lambda motion: RobotState(REST.pose, np.array([0.0, np.nan, 0.0])), 'velocity'),
+        (lambda motion: motion.predict(REST, [[0.0, np.inf, 0.0]], 0.05), 'waypoints'),
+        (lambda motion: motion.predict(REST, [[0.0, 1.0]], 0.05), 'waypoints'),
+        (lambda motion: motion.body(REST).step([0.0, 0.0, np.nan, 0.0], 0.05), 'command'),
+        (lambda motion: motion.body(REST).step([0.0, 0.0, 0.0, 0.0], 0.0), 'step'),
+        (lambda motion: MotionSettings(speed=-1.0), 'speed'),
+        (lambda motion: MotionSettings(speed=math.inf), 'finite'),
+    ],
+)
+def test_bad_states_and_commands_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make(make_motion(MODELS['mambo']))

@@ -156,16 +156,15 @@ class _Search:
             self.trace.leave(self.time, name)
             for group in self._groups:
                 if name in group.names:
-                    group.coordinator.leave(name)
+                    group.coordinator.plans[name].leave()
 
     def _plan(self, group: _Group) -> dict[str, PresentRobot]:
         """Plan for the free robots of a group, and send them to their waypoints."""
-        coordinator, here = group.coordinator, self._here
+        coordinator, plans, here = group.coordinator, group.coordinator.plans, self._here
         present = {
             name: PresentRobot(
                 here[name].state,
-                coordinator.is_idle(name)
-                or here[name].has_ended(coordinator.decision_index(name) + 1),
+                plans[name].staying or here[name].has_ended(plans[name].decision + 1),
             )
             for name in group.names
             if name in here
@@ -184,10 +183,10 @@ class _Search:
             self.trace.decision(self.time, group.space, decision, coordinator)
             for name, chosen in decision.robots.items():
                 if not chosen.stays:
-                    number = coordinator.decision_index(name) + 1
+                    number = plans[name].decision + 1
                     here[name].follower.take(Goal(number, self.step, chosen.waypoint))
         for name, robot in present.items():
-            self._destinations[name] = coordinator.destination(name, robot.state)
+            self._destinations[name] = plans[name].destination(robot.state)
         return present
 
     def _measure(self, group: _Group, present: Mapping[str, PresentRobot]) -> None:

@@ -2,7 +2,7 @@
 
 The instances are problems that robots meet in missions of figure 4 with N = 32 cuboids and the
 paper's undiscounted rewards. SCIP gets the same instances in the same run, as the tight
-formulation of `TightProblem`, to an absolute gap of 1e-4, and at most 20 s each.
+formulation of `MixedProblem`, to an absolute gap of 1e-4, and at most 20 s each.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / 'planner'))
 
 from cuboid_instances import joint_problems, problems_of_missions
-from literal_cuboid import TightProblem, solve_with_scip
+from mixed_cuboid import MixedProblem, solve_with_scip
 from timing import entry
 
 from maasi_planner.buildings.centralized import solve_jointly
@@ -43,7 +43,7 @@ def against_scip(number: int) -> dict[str, object]:
     for problem in problems:
         ours = time_of(lambda problem=problem: solver.solve(problem))
         plan = solver.solve(problem)
-        bound, value, spent = solve_with_scip(TightProblem(solver, problem), GAP, LIMIT)
+        bound, value, spent = solve_with_scip(MixedProblem(solver, problem, apart=True), GAP, LIMIT)
         if plan is None or not bound - GAP <= plan.objective <= value + GAP:
             raise RuntimeError(f'SCIP: another optimum, in [{bound}, {value}]: {plan}')
         # Stopped by the limit: its time is at least this.

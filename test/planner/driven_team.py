@@ -1,7 +1,8 @@
 """A planner, two real drivers and the robots that they drive, over real topics."""
 
-import gc
 import os
+import subprocess
+import sys
 import time
 from contextlib import contextmanager
 
@@ -10,27 +11,50 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from own_context import own_context
+from player import Player, parameters
 from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from std_srvs.srv import Trigger
-from test_planner_node import ROBOTS, SETTINGS, START
 from waiting import wait_until
 
 from maasi_drivers.drivers import TurtlebotDriver
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
-from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE
-from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import AgentState, FilterUpdate, PlanDecision
 from maasi_planner.motion import RobotState, make_motion
+from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
 
+ROBOTS = ('a', 'b')
+START = {'a': (0.5, 0.5), 'b': (1.5, 1.5)}
+SETTINGS = PlannerNodeSettings.model_validate(
+    {
+        'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
+        'planner': {'name': 'maasi'},
+        'state_timeout': 30.0,
+        'search_on_start': True,
+        'robots': {
+            name: {
+                'candidates': {'grid': [3, 3], 'spacing': 0.5, 'corner': [0.5, 0.5]},
+                'motion': {'model': 'constant_speed', 'speed': 0.5},
+                'sensor': {
+                    'detection': {
+                        'kind': 'box',
+                        'probability': 0.98,
+                        'lower': [-0.5, -0.5],
+                        'upper': [0.5, 0.5],
+                    },
+                    'noise': {'range': 0.01, 'bearing': 0.03},
+                    'period': 0.5,
+                },
+                'start': [*START[name], 0.0],
+            }
+            for name in ROBOTS
+        },
+    }
+)
 STEP = 0.05
 # Wall time of a step of the robots, where odometry is lost at most [s].
 TURN, LONGEST_TURN = 0.01, 1.0
@@ -50,27 +74,25 @@ _DRIVER = {
 }
 
 
-def parameters(settings):
-    return [Parameter(name, value=value) for name, value in flatten(settings).items()]
-
-
 class Robot:
     """A robot that obeys `cmd_vel`, and what is heard of it."""
 
-    def __init__(self, node, name):
+    def __init__(self, world, name):
         self.settings = DriverSettings.model_validate({**_DRIVER, 'start': [*START[name], 0.0]})
         self.start = Pose.from_yaw(self.settings.start, 0.0)
         motion = make_motion(self.settings.motion, radius=self.settings.radius)
         self.body = motion.body(RobotState(self.start))
-        self.states, self.command = [], [0.0] * 4
-        self.odometry = node.create_publisher(Odometry, f'{name}/odom', RELIABLE)
-        node.create_subscription(AgentState, f'{name}/state', self.states.append, RELIABLE)
-        node.create_subscription(TwistStamped, f'{name}/cmd_vel', self._obey, RELIABLE)
-        self.go_to = ActionClient(node, GoToWaypoint, f'{name}/go_to')
+        self.commands = world.hear(TwistStamped, f'{name}/cmd_vel')
+        self.states = world.hear(AgentState, f'{name}/state')
+        self.odometry = world.node.create_publisher(Odometry, f'{name}/odom', RELIABLE)
+        self.go_to = ActionClient(world.node, GoToWaypoint, f'{name}/go_to')
 
-    def _obey(self, message):
-        twist = message.twist
-        self.command = [twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z]
+    @property
+    def command(self):
+        if not self.commands:
+            return [0.0] * 4
+        twist = self.commands[-1].twist
+        return [twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z]
 
     def move(self, step, share=1.0):
         self.body.step(self.command, share * STEP)
@@ -92,6 +114,9 @@ class Robot:
     def place(self):
         return tuple(self.body.robot_state().pose.position)
 
+    def is_near(self, x, y, distance):
+        return np.hypot(self.place[0] - x, self.place[1] - y) < distance
+
     @property
     def stands(self):
         speed = np.abs(self.body.robot_state().velocity).max()
@@ -102,29 +127,23 @@ class Robot:
         return bool(self.states) and self.state.goal_status == AgentState.MOVING
 
 
-class World:
+class World(Player):
     """The planner (`planner`), the robots (by name in `robots`), and a client of both."""
 
     def __init__(self, context, settings):
-        self.context, self.domain = context, context.get_domain_id()
-        self.environment = dict(os.environ)
+        super().__init__(context, 'world')
         self.settings = settings
-        self.node = Node('world', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.robots = {name: Robot(self.node, name) for name in ROBOTS}
-        self.logs, self.status, self.decisions = [], {}, []
-        node = self.node
-        node.create_subscription(Log, '/rosout', self._take_log, LATCHED_ALL)
+        node, self.step, self.status = self.node, 0, {}
+        self.robots = {name: Robot(self, name) for name in ROBOTS}
+        self._logs = self.hear(Log, '/rosout', LATCHED_ALL)
+        self.decisions = self.hear(PlanDecision, 'decisions')
         node.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, 10)
-        node.create_subscription(PlanDecision, 'decisions', self.decisions.append, RELIABLE)
         self.updates = node.create_publisher(FilterUpdate, 'filter_update', LATCHED)
         self.search = ActionClient(node, SearchTargets, 'search')
-        self.step = 0
         self.drivers = []
         for name, robot in self.robots.items():
             driver = TurtlebotDriver(
-                context=self.context,
+                context=context,
                 namespace=f'/{name}',
                 parameter_overrides=parameters(robot.settings),
             )
@@ -132,16 +151,10 @@ class World:
             assert driver.trigger_activate().name == 'SUCCESS'
             self.executor.add_node(driver)
             self.drivers.append(driver)
-        self.planner = None
         self.start_planner()
 
     def start_planner(self):
-        self.planner = PlannerNode(
-            context=self.context, parameter_overrides=parameters(self.settings)
-        )
-        assert self.planner.trigger_configure().name == 'SUCCESS'
-        assert self.planner.trigger_activate().name == 'SUCCESS'
-        self.own = executor_of(self.planner, self.context)
+        self.planner = self.start(PlannerNode, self.settings)
         goals = self.planner._goals.clients.values()
         self.until(
             lambda: (
@@ -155,24 +168,20 @@ class World:
         )
 
     def end_planner(self):
-        self.planner.destroy_node()
-        self.own.shutdown()
-        self.planner = self.own = None
-        # See `own_context`.
-        gc.collect()
+        self.planner = None
+        self.end()
 
-    def _take_log(self, message):
-        self.logs.append(message.msg)
+    def close(self):
+        self.planner = None
+        super().close()
+        for driver in self.drivers:
+            driver.destroy_node()
 
     def _take_diagnostics(self, message):
         for status in message.status:
             if 'planner_node' in status.name:
                 self.status = {item.key: item.value for item in status.values}
                 self.status |= {'level': status.level, 'message': status.message}
-
-    def until(self, condition, *what):
-        """Let the robots move until something is true."""
-        wait_until(condition, self.turn, *what)
 
     def listen(self, condition, *what):
         """Let the robots get hardly any further until something is true."""
@@ -187,17 +196,11 @@ class World:
         while time.monotonic() < now + TURN or (
             self._is_behind() and time.monotonic() < now + LONGEST_TURN
         ):
-            self.spin()
+            super().turn()
 
     def _is_behind(self):
         """Tell whether a driver has not answered the present step, on a busy machine."""
         return any(robot.states and robot.state.step < self.step for robot in self.robots.values())
-
-    def spin(self):
-        """Do what waits to be done."""
-        if self.planner is not None:
-            self.own.spin_once(0.002)
-        self.executor.spin_once(timeout_sec=0.002)
 
     def pass_steps(self, steps):
         """Let the robots do some steps, each heard by the planner."""
@@ -206,33 +209,44 @@ class World:
         self.until(lambda: min(item.step for item in self.planner._heard.values()) >= last)
 
     def logged(self, text):
-        return any(text in line for line in self.logs)
-
-    def call(self, service):
-        """Return the answer of a service."""
-        client = self.node.create_client(Trigger, service)
-        self.until(client.service_is_ready, f'no service {service}')
-        future = client.call_async(Trigger.Request())
-        self.until(future.done, f'no answer of {service}')
-        self.node.destroy_client(client)
-        return future.result()
+        """Return what was logged with a text."""
+        return [item.msg for item in self._logs if text in item.msg]
 
     def send(self, name, position, number):
         """Send a goal as another client; return its handle and the future of its result."""
         goal = GoToWaypoint.Goal(goal_id=number)
         goal.waypoint.header.frame_id = 'map'
         goal.waypoint.pose.position.x, goal.waypoint.pose.position.y = position
-        future = self.robots[name].go_to.send_goal_async(goal)
+        return self._accepted(self.robots[name].go_to, goal)
+
+    def ask(self, **fields):
+        """Send a goal of the action search; return its handle and the future of its result."""
+        return self._accepted(self.search, SearchTargets.Goal(**fields))
+
+    def _accepted(self, client, goal):
+        future = client.send_goal_async(goal)
         self.until(future.done)
         assert future.result().accepted
         return future.result(), future.result().get_result_async()
 
-    def ask(self, **fields):
-        """Send a goal of the action search; return its handle and the future of its result."""
-        future = self.search.send_goal_async(SearchTargets.Goal(**fields))
-        self.until(future.done)
-        assert future.result().accepted
-        return future.result(), future.result().get_result_async()
+    def run(self, *words):
+        """Return a process of Python that takes part."""
+        return subprocess.Popen(
+            [sys.executable, *words],
+            env={**os.environ, 'ROS_DOMAIN_ID': str(self.context.get_domain_id())},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def ended(self, process):
+        """Return exit code and output of a process, while the robots go on."""
+        try:
+            self.until(lambda: process.poll() is not None, 'the command does not end')
+            return process.returncode, process.stdout.read()
+        finally:
+            process.kill()
+            process.communicate()
 
     def moving(self):
         return all(robot.moves for robot in self.robots.values())
@@ -240,20 +254,12 @@ class World:
     def standing(self):
         return all(robot.stands and not robot.moves for robot in self.robots.values())
 
-    def close(self):
-        if self.planner is not None:
-            self.end_planner()
-        self.executor.shutdown()
-        for driver in self.drivers:
-            driver.destroy_node()
-        self.node.destroy_node()
-
 
 @contextmanager
 def driven(**changes):
     """Run a planner with two drivers and their robots."""
     with own_context() as context:
-        settings = SETTINGS.model_copy(update={'others': {}, 'filter_timeout': 0.0, **changes})
+        settings = SETTINGS.model_copy(update={'filter_timeout': 0.0, **changes})
         world = World(context, settings)
         try:
             yield world

@@ -6,21 +6,15 @@ import itertools
 
 import numpy as np
 import pytest
+from test_coordinator import make, there
 
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_planner.coordinator import Coordinator, PresentRobot
-from maasi_planner.motion import RobotState
-from maasi_planner.node_settings import PlannerNodeSettings
 
-BOUNDS = [[0.0, 10.0], [0.0, 10.0]]
 WIDTH = {'a': 3.0, 'b': 1.0}
 ALPHA = 5.0
-
-
-def robot(width):
-    return {
-        'start': [5.0, 5.0, 0.0],
+ROBOTS = {
+    name: {
         'candidates': {'ring': 4, 'distance': 1.5},
         'motion': {'speed': 10.0, 'tolerance': 0.01},
         'sensor': {
@@ -30,25 +24,21 @@ def robot(width):
         },
         'radius': 0.0,
     }
+    for name, width in WIDTH.items()
+}
 
 
-def make(**planner):
-    return Coordinator(
-        PlannerNodeSettings.model_validate(
-            {
-                'step': 0.1,
-                'environment': {'bounds': BOUNDS},
-                'planner': {'name': 'maas', 'alpha': ALPHA, **planner},
-                'robots': {name: robot(width) for name, width in WIDTH.items()},
-                'exploration_spacing': 0.25,
-            }
-        )
-    )
+def explored(measured, **planner):
+    """Return a coordinator whose robots have measured at places."""
+    coordinator = make(ROBOTS, 0.25, **({'name': 'maas', 'alpha': ALPHA} | planner))
+    for name, place in measured:
+        coordinator.absorb({name: Pose(np.array([*place, 0.0]))}, [])
+    return coordinator
 
 
-def literal_explorations(measured, names):
-    """Return iota of each name (12); all of them together for one list of all names."""
-    grid = UnexploredMap(np.array(BOUNDS), 0.25)
+def literal_exploration(measured, names):
+    """Return iota (12) of what `names` have measured."""
+    grid = UnexploredMap(np.array([[0.0, 10.0], [0.0, 10.0]]), 0.25)
     nodes = grid.nodes()
     values = np.ones(len(nodes))
     for name, place in measured:
@@ -61,21 +51,17 @@ def literal_explorations(measured, names):
 
 def literal_best(measured, places, shared):
     """Return the largest alpha times the product of the e of both (16), and who goes where."""
-    names = list(WIDTH)
-    iota = {name: literal_explorations(measured, names if shared else [name]) for name in names}
+    iota = {
+        name: literal_exploration(measured, list(WIDTH) if shared else [name]) for name in WIDTH
+    }
     steps = [(1.5, 0.0), (-1.5, 0.0), (0.0, 1.5), (0.0, -1.5)]
-    ring = {name: [np.add(places[name], step) for step in steps] for name in names}
-    best = max(
-        itertools.product(ring['a'], ring['b']),
-        key=lambda pair: iota['a'].at(pair[0])[0] * iota['b'].at(pair[1])[0],
-    )
-    value = ALPHA * iota['a'].at(best[0])[0] * iota['b'].at(best[1])[0]
-    return value, dict(zip(names, best))
+    ring = [[np.add(places[name], step) for step in steps] for name in WIDTH]
 
+    def value(pair):
+        return ALPHA * iota['a'].at(pair[0])[0] * iota['b'].at(pair[1])[0]
 
-def explore(coordinator, measured):
-    for name, place in measured:
-        coordinator.absorb({name: Pose(np.array([*place, 0.0]))}, [])
+    best = max(itertools.product(*ring), key=value)
+    return value(best), dict(zip(WIDTH, best))
 
 
 @pytest.mark.parametrize('choice', ['own', 'shared'])
@@ -83,17 +69,9 @@ def test_the_joint_choice_is_the_literal_product(choice):
     different = 0
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        measured = [
-            (name, tuple(rng.uniform(1.0, 9.0, 2))) for _ in range(5) for name in ('a', 'b')
-        ]
-        places = {'a': rng.uniform(3.0, 7.0, 2), 'b': rng.uniform(3.0, 7.0, 2)}
-        coordinator = make(agent_exploration=choice)
-        explore(coordinator, measured)
-        present = {
-            name: PresentRobot(RobotState.at_rest([*place, 0.0]), True)
-            for name, place in places.items()
-        }
-        decision = coordinator.plan(0, present)
+        measured = [(name, tuple(rng.uniform(1.0, 9.0, 2))) for _ in range(5) for name in WIDTH]
+        places = {name: rng.uniform(3.0, 7.0, 2) for name in WIDTH}
+        decision = explored(measured, agent_exploration=choice).plan(0, there(**places))
         value, best = literal_best(measured, places, choice == 'shared')
         assert decision.objective == pytest.approx(value, rel=1e-9)
         for name, place in best.items():
@@ -106,19 +84,11 @@ def test_the_joint_choice_is_the_literal_product(choice):
 
 def test_own_explorations_are_the_default():
     """As printed: what one agent has seen is news to the other one."""
-    coordinator = make()
-    explore(coordinator, [('a', (5.0, 5.0))])
-    present = {'b': PresentRobot(RobotState.at_rest([5.0, 3.5, 0.0]), True)}
-    decision = coordinator.plan(0, present)
+    coordinator = explored([('a', (5.0, 5.0))])
+    decision = coordinator.plan(0, there(b=(5.0, 3.5)))
     # One step up, b is where a measured: by its own e the place is as good as any.
     assert decision.robots['b'].exploration == pytest.approx(np.ones(4))
     # What is published, and what decides about the end, is the exploration of the team.
     assert coordinator.exploration.at([[5.0, 5.0]])[0] == pytest.approx(0.02)
-
-
-def test_other_planners_have_no_explorations_of_their_own():
-    coordinator = make(name='maasi')
-    present = {'a': PresentRobot(RobotState.at_rest([5.0, 5.0, 0.0]), True)}
-    explore(coordinator, [('a', (5.0, 5.0))])
-    coordinator.plan(0, present)
-    assert all(plan.exploration is None for plan in coordinator._plans.values())
+    other = explored([('a', (5.0, 5.0))], name='maasi')
+    assert all(plan.exploration is None for plan in other.plans.values())

@@ -1,12 +1,18 @@
-"""The team's planning from step to step: who plans and who measures when."""
+"""The team's planning from step to step: who plans, who measures when, and on the fly."""
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from maasi_filter.models.pose import Pose
 from maasi_planner.coordinator import Coordinator, Member, PresentRobot
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.planners.intermittent import Intermittent
+from maasi_planner.team import Decision, single_choice, stay
+from maasi_sim.experiments.papers import experiments
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.search import search
 
 ROBOT = {
     'candidates': {'grid': [4, 4], 'spacing': 2.0, 'corner': [2.0, 2.0]},
@@ -18,16 +24,18 @@ ROBOT = {
     },
     'radius': 0.1,
 }
+BOTH = {'a': ROBOT, 'b': ROBOT}
 
 
-def make(**planner):
+def make(robots=BOTH, spacing=None, **planner):
     return Coordinator(
         PlannerNodeSettings.model_validate(
             {
                 'step': 0.1,
                 'environment': {'bounds': [[0.0, 10.0], [0.0, 10.0]]},
                 'planner': planner,
-                'robots': {'a': ROBOT, 'b': ROBOT},
+                'robots': robots,
+                'exploration_spacing': spacing,
             }
         )
     )
@@ -40,11 +48,17 @@ def there(free=True, **positions):
     }
 
 
+def started(**planner):
+    """Return a coordinator whose two robots are on their way since step 0."""
+    coordinator = make(**planner)
+    coordinator.plan(0, there(a=(1.0, 1.0), b=(9.0, 9.0)))
+    return coordinator
+
+
 def test_free_robots_plan_together_and_measure_at_once_then_every_period():
     coordinator = make()
     robots = there(a=(1.0, 1.0), b=(9.0, 9.0))
-    decision = coordinator.plan(0, robots)
-    assert sorted(decision.robots) == ['a', 'b']
+    assert sorted(coordinator.plan(0, robots).robots) == ['a', 'b']
     assert coordinator.measuring(0, robots) == [Member('a', 0, 0), Member('b', 0, 0)]
     moving = there(free=False, a=(1.1, 1.0), b=(9.0, 8.9))
     for step in (1, 2, 3):
@@ -54,71 +68,64 @@ def test_free_robots_plan_together_and_measure_at_once_then_every_period():
 
 
 def test_who_arrives_plans_alone_and_starts_its_period_anew():
-    coordinator = make()
-    coordinator.plan(0, there(a=(1.0, 1.0), b=(9.0, 9.0)))
-    robots = {
-        **there(a=(2.0, 2.0)),
-        **there(free=False, b=(8.5, 8.5)),
-    }
-    decision = coordinator.plan(6, robots)
-    assert list(decision.robots) == ['a']
-    assert coordinator.decision_index('a') == 1
-    assert coordinator.decision_index('b') == 0
-    assert [item.robot for item in coordinator.measuring(6, robots)] == ['a']
-    assert [item.robot for item in coordinator.measuring(8, robots)] == ['b']
-    assert [item.robot for item in coordinator.measuring(10, robots)] == ['a']
-
-
-def test_a_planner_is_told_where_the_others_go_and_when_they_measure_next():
-    coordinator = make()
-    coordinator.plan(0, there(a=(1.0, 1.0), b=(9.0, 9.0)))
-    robots = {**there(a=(2.0, 2.0)), **there(free=False, b=(8.5, 8.5))}
+    coordinator = started()
+    robots = there(a=(2.0, 2.0)) | there(free=False, b=(8.5, 8.5))
+    # The planner is told where the other one goes, and when it measures next.
     view = coordinator._team(6, robots, ['a'], ()).robots['b']
     assert view.phase == 2
-    assert view.remaining_path == pytest.approx(coordinator.path('b')[6:])
+    assert view.remaining_path == pytest.approx(coordinator.plans['b'].positions[6:])
+    assert list(coordinator.plan(6, robots).robots) == ['a']
+    assert coordinator.plans['a'].decision == 1
+    assert coordinator.plans['b'].decision == 0
+    for step, name in ((6, 'a'), (8, 'b'), (10, 'a')):
+        assert [item.robot for item in coordinator.measuring(step, robots)] == [name]
 
 
 def test_a_measurement_waits_for_an_image():
-    coordinator = make()
+    coordinator = started()
     robots = there(a=(1.0, 1.0), b=(9.0, 9.0))
-    coordinator.plan(0, robots)
     assert [item.robot for item in coordinator.measuring(0, robots, ['b'])] == ['b']
     assert [item.robot for item in coordinator.measuring(1, robots, ['a', 'b'])] == ['a']
     assert coordinator.measuring(2, robots, ['a', 'b']) == []
 
 
 def test_one_left_alone_plans_alone_and_the_other_joins_again():
-    coordinator = make()
-    coordinator.plan(0, there(a=(1.0, 1.0), b=(9.0, 9.0)))
-    coordinator.leave('b')
-    decision = coordinator.plan(5, there(a=(2.0, 2.0)))
-    assert list(decision.robots) == ['a']
-    robots = {**there(free=False, a=(3.0, 2.0)), **there(b=(9.0, 9.0))}
-    decision = coordinator.plan(9, robots)
-    assert list(decision.robots) == ['b']
+    coordinator = started()
+    coordinator.plans['b'].leave()
+    assert list(coordinator.plan(5, there(a=(2.0, 2.0))).robots) == ['a']
+    robots = there(free=False, a=(3.0, 2.0)) | there(b=(9.0, 9.0))
+    assert list(coordinator.plan(9, robots).robots) == ['b']
 
 
 def test_exploration_follows_the_poses_of_the_measurements():
     coordinator = make()
     coordinator.absorb({'a': Pose.from_yaw([5.0, 5.0, 0.0], 0.0)}, [])
-    assert coordinator.exploration.at(np.array([[5.0, 5.0]]))[0] == pytest.approx(0.1)
-    assert coordinator.exploration.at(np.array([[8.0, 8.0]]))[0] == 1.0
+    assert coordinator.exploration.at([[5.0, 5.0], [8.0, 8.0]]) == pytest.approx([0.1, 1.0])
 
 
-def test_an_event_trigger_that_is_never_met_leaves_the_measurement_at_the_decision():
-    coordinator = make(measurement='event', trigger='absolute', threshold=100.0)
+@pytest.mark.parametrize(
+    'planner',
+    [
+        {'measurement': 'event', 'trigger': 'absolute', 'threshold': 100.0},
+        {'name': 'maas'},
+        {'name': 'mutual_information'},
+    ],
+)
+def test_without_measurements_on_the_way_those_at_waypoints_are_left(planner):
+    coordinator = make(**planner)
     robots = there(a=(1.0, 1.0))
     coordinator.plan(0, robots)
     assert len(coordinator.measuring(0, robots)) == 1
-    assert coordinator.measuring(4, robots) == []
+    for step in (4, 8, 12):
+        assert coordinator.measuring(step, there(free=False, a=(2.0, 1.0))) == []
+    arrived = there(a=(2.0, 2.0))
+    assert coordinator.plan(14, arrived) is not None
+    assert len(coordinator.measuring(14, arrived)) == 1
 
 
 def test_nothing_is_planned_any_more_once_all_is_explored():
     coordinator = make()
-    for x in np.arange(0.0, 10.1, 0.5):
-        for y in np.arange(0.0, 10.1, 0.5):
-            for _ in range(4):
-                coordinator.absorb({'a': Pose.from_yaw([x, y, 0.0], 0.0)}, [])
+    coordinator.exploration.values[...] = 0.0
     decision = coordinator.plan(0, there(a=(1.0, 1.0), b=(9.0, 9.0)))
     assert decision.robots == {}
     assert 'explored' in decision.reason
@@ -130,32 +137,157 @@ def test_a_refused_goal_is_planned_anew_at_the_next_period():
     coordinator = make()
     robots = there(a=(1.0, 1.0))
     coordinator.plan(0, robots)
-    coordinator.refuse('a')
-    assert coordinator.is_idle('a')
+    coordinator.plans['a'].staying = True
     assert coordinator.plan(2, robots) is None
     assert list(coordinator.plan(4, robots).robots) == ['a']
 
 
 def test_places_of_robots_that_plan_for_themselves_are_kept_clear():
-    coordinator = make(name='nearest_widest')
     robots = there(a=(1.0, 1.0))
-    free = coordinator.plan(0, robots).robots['a'].waypoint
+    free = make(name='nearest_widest').plan(0, robots).robots['a'].waypoint
     again = make(name='nearest_widest')
     other = again.plan(0, robots, taken=[(free, 0.1)]).robots['a'].waypoint
     assert np.linalg.norm(other - free) >= 0.2
-    assert again.destination('a', robots['a'].state) == pytest.approx(other, abs=0.1)
-    again.refuse('a')
-    assert again.destination('a', robots['a'].state) == pytest.approx([1.0, 1.0, 0.0])
+    assert again.plans['a'].destination(robots['a'].state) == pytest.approx(other, abs=0.1)
+    again.plans['a'].staying = True
+    assert again.plans['a'].destination(robots['a'].state) == pytest.approx([1.0, 1.0, 0.0])
 
 
-@pytest.mark.parametrize('name', ['maas', 'mutual_information'])
-def test_active_search_measures_at_its_waypoints_only(name):
-    coordinator = make(name=name)
-    robots = there(a=(1.0, 1.0))
-    coordinator.plan(0, robots)
-    assert len(coordinator.measuring(0, robots)) == 1
-    for step in (4, 8, 12):
-        assert coordinator.measuring(step, there(free=False, a=(2.0, 1.0))) == []
-    arrived = there(a=(2.0, 2.0))
-    assert coordinator.plan(14, arrived) is not None
-    assert len(coordinator.measuring(14, arrived)) == 1
+# ---- decisions before a robot arrives -----------------------------------------------------------
+
+GOALS = ((3.0, 1.0), (3.0, 4.0), (7.0, 4.0))
+
+
+def flying(monkeypatch, radius=0.5, goals=GOALS, period=0.4):
+    """Return the coordinator of one robot that is sent to `goals` one by one, then stays."""
+    left = list(goals)
+
+    def decide(self, team):
+        view = team.robots['a']
+        if not left:
+            return Decision(team.step, {'a': stay(view, 'no more')})
+        points = np.array([[*left.pop(0), 0.0]])
+        prediction = view.motion.predict(view.state, points, team.step_time)
+        return Decision(team.step, {'a': single_choice(points, prediction, 0, 'the next')})
+
+    monkeypatch.setattr(Intermittent, 'decide', decide)
+    motion = ROBOT['motion'] | {'arrival_radius': radius}
+    sensor = ROBOT['sensor'] | {'period': period}
+    coordinator = make({'a': ROBOT | {'motion': motion, 'sensor': sensor}})
+    coordinator.plan(0, there(a=(1.0, 1.0)))
+    assert coordinator.measuring(0, there(a=(1.0, 1.0))) == [Member('a', 0, 0)]
+    return coordinator
+
+
+def on_the_way(*place):
+    return there(free=False, a=place)
+
+
+@pytest.mark.parametrize(
+    ('planner', 'motion', 'radius'),
+    [
+        # Where it brakes, at most what the sensor sees: speed per distance left is 5 1/s, or
+        # acceleration over speed.
+        ({}, {}, 0.2),
+        ({}, {'acceleration': 2.0}, 0.5),
+        ({}, {'acceleration': 0.5}, 1.0),
+        ({}, {'arrival_radius': 0.3}, 0.3),
+        # Robots of the papers stop at each waypoint.
+        ({'objective': 'paper'}, {}, 0.0),
+        ({'name': 'maas'}, {}, 0.0),
+        ({'name': 'maas'}, {'arrival_radius': 0.3}, 0.3),
+    ],
+)
+def test_radius_within_which_the_next_waypoint_is_decided(planner, motion, radius):
+    robot = ROBOT | {'motion': ROBOT['motion'] | motion}
+    assert make({'a': robot}, **planner).plans['a'].arrival_radius == pytest.approx(radius)
+
+
+def test_the_next_waypoint_is_decided_within_the_radius(monkeypatch):
+    coordinator = flying(monkeypatch)
+    assert coordinator.plan(1, on_the_way(2.4, 1.0)) is None
+    decision = coordinator.plan(2, on_the_way(2.6, 1.0))
+    assert_allclose(decision.robots['a'].waypoint[:2], GOALS[1])
+    assert coordinator.plans['a'].decision == 1
+    assert coordinator.plan(3, on_the_way(2.7, 1.0)) is None
+
+
+def test_without_a_radius_or_for_another_client_it_is_decided_on_arrival(monkeypatch):
+    coordinator = flying(monkeypatch, radius=0.0)
+    assert coordinator.plan(1, on_the_way(3.0, 1.0)) is None
+    assert coordinator.plan(2, there(a=(3.0, 1.0))) is not None
+    coordinator = flying(monkeypatch)
+    coordinator.plans['a'].lend(1)
+    assert coordinator.plan(2, on_the_way(2.9, 1.0)) is None
+
+
+def test_a_robot_with_nowhere_further_to_go_keeps_its_waypoint_and_plans_there(monkeypatch):
+    coordinator = flying(monkeypatch, goals=GOALS[:1])
+    assert coordinator.plan(2, on_the_way(2.6, 1.0)) is None
+    assert_allclose(coordinator.plans['a'].positions[-1][:2], GOALS[0], atol=0.2)
+    assert coordinator.plans['a'].decision == 0 and not coordinator.plans['a'].staying
+    assert coordinator.plan(3, on_the_way(2.7, 1.0)) is None
+    assert coordinator.plan(6, there(a=(3.0, 1.0))).robots['a'].stays
+
+
+def test_a_search_is_not_over_before_the_robot_has_arrived(monkeypatch):
+    coordinator = flying(monkeypatch)
+    coordinator.exploration.values[...] = 0.0
+    assert coordinator.plan(2, on_the_way(2.6, 1.0)) is None
+    assert coordinator.finished is None
+    assert 'explored' in coordinator.plan(5, there(a=(3.0, 1.0))).reason
+    assert coordinator.finished is not None
+
+
+def test_a_waypoint_within_the_radius_is_gone_to_until_it_is_reached(monkeypatch):
+    coordinator = flying(monkeypatch, goals=(GOALS[0], (3.0, 1.3), GOALS[2]))
+    coordinator.plan(2, on_the_way(2.6, 1.0))
+    assert coordinator.plan(3, on_the_way(2.9, 1.2)) is None
+    assert coordinator.plan(5, there(a=(3.0, 1.3))) is not None
+
+
+def test_the_measurement_at_a_waypoint_is_taken_at_the_closest_point(monkeypatch):
+    coordinator = flying(monkeypatch, period=0.8)
+    way = {2: (2.6, 1.0), 3: (2.8, 1.1), 4: (2.85, 1.3), 5: (2.9, 1.6), 6: (3.0, 1.9)}
+    measured = []
+    for step in range(2, 21):
+        robots = on_the_way(*way.get(step, (3.0, 3.0)))
+        if step in way:
+            coordinator.plan(step, robots)
+        measured += [step] * len(coordinator.measuring(step, robots))
+    # At step 4 it begins to get farther away, and the period begins.
+    assert measured == [4, 12, 20]
+
+
+def test_of_two_waypoints_passed_in_a_row_each_is_measured(monkeypatch):
+    goals = ((3.0, 1.0), (3.6, 1.0), (7.0, 4.0))
+    coordinator = flying(monkeypatch, goals=goals, period=10.0)
+    coordinator.plan(2, on_the_way(2.6, 1.0))
+    assert coordinator.measuring(2, on_the_way(2.6, 1.0)) == []
+    robots = on_the_way(2.95, 0.6)
+    coordinator.plans['a'].turning_distance = 1.0
+    assert coordinator.plan(3, robots) is not None
+    assert [item.robot for item in coordinator.measuring(3, robots)] == ['a']
+
+
+def test_a_search_passes_waypoints_without_slowing_down():
+    scenario = load_scenario('mambo')
+    content = scenario.model_dump(by_alias=True, exclude_unset=True)
+    content['limits']['time'] = 30.0
+    slow = []
+    for radius in (0.0, 0.3):
+        content['robots']['mambo']['motion']['arrival_radius'] = radius
+        result = search(type(scenario).model_validate(content), 1)
+        places = np.array([item.positions['mambo'] for item in result.progress])
+        times = np.array([item.time for item in result.progress])
+        speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times)
+        slow.append(np.mean(speeds < 0.15))
+    assert slow[1] < 0.5 * slow[0]
+
+
+def test_the_experiments_of_the_papers_stop_at_each_waypoint():
+    for name, experiment in experiments().items():
+        for case in experiment.cases(True):
+            robots = case.settings.get('scenario', {}).get('robots', {})
+            for robot in robots.values():
+                assert robot['motion']['arrival_radius'] == 0.0, (name, case.name)

@@ -4,16 +4,10 @@ import pytest
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from own_context import own_context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from std_srvs.srv import Trigger
-from waiting import wait_until
+from player import Player
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import RELIABLE
-from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.msg import AgentState, CuboidDecision, SearchLink, SearchLinkArray
 from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
 from maasi_planner.buildings.settings import CuboidPlannerSettings
@@ -26,51 +20,30 @@ SETTINGS = CuboidPlannerSettings.model_validate(
         'hazard': {'failures': False},
     }
 )
+STILL = [0.0, 0.0, 0.0]
 
 
-class Flight:
+class Flight(Player):
     """A drone that flies as it is commanded, step by step, without other robots."""
 
     def __init__(self, context):
-        self.node = Node('flight', context=context)
-        self.planner = CuboidPlannerNode(
-            context=context,
-            namespace='/rover',
-            parameter_overrides=[
-                Parameter(name, value=value) for name, value in flatten(SETTINGS).items()
-            ],
-        )
-        assert self.planner.trigger_configure().name == 'SUCCESS'
-        assert self.planner.trigger_activate().name == 'SUCCESS'
-        self.own = executor_of(self.planner, context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.commands, self.states, self.links, self.decisions = [], [], [], []
-        node = self.node
-        node.create_subscription(TwistStamped, 'rover/cmd_vel', self.commands.append, RELIABLE)
-        node.create_subscription(AgentState, 'rover/state', self.states.append, RELIABLE)
-        node.create_subscription(SearchLink, 'rover/link/tx', self.links.append, RELIABLE)
-        node.create_subscription(CuboidDecision, 'rover/decision', self.decisions.append, RELIABLE)
-        self.odometry = node.create_publisher(Odometry, 'rover/odom', RELIABLE)
-        self.heard = node.create_publisher(SearchLinkArray, 'rover/link/rx', RELIABLE)
-        self.step, self.place = 0, [0.0, 0.0, 0.0]
+        super().__init__(context, 'flight')
+        self.start(CuboidPlannerNode, SETTINGS, namespace='/rover')
+        self.commands = self.hear(TwistStamped, 'rover/cmd_vel')
+        self.states = self.hear(AgentState, 'rover/state')
+        self.links = self.hear(SearchLink, 'rover/link/tx')
+        self.decisions = self.hear(CuboidDecision, 'rover/decision')
+        self.odometry = self.node.create_publisher(Odometry, 'rover/odom', RELIABLE)
+        self.heard = self.node.create_publisher(SearchLinkArray, 'rover/link/rx', RELIABLE)
+        self.step, self.place = 0, STILL
+        topics = [f'rover/{topic}' for topic in ('cmd_vel', 'state', 'link/tx', 'decision')]
         self.until(
             lambda: (
                 self.odometry.get_subscription_count() == 1
                 and self.heard.get_subscription_count() == 1
-                and all(
-                    self.node.count_publishers(f'rover/{topic}') == 1
-                    for topic in ('cmd_vel', 'state', 'link/tx', 'decision')
-                )
+                and all(self.node.count_publishers(topic) == 1 for topic in topics)
             )
         )
-
-    def turn(self):
-        self.own.spin_once(0.005)
-        self.executor.spin_once(timeout_sec=0.005)
-
-    def until(self, condition):
-        wait_until(condition, self.turn)
 
     def move(self):
         """Do a step with the last command, until the robot has told its state to the others."""
@@ -100,17 +73,9 @@ class Flight:
     @property
     def command(self):
         if not self.commands:
-            return [0.0, 0.0, 0.0]
+            return STILL
         linear = self.commands[-1].twist.linear
         return [linear.x, linear.y, linear.z]
-
-    def call(self, word):
-        client = self.node.create_client(Trigger, f'rover/search/{word}')
-        self.until(client.service_is_ready)
-        future = client.call_async(Trigger.Request())
-        self.until(future.done)
-        self.node.destroy_client(client)
-        return future.result()
 
 
 @pytest.fixture
@@ -118,52 +83,52 @@ def flight():
     with own_context() as context:
         flight = Flight(context)
         yield flight
-        flight.own.shutdown()
-        flight.executor.shutdown()
-        flight.planner.destroy_node()
-        flight.node.destroy_node()
+        flight.close()
 
 
 def test_a_robot_among_buildings_moves_only_while_it_searches(flight):
-    still = [0.0, 0.0, 0.0]
-    assert flight.fly(3) == [still] * 3
+    def moves():
+        return any(command != STILL for command in flight.fly(3))
+
+    assert not moves()
     assert flight.states[-1].goal_status == AgentState.IDLE
     assert flight.states[-1].reason == 'waiting for start'
-    assert not flight.call('pause').success
-    home = flight.call('home')
+    assert not flight.call('rover/search/pause').success
+    home = flight.call('rover/search/home')
     assert not home.success and 'no home' in home.message
-    assert flight.call('start').success
-    assert any(command != still for command in flight.fly(3))
+    assert flight.call('rover/search/start').success
+    assert moves()
     assert flight.states[-1].goal_status == AgentState.MOVING
     frames = [item[-1].header.frame_id for item in (flight.states, flight.commands)]
     assert frames == ['map', 'rover/base_link']
     known = len(flight.commands)
-    assert flight.call('pause').success
+    assert flight.call('rover/search/pause').success
     # At once, not with the next step.
     flight.until(lambda: len(flight.commands) > known)
-    assert flight.command == still
-    assert flight.fly(2) == [still] * 2
+    assert flight.command == STILL
+    assert not moves()
     assert flight.states[-1].reason == 'paused'
-    assert flight.call('resume').success
-    assert any(command != still for command in flight.fly(3))
-    assert flight.call('stop').success
-    flight.until(lambda: flight.command == still)
-    assert flight.fly(2) == [still] * 2
-    assert not flight.call('resume').success
+    assert flight.call('rover/search/resume').success
+    assert moves()
+    assert flight.call('rover/search/stop').success
+    flight.until(lambda: flight.command == STILL)
+    assert not moves()
+    assert not flight.call('rover/search/resume').success
 
 
 def test_a_snapshot_of_a_step_without_decision_is_in_the_next_decision(flight):
-    assert flight.call('start').success
-    flight.fly(1)
-    centre = flight.planner.agent.mission.centres[0]
+    def shots():
+        """Return the cuboids whose snapshots a step's decision has."""
+        flight.fly(1)
+        flight.until(lambda: flight.decisions and flight.decisions[-1].step == flight.step)
+        return [shot.cuboid for shot in flight.decisions[-1].snapshots]
+
+    assert flight.call('rover/search/start').success
+    assert shots() == []
+    centre = flight.tested.agent.mission.centres[0]
     flight.place = list(centre - SETTINGS.start - flight.command)  # odom begins at the start
     flight.move()
     assert flight.links[-1].visited[0]
     assert flight.decisions[-1].step < flight.step
-    flight.fly(1)
-    flight.until(lambda: flight.decisions[-1].step == flight.step)
-    assert 0 in [shot.cuboid for shot in flight.decisions[-1].snapshots]
-    assert [shot.cuboid for decision in flight.decisions[:-1] for shot in decision.snapshots] == []
-    flight.fly(1)
-    flight.until(lambda: flight.decisions[-1].step == flight.step)
-    assert 0 not in [shot.cuboid for shot in flight.decisions[-1].snapshots]
+    assert 0 in shots()
+    assert 0 not in shots()

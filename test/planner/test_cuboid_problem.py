@@ -1,4 +1,4 @@
-"""P2 and P1 of 004: the lean problem against the literal one, and states that are hard."""
+"""P2 and P1 of 004: the lean problem against a mixed-integer one, and states that are hard."""
 
 import itertools
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cuboid_instances import problems_of_missions, random_problem, solver_for
-from literal_cuboid import LiteralProblem, solve_with_scip
+from mixed_cuboid import MixedProblem, solve_with_scip
 
 from maasi_planner.buildings import problem as problem_module
 from maasi_planner.buildings.centralized import solve_jointly
@@ -15,27 +15,27 @@ from maasi_planner.buildings.problem import Problem
 
 
 def same_optimum(solver, problem):
-    """Assert that the lean solution is the literal optimum; return whether there is one."""
-    literal = LiteralProblem(solver, problem)
-    bound, value, _ = solve_with_scip(literal)
+    """Assert that the lean solution is the optimum; return whether there is one."""
+    mixed = MixedProblem(solver, problem)
+    bound, value, _ = solve_with_scip(mixed)
     plan = solver.solve(problem)
     if plan is None:
         assert value == np.inf
         return False
     assert plan.how == 'optimal'
-    objective = literal.check(plan)
+    objective = mixed.check(plan)
     assert objective == pytest.approx(plan.objective, abs=1e-6)
     assert bound - 1e-4 <= objective <= value + 1e-4
     return True
 
 
-def test_same_optimum_as_the_literal_problem_on_problems_of_missions():
+def test_same_optimum_as_scip_on_problems_of_missions():
     solver, problems = problems_of_missions(3, 40, seed=0)
     assert all(same_optimum(solver, problem) for problem in problems)
 
 
 @pytest.mark.parametrize('part', range(5))
-def test_same_optimum_as_the_literal_problem_among_obstacles(part):
+def test_same_optimum_as_scip_among_obstacles(part):
     rng = np.random.default_rng(part)
     horizon, discount = 4 if part == 0 else 3, 1.0 if part % 2 else 0.9
     solvers = [solver_for(horizon, discount, between_samples=way) for way in (True, False)]
@@ -118,21 +118,15 @@ def test_every_plan_leaves_a_problem_that_has_one():
         assert len(list(flown(solver, problem, 9))) == 9
 
 
-def test_start_inside_a_cuboid():
-    problem = problem_at([50, 50, 50], [0, 0, 0], [50, 50, 50], [[[40.0, 60.0]] * 3])
+@pytest.mark.parametrize(('x', 'due'), [(50.0, True), (40 - 1e-9, True), (40 - 1e-3, False)])
+def test_a_given_visit_counts_despite_rounding(x, due):
+    """P_1 is given by the state: inside a cuboid or on its face the visit is due."""
+    problem = problem_at([x, 50, 50], [0, 0, 0], [50, 50, 50], [[[40.0, 60.0]] * 3])
     solver = solver_for(5)
     plan = solver.solve(problem)
-    # P_1 is given by the state: the visit is due whatever is done.
-    assert plan.visits == [(1, 0)]
-    literal = LiteralProblem(solver, problem)
-    assert literal.check(plan) == pytest.approx(plan.objective, abs=1e-6)
-
-
-def test_a_given_visit_on_a_face_counts_despite_rounding():
-    for beyond, due in ((1e-9, True), (1e-3, False)):
-        problem = problem_at([40 - beyond, 50, 50], [0, 0, 0], [50, 50, 50], [[[40.0, 60.0]] * 3])
-        ((step, cuboid),) = solver_for(5).solve(problem).visits
-        assert cuboid == 0 and (step == 1) == due
+    ((step, cuboid),) = plan.visits
+    assert cuboid == 0 and (step == 1) == due
+    assert MixedProblem(solver, problem).check(plan) == pytest.approx(plan.objective, abs=1e-6)
 
 
 @pytest.mark.parametrize('beyond', [0.0, 1e-6, 5e-5])

@@ -3,116 +3,102 @@
 import threading
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
-from driven_team import driven
-from test_planner_node import SETTINGS
+from driven_team import SETTINGS, driven
 from waiting import wait_until
 
 from maasi_msgs.msg import AgentState
 
-# A grid of 0.5 m: they are always near a waypoint, and turn to the next one.
-ROBOTS = {
-    name: robot.model_copy(
-        update={'motion': robot.motion.model_copy(update={'arrival_radius': 0.2})}
-    )
-    for name, robot in SETTINGS.robots.items()
-}
 
-
-def test_robots_whose_planner_dies_while_they_pass_a_waypoint_stop_at_the_last_one():
-    with driven(robots=ROBOTS) as world:
-        a = world.robots['a']
-        world.until(lambda: a.moves and a.state.goal_id >= 3)
-        # It has passed two waypoints, and never stood.
-        statuses = {state.goal_status for state in a.states if 0 < state.goal_id < 3}
-        assert statuses == {AgentState.MOVING}
-        last = next(
-            robot
-            for decision in reversed(world.decisions)
-            for robot in decision.robots
-            if robot.robot == 'a'
+@pytest.fixture
+def world():
+    """Run robots on a grid of 0.5 m that turn 0.2 m before each waypoint: often."""
+    robots = {
+        name: robot.model_copy(
+            update={'motion': robot.motion.model_copy(update={'arrival_radius': 0.2})}
         )
-        world.end_planner()
-        world.until(world.standing)
-        assert a.state.goal_status == AgentState.REACHED
-        point = last.waypoint
-        assert np.hypot(a.place[0] - point.x, a.place[1] - point.y) < 0.06
+        for name, robot in SETTINGS.robots.items()
+    }
+    with driven(robots=robots) as made:
+        made.until(made.moving)
+        yield made
+
+
+def test_robots_whose_planner_dies_while_they_pass_a_waypoint_stop_at_the_last_one(world):
+    a = world.robots['a']
+    world.until(lambda: a.moves and a.state.goal_id >= 3)
+    # It has passed two waypoints, and never stood.
+    statuses = {state.goal_status for state in a.states if 0 < state.goal_id < 3}
+    assert statuses == {AgentState.MOVING}
+    robots = [robot for decision in world.decisions for robot in decision.robots]
+    last = [robot.waypoint for robot in robots if robot.robot == 'a'][-1]
+    world.end_planner()
+    world.until(world.standing)
+    assert a.state.goal_status == AgentState.REACHED
+    assert a.is_near(last.x, last.y, 0.06)
 
 
 @pytest.mark.parametrize('cleaned', [False, True])
-def test_a_planner_that_ends_stops_robots_whose_next_goal_is_on_its_way(cleaned):
-    with driven(robots=ROBOTS) as world:
-        world.until(lambda: all(robot.moves for robot in world.robots.values()))
+def test_a_planner_that_ends_stops_robots_whose_next_goal_is_on_its_way(world, cleaned):
+    planner, waiting = world.planner, world.planner._goals.waiting
 
-        planner, waiting = world.planner, world.planner._goals.waiting
+    def turn():
+        """Do a step of the robots, up to a goal that no driver has answered yet."""
+        world.step += 1
+        for robot in world.robots.values():
+            robot.move(world.step)
+        for _ in range(10):
+            if not waiting:
+                world.executor.spin_once(timeout_sec=0.001)
+                world.own.spin_once(0.001)
 
-        def turn():
-            """Do a step of the robots, up to a goal that no driver has answered yet."""
-            world.step += 1
-            for robot in world.robots.values():
-                robot.move(world.step)
-            for _ in range(10):
-                if not waiting:
-                    world.executor.spin_once(timeout_sec=0.001)
-                    world.own.spin_once(0.001)
-
-        wait_until(lambda: waiting, turn)
-        if cleaned:
-            # The drivers answer after that.
-            assert planner.trigger_deactivate().name == 'SUCCESS'
-            assert planner.trigger_cleanup().name == 'SUCCESS'
-        else:
-            # As its process does it; the drivers answer meanwhile.
-            end = threading.Thread(target=lambda: (planner.halt(), world.end_planner()))
-            end.start()
-            while end.is_alive():
-                world.executor.spin_once(timeout_sec=0.01)
-        places = [robot.place for robot in world.robots.values()]
-        world.until(world.standing)
-        for robot, place in zip(world.robots.values(), places, strict=True):
-            assert robot.state.goal_status == AgentState.CANCELED
-            assert np.hypot(robot.place[0] - place[0], robot.place[1] - place[1]) < 0.3
+    wait_until(lambda: waiting, turn)
+    if cleaned:
+        # The drivers answer after that.
+        assert planner.trigger_deactivate().name == 'SUCCESS'
+        assert planner.trigger_cleanup().name == 'SUCCESS'
+    else:
+        # As its process does it; the drivers answer meanwhile.
+        end = threading.Thread(target=lambda: (planner.halt(), world.end_planner()))
+        end.start()
+        while end.is_alive():
+            world.executor.spin_once(timeout_sec=0.01)
+    places = [robot.place for robot in world.robots.values()]
+    world.until(world.standing)
+    for robot, place in zip(world.robots.values(), places, strict=True):
+        assert robot.state.goal_status == AgentState.CANCELED
+        assert robot.is_near(*place[:2], 0.3)
 
 
-def test_a_robot_that_refuses_the_next_waypoint_is_stopped_and_planned_anew():
-    with driven(robots=ROBOTS) as world:
-        a = world.robots['a']
-        world.until(lambda: a.moves)
-        goals = world.drivers[0].goals
-        problem, refused = goals.problem, []
+def test_a_robot_that_refuses_the_next_waypoint_is_stopped_and_planned_anew(world):
+    a, goals = world.robots['a'], world.drivers[0].goals
+    problem, refused = goals.problem, []
 
-        def refuses(request):
-            if not refused:
-                refused.append(int(request.goal_id))
-                return 'tested'
-            return problem(request)
+    def refuses(request):
+        if not refused:
+            refused.append(int(request.goal_id))
+            return 'tested'
+        return problem(request)
 
-        goals.problem = refuses
-        world.until(lambda: refused and a.moves and a.state.goal_id > refused[0])
-        stopped = [state.goal_status for state in a.states if state.goal_id == refused[0] - 1]
-        assert AgentState.CANCELED in stopped
-        assert not world.logged('of another client')
+    goals.problem = refuses
+    world.until(lambda: refused and a.moves and a.state.goal_id > refused[0])
+    stopped = [state.goal_status for state in a.states if state.goal_id == refused[0] - 1]
+    assert AgentState.CANCELED in stopped
+    assert not world.logged('of another client')
 
 
-def test_robots_that_refuse_every_goal_are_an_error(monkeypatch):
+def test_robots_that_refuse_every_goal_are_an_error(world, monkeypatch):
     monkeypatch.setattr('maasi_planner.planner_node._REFUSAL_PATIENCE', 1.0)
-    with driven(robots=ROBOTS) as world:
-        world.until(world.moving)
-        problems = [driver.goals.problem for driver in world.drivers]
+    with monkeypatch.context() as patch:
         for driver in world.drivers:
-            driver.goals.problem = lambda request: 'tested'
+            patch.setattr(driver.goals, 'problem', lambda request: 'tested')
         world.until(lambda: world.planner.fault().startswith('no goal accepted for '))
-        for driver, problem in zip(world.drivers, problems, strict=True):
-            driver.goals.problem = problem
-        world.until(lambda: world.moving() and not world.planner.fault())
+    world.until(lambda: world.moving() and not world.planner.fault())
 
 
-def test_a_driver_that_is_ended_is_no_warning():
-    with driven(robots=ROBOTS) as world:
-        world.until(world.moving)
-        infos, warnings = [], []
-        world.planner._goals._logger = SimpleNamespace(info=infos.append, warning=warnings.append)
-        assert world.drivers[0].trigger_deactivate().name == 'SUCCESS'
-        world.until(lambda: any(text.endswith('the driver stops') for text in infos + warnings))
-        assert warnings == []
+def test_a_driver_that_is_ended_is_no_warning(world):
+    infos, warnings = [], []
+    world.planner._goals._logger = SimpleNamespace(info=infos.append, warning=warnings.append)
+    assert world.drivers[0].trigger_deactivate().name == 'SUCCESS'
+    world.until(lambda: any(text.endswith('the driver stops') for text in infos + warnings))
+    assert warnings == []

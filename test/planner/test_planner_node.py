@@ -6,57 +6,32 @@ from functools import partial
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from driven_team import ROBOTS, SETTINGS, START
 from geometry_msgs.msg import PointStamped
 from own_context import own_context
+from player import Player, parameters
 from rcl_interfaces.msg import Log
-from rclpy.action import ActionClient, ActionServer, GoalResponse
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.parameter import Parameter
-from waiting import wait_until
 
-from maasi_filter.ros.parameters import flatten
-from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, UPDATES
-from maasi_filter.ros.run_node import executor_of
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
     AgentState,
     BatchMember,
     Cluster,
     FilterUpdate,
+    FoundTarget,
+    FoundTargetArray,
     LockstepDone,
     LockstepStep,
     MeasurementBatch,
     PlanDecision,
 )
-from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.conversions import checked_state, checked_update
+from maasi_planner.node.filter_guard import FilterWatch
+from maasi_planner.node_settings import OtherRobotSettings
 from maasi_planner.planner_node import PlannerNode
-
-ROBOTS = ('a', 'b')
-START = {'a': (0.5, 0.5), 'b': (1.5, 1.5)}
-BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}
-SETTINGS = PlannerNodeSettings.model_validate(
-    {
-        'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
-        'planner': {'name': 'maasi'},
-        'state_timeout': 30.0,
-        'search_on_start': True,
-        'robots': {
-            name: {
-                'candidates': {'grid': [3, 3], 'spacing': 0.5, 'corner': [0.5, 0.5]},
-                'motion': {'model': 'constant_speed', 'speed': 0.5},
-                'sensor': {
-                    'detection': BOX,
-                    'noise': {'range': 0.01, 'bearing': 0.03},
-                    'period': 0.5,
-                },
-                'start': [*START[name], 0.0],
-            }
-            for name in ROBOTS
-        },
-        'others': {'c': {'start': [0.2, 1.8, 0.0]}},
-    }
-)
 
 
 def changed(message, changes):
@@ -70,293 +45,344 @@ def changed(message, changes):
     return message
 
 
-class Team:
+def state_of(name, step=0, **changes):
+    message = AgentState(robot=name, step=step)
+    message.header.frame_id = 'map'
+    message.pose.pose.position.x, message.pose.pose.position.y = START[name]
+    message.pose.pose.orientation.w = 1.0
+    return changed(message, changes)
+
+
+def member_of(name, measurement=0, **changes):
+    """Return a member of an update that measured at its start."""
+    member = BatchMember(robot=name, measurement=measurement)
+    member.pose.position.x, member.pose.position.y = START[name]
+    return changed(member, changes)
+
+
+def update_of(batch, measured, **changes):
+    """Return an update of measurements at the starts: members of a batch."""
+    members = [member_of(item.robot, item.measurement) for item in measured]
+    message = FilterUpdate(batch_id=batch, members=members)
+    message.header.frame_id = 'map'
+    return changed(message, changes)
+
+
+def cluster_of(mass, x=1.0):
+    cluster = Cluster(mass=mass)
+    cluster.position.x = cluster.position.y = x
+    return cluster
+
+
+class Team(Player):
     """The rest of the team: drivers, filter and users."""
 
-    def __init__(self, context, others):
-        self.node = Node('team', context=context)
-        self.others = others
-        self.decisions, self.batches, self.warnings, self.diagnostics = [], [], [], []
-        self.goals = {name: [] for name in ROBOTS}
+    def __init__(self, context, settings):
+        super().__init__(context, 'team')
+        self.start(PlannerNode, settings)
         node = self.node
         self.states = {
             name: node.create_publisher(AgentState, f'{name}/state', RELIABLE) for name in ROBOTS
         }
         self.updates = node.create_publisher(FilterUpdate, 'filter_update', UPDATES)
-        self.destination = node.create_publisher(PointStamped, 'c/destination', RELIABLE)
-        self.search = ActionClient(node, SearchTargets, 'search')
+        self.steps = node.create_publisher(LockstepStep, 'lockstep/step', RELIABLE)
+        self.goals = {name: [] for name in ROBOTS}
+        self.cancelled = []
         self.servers = [
             ActionServer(
                 node,
                 GoToWaypoint,
                 f'{name}/go_to',
                 execute_callback=lambda handle: GoToWaypoint.Result(),
-                goal_callback=lambda goal, name=name: self._take_goal(name, goal),
+                goal_callback=partial(self._take_goal, name),
                 handle_accepted_callback=lambda handle: None,
+                cancel_callback=self._cancel,
             )
             for name in ROBOTS
         ]
-        node.create_subscription(PlanDecision, 'decisions', self.decisions.append, RELIABLE)
-        node.create_subscription(
-            MeasurementBatch, 'measurement_batch', self.batches.append, RELIABLE
+        self.decisions = self.hear(PlanDecision, 'decisions')
+        self.batches = self.hear(MeasurementBatch, 'measurement_batch')
+        self.done = self.hear(LockstepDone, 'lockstep/done')
+        self.logs = self.hear(Log, '/rosout', LATCHED_ALL)
+        self.diagnostics = self.hear(DiagnosticArray, '/diagnostics')
+        publishers = [*self.states.values(), self.updates]
+        self.until(
+            lambda: (
+                all(item.get_subscription_count() == 1 for item in publishers)
+                and node.count_publishers('/decisions') == 1
+                and node.count_publishers('/measurement_batch') == 1
+                and all(item.server_is_ready() for item in self.tested._goals.clients.values())
+            )
         )
-        self.steps = node.create_publisher(LockstepStep, 'lockstep/step', RELIABLE)
-        self.done = []
-        node.create_subscription(LockstepDone, 'lockstep/done', self.done.append, RELIABLE)
-        node.create_subscription(Log, '/rosout', self._take_log, LATCHED_ALL)
-        node.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, 10)
 
     def _take_goal(self, name, goal):
         self.goals[name].append(goal)
         return GoalResponse.ACCEPT
 
-    def _take_log(self, message):
-        if 'dropped' in message.msg:
-            self.warnings.append(message.msg)
+    def _cancel(self, handle):
+        self.cancelled.append(handle)
+        return CancelResponse.ACCEPT
 
-    def _take_diagnostics(self, message):
-        self.diagnostics.extend(message.status)
+    def tell(self, step):
+        """Let both robots say where they are."""
+        for name in ROBOTS:
+            self.states[name].publish(state_of(name, step))
+        self.until(lambda: [item.step for item in self.tested._heard.values()] == [step, step])
 
-    def state(self, name, step, **changes):
-        message = AgentState(robot=name, step=step)
-        message.header.frame_id = 'map'
-        message.pose.pose.position.x, message.pose.pose.position.y = START[name]
-        message.pose.pose.orientation.w = 1.0
-        self.states[name].publish(changed(message, changes))
+    def begin(self):
+        """Return once both robots are sent on their way."""
+        # Who is heard first plans alone; the other one at the next step.
+        self.tell(0)
+        self.tell(10)
+        self.until(lambda: all(self.goals.values()))
+        self.until(lambda: self.batches)
 
-    @staticmethod
-    def member(name, measurement=0, **changes):
-        """Return a member of an update that measured at its start."""
-        member = BatchMember(robot=name, measurement=measurement)
-        member.pose.position.x, member.pose.position.y = START[name]
-        return changed(member, changes)
+    def answer(self):
+        """Answer the last batch."""
+        self.updates.publish(update_of(self.batches[-1].id, self.batches[-1].members))
 
-    def update(self, batch, measured, **changes):
-        """Publish an update of measurements at the starts: members of a batch, or names."""
-        members = [
-            self.member(*((item, 0) if isinstance(item, str) else (item.robot, item.measurement)))
-            for item in measured
-        ]
-        message = FilterUpdate(batch_id=batch, members=members)
-        message.header.frame_id = 'map'
-        self.updates.publish(changed(message, changes))
-
-    @property
-    def connected(self):
-        publishers = [*self.states.values(), self.updates]
-        return (
-            all(item.get_subscription_count() == 1 for item in publishers)
-            and self.destination.get_subscription_count() == self.others
-            and self.node.count_publishers('/decisions') == 1
-            and self.node.count_publishers('/measurement_batch') == 1
-            and self.search.server_is_ready()
-        )
+    def status(self):
+        """Return the last diagnostics of the planner."""
+        statuses = [item for array in self.diagnostics for item in array.status]
+        return next((item for item in statuses[::-1] if 'planner_node' in item.name), None)
 
 
 @contextmanager
 def running(**changes):
-    """Run a node with the team around it; yield both, and how to wait for something."""
+    """Run a node with the team around it."""
     with own_context() as context:
-        settings = SETTINGS.model_copy(update=changes)
-        parameters = [Parameter(name, value=value) for name, value in flatten(settings).items()]
-        node = PlannerNode(context=context, parameter_overrides=parameters)
-        node.trigger_configure()
-        node.trigger_activate()
-        team = Team(context, len(settings.others))
-        own = executor_of(node, context)
-        other = SingleThreadedExecutor(context=context)
-        other.add_node(team.node)
-
-        def turn():
-            own.spin_once(0.01)
-            other.spin_once(timeout_sec=0.01)
-
-        until = partial(wait_until, turn=turn)
-
+        team = Team(context, SETTINGS.model_copy(update=changes))
         try:
-            until(lambda: team.connected)
-            until(lambda: all(item.server_is_ready() for item in node._goals.clients.values()))
-            yield node, team, until
+            yield team
         finally:
-            node.destroy_node()
-            own.shutdown()
-            other.shutdown()
-            team.node.destroy_node()
+            team.close()
 
 
 @pytest.fixture
-def world():
-    with running() as everything:
-        yield everything
+def team():
+    with running() as made:
+        yield made
 
 
-def begin(node, team, until):
-    """Let both robots say where they are; return once they are sent on their way."""
-    # Who is heard first plans alone; the other one at the next step.
-    for step in (0, 10):
-        for name in ROBOTS:
-            team.state(name, step)
-        until(lambda step=step: [item.step for item in node._heard.values()] == [step, step])
-    until(lambda: {item.robot for d in team.decisions for item in d.robots} == set(ROBOTS))
-    until(lambda: all(team.goals[name] for name in ROBOTS))
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    [
+        ({'pose__pose__position__x': math.nan}, 'position'),
+        ({'pose__pose__position__y': math.inf}, 'position'),
+        ({'pose__pose__orientation__w': 0.0}, 'orientation'),
+        ({'twist__linear__x': math.nan}, r'twist\.linear'),
+        ({'twist__angular__z': math.inf}, r'twist\.angular'),
+        ({'header__frame_id': 'odom'}, r"header\.frame_id: read 'odom', allowed is 'map'"),
+        ({'robot': 'nobody'}, "robot: read 'nobody', allowed is 'a'"),
+        ({'step': 2**64 - 1}, 'step: read'),
+    ],
+)
+def test_wrong_states_are_refused_by_their_field(changes, words):
+    with pytest.raises(ValueError, match=words):
+        checked_state('a', state_of('a', **changes), SETTINGS)
 
 
-BAD_STATES = [
-    {'pose__pose__position__x': math.nan},
-    {'pose__pose__position__y': math.inf},
-    {'pose__pose__orientation__w': 0.0},
-    {'twist__linear__x': math.nan},
-    {'twist__angular__z': math.inf},
-    {'header__frame_id': 'odom'},
-    {'robot': 'nobody'},
-]
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    [
+        ({'clusters': [cluster_of(0.5, math.nan)]}, 'position'),
+        ({'clusters': [cluster_of(math.inf)]}, 'mass'),
+        ({'clusters': [cluster_of(1e308)]}, 'mass'),
+        ({'clusters': [Cluster(covariance=[math.nan] * 9)]}, 'covariance'),
+        ({'header__frame_id': 'odom'}, r'header\.frame_id'),
+        ({'members': [BatchMember(robot='nobody')]}, "members: read .'nobody'"),
+        ({'members': [member_of('a', pose__position__x=math.nan)]}, r'members: a: pose\.position'),
+        ({'members': [member_of('a', pose__orientation__w=0.0)]}, r'members: a: pose\.orientation'),
+        ({'members': [member_of('a', 2**64 - 1)]}, 'members: a: measurement: read'),
+        ({'batch_id': 2**64 - 1}, 'batch_id: read'),
+    ],
+)
+def test_wrong_updates_are_refused_by_their_field(changes, words):
+    with pytest.raises(ValueError, match=words):
+        checked_update(update_of(1, [member_of('a')], **changes), ROBOTS, SETTINGS, 1)
 
 
-def test_wrong_states_are_dropped_counted_and_told_and_nobody_is_sent_anywhere(world):
-    node, team, until = world
-    for number, changes in enumerate(BAD_STATES, start=1):
-        team.state('a', 0, **changes)
-        until(lambda number=number: node.dropped['bad state'] == number)
+def test_wrong_states_are_dropped_counted_and_told_and_nobody_is_sent_anywhere(team):
+    for number in (1, 2, 3):
+        team.states['a'].publish(state_of('a', header__frame_id='odom'))
+        team.until(lambda number=number: team.tested.dropped['bad state'] == number)
     assert team.decisions == []
-    until(lambda: team.warnings)
     # The first one is told, the others only counted.
-    assert 'a/state' in team.warnings[0]
-    assert len(team.warnings) < len(BAD_STATES)
-    begin(node, team, until)
-    team.state('a', 15)
-    until(lambda: node._heard['a'].step == 15)
-    team.state('a', 12)
-    until(lambda: node.dropped['old state'] == 1)
-    until(lambda: any('dropped: old state' in _values(item) for item in team.diagnostics))
-    last = next(item for item in team.diagnostics[::-1] if 'planner_node' in item.name)
-    assert last.level == DiagnosticStatus.WARN
-    assert _values(last)['dropped: bad state'] == str(len(BAD_STATES))
+    team.until(lambda: any('dropped' in item.msg for item in team.logs))
+    (warning,) = [item.msg for item in team.logs if 'dropped' in item.msg]
+    assert 'a/state' in warning
+    team.begin()
+    team.tell(15)
+    team.states['a'].publish(state_of('a', 12))
+    team.until(lambda: team.tested.dropped['old state'] == 1)
+    # A step that is far away is taken if the next one follows it.
+    team.states['a'].publish(state_of('a', 10**9))
+    team.until(lambda: team.tested.dropped['bad state'] == 4)
+    team.tell(16)
+    team.until(lambda: team.tested._taken_step == 16)
+
+    def values():
+        return {item.key: item.value for item in team.status().values}
+
+    team.until(lambda: team.status() and values().get('dropped: bad state') == '4')
+    assert team.status().level == DiagnosticStatus.WARN
 
 
-def _values(status):
-    return {item.key: item.value for item in status.values}
-
-
-def test_wrong_updates_change_nothing(world):
-    node, team, until = world
-    begin(node, team, until)
-    until(lambda: team.batches)
-    batch = team.batches[0].id
-    members = [item.robot for item in team.batches[0].members]
-    before = node.coordinator.exploration.explored_fraction()
-    wrong = Cluster(mass=0.5)
-    wrong.position.x = math.nan
-    for number, changes in enumerate(
-        (
-            {'clusters': [wrong]},
-            {'clusters': [Cluster(mass=math.inf)]},
-            {'clusters': [Cluster(covariance=[math.nan] * 9)]},
-            {'header__frame_id': 'odom'},
-            {'members': [BatchMember(robot='nobody')]},
-            {'members': [team.member('a', pose__position__x=math.nan)]},
-            {'members': [team.member('a', pose__orientation__w=0.0)]},
-            {'batch_id': 2**64 - 1},
-            {'members': [BatchMember(robot='a', measurement=2**64 - 1)]},
-            {'clusters': [Cluster(mass=1e308)]},
-        ),
-        start=1,
-    ):
-        team.update(batch, members, **changes)
-        until(lambda number=number: node.dropped['bad update'] == number)
-    team.update(batch, members, clusters=[Cluster(mass=0.5)] * 2000)
-    until(lambda: node.dropped['too large message'] == 1)
-    assert node.coordinator.exploration.explored_fraction() == before
-    right = Cluster(mass=0.5)
-    right.position.x = right.position.y = 1.0
-    team.update(batch, members, clusters=[right])
-    until(lambda: node.coordinator.clusters)
-    explored = node.coordinator.exploration.explored_fraction()
+def test_updates_count_once_and_wrong_ones_not(team):
+    team.begin()
+    coordinator, dropped = team.tested.coordinator, team.tested.dropped
+    batch, members = team.batches[0].id, team.batches[0].members
+    before = coordinator.exploration.explored_fraction()
+    team.updates.publish(update_of(batch, members, header__frame_id='odom'))
+    team.until(lambda: dropped['bad update'] == 1)
+    team.updates.publish(update_of(batch, members, clusters=[cluster_of(0.5)] * 2000))
+    team.until(lambda: dropped['too large message'] == 1)
+    assert coordinator.exploration.explored_fraction() == before
+    team.updates.publish(update_of(batch, members, clusters=[cluster_of(0.5)]))
+    team.until(lambda: coordinator.clusters)
+    explored = coordinator.exploration.explored_fraction()
     assert explored > before
     # A restarted filter publishes its last update again.
-    right.mass = 0.7
-    team.update(batch, members, clusters=[right])
-    right.mass = 0.6
-    team.update(batch, [], clusters=[right])
-    until(lambda: node.coordinator.clusters[0].mass == 0.6)
-    assert node.coordinator.exploration.explored_fraction() == explored
-
-
-@pytest.mark.parametrize('step', [2**64 - 1, 10**9])
-def test_a_state_of_an_absurd_step_changes_nothing(world, step):
-    node, team, until = world
-    begin(node, team, until)
-    decisions = len(team.decisions)
-    team.state('a', step)
-    until(lambda: node.dropped['bad state'] == 1)
-    for name in ROBOTS:
-        team.state(name, 12)
-    until(lambda: [item.step for item in node._heard.values()] == [12, 12])
-    assert len(team.decisions) == decisions
+    team.updates.publish(update_of(batch, members, clusters=[cluster_of(0.7)]))
+    team.updates.publish(update_of(batch, [], clusters=[cluster_of(0.6)]))
+    team.until(lambda: coordinator.clusters[0].mass == 0.6)
+    assert coordinator.exploration.explored_fraction() == explored
 
 
 def test_a_step_that_comes_again_brings_the_batch_again_and_no_other():
     """The filter that was to answer it may be gone, and another one in its place."""
-    with running(lockstep=True, others={}) as (node, team, until):
-        until(lambda: team.steps.get_subscription_count() == 1)
-        until(lambda: team.node.count_publishers('/lockstep/done') == 1)
+    with running(lockstep=True) as team:
+        team.until(lambda: team.steps.get_subscription_count() == 1)
+        team.until(lambda: team.node.count_publishers('/lockstep/done') == 1)
         step = LockstepStep(step=0, robots=list(ROBOTS), imaging=list(ROBOTS))
         for name in ROBOTS:
-            team.state(name, 0, goal_id=1)
+            team.states[name].publish(state_of(name, goal_id=1))
         team.steps.publish(step)
-        until(lambda: team.batches and all(team.goals.values()) and not node._goals.waiting)
+        goals = team.tested._goals
+        team.until(lambda: team.batches and all(team.goals.values()) and not goals.waiting)
         step.imaging = []
         team.steps.publish(step)
-        until(lambda: len(team.batches) == 2)
+        team.until(lambda: len(team.batches) == 2)
         assert team.batches[0] == team.batches[1]
         assert len(team.decisions) == 1 and team.done == []
-        team.update(team.batches[0].id, ROBOTS)
-        until(lambda: team.done)
+        team.answer()
+        team.until(lambda: team.done)
         assert [(item.node, item.step) for item in team.done] == [('/planner_node', 0)]
         # Who knows nothing of its goal, as a driver that was started again, is sent anew.
-        team.state('a', 20, goal_id=1, goal_status=AgentState.MOVING)
-        team.state('b', 20, goal_id=0)
+        moving = state_of('a', 20, goal_id=1, goal_status=AgentState.MOVING)
+        team.states['a'].publish(moving)
+        team.states['b'].publish(state_of('b', 20, goal_id=0))
         step.step = 20
         team.steps.publish(step)
-        until(lambda: len(team.goals['b']) == 2)
+        team.until(lambda: len(team.goals['b']) == 2)
         assert len(team.goals['a']) == 1
 
 
-def test_destinations_that_are_wrong_are_dropped(world):
-    node, team, until = world
-    for number, changes in enumerate(
-        ({'point__x': math.nan}, {'header__frame_id': 'odom'}), start=1
-    ):
-        message = PointStamped()
-        message.header.frame_id = 'map'
-        team.destination.publish(changed(message, changes))
-        until(lambda number=number: node.dropped['bad destination'] == number)
-    assert node._others.taken(0, None)[0][0].tolist() == [0.2, 1.8, 0.0]
-
-
-def test_a_search_of_no_finite_time_is_refused(world):
-    node, team, until = world
-    for limit in (math.nan, -1.0):
-        answer = team.search.send_goal_async(SearchTargets.Goal(time_limit=limit))
-        until(answer.done)
-        assert not answer.result().accepted
-    assert node.dropped['bad goal'] == 2
+def test_wrong_destinations_and_searches_are_dropped():
+    with running(others={'c': OtherRobotSettings(start=[0.2, 1.8, 0.0])}) as team:
+        publisher = team.node.create_publisher(PointStamped, 'c/destination', RELIABLE)
+        team.until(lambda: publisher.get_subscription_count() == 1)
+        cases = ({'point__x': math.nan}, {'header__frame_id': 'odom'})
+        for number, changes in enumerate(cases, start=1):
+            message = PointStamped()
+            message.header.frame_id = 'map'
+            publisher.publish(changed(message, changes))
+            team.until(lambda number=number: team.tested.dropped['bad destination'] == number)
+        assert team.tested._others.taken(0, None)[0][0].tolist() == [0.2, 1.8, 0.0]
+        search = ActionClient(team.node, SearchTargets, 'search')
+        team.until(search.server_is_ready)
+        for limit in (math.nan, -1.0):
+            answer = search.send_goal_async(SearchTargets.Goal(time_limit=limit))
+            team.until(answer.done)
+            assert not answer.result().accepted
+        assert team.tested.dropped['bad goal'] == 2
 
 
 @pytest.mark.parametrize(
     ('name', 'value'),
-    [
-        ('planner.alpha', -1.0),
-        ('planner.beta', math.nan),
-        ('environment.bounds', [0.0, 2.0, 0.0, math.inf]),
-    ],
+    [('planner.beta', math.nan), ('environment.bounds', [0.0, 2.0, 0.0, math.inf])],
 )
 def test_wrong_parameters_are_refused_by_name(name, value):
-    flat = {**flatten(SETTINGS), name: value}
     with own_context() as context:
-        node = PlannerNode(
-            context=context,
-            parameter_overrides=[Parameter(key, value=item) for key, item in flat.items()],
-        )
+        overrides = [*parameters(SETTINGS), Parameter(name, value=value)]
+        node = PlannerNode(context=context, parameter_overrides=overrides)
         assert node.trigger_configure().name == 'FAILURE'
         assert f'parameter {name}' in node.problem
         node.destroy_node()
+
+
+# ---- the filter --------------------------------------------------------------------------------
+
+
+def test_silence_is_that_of_heartbeats_and_of_the_oldest_open_batch():
+    watch = FilterWatch(4.0)
+    assert not watch.problem(1000.0)
+    watch.beat(10.0)
+    assert not watch.problem(13.9)
+    assert watch.problem(14.1) == 'no heartbeat of the filter for 4.1 s'
+    # A planner that stood still itself blames nobody.
+    watch.stalled(30.0)
+    assert not watch.problem(43.9)
+    watch = FilterWatch(4.0)
+    watch.asked(1, 10.0)
+    watch.asked(2, 13.0)
+    assert 'batch 1' in watch.problem(14.1)
+    watch.answered(1)
+    assert not watch.problem(14.1)
+    watch.asked(3, 14.0)
+    watch.stalled(30.0)
+    assert not watch.problem(46.9) and watch.problem(47.1)
+    # Updates come in the order of batches: those before will not come any more.
+    watch.answered(3)
+    assert not watch.problem(100.0)
+    never = FilterWatch(0.0)
+    never.asked(1, 0.0)
+    assert not never.problem(1e6)
+
+
+@pytest.mark.parametrize('silent', ['updates', 'heartbeat'])
+def test_robots_are_held_until_the_filter_answers_again(silent):
+    # Long enough for a heartbeat of each second on a busy machine.
+    with running(filter_timeout=4.0) as team:
+        beats = team.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        beat = DiagnosticArray(status=[DiagnosticStatus(name='/team')])
+        guard = team.tested._guard
+        team.until(lambda: '/team' in guard.names and beats.get_subscription_count())
+        team.begin()
+        if silent == 'heartbeat':
+            beats.publish(beat)
+            team.answer()
+        team.until(lambda: team.status() and team.status().level == DiagnosticStatus.ERROR)
+        assert 'robots are held: no ' in team.status().message
+        team.until(lambda: len(team.cancelled) == len(ROBOTS))
+        decisions, batches = len(team.decisions), len(team.batches)
+        for step in (40, 60):
+            team.tell(step)
+            team.until(lambda step=step: team.tested._taken_step == step)
+        assert len(team.decisions) == decisions
+        if silent == 'updates':
+            # It is asked for again, so that a restarted filter can answer.
+            team.until(lambda: len(team.batches) > batches)
+            assert team.batches[-1] == team.batches[batches - 1]
+        else:
+            beats.publish(beat)
+        team.answer()
+        team.until(lambda: not team.tested._held)
+        team.tell(80)
+        team.until(lambda: len(team.decisions) > decisions)
+
+
+def test_found_targets_are_kept_for_a_filter_that_starts_again(team):
+    kept = team.hear(FoundTargetArray, 'found_targets/kept', LATCHED)
+    team.until(lambda: kept)
+    assert kept[0].targets == []
+    publisher = team.node.create_publisher(FoundTargetArray, 'found_targets', LATCHED)
+    team.until(lambda: publisher.get_subscription_count())
+    both = [FoundTarget(id=1), FoundTarget(id=2)]
+    publisher.publish(FoundTargetArray(batch_id=7, targets=both))
+    team.until(lambda: len(kept[-1].targets) == 2)
+    refined = FoundTarget(id=2, measurement=5)
+    publisher.publish(FoundTargetArray(batch_id=8, targets=[refined]))
+    team.until(lambda: kept[-1].batch_id == 8)
+    # Kept once, kept for good.
+    assert kept[-1].targets == [FoundTarget(id=1), refined]

@@ -27,179 +27,152 @@ from maasi_planner.planners.mutual_information import intensity, mutual_informat
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
-NAMES = ('maasi', 'asi', 'maas', 'as', 'mutual_information', 'nearest_widest', 'lawnmower')
+NAMES = ('maasi', 'maas', 'mutual_information', 'nearest_widest')
 
 
-def test_unknown_planner_is_refused():
+def one_robot(seed=0, **options):
+    """Return a team of one robot with three candidates and no clusters, and its view."""
+    options = {'dimension': 2, 'planning': 1, 'waiting': 0, 'candidates': 3} | options
+    team = random_team(np.random.default_rng(seed), **options)
+    team.clusters = []
+    return team, team.robots[team.planning()[0]]
+
+
+def decide(name, team, **settings):
+    """Return the decision for the robot that plans."""
+    decision = make_planner(name, PlannerSettings(name=name, **settings)).decide(team)
+    return decision.robots[team.planning()[0]]
+
+
+def at(x, y):
+    return RobotState.at_rest([x, y, 0.0])
+
+
+def cluster(place, radius=0.1, mass=0.9):
+    return Cluster(np.array(place), radius**2 * np.eye(2), radius, mass)
+
+
+def test_planners_are_made_by_name():
+    for one, other in (('maasi', 'asi'), ('maas', 'as')):
+        assert type(make_planner(one)) is type(make_planner(other))
     with pytest.raises(ValueError, match='known are'):
         make_planner('best')
 
 
-def test_aliases_are_the_same_planner():
-    for one, other in (('maasi', 'asi'), ('maas', 'as')):
-        assert type(make_planner(one)) is type(make_planner(other))
-
-
-# Finishing
-
-
 def test_finished_says_why():
-    rng = np.random.default_rng(1)
-    team = random_team(rng, dimension=2, planning=1, waiting=0, candidates=3)
+    team, view = one_robot(1, kinds=('box',))
     planner = make_planner('maasi')
-    team.exploration.values[...] = 0.0
-    team.clusters = []
-    assert '100.0 %' in planner.finished(team)
-    team.clusters = [Cluster(np.array([1.0, 1.0]), np.eye(2), 0.5, 0.5)]
-    assert planner.finished(team) is None
-    team.clusters = [Cluster(np.array([1.0, 1.0]), np.eye(2), 0.5, 0.01)]
-    assert planner.finished(team) is not None
-    team.exploration.values[...] = 0.5
-    assert planner.finished(team) is None
-
-
-def test_finished_when_no_candidate_can_show_more():
-    rng = np.random.default_rng(2)
-    team = random_team(rng, dimension=2, planning=1, waiting=0, candidates=3, kinds=('box',))
-    name = team.planning()[0]
-    team.clusters = []
-    team.exploration.values[...] = 0.0
+    for unseen, clusters, reason in (
+        (0.0, [], '100.0 %'),
+        (0.0, [cluster([1.0, 1.0], mass=0.5)], None),
+        (0.0, [cluster([1.0, 1.0], mass=0.01)], '100.0 %'),
+        (0.5, [], None),
+    ):
+        team.exploration.values[...] = unseen
+        team.clusters = clusters
+        found = planner.finished(team)
+        assert (found is None) == (reason is None) and (reason or '') in (found or '')
     # A corner that is out of reach of every candidate.
     team.exploration = UnexploredMap(team.bounds, 0.1)
     team.exploration.values[...] = 0.0
     team.exploration.values[-4:, -4:] = 1.0
-    view = team.robots[name]
-    view.state = RobotState.at_rest([0.3, 0.3, 0.0])
+    view.state = at(0.3, 0.3)
     view.candidates = np.array([[0.1, 0.1, 0.0], [0.5, 0.2, 0.0]])
-    planner = make_planner('maasi')
     planner.decide(team)
     assert 'no candidate of any robot' in planner.finished(team)
 
 
-# Active search
+# ---- active search ------------------------------------------------------------------------------
 
 
-def brute_active_search(team, settings, seen=None):
+def brute_active_search(team, settings, seen):
     """Return the best joint value over all first waypoints and sequences (001, 002).
 
-    T is the sum of pi at the cluster centres, or seen(robot, sequence).
+    T of a sequence of a robot is seen(robot, sequence).
     """
-    names = team.planning()
-    centres = [cluster.position for cluster in team.clusters]
+    low, high = team.bounds[:, 0] - 1e-9, team.bounds[:, 1] + 1e-9
 
-    def sequences(name):
+    def scored(name):
         view = team.robots[name]
         here = view.state.pose.position
-        steps = view.candidates - here
-        found = [[here + step] for step in steps]
-        for _ in range(settings.horizon - 1):
-            found = [[*past, past[-1] + step] for past in found for step in steps]
-        bounds = team.bounds
-        return [
-            past
-            for past in found
-            if all(
-                (place[:2] >= bounds[:, 0] - 1e-9).all()
-                and (place[:2] <= bounds[:, 1] + 1e-9).all()
-                for place in past
-            )
-        ]
+        for steps in itertools.product(view.candidates - here, repeat=settings.horizon):
+            way = here + np.cumsum(steps, axis=0)
+            if ((way[:, :2] >= low) & (way[:, :2] <= high)).all():
+                yield seen(name, way), [float(team.exploration.at(place)[0]) for place in way]
 
-    def refinement(name, past):
-        detection = team.robots[name].sensor.detection
-        return sum(
-            float(detection.probability(np.array(centres), Pose.from_yaw(place, 0.0)).sum())
-            for place in past
-        )
-
-    scored = [
-        [
-            (
-                (seen or refinement)(name, past),
-                [float(team.exploration.at(place)[0]) for place in past],
-            )
-            for past in sequences(name)
-        ]
-        for name in names
-    ]
     return max(
         sum(part for part, _ in joint)
-        + settings.alpha
-        * sum(math.prod(explored[j] for _, explored in joint) for j in range(settings.horizon))
-        for joint in itertools.product(*scored)
+        + settings.alpha * sum(map(math.prod, zip(*(explored for _, explored in joint))))
+        for joint in itertools.product(*(list(scored(name)) for name in team.planning()))
     )
 
 
-def ring_team(rng, planning):
+def ring_team(seed, planning):
+    rng = np.random.default_rng(seed)
     team = random_team(
         rng, dimension=2, planning=planning, waiting=0, candidates=1, kinds=('exponential',)
     )
     for view in team.robots.values():
-        place = np.append(rng.uniform(0.6, 1.4, 2), 0.0)
-        view.state = RobotState.at_rest(place)
-        settings = view.motion.settings.model_copy(
-            update={'model': 'constant_speed', 'heading': 'keep'}
-        )
-        view.motion = make_motion(settings)
+        view.state = at(*rng.uniform(0.6, 1.4, 2))
+        change = {'model': 'constant_speed', 'heading': 'keep'}
+        view.motion = make_motion(view.motion.settings.model_copy(update=change))
         ring = CandidateSet(CandidateSettings(ring=4, distance=0.25), team.bounds)
-        view.candidates = ring.at(place)
+        view.candidates = ring.at(view.state.pose.position)
     return team
 
 
+def detected(team, name, way, points):
+    """Return pi of points from each place of a way, (n, m)."""
+    detection = team.robots[name].sensor.detection
+    return np.array([detection.probability(points, Pose.from_yaw(place, 0.0)) for place in way])
+
+
 @pytest.mark.parametrize(
-    ('planning', 'horizon'),
-    [(1, 1), (1, 2), (1, 3), (2, 1), (2, 2), (2, 3), (3, 1), (3, 2)],
+    ('planning', 'horizon', 'kind'),
+    [
+        *((1, horizon, 'centres') for horizon in (1, 2, 3)),
+        *((2, horizon, 'centres') for horizon in (1, 2, 3)),
+        *((3, horizon, 'centres') for horizon in (1, 2)),
+        *((1, horizon, 'mutual_information') for horizon in (2, 3)),
+        (2, 2, 'mutual_information'),
+    ],
 )
-def test_active_search_is_brute_force(planning, horizon):
-    settings = PlannerSettings(name='maas', alpha=0.8, horizon=horizon)
-    for seed in range(4):
-        team = ring_team(np.random.default_rng(seed), planning)
-        decision = make_planner('maas', settings).decide(team)
-        assert decision.objective == pytest.approx(brute_active_search(team, settings), rel=1e-9)
-        assert decision.exact
-        for robot in decision.robots.values():
-            assert robot.objective[robot.chosen] == pytest.approx(decision.objective, rel=1e-9)
-
-
-@pytest.mark.parametrize(('planning', 'horizon'), [(1, 2), (1, 3), (2, 2)])
-def test_active_search_by_mutual_information_is_brute_force(planning, horizon):
-    """001, eq. (10) to (13): T of a sequence is what its empty measurements tell together."""
-    settings = PlannerSettings(
-        name='maas', alpha=0.1, horizon=horizon, refinement='mutual_information'
-    )
+def test_active_search_is_brute_force(planning, horizon, kind):
+    """001, eq. (10) to (13) of mutual information: what empty measurements tell together."""
+    alpha = 0.8 if kind == 'centres' else 0.1
+    settings = PlannerSettings(name='maas', alpha=alpha, horizon=horizon, refinement=kind)
     for seed in range(3):
-        rng = np.random.default_rng(seed)
-        team = ring_team(rng, planning)
+        team = ring_team(seed, planning)
         points, weights = intensity(team)
-        assert len(points)
+        centres = np.array([item.position for item in team.clusters])
 
-        def seen(name, past, team=team, points=points, weights=weights):
-            detection = team.robots[name].sensor.detection
-            missed = np.ones(len(points))
-            for place in past:
-                missed *= 1.0 - detection.probability(points, Pose.from_yaw(place, 0.0))
-            return mutual_information(missed, weights)
+        def seen(name, way, team=team, points=points, weights=weights, centres=centres):
+            if kind == 'mutual_information':
+                missed = (1.0 - detected(team, name, way, points)).prod(axis=0)
+                return mutual_information(missed, weights)
+            return float(detected(team, name, way, centres).sum())
 
         decision = make_planner('maas', settings).decide(team)
         expected = brute_active_search(team, settings, seen)
         assert decision.objective == pytest.approx(expected, rel=1e-9)
         assert decision.exact
+        for robot in decision.robots.values():
+            assert robot.objective[robot.chosen] == pytest.approx(decision.objective, rel=1e-9)
 
 
 def test_active_search_in_turn_is_close_to_the_optimum():
     """Where sequences are too many to compare jointly, robots choose in turn."""
     for seed in range(6):
-        team = ring_team(np.random.default_rng(seed), 3)
-        exact = make_planner('maas', PlannerSettings(name='maas', alpha=0.8, horizon=2)).decide(
-            team
-        )
-        settings = PlannerSettings(name='maas', alpha=0.8, horizon=2, enumeration_limit=10)
-        decision = make_planner('maas', settings).decide(team)
+        team = ring_team(seed, 3)
+        settings = PlannerSettings(name='maas', alpha=0.8, horizon=2)
+        exact = make_planner('maas', settings).decide(team)
+        few = settings.model_copy(update={'enumeration_limit': 10})
+        decision = make_planner('maas', few).decide(team)
         assert not decision.exact
         assert exact.objective >= decision.objective >= 0.98 * exact.objective
 
 
-# Mutual information
+# ---- mutual information -------------------------------------------------------------------------
 
 
 def entropy(p):
@@ -222,9 +195,6 @@ def test_mutual_information_of_few_places():
             conditional += chance * entropy(left)
         expected = entropy(mean) - conditional
         assert mutual_information(missed, weights) == pytest.approx(expected, abs=2e-5, rel=1e-3)
-
-
-def test_mutual_information_extremes():
     assert mutual_information(np.ones(3), np.full(3, 0.5)) == 0.0
     assert mutual_information(np.zeros(0), np.zeros(0)) == 0.0
     # A certain view of one place with mass m: the event says all about "is there any".
@@ -233,37 +203,24 @@ def test_mutual_information_extremes():
 
 
 def test_mutual_information_chooses_the_most_informative_pair():
-    rng = np.random.default_rng(4)
-    team = random_team(rng, dimension=2, planning=2, waiting=0, candidates=4)
+    team = random_team(np.random.default_rng(4), dimension=2, planning=2, waiting=0, candidates=4)
     points, weights = intensity(team)
     assert len(points)
     decision = make_planner('mutual_information').decide(team)
-    names = team.planning()
-    missed = {}
-    for name in names:
-        view = team.robots[name]
-        here = view.state.pose.position
-        turns = view.motion.settings.model == 'unicycle' or (
-            view.motion.settings.heading == 'travel'
-        )
-        rows = []
-        for place in view.candidates:
-            yaw = view.state.pose.yaw
-            if turns:
-                yaw = math.atan2(place[1] - here[1], place[0] - here[0])
-            pose = Pose.from_yaw(place, yaw)
-            rows.append(1.0 - view.sensor.detection.probability(points, pose))
-        missed[name] = rows
-    best = max(
-        mutual_information(one * two, weights)
-        for one in missed[names[0]]
-        for two in missed[names[1]]
-    )
+    missed = []
+    for view in (team.robots[name] for name in team.planning()):
+        settings = view.motion.settings
+        turns = settings.model == 'unicycle' or settings.heading == 'travel'
+        ways = view.candidates - view.state.pose.position
+        yaws = np.arctan2(ways[:, 1], ways[:, 0]) if turns else [view.state.pose.yaw] * 4
+        poses = [Pose.from_yaw(place, yaw) for place, yaw in zip(view.candidates, yaws)]
+        missed.append([1.0 - view.sensor.detection.probability(points, pose) for pose in poses])
+    best = max(mutual_information(a * b, weights) for a, b in itertools.product(*missed))
     assert decision.objective == pytest.approx(best, rel=1e-9)
 
 
 def test_without_information_robots_go_straight_on():
-    team = ring_team(np.random.default_rng(3), 1)
+    team = ring_team(3, 1)
     team.clusters = []
     name = team.planning()[0]
     planner = make_planner('mutual_information')
@@ -276,34 +233,21 @@ def test_without_information_robots_go_straight_on():
     assert 'straight on' in second.reason
 
 
-# Nearest, widest
+# ---- nearest, widest and the lawnmower ----------------------------------------------------------
 
 
 def test_nearest_then_widest():
-    team = ring_team(np.random.default_rng(3), 1)
-    name = team.planning()[0]
-    team.robots[name].state = RobotState.at_rest([0.2, 0.2, 0.0])
+    team, view = one_robot()
+    view.state = at(0.2, 0.2)
     near, wide = np.array([0.5, 0.4]), np.array([1.7, 1.6])
-    team.clusters = [
-        Cluster(wide, 0.1 * np.eye(2), 0.4, 0.9),
-        Cluster(near, 0.01 * np.eye(2), 0.1, 0.9),
-    ]
+    team.clusters = [cluster(wide, 0.4), cluster(near)]
     planner = make_planner('nearest_widest')
-    waypoints = [planner.decide(team).robots[name].waypoint[:2] for _ in range(4)]
-    assert np.allclose(waypoints, [near, wide, near, wide])
-
-
-def test_nearest_widest_explores_without_clusters():
-    team = ring_team(np.random.default_rng(3), 1)
-    name = team.planning()[0]
+    robots = [next(iter(planner.decide(team).robots.values())) for _ in range(4)]
+    assert np.allclose([robot.waypoint[:2] for robot in robots], [near, wide, near, wide])
     team.clusters = []
-    decision = make_planner('nearest_widest').decide(team).robots[name]
-    explored = team.exploration.at(team.robots[name].candidates)
-    assert decision.chosen == int(np.argmax(explored))
-    assert 'no cluster' in decision.reason
-
-
-# Lawnmower
+    robot = next(iter(planner.decide(team).robots.values()))
+    assert robot.chosen == int(np.argmax(team.exploration.at(view.candidates)))
+    assert 'no cluster' in robot.reason
 
 
 @pytest.mark.parametrize('bounds', [[[-0.3, 2.4]] * 2, [[0.0, 260.0]] * 3])
@@ -311,13 +255,10 @@ def test_lanes_cover_everything_within_half_a_spacing(bounds):
     bounds = np.array(bounds)
     spacing = float((bounds[:, 1] - bounds[:, 0]).max()) / 6.5
     found = lanes(bounds, spacing, spacing, 0.5 * spacing)
-    rng = np.random.default_rng(0)
-    d = len(bounds)
-    for _ in range(200):
-        place = rng.uniform(bounds[:, 0], bounds[:, 1])
+    for place in np.random.default_rng(0).uniform(bounds[:, 0], bounds[:, 1], (200, len(bounds))):
         gaps = []
         for start, end in found:
-            across = np.abs(place[1:] - start[1:d])
+            across = np.abs(place[1:] - start[1 : len(bounds)])
             along = max(0.0, min(start[0], end[0]) - place[0], place[0] - max(start[0], end[0]))
             gaps.append(max(along, across.max()))
         assert min(gaps) <= 0.5 * spacing + 1e-9
@@ -328,15 +269,11 @@ def test_lanes_cover_everything_within_half_a_spacing(bounds):
 def test_lawnmowers_cover_the_floor_and_meet_in_the_middle():
     result = search(load_scenario('no_targets'), 1, planner='lawnmower')
     assert result.end_reason == 'planner_done'
-    rows = {
-        name: [
-            robot.waypoint[1]
-            for decision in result.decisions
-            for own, robot in decision.robots.items()
-            if own == name and not robot.stays
-        ]
-        for name in ('mambo', 'turtlebot')
-    }
+    rows = {'mambo': [], 'turtlebot': []}
+    for decision in result.decisions:
+        for name, robot in decision.robots.items():
+            if not robot.stays:
+                rows[name].append(robot.waypoint[1])
     assert rows['mambo'][0] > 1.8
     assert rows['turtlebot'][0] < 0.3
     assert min(rows['mambo']) > max(rows['turtlebot']) - 1e-6
@@ -344,115 +281,67 @@ def test_lawnmowers_cover_the_floor_and_meet_in_the_middle():
     assert np.diff(sorted({*rows['mambo'], *rows['turtlebot']})).max() < 0.31
 
 
-# Waypoints of several robots
+# ---- what every planner keeps to ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize('name', ['maasi', 'maas', 'mutual_information', 'nearest_widest'])
+@pytest.mark.parametrize('name', NAMES)
 def test_robots_are_not_sent_to_one_place(name):
-    rng = np.random.default_rng(0)
-    team = random_team(rng, dimension=2, planning=2, waiting=0, candidates=3, radius=0.1)
-    shared = np.array([[0.5, 0.5, 0.0], [1.0, 0.5, 0.0], [0.5, 1.4, 0.0]])
-    team.clusters = [Cluster(np.array([1.0, 0.5]), 0.01 * np.eye(2), 0.1, 0.9)]
+    team, _ = one_robot(planning=2, radius=0.1)
+    team.clusters = [cluster([1.0, 0.5])]
     for view in team.robots.values():
-        view.candidates = shared.copy()
+        view.candidates = np.array([[0.5, 0.5, 0.0], [1.0, 0.5, 0.0], [0.5, 1.4, 0.0]])
     decision = make_planner(name).decide(team)
     one, two = (robot.waypoint for robot in decision.robots.values())
     assert np.linalg.norm(one - two) >= 0.4 - 1e-9
 
 
-@pytest.mark.parametrize('name', ['maasi', 'maas', 'mutual_information', 'nearest_widest'])
+@pytest.mark.parametrize('name', NAMES)
 def test_idle_robots_and_goals_of_others_count(name):
-    rng = np.random.default_rng(0)
-    team = random_team(rng, dimension=2, planning=1, waiting=2, candidates=3, radius=0.1)
-    planning = team.planning()[0]
-    first, second = (n for n in team.names() if n != planning)
-    team.robots[first].remaining_path = None
-    team.robots[first].remaining_yaws = None
-    team.robots[first].state = RobotState.at_rest([0.5, 0.5, 0.0])
-    team.robots[second].remaining_path = np.array([[1.9, 1.9, 0.0], [1.5, 1.5, 0.0]])
-    team.robots[second].remaining_yaws = None
-    team.clusters = []
-    team.robots[planning].state = RobotState.at_rest([0.1, 1.9, 0.0])
-    team.robots[planning].candidates = np.array(
-        [[0.55, 0.5, 0.0], [1.5, 1.45, 0.0], [0.4, 1.5, 0.0]]
-    )
-    decision = make_planner(name).decide(team)
-    assert decision.robots[planning].waypoint == pytest.approx([0.4, 1.5, 0.0])
+    team, view = one_robot(waiting=2, radius=0.1)
+    first, second = (item for item in team.robots.values() if item is not view)
+    first.remaining_path = first.remaining_yaws = second.remaining_yaws = None
+    first.state = at(0.5, 0.5)
+    second.remaining_path = np.array([[1.9, 1.9, 0.0], [1.5, 1.5, 0.0]])
+    view.state = at(0.1, 1.9)
+    view.candidates = np.array([[0.55, 0.5, 0.0], [1.5, 1.45, 0.0], [0.4, 1.5, 0.0]])
+    assert decide(name, team).waypoint == pytest.approx([0.4, 1.5, 0.0])
 
 
-# Bad input
-
-
-def one_robot(seed=0):
-    team = random_team(
-        np.random.default_rng(seed), dimension=2, planning=1, waiting=0, candidates=3
-    )
-    return team, team.planning()[0]
-
-
-@pytest.mark.parametrize('name', NAMES[:-1])
-def test_no_candidates_means_stay(name):
-    team, robot = one_robot()
-    team.clusters = []
-    team.robots[robot].candidates = np.zeros((0, 3))
-    decision = make_planner(name).decide(team).robots[robot]
-    assert decision.stays
-    assert 'no candidates' in decision.reason
-    assert decision.waypoint == pytest.approx(team.robots[robot].state.pose.position)
-
-
-@pytest.mark.parametrize('name', NAMES[:-1])
-def test_all_candidates_in_obstacles_means_stay(name):
-    team, robot = one_robot()
-    team.clusters = []
-    view = team.robots[robot]
-    centre = np.array([[1.0, 1.0, 0.0]])
-    obstacles = Obstacles(centre, np.array([0.5]), np.array([False]))
+@pytest.mark.parametrize('name', NAMES)
+@pytest.mark.parametrize(
+    ('start', 'candidates', 'chosen', 'reason'),
+    [
+        ((0.2, 1.2), [], None, 'no candidates'),
+        ((0.2, 1.2), [[3.0, 1.0, 0.0]], None, 'outside the bounds'),
+        ((0.2, 1.2), [[0.2, 1.2, 0.0]], None, 'already'),
+        # At the edge of the obstacle.
+        ((0.397, 1.0), [[1.0, 1.0, 0.0], [1.1, 1.0, 0.0]], None, 'in obstacles'),
+        ((0.2, 1.2), [[3.0, 1.0, 0.0], [np.nan, 0.0, 0.0], [0.3, 1.4, 0.0]], [0.3, 1.4, 0.0], ''),
+    ],
+)
+def test_robots_without_a_usable_candidate_stay(name, start, candidates, chosen, reason):
+    team, view = one_robot()
+    obstacles = Obstacles(np.array([[1.0, 1.0, 0.0]]), np.array([0.5]), np.array([False]))
     view.motion = make_motion(view.motion.settings, obstacles, 0.1)
-    # At the edge already: there is no way further towards the candidates.
-    view.state = RobotState.at_rest([0.397, 1.0, 0.0])
-    view.candidates = np.array([[1.0, 1.0, 0.0], [1.1, 1.0, 0.0]])
-    decision = make_planner(name).decide(team).robots[robot]
-    assert decision.stays
-    assert 'obstacles' in decision.reason
+    view.state = at(*start)
+    view.candidates = np.array(candidates).reshape(-1, 3)
+    robot = decide(name, team)
+    assert robot.stays == (chosen is None) and reason in robot.reason
+    assert robot.waypoint == pytest.approx(chosen or [*start, 0.0])
 
 
-@pytest.mark.parametrize('name', NAMES[:-1])
-def test_waypoints_outside_are_never_chosen(name):
-    team, robot = one_robot()
-    team.clusters = []
-    team.robots[robot].candidates = np.array([[3.0, 1.0, 0.0], [np.nan, 0.0, 0.0], [1.0, 1.2, 0.0]])
-    decision = make_planner(name).decide(team).robots[robot]
-    assert decision.waypoint == pytest.approx([1.0, 1.2, 0.0])
-    team.robots[robot].candidates = np.array([[3.0, 1.0, 0.0]])
-    decision = make_planner(name).decide(team).robots[robot]
-    assert decision.stays
-    assert 'outside the bounds' in decision.reason
-
-
-def test_only_candidate_is_where_the_robot_is():
-    team, robot = one_robot()
-    team.clusters = []
-    team.robots[robot].candidates = np.array([team.robots[robot].state.pose.position])
-    decision = make_planner('maasi').decide(team).robots[robot]
-    assert decision.stays
-    assert 'already' in decision.reason
-
-
-def test_candidate_at_the_present_place_is_not_chosen():
-    team, robot = one_robot()
-    here = np.array(team.robots[robot].state.pose.position)
-    team.robots[robot].candidates = np.vstack([here, team.robots[robot].candidates])
-    for kind in ('paper', 'information'):
-        settings = PlannerSettings(objective=kind, cluster_candidates=False)
-        decision = make_planner('maasi', settings).decide(team).robots[robot]
-        assert decision.chosen != 0
-        assert decision.lengths[0] == 0
-        assert decision.objective[0] == -np.inf
+@pytest.mark.parametrize('kind', ['paper', 'information'])
+def test_candidate_at_the_present_place_is_not_chosen(kind):
+    team, view = one_robot()
+    view.candidates = np.vstack([view.state.pose.position, view.candidates])
+    robot = decide('maasi', team, objective=kind, cluster_candidates=False)
+    assert robot.chosen != 0
+    assert robot.lengths[0] == 0
+    assert robot.objective[0] == -np.inf
 
 
 def test_wrong_team_is_refused():
-    team, robot = one_robot()
+    team, view = one_robot()
     for change in (
         {'period_steps': 0},
         {'radius': math.nan},
@@ -460,12 +349,12 @@ def test_wrong_team_is_refused():
         {'candidates': np.zeros((3, 2))},
     ):
         with pytest.raises(ValueError, match=next(iter(change))):
-            dataclasses.replace(team.robots[robot], **change)
+            dataclasses.replace(view, **change)
     with pytest.raises(ValueError, match='step_time'):
         dataclasses.replace(team, step_time=0.0)
 
 
-def test_nobody_plans():
+@pytest.mark.parametrize('name', [*NAMES, 'lawnmower'])
+def test_nobody_plans(name):
     team = random_team(np.random.default_rng(0), planning=0, waiting=2)
-    for name in NAMES:
-        assert make_planner(name).decide(team).robots == {}
+    assert make_planner(name).decide(team).robots == {}

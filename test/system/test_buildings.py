@@ -27,6 +27,10 @@ def small(tmp_path, **changes):
     return file
 
 
+def place_of(state):
+    return np.array([state['pose']['pose']['position'][axis] for axis in 'xyz'])
+
+
 def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path):
     file = small(tmp_path)
     run = run_scenario(file, tmp_path / 'run', '--lockstep', '--seed', 3)
@@ -55,8 +59,7 @@ def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path
     assert report['time_to_find_all'] == record.steps
     for name, path in record.paths.items():
         states = of_topic(run, f'/{name}/state')
-        flown = [state['pose']['pose']['position'] for state in states]
-        ours = np.array([[place[axis] for axis in 'xyz'] for place in flown])
+        ours = np.array([place_of(state) for state in states])
         assert ours == pytest.approx(path[: len(ours)], abs=1e-6)
         assert len(ours) >= record.steps
     assert [(shot['cuboid'], shot['agent'], shot['time']) for shot in report['snapshots']] == [
@@ -65,22 +68,16 @@ def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path
 
 
 def test_the_link_has_a_range_and_batteries_fail(tmp_path):
-    content = load_cuboid_scenario('buildings_four').content()
-    robots = {name: content['robots'][name] for name in ('blue', 'green')}
-    for robot in robots.values():
+    content = yaml.safe_load(small(tmp_path).read_text())
+    for robot in content['robots'].values():
         robot['hazard'].update(alpha=14.0, recharge_steps=[2, 4])
-    planner = {**content['planner'], 'objects': content['planner']['objects'][:1]}
-    planner.update(horizon=6, time_limit=1e9, communication_range=40.0)
-    file = small(
-        tmp_path,
-        robots=robots,
-        planner=planner,
-        stop='planner_done',
-        events=[
-            {'at': 4.0, 'robot': 'green', 'do': 'leave'},
-            {'at': 9.0, 'robot': 'green', 'do': 'back'},
-        ],
-    )
+    content['planner'].update(communication_range=40.0)
+    events = [
+        {'at': 4.0, 'robot': 'green', 'do': 'leave'},
+        {'at': 9.0, 'robot': 'green', 'do': 'back'},
+    ]
+    file = tmp_path / 'small.yaml'
+    file.write_text(yaml.safe_dump({**content, 'stop': 'planner_done', 'events': events}))
     run = run_scenario(file, tmp_path / 'run', '--lockstep', '--time-limit', 300)
     assert run.code == 0, run.output
     report = run.report
@@ -88,24 +85,16 @@ def test_the_link_has_a_range_and_batteries_fail(tmp_path):
     assert report['collisions'] == 0
     words = {(event['agent'], event['event']) for event in report['events']}
     assert {('green', 'lost'), ('green', 'joined')} <= words
-    assert any(word == 'returning' for _, word in words)
-    assert any(word == 'recharging' for _, word in words)
-    assert any(word == 'searching' for _, word in words)
+    assert {'returning', 'recharging', 'searching'} <= {word for _, word in words}
     places = {
-        name: {
-            state['step']: np.array([state['pose']['pose']['position'][axis] for axis in 'xyz'])
-            for state in of_topic(run, f'/{name}/state')
-        }
+        name: {state['step']: place_of(state) for state in of_topic(run, f'/{name}/state')}
         for name in ('blue', 'green')
     }
-    heard = 0
-    for item in of_topic(run, '/blue/link/rx'):
-        if item['messages']:
-            heard += 1
-            step = item['step']
-            assert np.linalg.norm(places['blue'][step] - places['green'][step]) <= 40.0
-            assert not 4 <= step < 9
-    assert heard > 2
+    heard = [item['step'] for item in of_topic(run, '/blue/link/rx') if item['messages']]
+    assert len(heard) > 2
+    for step in heard:
+        assert np.linalg.norm(places['blue'][step] - places['green'][step]) <= 40.0
+        assert not 4 <= step < 9
 
 
 def test_a_killed_planner_stops_nobody_and_takes_up_its_work(tmp_path):
@@ -136,11 +125,8 @@ def test_a_killed_planner_stops_nobody_and_takes_up_its_work(tmp_path):
         }
     steps = [item['step'] for item in decisions['green']]
     gaps = np.diff(steps)
+    lost, away = steps[int(np.argmax(gaps))], gaps.max()
     # It was away for a while, the other one went on, and it came back.
-    assert gaps.max() > 1
-    lost = steps[int(np.argmax(gaps))]
-    between = [
-        item['step'] for item in decisions['blue'] if lost < item['step'] < lost + gaps.max()
-    ]
-    assert len(between) >= gaps.max() // 2
-    assert steps[-1] > lost
+    assert away > 1 and steps[-1] > lost
+    between = [item for item in decisions['blue'] if lost < item['step'] < lost + away]
+    assert len(between) >= away // 2

@@ -10,14 +10,6 @@ from maasi_sim.search import search
 pytestmark = pytest.mark.system
 
 
-def test_ranging_drones_search_space(tmp_path):
-    options = ('--seed', 1, '--lockstep', '--time-limit', 30)
-    run = run_scenario('ranging_pair_3d', tmp_path / 'run', *options)
-    assert run.code in (0, 1), run.output
-    assert sum(run.report['measurements'].values()) >= 40
-    assert len(run.report['found']) >= 1
-
-
 def test_independent_robots_share_what_they_find_and_nothing_else(tmp_path):
     """A filter and a planner for each robot decide as the search in one process; 002, section 4."""
     scenario = load_scenario('ranging_pair_3d').content()
@@ -67,16 +59,3 @@ def test_without_targets_the_planner_says_when_nothing_is_left(tmp_path):
     assert result.end_reason == 'planner_done'
     assert report['measurements'] == result.measurements
     assert report['time_to_find_all'] is None
-
-
-def test_another_planner_than_the_default_runs_in_the_planner_node(tmp_path):
-    name = 'mutual_information'
-    options = ('--planner', name, '--lockstep', '--no-record', '--time-limit', 12)
-    run = run_scenario('ranging_drone_3d', tmp_path / 'run', *options)
-    assert run.code == 1, run.output
-    report = run.report
-    assert report['planner'] == name
-    assert report['end_reason'] == 'time_limit'
-    assert report['decisions'] >= 1
-    assert report['measurements']['drone'] >= 1
-    assert report['distance']['drone'] > 50.0

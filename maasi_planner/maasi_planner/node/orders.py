@@ -61,14 +61,14 @@ class Orders:
         """Cancel the goals of robots, and discard their plans."""
         for name in names:
             self.goals.cancel(name)
-            self._coordinator.leave(name)
+            self._coordinator.plans[name].leave()
 
     def hold(self, names: Iterable[str]) -> None:
         """Stop robots where they are, but for those on their way home; they get new goals."""
         for name in names:
             if name not in self._homing:
                 self.goals.cancel(name)
-                self._coordinator.refuse(name)
+                self._coordinator.plans[name].staying = True
 
     def begin_homing(self, names: Iterable[str]) -> None:
         """Send robots to their starts as soon as they are free."""
@@ -85,7 +85,7 @@ class Orders:
         self.lent.pop(name, None)
         if name in self._homing:
             self._homing[name] = -1
-        self._coordinator.leave(name)
+        self._coordinator.plans[name].leave()
 
     # ---- goals -------------------------------------------------------------------------------
 
@@ -101,7 +101,9 @@ class Orders:
         """Send a free robot to its start, if it has to go there."""
         if name not in self._homing:
             return
-        number = self._homing[name] = self._coordinator.next_number(name)
+        plan = self._coordinator.plans[name]
+        plan.decision += 1
+        number = self._homing[name] = plan.decision + 1
         self.send(name, number, np.array(self._node.settings.robots[name].start), header)
 
     def _on_answer(self, name: str, number: int, accepted: bool) -> None:
@@ -117,13 +119,13 @@ class Orders:
             self._refused_since = now
         self.refused_for = now - self._refused_since
         self.goals.forget(name)
-        self._coordinator.refuse(name)
+        self._coordinator.plans[name].staying = True
 
     def is_free(self, name: str, heard: HeardState, step: int) -> bool:
         """Return whether a robot can take a goal: it has none, from any client."""
-        coordinator, logger = self._coordinator, self._node.get_logger()
-        if not coordinator.is_idle(name):
-            number = coordinator.decision_index(name) + 1
+        plan, logger = self._coordinator.plans[name], self._node.get_logger()
+        if not plan.staying:
+            number = plan.decision + 1
             if heard.goal == number:
                 self._refused_since, self.refused_for = None, 0.0
             course = self.goals.course(name, number, heard)
@@ -156,8 +158,9 @@ class Orders:
     def _lend(self, name: str, heard: HeardState, step: int) -> None:
         new = self.lent.get(name) != heard.goal
         self.lent[name] = heard.goal
-        if self._modes.of[name] is Mode.SEARCHING and self._coordinator.destined(name):
-            self._coordinator.lend(name, step)
+        plan = self._coordinator.plans[name]
+        if self._modes.of[name] is Mode.SEARCHING and plan.destined:
+            plan.lend(step)
         if new:
             self._node.get_logger().warning(
                 f'{name} follows goal {heard.goal} of another client: it measures, and gets no '

@@ -62,7 +62,7 @@ class PlannerViews:
             )
         shown = {}
         for name, robot in robots.items():
-            path = coordinator.path(name)
+            path = coordinator.plans[name].positions
             place = np.asarray(robot.state.pose.position)
             shown[name] = (place, path[-1] if len(path) else place, path)
         self._markers.publish(self._board.replace(planner_markers(shown, header, self._size)))

@@ -16,7 +16,6 @@ from maasi_planner.objective.predicted_measurements import (
     Measurements,
     apply_misses,
     chances,
-    first_of_each,
 )
 from maasi_planner.objective.terms import Terms
 from maasi_planner.settings import PlannerSettings
@@ -136,29 +135,23 @@ def information_terms(
 ) -> Terms:
     """Return the terms of candidates: robots that plan, and their measurements from `first` on.
 
-    `settled`: the robots that do not plan, and their measurements.
+    `settled`: robots whose measurements do not depend on the choice, and these.
     """
     d, clusters = team.dimension, team.clusters
-    # What does not depend on the choice: settled robots, and the present measurements.
-    given = [settled, (planned[0], first_of_each(planned[1]))][: 1 + first]
     places, left = _unseen(team, settings, bool((planned[1].kind >= BOX).any()))
-    for _, measured in given:
-        for miss in _misses(measured, 0, places):
-            left *= miss
+    for miss in _misses(settled[1], 0, places):
+        left *= miss
     kept = np.flatnonzero(left > 0.0)
     miss = _misses(planned[1], first, np.ascontiguousarray(places[:, kept]))
     total = len(miss)
     return Terms(
         refinement=np.zeros(total),
-        mass=np.array([min(1.0, max(0.0, cluster.mass)) for cluster in clusters], float),
-        covariance=np.array([c.covariance[:d, :d] for c in clusters], float).reshape(-1, d, d),
-        base=np.asarray(sum(_information(*group, 0, centres, d).sum(axis=0) for group in given)),
-        gain=_information(*planned, first, centres, d),
         filled=np.full(total, len(kept)),
         value=left[kept] * (1.0 - miss),
-        place=np.zeros((0, 3, 0)),
-        time=np.zeros((0, 0), np.int64),
         slot=np.tile(np.arange(total), (total, 1)),
         cache=miss,
-        used=np.zeros(1, np.int64),
+        mass=np.array([min(1.0, max(0.0, cluster.mass)) for cluster in clusters], float),
+        covariance=np.array([c.covariance[:d, :d] for c in clusters], float).reshape(-1, d, d),
+        base=_information(*settled, 0, centres, d).sum(axis=0),
+        gain=_information(*planned, first, centres, d),
     )

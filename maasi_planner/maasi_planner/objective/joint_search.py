@@ -199,21 +199,16 @@ def _search_in_turn(
     chosen[:] = -1
     evaluated = 0
     total = -np.inf
-    for i in range(robots):
-        r = robots - 1 - i if backwards else i
-        g, value, count = _best_reply(table, r, alone, order, chosen)
-        evaluated += count
-        if g >= 0:
-            chosen[r] = g
-            total = value
-    for _ in range(rounds):
+    for attempt in range(1 + rounds):
         changed = False
-        for r in range(robots):
-            if chosen[r] < 0:
+        for i in range(robots):
+            r = robots - 1 - i if backwards and attempt == 0 else i
+            if attempt > 0 and chosen[r] < 0:
                 continue
             g, value, count = _best_reply(table, r, alone, order, chosen)
             evaluated += count
-            if g >= 0 and g != chosen[r] and value > total + 1e-12 * abs(total):
+            better = attempt == 0 or value > total + 1e-12 * abs(total)
+            if g >= 0 and g != chosen[r] and better:
                 chosen[r] = g
                 total = value
                 changed = True

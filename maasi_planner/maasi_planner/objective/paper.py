@@ -92,15 +92,11 @@ def paper_terms(
     pairs = len(planned.own) if len(planned.kind) > 1 else 0
     return Terms(
         refinement=chances(planned, first, centres).sum(axis=(1, 2)),
-        mass=np.zeros(0),
-        covariance=np.zeros((0, 0, 0)),
-        base=np.zeros((0, 0, 0)),
-        gain=np.zeros((0, 0, 0, 0)),
         filled=count,
         value=value,
-        place=place,
-        time=time,
         slot=np.full((pairs, pairs), -1),
         cache=np.empty((min(CACHE_ROWS, pairs * pairs), value.shape[1])),
+        place=place,
+        time=time,
         used=np.zeros(1, np.int64),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -72,6 +72,13 @@ def remaining_way(view: RobotView) -> Ways:
     return Ways(view, positions[None], yaws[None], lengths, max(0, view.phase), arrival)
 
 
+def present_place(view: RobotView) -> Ways:
+    """Return the way of a robot that measures where it is, once."""
+    pose = view.state.pose
+    place, yaw = np.array(pose.position)[None, None], np.full((1, 1), pose.yaw)
+    return Ways(view, place, yaw, np.zeros(1, np.int64), 0, True)
+
+
 @njit(cache=True)
 def _fill(
     positions: FloatArray,
@@ -106,12 +113,6 @@ def _fill(
             out.turns[w, i, 0], out.turns[w, i, 1] = math.cos(yaws[w, k]), math.sin(yaws[w, k])
 
 
-def _rows(measured: Measurements, rows: Any) -> Measurements:
-    """Return the measurements on some trajectories."""
-    columns: list[Any] = [column[rows] for column in measured[:6]]
-    return Measurements._make([*columns, *measured[6:]])
-
-
 def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurements:
     """Return the measurements of robots on their trajectories.
 
@@ -138,7 +139,7 @@ def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurement
     end = 0
     for ways, count in zip(robots, counts):
         begin, end = end, end + count
-        rows = _rows(out, slice(begin, end))
+        rows = Measurements._make([*(column[begin:end] for column in out[:6]), *out[6:]])
         timing = ways.phase, ways.view.period_steps, horizon if extend else -1, ways.arrival
         _fill(ways.positions, ways.yaws, ways.lengths, timing, rows)
         if ways.view.sensor.dimension == 2:
@@ -146,24 +147,20 @@ def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurement
     return out
 
 
-def first_of_each(measured: Measurements) -> Measurements:
-    """Return of each robot the first planned measurement of its first trajectory, if any."""
-    _, first = np.unique(measured.robot, return_index=True)
-    rows = _rows(measured, first)
-    once = np.minimum(rows.own, 1)
-    return rows._replace(number=once, own=once)
-
-
 @njit(cache=True)
 def chances(measured: Measurements, first: int, points: FloatArray) -> FloatArray:
     """Return pi at points (C, 3) of the planned measurements from `first` on, (G, n, C)."""
     number = points.shape[0]
     out = np.zeros((measured.own.shape[0], measured.times.shape[1], number))
+    x, y, z = np.empty((3, number))
     for g in range(out.shape[0]):
         robot = measured.robot[g]
         kind, parameters = measured.kind[robot], measured.parameters[robot]
         for e in range(first, measured.own[g]):
-            x, y, z = (points - measured.places[g, e]).T.copy()
+            for c in range(number):
+                x[c] = points[c, 0] - measured.places[g, e, 0]
+                y[c] = points[c, 1] - measured.places[g, e, 1]
+                z[c] = points[c, 2] - measured.places[g, e, 2]
             cosine, sine = measured.turns[g, e]
             fill_probabilities(kind, parameters, x, y, z, number, cosine, sine, out[g, e])
     return out

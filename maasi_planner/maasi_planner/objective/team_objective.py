@@ -11,7 +11,12 @@ from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.objective.information import information_terms
 from maasi_planner.objective.joint_search import CandidateTable, search, total_value, values_given
 from maasi_planner.objective.paper import paper_terms
-from maasi_planner.objective.predicted_measurements import Ways, predicted, remaining_way
+from maasi_planner.objective.predicted_measurements import (
+    Ways,
+    predicted,
+    present_place,
+    remaining_way,
+)
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import TeamView, UsableCandidates
 
@@ -50,7 +55,12 @@ class TeamObjective:
         horizon = int(lengths.max(initial=0))
         views = [team.robots[name] for name in names]
         others = [team.robots[name] for name in team.names() if name not in names]
+        rest = [remaining_way(view) for view in others]
         arrival, extend = weights.arrival, weights.extend
+        # The first measurement that counts: the present one does not depend on the choice.
+        first = 0 if weights.present else 1
+        if first and weights.information:
+            rest += map(present_place, views)
         planned = predicted(
             [
                 Ways(view, way.positions, way.yaws, way.lengths, 0, arrival)
@@ -59,15 +69,13 @@ class TeamObjective:
             horizon,
             extend,
         )
-        settled = predicted([remaining_way(view) for view in others], horizon, extend)
+        settled = predicted(rest, horizon, extend)
         self.measurements = planned.own
         centres = np.zeros((len(team.clusters), 3))
         for centre, cluster in zip(centres, team.clusters):
             centre[: team.dimension] = cluster.position[: team.dimension]
-        # The first measurement that counts: the present one does not depend on the choice.
-        first = 0 if weights.present else 1
         if weights.information:
-            groups = (views, planned), (others, settled)
+            groups = (views, planned), ([way.view for way in rest], settled)
             terms = information_terms(team, settings, *groups, first, centres)
         else:
             grid = team.exploration.kernel()

@@ -18,27 +18,27 @@ CACHE_ROWS = 8000
 class Terms(NamedTuple):
     """What T and E of G candidates consist of.
 
-    T is refinement (G,), and of C clusters with mass (C,) and covariance (C, d, d) the information
-    that a candidate's gain (G, C, d, d) adds to base (C, d, d), both sums of pi H' R^-1 H.
-
     E is what others leave of value (G, n), of which filled[g] numbers are used: their product with
     what each other candidate leaves. That is row slot (G, G) of cache (S, n), or where that is
     negative comes from its measurements until time (G, n) [steps from now] at place (G, 3, n) [m],
     and is kept, as the search needs it many times; used (1,) counts rows.
+
+    T is refinement (G,), and of C clusters with mass (C,) and covariance (C, d, d) the information
+    that a candidate's gain (G, C, d, d) adds to base (C, d, d), both sums of pi H' R^-1 H.
     """
 
     refinement: FloatArray
-    mass: FloatArray
-    covariance: FloatArray
-    base: FloatArray
-    gain: FloatArray
     filled: IntArray
     value: FloatArray
-    place: FloatArray
-    time: IntArray
     slot: IntArray
     cache: FloatArray
-    used: IntArray
+    place: FloatArray = np.zeros((0, 3, 0))
+    time: IntArray = np.zeros((0, 0), np.int64)
+    used: IntArray = np.zeros(1, np.int64)
+    mass: FloatArray = np.zeros(0)
+    covariance: FloatArray = np.zeros((0, 0, 0))
+    base: FloatArray = np.zeros((0, 0, 0))
+    gain: FloatArray = np.zeros((0, 0, 0, 0))
 
 
 @njit(cache=True)

@@ -218,7 +218,7 @@ class SearchTrace:
         self, time: float, space: str, decision: Decision, coordinator: Coordinator
     ) -> None:
         """Add a joint decision."""
-        indices = {name: coordinator.decision_index(name) for name in decision.robots}
+        indices = {name: coordinator.plans[name].decision for name in decision.robots}
         explored = coordinator.exploration.explored_fraction()
         planner = self.scenario.planner.name
         self._add(EventMaker.plan, time, space, planner, decision, indices, explored)

@@ -1,7 +1,8 @@
-"""P2 of 004 as it is printed, with its big-M rows and binaries, for SCIP.
+"""P2 of 004 as a mixed-integer problem for SCIP: the oracle of tests, and a baseline of speed.
 
-The oracle of the tests and the baseline of the benchmark. What the lean problem adds (segments that
-keep away from obstacles, a way to brake) is added here as rows, too.
+One binary for a visit, and only where the cuboid meets what extreme forces reach; faces of
+obstacles only where they can matter; big M as small as what can be reached allows. What the lean
+problem adds (segments that keep away from obstacles, a way to brake) is added here as rows, too.
 """
 
 import time
@@ -14,11 +15,15 @@ from maasi_planner.buildings.problem import TOUCH
 BIG = 1000.0
 
 
-class LiteralProblem:
-    """Columns and rows of P2; `squares` are (weight, columns, coefficients, constant)."""
+class MixedProblem:
+    """Columns and rows of P2; `squares` are (weight, columns, coefficients, constant).
 
-    def __init__(self, solver, problem):
+    apart: whether no two cuboids can be visited at one step.
+    """
+
+    def __init__(self, solver, problem, apart=False):
         self.dynamics, self.settings, self.problem = solver.dynamics, solver.settings, problem
+        self.apart = apart
         self.lower, self.upper, self.integer, self.cost = [], [], [], []
         self.rows = []
         self.squares = []
@@ -60,50 +65,67 @@ class LiteralProblem:
                 fall = -gamma * d.weight[a]
                 self.row([self.v[k + 1, a], self.v[k, a], u], [1, -d.retained, -gamma], fall, fall)
 
+    def _reach(self):
+        d, T, p = self.dynamics, self.settings.horizon, self.problem
+        reach = np.empty((T + 1, 3, 2))
+        for side, sign in enumerate((-1.0, 1.0)):
+            place, speed = p.position.astype(float), p.velocity.astype(float)
+            for k in range(T + 1):
+                reach[k, :, side] = place
+                place, speed = d.next(place, speed, np.full(3, sign * d.force))
+                speed = np.clip(speed, -d.speed, d.speed)
+        reach[2:, :, 0] = np.maximum(reach[2:, :, 0], p.area[:, 0])
+        reach[2:, :, 1] = np.minimum(reach[2:, :, 1], p.area[:, 1])
+        return reach
+
     def _visit_rows(self):
         T, p = self.settings.horizon, self.problem
+        self.reach = self._reach()
         rewards = self.settings.rewards()
+        possible = {}
         for n in np.flatnonzero(p.wanted):
-            inside = []
+            visits = []
             for k in range(1, T + 1):
-                faces = []
-                for a in range(3):
-                    for sign, bound in ((-1.0, -p.cuboids[n, a, 0]), (1.0, p.cuboids[n, a, 1])):
-                        b = self.binary()  # b_{tau,n,l}
-                        self.row([self.P[k, a], b], [sign, BIG - bound], -np.inf, BIG)
-                        faces.append(b)
-                b_tilde = self.binary()
-                self.row([b_tilde, *faces], [6, *[-1] * 6], -np.inf, 0)
-                inside.append(b_tilde)
-            b_hat = self.binary()
-            if self.settings.discount == 1.0:
-                self.row([b_hat, *inside], [1, *[-1] * T], -np.inf, 0)
-                self.row([self.binary(-rewards[1]), b_hat], [1, -1], -np.inf, 0)
-            else:
-                # One visit counts, with the reward of its step.
-                counted = [self.binary(-rewards[k]) for k in range(1, T + 1)]
-                for c, b_tilde in zip(counted, inside):
-                    self.row([c, b_tilde], [1, -1], -np.inf, 0)
-                self.row([b_hat, *counted], [-1, *[1] * T], -np.inf, 0)
-
-    def _faces(self):
-        """Return z of the six faces of an object, of which one is kept beyond."""
-        z = [self.binary() for _ in range(6)]
-        self.row(z, [1] * 6, -np.inf, 5)
-        return z
-
-    def _beyond(self, z, a, box, columns, coefficients=(1,), up=0.0, down=0.0):
-        below, above = z[2 * a : 2 * a + 2]
-        self.row([*columns, below], [*coefficients, -BIG], -np.inf, box[a, 0] + up)
-        self.row([*columns, above], [*coefficients, BIG], box[a, 1] - down, np.inf)
+                low, high = self.reach[k].T
+                # Where the next step leads is given: a visit on a face counts despite rounding.
+                box = p.cuboids[n] + [-TOUCH, TOUCH] if k == 1 else p.cuboids[n]
+                if (box[:, 0] <= high).all() and (box[:, 1] >= low).all():
+                    beta = self.binary(-rewards[k])
+                    visits.append(beta)
+                    possible.setdefault((k, None if self.apart else n), []).append((beta, box))
+            if len(visits) > 1:
+                self.row(visits, [1] * len(visits), -np.inf, 1)
+        for (k, _), betas in possible.items():
+            columns = [beta for beta, _ in betas]
+            for a in range(3):
+                low, high = self.reach[k, a]
+                lifts = [max(box[a, 0] - low, 0.0) for _, box in betas]
+                drops = [max(high - box[a, 1], 0.0) for _, box in betas]
+                self.row([self.P[k, a], *columns], [1, *(-x for x in lifts)], low, np.inf)
+                self.row([self.P[k, a], *columns], [1, *drops], -np.inf, high)
 
     def _obstacle_rows(self):
-        for box in self.problem.obstacles:
-            for k in range(2, self.settings.horizon + 1):
-                z = self._faces()
+        T, p = self.settings.horizon, self.problem
+        for box in p.obstacles:
+            for k in range(2, T + 1):
+                steps = [k - 1, k] if self.settings.between_samples else [k]
+                low, high = self.reach[steps, :, 0].min(axis=0), self.reach[steps, :, 1].max(axis=0)
+                if (high <= box[:, 0]).any() or (low >= box[:, 1]).any():
+                    continue
+                faces = []
                 for a in range(3):
-                    for i in (k - 1, k) if self.settings.between_samples else (k,):
-                        self._beyond(z, a, box, [self.P[i, a]])
+                    # The lower face, then the upper one, mirrored.
+                    for side, sign in ((0, 1), (1, -1)):
+                        face = sign * box[a, side]
+                        nearest = (low, -high)[side][a]
+                        if face <= sign * p.area[a, side] or nearest > face:
+                            continue
+                        z = self.binary()
+                        faces.append(z)
+                        for i in steps:
+                            most = max(sign * self.reach[i, a, 1 - side] - face, 0.0)
+                            self.row([self.P[i, a], z], [sign, -most], -np.inf, face)
+                self.row(faces, [1] * len(faces), -np.inf, len(faces) - 1)
 
     def _braking_rows(self):
         """The way to brake, each axis with full force, stays in the area and beyond a face."""
@@ -114,11 +136,14 @@ class LiteralProblem:
                 self.row(ends[a], [1, factor], p.area[a, 0] - down, np.inf)
                 self.row(ends[a], [1, factor], -np.inf, p.area[a, 1] + up)
         for box in p.obstacles:
-            z = self._faces()
+            # Of the six faces one is kept beyond.
+            z = np.array([self.binary() for _ in range(6)]).reshape(3, 2)
+            self.row(z.ravel(), [1] * 6, -np.inf, 5)
             for a in range(3):
-                self._beyond(z, a, box, [self.P[T, a]])
-                for factor, up, down in self._stops(a):
-                    self._beyond(z, a, box, ends[a], [1, factor], up, down)
+                for factor, up, down in ((0.0, 0.0, 0.0), *self._stops(a)):
+                    below, above = ([*ends[a], column] for column in z[a])
+                    self.row(below, [1, factor, -BIG], -np.inf, box[a, 0] + up)
+                    self.row(above, [1, factor, BIG], box[a, 1] - down, np.inf)
 
     def _stops(self, a):
         """Return way = P + factor v - up (moving up), + down (moving down), after each step."""
@@ -177,78 +202,7 @@ class LiteralProblem:
         return total
 
 
-class TightProblem(LiteralProblem):
-    """The same optimum with what a modeller would do for a general solver.
-
-    One binary for a visit, and only where the cuboid meets what extreme forces reach; faces of
-    obstacles only where they can matter; every big M as small as what can be reached allows.
-    """
-
-    def _reach(self):
-        d, T, p = self.dynamics, self.settings.horizon, self.problem
-        reach = np.empty((T + 1, 3, 2))
-        for side, sign in enumerate((-1.0, 1.0)):
-            place, speed = p.position.astype(float), p.velocity.astype(float)
-            for k in range(T + 1):
-                reach[k, :, side] = place
-                place, speed = d.next(place, speed, np.full(3, sign * d.force))
-                speed = np.clip(speed, -d.speed, d.speed)
-        reach[2:, :, 0] = np.maximum(reach[2:, :, 0], p.area[:, 0])
-        reach[2:, :, 1] = np.minimum(reach[2:, :, 1], p.area[:, 1])
-        return reach
-
-    def _visit_rows(self):
-        T, p = self.settings.horizon, self.problem
-        self.reach = self._reach()
-        rewards = self.settings.rewards()
-        at_step = {k: [] for k in range(1, T + 1)}
-        for n in np.flatnonzero(p.wanted):
-            visits = []
-            for k in range(1, T + 1):
-                low, high = self.reach[k].T
-                # Where the next step leads is given: a visit on a face counts despite rounding.
-                box = p.cuboids[n] + [-TOUCH, TOUCH] if k == 1 else p.cuboids[n]
-                if (box[:, 0] <= high).all() and (box[:, 1] >= low).all():
-                    beta = self.binary(-rewards[k])
-                    visits.append(beta)
-                    at_step[k].append((beta, box))
-            if len(visits) > 1:
-                self.row(visits, [1] * len(visits), -np.inf, 1)
-        for k, betas in at_step.items():
-            # A row for all cuboids of a step: those of missions are apart.
-            columns = [beta for beta, _ in betas]
-            for a in range(3):
-                low, high = self.reach[k, a]
-                lifts = [max(box[a, 0] - low, 0.0) for _, box in betas]
-                drops = [max(high - box[a, 1], 0.0) for _, box in betas]
-                self.row([self.P[k, a], *columns], [1, *(-x for x in lifts)], low, np.inf)
-                self.row([self.P[k, a], *columns], [1, *drops], -np.inf, high)
-
-    def _obstacle_rows(self):
-        T, p = self.settings.horizon, self.problem
-        for box in p.obstacles:
-            for k in range(2, T + 1):
-                steps = [k - 1, k] if self.settings.between_samples else [k]
-                low, high = self.reach[steps, :, 0].min(axis=0), self.reach[steps, :, 1].max(axis=0)
-                if (high <= box[:, 0]).any() or (low >= box[:, 1]).any():
-                    continue
-                faces = []
-                for a in range(3):
-                    # The lower face, then the upper one, mirrored.
-                    for side, sign in ((0, 1), (1, -1)):
-                        face = sign * box[a, side]
-                        nearest = (low, -high)[side][a]
-                        if face <= sign * p.area[a, side] or nearest > face:
-                            continue
-                        z = self.binary()
-                        faces.append(z)
-                        for i in steps:
-                            most = max(sign * self.reach[i, a, 1 - side] - face, 0.0)
-                            self.row([self.P[i, a], z], [sign, -most], -np.inf, face)
-                self.row(faces, [1] * len(faces), -np.inf, len(faces) - 1)
-
-
-def solve_with_scip(literal, gap=1e-6, limit=60.0):
+def solve_with_scip(mixed, gap=1e-6, limit=60.0):
     """Return (lower bound, value of the best point found, seconds) of SCIP."""
     begun = time.perf_counter()
     model = pyscipopt.Model()
@@ -258,13 +212,13 @@ def solve_with_scip(literal, gap=1e-6, limit=60.0):
     model.setParam('parallel/maxnthreads', 1)
     columns = [
         model.addVar(vtype='B' if kind else 'C', lb=low, ub=high)
-        for low, high, kind in zip(literal.lower, literal.upper, literal.integer)
+        for low, high, kind in zip(mixed.lower, mixed.upper, mixed.integer)
     ]
 
     def total(indices, coefficients):
         return pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients))
 
-    for indices, coefficients, low, high in literal.rows:
+    for indices, coefficients, low, high in mixed.rows:
         value = total(indices, coefficients)
         if low > -np.inf:
             model.addCons(value >= low)
@@ -272,12 +226,12 @@ def solve_with_scip(literal, gap=1e-6, limit=60.0):
             model.addCons(value <= high)
     # A column for each square: as one row, its relaxation is far weaker.
     squares = []
-    for weight, indices, coefficients, constant in literal.squares:
+    for weight, indices, coefficients, constant in mixed.squares:
         inner = model.addVar(vtype='C', lb=None, ub=None)
         model.addCons(inner == total(indices, coefficients) + constant)
         squares.append(model.addVar(vtype='C', lb=0.0, ub=None))
         model.addCons(weight * inner * inner <= squares[-1])
-    linear = total(range(len(columns)), literal.cost)
+    linear = total(range(len(columns)), mixed.cost)
     model.setObjective(linear + pyscipopt.quicksum(squares), 'minimize')
     model.optimize()
     value = model.getObjVal() if model.getNSols() else np.inf

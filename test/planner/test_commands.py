@@ -1,0 +1,226 @@
+"""Nothing moves before `start`; the services of a search, and the command-line tools."""
+
+import signal
+
+import pytest
+from driven_team import driven
+from rclpy.action import ActionServer
+
+from maasi_drivers.agent.agent_driver import STOPPED
+from maasi_drivers.robot_command import DONE, FAILED, INTERRUPTED, build_parser
+from maasi_filter.ros.qos import SENSOR
+from maasi_msgs.action import GoToWaypoint
+from maasi_msgs.msg import AgentState
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.search_command import wanted
+
+
+@pytest.fixture
+def world():
+    """Return a world whose planner has not been given any command."""
+    with driven(search_on_start=False) as made:
+        yield made
+
+
+def search(world, *words):
+    """Return exit code and output of search_command."""
+    return world.ended(world.run('-m', 'maasi_planner.search_command', *words))
+
+
+def robot(world, *words):
+    """Return a process of robot_command."""
+    return world.run('-m', 'maasi_drivers.robot_command', *words)
+
+
+def test_nothing_moves_without_start_and_each_service_does_what_it_says(world):
+    a, b = world.robots.values()
+    assert PlannerNodeSettings.model_fields['search_on_start'].default is False
+    places = [a.place, b.place]
+
+    def refused(service, message):
+        answer = world.call(service)
+        assert not answer.success and answer.message == message
+
+    def stay():
+        """Let both robots stay where they are, with no decision."""
+        places, decisions = [a.place, b.place], len(world.decisions)
+        world.pass_steps(40)
+        assert [a.place, b.place] == places and len(world.decisions) == decisions
+
+    stay()
+    assert [a.place, b.place] == places and world.decisions == []
+    assert {state.goal_id for item in (a, b) for state in item.states} == {0}
+    world.until(lambda: world.status.get('search') == 'waiting for start')
+    for word in ('pause', 'resume'):
+        refused(f'search/{word}', f'a, b: waiting for start; {word} changes nothing')
+
+    answer = world.call('a/search/start')
+    assert answer.success and answer.message == 'start: a'
+    world.until(lambda: a.moves)
+    world.pass_steps(20)
+    assert b.place == places[1] and b.state.goal_id == 0
+    world.until(lambda: world.status.get('search') == 'a searching, b waiting for start')
+    refused('b/search/resume', 'b: waiting for start; resume changes nothing')
+    assert world.call('search/start').success
+    world.until(world.moving)
+
+    assert world.call('search/pause').message == 'pause: a, b'
+    world.until(world.standing)
+    stay()
+    world.until(lambda: world.status.get('search') == 'paused')
+    before = a.place
+    assert world.call('b/search/resume').success
+    world.until(lambda: b.moves)
+    world.pass_steps(10)
+    assert a.place == before
+    assert world.call('search/resume').success
+    world.until(world.moving)
+
+    assert world.call('search/home').success
+    world.until(
+        lambda: all(
+            item.is_near(*item.start.position[:2], 0.2)
+            and item.state.goal_status == AgentState.REACHED
+            for item in (a, b)
+        ),
+        'not at home',
+    )
+    world.until(world.standing)
+    stay()
+    world.until(lambda: world.status.get('search') == 'sent home')
+    assert world.call('search/resume').success
+    world.until(world.moving)
+
+    assert world.call('a/search/stop').message == 'stop: a'
+    world.until(lambda: a.stands and not a.moves)
+    refused('a/search/resume', 'a: stopped; resume changes nothing')
+    assert world.call('search/stop').success
+    world.until(world.standing)
+    assert not world.call('search/resume').success
+    assert world.call('search/start').success
+    world.until(world.moving)
+
+    # A planner that is not active refuses, and its robots stand.
+    assert world.planner.trigger_deactivate().name == 'SUCCESS'
+    world.until(world.standing)
+    refused('search/start', 'the planner is not active')
+
+
+def test_search_command_reaches_planner_and_drivers(world):
+    a, b = world.robots.values()
+    answer = '/search/pause: a, b: waiting for start; pause changes nothing\n'
+    assert search(world, 'pause') == (1, answer)
+    assert search(world, 'start', '--robot', 'a') == (0, '/a/search/start: start: a\n')
+    world.until(lambda: a.moves)
+    assert b.state.goal_id == 0
+    assert world.call('search/start').success
+    world.until(world.moving)
+    code, text = search(world, 'stop', '--robot', 'b')
+    assert code == 0 and '/b/search/stop: stop: b' in text and '/b/stop: ' in text
+    assert '/a' not in text
+    world.until(lambda: b.stands and b.state.reason == STOPPED)
+    assert a.state.reason != STOPPED
+    # Without a planner the drivers are reached all the same.
+    world.end_planner()
+    code, text = search(world, 'stop')
+    assert code == 0 and '/a/stop: ' in text and '/b/stop: ' in text
+    world.until(lambda: a.stands and a.state.reason == STOPPED)
+    code, text = search(world, 'pause', '--timeout', '2')
+    assert code == 2 and text.startswith('no service for pause within 2 s')
+    assert search(world, 'release')[0] == 0
+    for item in (a, b):
+        world.until(lambda item=item: item.state.goal_status != AgentState.UNAVAILABLE)
+
+
+TRIGGER = ['std_srvs/srv/Trigger']
+SERVICES = {
+    name: TRIGGER
+    for top in ('', '/north')
+    for name in (
+        f'{top}/search/stop',
+        *(f'{top}/{robot}/search/stop' for robot in ('a', 'b')),
+        *(f'{top}/{robot}/{word}' for robot in ('a', 'b') for word in ('stop', 'release')),
+    )
+}
+# Neither another type nor a stop without a release is a robot's.
+SERVICES |= {'/c/stop': TRIGGER, '/d/search/stop': ['std_srvs/srv/Empty']}
+SERVICES |= {'/a/arm': TRIGGER, '/c/arm': TRIGGER}
+# A planner for each robot.
+SERVICES |= {'/a/search/pause': TRIGGER, '/b/search/pause': TRIGGER}
+
+
+@pytest.mark.parametrize(
+    ('word', 'name', 'team', 'called'),
+    [
+        ('stop', '', '', {'/search/stop', '/a/stop', '/b/stop'}),
+        ('stop', 'a', '', {'/a/search/stop', '/a/stop'}),
+        ('release', '', 'north', {'/north/a/release', '/north/b/release'}),
+        ('stop', 'b', '/north/', {'/north/b/search/stop', '/north/b/stop'}),
+        ('stop', '', 'south', set()),
+        ('pause', '', 'north', set()),
+        # Of those that fly.
+        ('arm', '', '', {'/a/arm'}),
+        ('arm', 'b', '', set()),
+        ('pause', '', '', {'/a/search/pause', '/b/search/pause'}),
+    ],
+)
+def test_search_command_calls_what_was_asked_for(word, name, team, called):
+    assert wanted(SERVICES, word, name, team) == called
+
+
+def test_robot_command_shows_sends_and_stops_a_robot(world):
+    a = world.robots['a']
+    code, said = world.ended(robot(world, 'a', 'state'))
+    assert code == DONE, said
+    assert said.startswith('a: no goal; at (') and 'in map, battery' in said
+
+    x, y = a.place[0] + 0.1, a.place[1]
+    code, said = world.ended(robot(world, 'a', 'go', f'{x}', f'{y}'))
+    assert code == DONE and said.startswith('reached; it stands at'), said
+    assert abs(a.place[0] - x) < 0.05
+
+    code, said = world.ended(robot(world, 'a', 'go', '100', '0'))
+    assert code == FAILED and ('refused' in said or 'not reached' in said), said
+
+    process = robot(world, 'a', 'go', f'{x - 0.6}', f'{y}')
+    world.until(lambda: a.moves, 'it does not move')
+    process.send_signal(signal.SIGINT)
+    code, said = world.ended(process)
+    assert code == FAILED and 'not reached: cancelled' in said, said
+    world.until(lambda: not a.moves, 'it goes on')
+
+
+@pytest.mark.parametrize(('words', 'height'), [(['1', '2'], 5.0), (['1', '2', '3'], 3.0)])
+def test_a_robot_that_flies_keeps_its_height_unless_it_is_told_another(world, words, height):
+    goals = []
+
+    def take(handle):
+        goals.append(handle.request.waypoint.pose.position)
+        handle.succeed()
+        return GoToWaypoint.Result(reached=True)
+
+    server = ActionServer(world.node, GoToWaypoint, '/drone/go_to', take)
+    publisher = world.node.create_publisher(AgentState, '/drone/state', SENSOR)
+    state = AgentState(robot='drone')
+    state.pose.pose.position.z = 5.0
+    timer = world.node.create_timer(0.05, lambda: publisher.publish(state))
+    code, said = world.ended(robot(world, 'drone', 'go', *words))
+    assert code == DONE, said
+    assert [(goal.x, goal.y, goal.z) for goal in goals] == [(1.0, 2.0, height)]
+    for entity in (timer, publisher, server):
+        entity.destroy()
+
+
+@pytest.mark.parametrize('words', [['state'], ['go', '1', '2']])
+def test_robot_command_that_waits_for_a_driver_ends_at_once(world, words):
+    process = robot(world, '--timeout', '1000', 'nobody', *words)
+    # A node of it is in the graph: it waits.
+    world.until(lambda: 'robot_command' in world.node.get_node_names(), 'it does not start')
+    process.send_signal(signal.SIGINT)
+    assert world.ended(process) == (INTERRUPTED, '')
+
+
+@pytest.mark.parametrize('words', [[], ['a'], ['a', 'go'], ['a', 'go', '1', 'nan'], ['a', 'fly']])
+def test_wrong_arguments_of_robot_command_end_with_2(words):
+    with pytest.raises(SystemExit, match='2'):
+        build_parser().parse_args(words)
