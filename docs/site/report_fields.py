@@ -17,15 +17,20 @@ def with_fields(page: str) -> str:
     """Return a page in Markdown with tables of all fields between its marks."""
     before, rest = page.split(BEGIN)
     parts = []
-    for kind in json.loads(SCHEMA.read_text(encoding='utf-8'))['oneOf']:
-        parts.append(f'### {kind["description"]}\n\n| field | type | meaning |\n|---|---|---|')
-        parts += [
+    tables = {
+        kind['description']: [
             f'| `{name}` | {_type(part)} | {part.get("description", "")} |'
             for name, part in _fields(kind, '')
         ]
-        parts.append('')
-    tables = '\n'.join(parts)
-    return f'{before}{BEGIN}\n{tables}{END}{rest.split(END)[1]}'
+        for kind in json.loads(SCHEMA.read_text(encoding='utf-8'))['oneOf']
+    }
+    first, *others = tables.values()
+    both = [row for row in first if all(row in rows for rows in others)]
+    for title, rows in [('Of both kinds', both), *tables.items()]:
+        parts.append(f'### {title}\n\n| field | type | meaning |\n|---|---|---|')
+        parts += [row for row in rows if rows is both or row not in both] + ['']
+    fields = '\n'.join(parts)
+    return f'{before}{BEGIN}\n{fields}{END}{rest.split(END)[1]}'
 
 
 def _fields(part: dict[str, Any], prefix: str) -> Iterator[tuple[str, dict[str, Any]]]:

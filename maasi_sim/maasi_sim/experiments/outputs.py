@@ -155,13 +155,12 @@ def page(sections: dict[str, Section]) -> str:
         parts.append(''.join(f'{n}. {listed([c])[2:]}' for n, c in enumerate(choices, start=1)))
         for item in items:
             section = sections[item.name]
-            parts.append(
-                f'### {item.name}\n\n{item.title}.\nRests on {section.rests}.{section.duration}\n'
-            )
+            numbers = ', '.join(str(choices.index(choice) + 1) for choice in item.choices)
+            words = f'{item.title}. Rests on {section.rests}.{section.duration}'
+            words += f' Open points: {numbers}.' if numbers else ''
+            parts.append(f'### {item.name}\n\n{words}\n')
             parts.append(f'![{item.title}](reproduction/{item.name}.png)\n')
             parts += _described(item, section.cases, section.pairs)
-            numbers = ', '.join(str(choices.index(choice) + 1) for choice in item.choices)
-            parts.append(f'Open points of paper {paper}: {numbers}.\n' if numbers else '')
     return '\n'.join(filter(None, parts))
 
 
