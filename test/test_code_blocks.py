@@ -4,14 +4,11 @@ A block that cannot be run here has `<!-- not run: REASON -->` before it; one th
 fenced as text.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 import yaml
@@ -28,12 +25,8 @@ from maasi_sim.scenario.loading import find_scenario, load_scenario, read_layer
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [
-    ROOT / 'README.md',
-    ROOT / 'CONTRIBUTING.md',
-    *sorted((ROOT / 'docs').rglob('*.md')),
-    *sorted((ROOT / 'examples').rglob('*.md')),
-]
+DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md']
+DOCUMENTS += [path for name in ('docs', 'examples') for path in sorted((ROOT / name).rglob('*.md'))]
 NODES = {'filter_node': FilterNodeSettings, '/**': DriverSettings}
 
 
@@ -43,7 +36,7 @@ class Block(NamedTuple):
     text: str
 
 
-def blocks(text: str, name: str) -> Iterator[Block]:
+def blocks(text, name):
     """Yield the code blocks of a document that are not marked as not run."""
     marked = False
     for token in MarkdownIt().parse(text):
@@ -58,7 +51,7 @@ def blocks(text: str, name: str) -> Iterator[Block]:
             marked = False
 
 
-def guess(text: str) -> str:
+def guess(text):
     """Return the language of a block that does not say it."""
     if re.match(r'(from|import) \w', text):
         return 'python'
@@ -72,7 +65,7 @@ BLOCKS = [
 ]
 
 
-def of(language: str) -> pytest.MarkDecorator:
+def of(language):
     chosen = [block for block in BLOCKS if block.language == language]
     # The program of the README is run by test_pip_install.py.
     if language == 'python':
@@ -80,72 +73,89 @@ def of(language: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize('block', chosen, ids=lambda block: block.place)
 
 
-def test_each_block_has_a_language_that_is_checked() -> None:
+def test_each_block_has_a_language_that_is_checked():
     assert {item.language for item in BLOCKS} == {'python', 'yaml', 'sh'}
     text = 'A\n\n<!-- not run: flies -->\n```sh\nx\n```\n\n    ./scripts/demo\n\n```text\nx\n```\n'
     assert [(block.place, block.language) for block in blocks(text, 'a.md')] == [('a.md:8', 'sh')]
 
 
 @of('python')
-def test_python(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python(block, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv('MPLBACKEND', 'Agg')
     exec(compile(block.text, block.place, 'exec'), {'__name__': '__main__'})
 
 
-def check_yaml(text: str, folder: Path) -> None:
+def check_yaml(text, folder):
     """Validate a scenario, a part of one, a robot type, or parameters of a node."""
     file = folder / 'block.yaml'
     file.write_text(text)
     layer = read_layer(file)
     keys = set(layer.data)
-    if {'version', 'robots'} <= keys:
-        load_scenario(file)
-    elif keys <= set(NODES):
+    if keys <= set(NODES):
         for name, content in layer.data.items():
             assert check(NODES[name], flat(content['ros__parameters']))[1] == {}
+        return
+    if {'version', 'robots'} <= keys:
+        whole = layer.data
     elif keys <= set(Scenario.model_fields):
-        file.write_text(to_yaml(merge(read_layer(find_scenario('mambo_turtlebot')), layer).data))
-        load_scenario(file)
+        whole = merge(read_layer(find_scenario('mambo_turtlebot')), layer).data
     elif keys <= set(RobotSettings.model_fields):
         (folder / 'robots').mkdir()
         (folder / 'robots' / 'block.yaml').write_text(text)
-        base = yaml.safe_load(find_scenario('mambo').read_text())
-        base['robots'] = {'robot': {'type': 'block', 'start': [0.5, 0.5, 0.0]}}
-        file.write_text(to_yaml(base))
-        load_scenario(file)
+        whole = yaml.safe_load(find_scenario('mambo').read_text())
+        whole['robots'] = {'robot': {'type': 'block', 'start': [0.5, 0.5, 0.0]}}
     else:
         known = {item.name for item in parameter_fields(DriverSettings, flat(layer.data))}
         assert keys <= known, keys - known
+        return
+    file.write_text(to_yaml(whole))
+    load_scenario(file)
 
 
-def flat(values: dict[str, Any], prefix: str = '') -> dict[str, Any]:
-    result: dict[str, Any] = {}
+def flat(values, prefix=''):
+    result = {}
     for key, value in values.items():
-        result |= (
-            flat(value, f'{prefix}{key}.') if isinstance(value, dict) else {prefix + key: value}
-        )
+        whole = prefix + key
+        result |= flat(value, f'{whole}.') if isinstance(value, dict) else {whole: value}
     return result
 
 
 @of('yaml')
-def test_yaml(block: Block, tmp_path: Path) -> None:
+def test_yaml(block, tmp_path):
     check_yaml(block.text, tmp_path)
 
 
-def test_wrong_yaml_is_found(tmp_path: Path) -> None:
-    for text in (
-        'filter: {filters: pmb}',
-        'planner: {name: fastest}',
-        'camera.widht: 640',
-        'filter_node: {ros__parameters: {environment.bounds: [0.0, 1.0, 0.0]}}',
-        'driver: ranging_driver\nmotion: {speed: -1.0}',
+WRONG_YAML = (
+    'filter: {filters: pmb}',
+    'planner: {name: fastest}',
+    'camera.widht: 640',
+    'filter_node: {ros__parameters: {environment.bounds: [0.0, 1.0, 0.0]}}',
+    'driver: ranging_driver\nmotion: {speed: -1.0}',
+)
+WRONG_COMMANDS = (
+    './scripts/run_scenario mambo --sed 1',
+    './scripts/run_scenario mambo --seed 1.5',
+    './scripts/gone',
+    './scripts/golden --wrote',
+    './scripts/chaos [--cases NAME ...]',
+    'ros2 run maasi_filter filter --ros-args',
+    'ros2 run maasi_filter filter_node --fast',
+    'ros2 launch maasi_sim scenario.launch.py scenarios:=mambo',
+)
+
+
+def test_what_is_wrong_is_found(tmp_path):
+    for check_block, texts in (
+        (lambda text: check_yaml(text, tmp_path), WRONG_YAML),
+        (check_commands, WRONG_COMMANDS),
     ):
-        with pytest.raises((ValueError, AssertionError)):
-            check_yaml(text, tmp_path)
+        for text in texts:
+            with pytest.raises((ValueError, AssertionError, OSError)):
+                check_block(text)
 
 
-def check_commands(text: str) -> None:
+def check_commands(text):
     """Check that the commands of ours in a block exist, and take their options."""
     # A line that is indented goes on.
     text = re.sub(r'\$\(.*?\)', 'X', re.sub(r'\\?\n\s+', ' ', text.strip()))
@@ -154,23 +164,23 @@ def check_commands(text: str) -> None:
         while words and re.match(r'[A-Z_]+=', words[0]):
             words.pop(0)
         if words:
-            check_command(words)
+            check_command(*words)
 
 
-def check_command(words: list[str]) -> None:
-    program, *rest = words
+def check_command(program, *rest):
     if program.startswith('./scripts/'):
         check_script(ROOT / program, rest)
     elif program == 'ros2' and rest[1].startswith('maasi'):
-        if rest[0] == 'run':
-            entries = (ROOT / rest[1] / 'setup.py').read_text()
-            assert f"'{rest[2]} = maasi_entry:{rest[2]}'" in entries, rest
-            (target,) = getattr(maasi_entry, rest[2]).args
-            check_module(target.partition(':')[0], rest[3:])
+        verb, package, name, *arguments = rest
+        if verb == 'run':
+            entry = f"'{name} = maasi_entry:{name}'"
+            assert entry in (ROOT / package / 'setup.py').read_text(), rest
+            (target,) = getattr(maasi_entry, name).args
+            check_module(target.partition(':')[0], arguments)
         else:
-            launch = (ROOT / rest[1] / 'launch' / rest[2]).read_text()
-            names = {argument.partition(':=')[0] for argument in rest[3:]}
-            assert all(name in ARGUMENTS or f"'{name}'" in launch for name in names)
+            launch = (ROOT / package / 'launch' / name).read_text()
+            given = {argument.partition(':=')[0] for argument in arguments}
+            assert all(item in ARGUMENTS or f"'{item}'" in launch for item in given)
     elif program.startswith('python') and rest[0] == '-m' and rest[1].startswith('maasi'):
         check_module(rest[1], rest[2:])
     elif program.startswith('python') and rest[0].endswith('.py'):
@@ -178,12 +188,12 @@ def check_command(words: list[str]) -> None:
         assert any(ROOT.glob(f'scripts/{name}')) or any(ROOT.glob(f'examples/**/{name}')), name
 
 
-def check_script(script: Path, arguments: list[str]) -> None:
+def check_script(script, arguments):
     text = script.read_text()
     module = re.search(r'python -m (\S+) "\$@"', text)
     file = re.search(r'python "\$maasi_root/(\S+)" "\$@"', text)
     if script.name == 'shell':
-        check_command(arguments)
+        check_command(*arguments)
     elif script.name == 'demo':
         check_module('maasi_sim.run.run_options', ['mambo_turtlebot', *arguments])
     elif module:
@@ -192,7 +202,7 @@ def check_script(script: Path, arguments: list[str]) -> None:
         check_options(arguments, re.findall(r"'(--[\w-]+)'", (ROOT / file[1]).read_text()))
 
 
-def check_module(name: str, arguments: list[str]) -> None:
+def check_module(name, arguments):
     if name == 'maasi_sim.run.run_scenario':
         name = 'maasi_sim.run.run_options'
     module = importlib.import_module(name)
@@ -210,26 +220,11 @@ def check_module(name: str, arguments: list[str]) -> None:
             raise AssertionError(f'{name} refuses {arguments}') from leaving
 
 
-def check_options(arguments: list[str], known: Any) -> None:
+def check_options(arguments, known):
     unknown = set(re.findall(r'--[a-z][\w-]*', ' '.join(arguments))) - set(known)
     assert not unknown, f'unknown options: {sorted(unknown)}'
 
 
 @of('sh')
-def test_commands(block: Block) -> None:
+def test_commands(block):
     check_commands(block.text)
-
-
-def test_wrong_commands_are_found() -> None:
-    for line in (
-        './scripts/run_scenario mambo --sed 1',
-        './scripts/run_scenario mambo --seed 1.5',
-        './scripts/gone',
-        './scripts/golden --wrote',
-        './scripts/chaos [--cases NAME ...]',
-        'ros2 run maasi_filter filter --ros-args',
-        'ros2 run maasi_filter filter_node --fast',
-        'ros2 launch maasi_sim scenario.launch.py scenarios:=mambo',
-    ):
-        with pytest.raises((AssertionError, OSError)):
-            check_commands(line)

@@ -19,21 +19,19 @@ def arguments(name):
 def test_commands_are_valid_and_what_is_copied_and_run_exists():
     for command in arguments('RUN'):
         subprocess.run(['bash', '-n', '-c', command], check=True)
+        for path in re.findall(r'\bsrc/([\w./-]+)', command):
+            assert (ROOT / path).is_file()
     for words in map(json.loads, arguments('(?:SHELL|ENTRYPOINT|CMD)')):
         assert words and all(isinstance(word, str) for word in words)
-    ignored = [
-        pattern.removeprefix('**/') for pattern in (ROOT / '.dockerignore').read_text().split()
-    ]
-    copied = [argument.split() for argument in arguments('COPY')]
-    for source, target in copied:
+    ignored = (ROOT / '.dockerignore').read_text().replace('**/', '').split()
+    copied = dict(argument.split() for argument in arguments('COPY'))
+    for source, target in copied.items():
         assert (ROOT / source).exists()
         assert not any(fnmatch(source, pattern) for pattern in ignored)
         assert target in ('src/', f'src/{Path(source).parent}/')
-    for path in re.findall(r'\bsrc/([\w./-]+)', ' '.join(arguments('RUN'))):
-        assert (ROOT / path).is_file()
     # Dependencies are those of all packages.
     manifests = {path.relative_to(ROOT).as_posix() for path in ROOT.glob('*/package.xml')}
-    assert manifests == {source for source, _ in copied if source.endswith('package.xml')}
+    assert manifests == {source for source in copied if source.endswith('package.xml')}
 
 
 def test_the_development_container_is_a_stage_of_the_image():

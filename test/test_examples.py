@@ -11,7 +11,11 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from waiting import wait_until
 
 from maasi_drivers.settings.driver import DriverSettings, GuardSettings
 from maasi_filter import plugins
@@ -32,13 +36,8 @@ PATIENCE = 400.0
 
 def run_python(*arguments):
     """Run Python to its end and return what it did."""
-    return subprocess.run(
-        [sys.executable, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
 @pytest.fixture(autouse=True)
@@ -103,11 +102,9 @@ def report(run):
 
 def test_nodes_run_planner_and_sensor_as_one_process_does(run, report):
     result = search(load_scenario(run / 'search.yaml'), seed=1)
+    assert result.total_measurements > 20 and report['measurements'] == result.measurements
     found = [item['position'] for item in report['found']]
-    assert result.total_measurements > 20
-    assert report['measurements'] == result.measurements
-    positions = [item.position for item in result.found_targets]
-    assert np.allclose(found, positions, atol=1e-6)
+    assert np.allclose(found, [item.position for item in result.found_targets], atol=1e-6)
 
 
 def test_a_recording_is_read_as_the_document_says(run, report, capsys):
@@ -131,11 +128,9 @@ def test_a_recording_is_read_without_our_packages(run, report):
 
 def test_detections_of_ones_own_are_found_without_a_warning(domain):
     folder = EXAMPLES / 'own_detections'
+    parameters = ['--ros-args', '--params-file', str(folder / 'filter.yaml')]
     node = subprocess.Popen(
-        ['filter_node', '--ros-args', '--params-file', str(folder / 'filter.yaml')],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
+        ['filter_node', *parameters], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     try:
         done = run_python(folder / 'own_detections.py')
@@ -153,13 +148,21 @@ def test_the_team_of_the_field_finds_its_targets_in_simulation():
     assert result.missed == 0 and result.false_found == 0
 
 
-# Settings of each node, and what differs from the simulation: the rest has to be the same.
+# Of each node: executable, settings, and what differs from the simulation; the rest is the same.
 OF_THE_FIELD = {
-    'turtlebot_driver': (DriverSettings, {'battery_minimum', 'image_transport', 'tf_rate'}),
-    'turtlebot_guard': (GuardSettings, set()),
-    'drone_driver': (DriverSettings, {'battery_minimum', 'image_transport', 'link'}),
-    'filter_node': (FilterNodeSettings, set()),
-    'planner_node': (PlannerNodeSettings, set()),
+    'turtlebot_driver': (
+        'turtlebot_driver',
+        DriverSettings,
+        {'battery_minimum', 'image_transport', 'tf_rate'},
+    ),
+    'turtlebot_guard': ('guard_node', GuardSettings, set()),
+    'drone_driver': (
+        'mavlink_camera_driver',
+        DriverSettings,
+        {'battery_minimum', 'image_transport', 'link'},
+    ),
+    'filter_node': ('filter_node', FilterNodeSettings, set()),
+    'planner_node': ('planner_node', PlannerNodeSettings, set()),
 }
 
 
@@ -170,7 +173,7 @@ def test_the_parameters_of_the_field_are_those_of_its_simulation():
         '_'.join(filter(None, (plan.namespace, plan.name))): plan
         for plan in plan_nodes(load_scenario(file), RunSettings(1, False, None, False, file))
     }
-    for node, (model, allowed) in OF_THE_FIELD.items():
+    for node, (_, model, allowed) in OF_THE_FIELD.items():
         parameters = yaml.safe_load((folder / f'{node}.yaml').read_text())['/**']['ros__parameters']
         settings, problems = check(model, parameters)
         assert problems == {}, node
@@ -181,42 +184,29 @@ def test_the_parameters_of_the_field_are_those_of_its_simulation():
         # Of the autopilot the simulation knows nothing.
         different = {key for key in here if here[key] != there.get(key)}
         assert {key for key in different if not key.startswith('mavlink.')} == allowed, node
-        own_system = parameters.get('mavlink.own_system', None)
-        if own_system is not None:
+        if 'mavlink.own_system' in parameters:
             lines = (folder / 'arducopter.parm').read_text().splitlines()
             autopilot = dict(line.split() for line in lines if not line.startswith('#'))
-            assert int(autopilot['MAV_GCS_SYSID']) == own_system
+            assert int(autopilot['MAV_GCS_SYSID']) == parameters['mavlink.own_system']
 
 
 def test_the_nodes_of_the_field_become_active_with_their_file(context, tmp_path):
-    import rclpy
-    from diagnostic_msgs.msg import DiagnosticArray
-    from rclpy.executors import SingleThreadedExecutor
-    from waiting import wait_until
-
-    started = {
-        '/turtlebot/driver': 'turtlebot_driver',
-        '/turtlebot/guard': 'guard_node',
-        '/drone/driver': 'mavlink_camera_driver',
-        '/filter_node': 'filter_node',
-        '/planner_node': 'planner_node',
-    }
-    heard = {}
-
-    def listen(message):
-        heard.update({status.name: status.message for status in message.status})
-
+    heard, processes, names = {}, [], set()
     node = rclpy.create_node('listener', context=context)
-    node.create_subscription(DiagnosticArray, '/diagnostics', listen, 50)
+    node.create_subscription(
+        DiagnosticArray,
+        '/diagnostics',
+        lambda message: heard.update({item.name: item.message for item in message.status}),
+        50,
+    )
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    processes = []
     try:
-        for name, executable in started.items():
-            namespace = name.rpartition('/')[0] or '/'
-            file = f'{name.strip("/").replace("/", "_")}.yaml'
-            words = ['--ros-args', '-r', f'__ns:={namespace}', '--params-file', file]
-            with (tmp_path / executable).open('w') as log:
+        for file, (executable, *_) in OF_THE_FIELD.items():
+            robot = file.partition('_')[0] if file.endswith(('_driver', '_guard')) else ''
+            names.add('/' + file.replace(f'{robot}_', f'{robot}/') if robot else f'/{file}')
+            words = ['--ros-args', '-r', f'__ns:=/{robot}', '--params-file', f'{file}.yaml']
+            with (tmp_path / file).open('w') as log:
                 processes.append(
                     subprocess.Popen(
                         [executable, *words], cwd=EXAMPLES / 'field_team', stdout=log, stderr=log
@@ -225,7 +215,7 @@ def test_the_nodes_of_the_field_become_active_with_their_file(context, tmp_path)
 
         def active():
             assert all(process.poll() is None for process in processes)
-            return all(heard.get(name, '').startswith('active') for name in started)
+            return all(heard.get(name, '').startswith('active') for name in names)
 
         wait_until(active, lambda: executor.spin_once(0.1), lambda: heard)
     finally:

@@ -1,7 +1,5 @@
 """Which module may import which: packages one way, ROS in few places, no cycles."""
 
-from __future__ import annotations
-
 import ast
 from fnmatch import fnmatch
 from functools import cache
@@ -38,7 +36,7 @@ ROS_PACKAGES = ('*_msgs', '*_interfaces', 'rcl*', 'rosidl*', 'std_srvs', 'tf2_*'
 
 
 @cache
-def modules() -> dict[str, Path]:
+def modules():
     """Return the file of each of our modules by its name."""
     found = {}
     for package in PACKAGES[1:]:
@@ -48,60 +46,55 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def package_of(name: str) -> str:
-    return name.partition('.')[0].removeprefix('maasi_')
-
-
 @cache
-def imports(name: str) -> list[tuple[str, int]]:
-    """Return what a module imports, also in functions and for types only: name and line."""
+def imports(name):
+    """Return what a module imports, also in functions and for types only, by its place."""
     path = modules()[name]
     package = name if path.name == '__init__.py' else name.rpartition('.')[0]
     found = []
     for node in ast.walk(ast.parse(path.read_text())):
+        names = []
         if isinstance(node, ast.Import):
-            found += [(item.name, node.lineno) for item in node.names]
+            names = [item.name for item in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = package.split('.')[: len(package.split('.')) - node.level + 1]
             base = '.'.join([*(above if node.level else []), *filter(None, [node.module])])
-            for item in node.names:
-                whole = f'{base}.{item.name}'
-                found.append((whole if whole in modules() else base, node.lineno))
+            wholes = [f'{base}.{item.name}' for item in node.names]
+            names = [whole if whole in modules() else base for whole in wholes]
+        found += [(other, f'{path.relative_to(ROOT)}:{node.lineno}: {other}') for other in names]
     return found
 
 
+def rank(name):
+    """Return which of our packages a module belongs to; -1: to none."""
+    package = name.partition('.')[0].removeprefix('maasi_')
+    return PACKAGES.index(package) if name.startswith('maasi_') else -1
+
+
 def test_packages_import_one_way():
-    wrong = []
-    for name in modules():
-        later = PACKAGES[PACKAGES.index(package_of(name)) + 1 :]
-        for other, line in imports(name):
-            if other.startswith('maasi_') and package_of(other) in later:
-                wrong.append(f'{modules()[name].relative_to(ROOT)}:{line}: imports {other}')
+    every = [(name, *item) for name in modules() for item in imports(name)]
+    wrong = [place for name, other, place in every if rank(other) > rank(name)]
     assert not wrong, '\n'.join(wrong)
 
 
 def test_only_few_places_import_ros():
-    wrong = []
-    needed = set()
+    wrong, needed = [], set()
     for name, path in modules().items():
         ros = [
-            f'{path.relative_to(ROOT)}:{line}: imports {other}'
-            for other, line in imports(name)
+            place
+            for other, place in imports(name)
             if any(fnmatch(other.partition('.')[0], pattern) for pattern in ROS_PACKAGES)
         ]
-        if not ros or set(path.relative_to(ROOT).parts) & set(ROS_FOLDERS):
-            continue
-        allowed = {pattern for pattern in ROS_FILES if fnmatch(path.name, pattern)}
-        needed |= allowed
-        wrong += [] if allowed else ros
+        if ros and not set(path.relative_to(ROOT).parts) & set(ROS_FOLDERS):
+            allowed = {pattern for pattern in ROS_FILES if fnmatch(path.name, pattern)}
+            needed |= allowed
+            wrong += [] if allowed else ros
     assert not wrong, '\n'.join(wrong)
-    gone = set(ROS_FILES) - needed
-    assert not gone, f'import no ROS, or are in a folder that may: take out of ROS_FILES: {gone}'
+    assert needed == set(ROS_FILES), 'take those out that import no ROS, or whose folder may'
 
 
 def test_modules_do_not_import_each_other_in_circles():
-    graph = {
-        name: {other for other, _ in imports(name) if other in modules()} for name in modules()
-    }
     # CycleError names the modules.
-    TopologicalSorter(graph).prepare()
+    TopologicalSorter(
+        {name: {other for other, _ in imports(name) if other in modules()} for name in modules()}
+    ).prepare()

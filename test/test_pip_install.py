@@ -37,12 +37,11 @@ def prefix(tmp_path_factory):
 
 
 def modules_of(prefix):
-    """Return the folder of the modules that pip installed."""
     return next(prefix.glob('**/maasi_filter/filter_node.py')).parents[1]
 
 
 def run(folder, path, *arguments):
-    """Run Python in a folder, with these folders in its path; ROS and extras are not there."""
+    """Run Python in a folder, with a path of these folders and without ROS and extras."""
     blocked = folder / 'blocked'
     blocked.mkdir()
     for name in BLOCKED:

@@ -106,31 +106,27 @@ def chosen(result) -> list[int]:
     return [decision.robots['rover'].chosen for decision in result.decisions]
 
 
-def test_planner_beside_the_scenario(folder):
+def test_planner_beside_the_scenario(folder, tmp_path_factory):
     scenario = load_scenario(folder / 'search.yaml')
     assert scenario.planner.settings.stride == 3
     assert chosen(search(scenario, 1, most_measurements=5)) == [0]
+    # Its text names the folder, for a copy elsewhere.
+    copy = tmp_path_factory.mktemp('run') / 'scenario.yaml'
+    copy.write_text(scenario.text())
+    assert load_scenario(copy).plugin_path[0] == str(folder)
+    assert load_scenario(copy).planner.settings.stride == 3
     # Another one instead of it: by name, and as a class.
-    other = search(scenario, 1, most_measurements=5, planner='lawnmower')
-    assert 'lane' in other.decisions[0].robots['rover'].reason
     (folder / 'second.py').write_text(ONE_BY_ONE.replace('OneByOne', 'Second'))
-    own = search(scenario, 1, most_measurements=5, planner='second:Second')
-    assert 'next' in own.decisions[0].robots['rover'].reason
+    for planner, word in (('lawnmower', 'lane'), ('second:Second', 'next')):
+        other = search(scenario, 1, most_measurements=5, planner=planner)
+        assert word in other.decisions[0].robots['rover'].reason
     assert search(scenario, 1, most_measurements=5, planner=sys.modules['second'].Second).decisions
     with pytest.raises(ValueError, match=r"^planner: unknown planner 'third'"):
         search(scenario, 1, planner='third')
 
 
-def test_scenario_as_text_names_the_folder(folder, tmp_path_factory):
-    scenario = load_scenario(folder / 'search.yaml')
-    copy = tmp_path_factory.mktemp('run') / 'scenario.yaml'
-    copy.write_text(scenario.text())
-    assert load_scenario(copy).plugin_path[0] == str(folder)
-    assert load_scenario(copy).planner.settings.stride == 3
-
-
 def test_installed_planner(folder):
-    """An entry point in a dist-info folder on the path is one of an installed package."""
+    # An entry point in a dist-info folder on the path is one of an installed package.
     info = folder / 'walks-1.0.dist-info'
     info.mkdir()
     (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: walks\nVersion: 1.0\n')
@@ -139,17 +135,15 @@ def test_installed_planner(folder):
     )
     sys.path.insert(0, str(folder))
     assert {'walk', 'maasi'} <= set(PLANNERS.names())
-    path = change(folder, 'one_by_one:OneByOne', 'walk')
-    scenario = load_scenario(path)
-    assert scenario.planner.settings.stride == 3
-    assert scenario.plugin_path == []
+    scenario = load_scenario(change(folder, 'one_by_one:OneByOne', 'walk'))
+    assert (scenario.planner.settings.stride, scenario.plugin_path) == (3, [])
     assert isinstance(make_planner('walk', scenario.planner), Planner)
-    with pytest.raises(ValueError, match="planner 'broken': there is no module no_such_module"):
-        make_planner('broken')
-    with pytest.raises(
-        ValueError, match=r"unknown planner 'wolk' \(did you mean 'walk'\?\), .*maas"
+    for name, message in (
+        ('broken', "planner 'broken': there is no module no_such_module"),
+        ('wolk', r"unknown planner 'wolk' \(did you mean 'walk'\?\), .*maas"),
     ):
-        make_planner('wolk')
+        with pytest.raises(ValueError, match=message):
+            make_planner(name)
 
 
 @pytest.mark.parametrize(
@@ -180,25 +174,17 @@ def test_bad_plugin_is_named(folder, file, name, message):
 @pytest.mark.parametrize(
     ('before', 'after', 'message'),
     [
-        (
-            'stride: 3',
-            'stride: 0',
-            'planner.settings.stride: read 0, allowed is greater than or equal to 1',
-        ),
-        (
-            'stride: 3',
-            "stride: '3'",
-            "planner.settings.stride: read '3', allowed is a valid integer",
-        ),
-        ('stride: 3', 'strid: 3', "planner.settings.strid: unknown key 'strid' .*known are stride"),
-        ('one_by_one:OneByOne', 'lawnmower', "settings: planner 'lawnmower' has no settings of"),
+        ('stride: 3', 'stride: 0', 'stride: read 0, allowed is greater than or equal to 1'),
+        ('stride: 3', "stride: '3'", "stride: read '3', allowed is a valid integer"),
+        ('stride: 3', 'strid: 3', "strid: unknown key 'strid' .*known are stride"),
+        ('one_by_one:OneByOne', 'lawnmower', "planner 'lawnmower' has no settings of"),
     ],
 )
 def test_bad_settings_have_file_and_line(folder, before, after, message):
     path = change(folder, before, after)
     with pytest.raises(ScenarioError, match=message) as error:
         load_scenario(path)
-    assert str(error.value).startswith(f'{path}:14: ')
+    assert str(error.value).startswith(f'{path}:14: planner.settings')
 
 
 def test_two_modules_of_one_name_are_refused(folder, tmp_path_factory):
@@ -212,13 +198,12 @@ def test_two_modules_of_one_name_are_refused(folder, tmp_path_factory):
 
 
 def test_the_command_line_replaces_a_planner_with_its_settings(folder):
-    change = {'--planner': (('planner', 'name'), 'maasi')}
-    assert load_scenario(folder / 'search.yaml', change).planner.settings is None
-    path = folder / 'search.yaml'
-    text = path.read_text().replace('  settings: {stride: 3}\n', '')
-    path.write_text(text.replace('one_by_one:OneByOne', 'maasi'))
-    change = {'--planner': (('planner', 'name'), 'one_by_one:OneByOne')}
-    assert load_scenario(path, change).plugin_path[0] == str(folder)
+    changes = {'--planner': (('planner', 'name'), 'maasi')}
+    assert load_scenario(folder / 'search.yaml', changes).planner.settings is None
+    path = change(folder, '  settings: {stride: 3}\n', '')
+    change(folder, 'one_by_one:OneByOne', 'maasi')
+    changes = {'--planner': (('planner', 'name'), 'one_by_one:OneByOne')}
+    assert load_scenario(path, changes).plugin_path[0] == str(folder)
 
 
 def test_parameters_of_a_plugin(folder):
@@ -316,46 +301,36 @@ def test_detector_of_ones_own(folder):
 
 
 @pytest.mark.parametrize(
-    ('body', 'message'),
+    ('returned', 'message'),
     [
-        ('def reach(self): return 2.0', 'NotImplementedError: .* lacks compiled or evaluate'),
-        ('def reach(self): return 0.0', 'reach: got 0.0, allowed are finite numbers above 0'),
+        ({'reach': '2.0'}, 'NotImplementedError: .* lacks compiled or evaluate'),
+        ({'reach': '0.0'}, 'reach: got 0.0, allowed are finite numbers above 0'),
+        ({'reach': "'far'"}, "reach: got 'far', allowed are numbers"),
+        ({'evaluate': 'x'}, r'got a probability of -1.0, allowed are numbers in \[0, 1\]'),
+        ({'evaluate': '0.5'}, r'evaluate: got shape \(\), allowed is \(263169,\)'),
+        ({'evaluate': "'never'"}, "evaluate: got 'never', allowed are numbers"),
+        ({'compiled': "'often'"}, r"compiled: got \['often', .*, allowed are numbers"),
+        ({'compiled': '1.0 + x * x'}, 'got a probability of 1.'),
         (
-            'def reach(self): return 1.0\n    def evaluate(self, x, y, z): return x',
-            r'got a probability of -1.0, allowed are numbers in \[0, 1\]',
-        ),
-        (
-            'def reach(self): return 1.0\n    def evaluate(self, x, y, z): return 0.5',
-            r'evaluate: got shape \(\), allowed is \(263169,\)',
-        ),
-        ("def reach(self): return 'far'", "mine:Mine: reach: got 'far', allowed are numbers"),
-        (
-            "def reach(self): return 1.0\n    def evaluate(self, x, y, z): return 'never'",
-            "mine:Mine: evaluate: got 'never', allowed are numbers",
-        ),
-        (
-            "def reach(self): return 1.0\n    def compiled(x, y, z, values): return 'often'",
-            r"mine:Mine: compiled: got \['often', .*, allowed are numbers",
-        ),
-        (
-            'def reach(self): return 1.0\n    def values(self): return [[1.0], []]\n'
-            '    def compiled(x, y, z, values): return 0.5',
-            r'mine:Mine: values: got \[\[1.0\], \[\]\], allowed are numbers',
-        ),
-        (
-            'def reach(self): return 1.0\n    def compiled(x, y, z, values): return 1.0 + x * x',
-            'got a probability of 1.',
+            {'values': '[[1.0], []]', 'compiled': '0.5'},
+            r'values: got \[\[1.0\], \[\]\], allowed are numbers',
         ),
     ],
 )
-def test_wrong_detection_models_are_refused_before_anything_starts(folder, body, message):
+def test_wrong_detection_models_are_refused_before_anything_starts(folder, returned, message):
+    arguments = {'evaluate': 'self, x, y, z', 'compiled': 'x, y, z, values'}
+    methods = ''.join(
+        f'    def {name}({arguments.get(name, "self")}): return {value}\n'
+        for name, value in {'reach': '1.0', **returned}.items()
+    )
     (folder / 'mine.py').write_text(
         'from maasi_filter.models.own_detection import OwnDetection\n'
-        f'class Mine(OwnDetection):\n    {body}\n'
+        f'class Mine(OwnDetection):\n{methods}'
     )
     changes = {'kind': (('robots', 'rover', 'sensor', 'detection', 'kind'), 'mine:Mine')}
-    with pytest.raises(ScenarioError, match=message):
+    with pytest.raises(ScenarioError, match=message) as error:
         load_scenario(folder / 'search.yaml', changes)
+    assert 'mine:Mine' in str(error.value)
 
 
 @pytest.mark.parametrize(

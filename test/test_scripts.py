@@ -38,26 +38,19 @@ def test_python_runs_a_file_from_any_folder(tmp_path):
     assert set(ROOT.glob('maasi_*/**/*.pyc')) <= compiled
 
 
-def test_shell_runs_a_command_and_gives_its_exit_code(tmp_path):
+def test_shell_runs_commands_and_executables_and_gives_their_exit_code(tmp_path):
     result = call(SHELL, 'bash', '-c', 'echo $ROS_DISTRO; exit 7', folder=tmp_path)
     assert (result.returncode, result.stdout) == (7, 'jazzy\n')
-
-
-def test_shell_finds_executables_by_their_names_and_their_help_may_be_cut(tmp_path):
     result = call(SHELL, 'filter_node', '--help', folder=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert 'measurement_batch' in result.stdout
+    assert result.returncode == 0 and 'measurement_batch' in result.stdout, result.stderr
+    # Their help may be cut.
     help_of_node = f'{SHELL} filter_node --help | true; echo ${{PIPESTATUS[0]}}'
     result = call('bash', '-c', help_of_node, folder=tmp_path)
     assert (result.stdout, result.stderr) == ('0\n', '')
-
-
-def test_a_node_whose_parameter_file_is_missing_ends_with_wrong_input(tmp_path):
     node = [SHELL, 'filter_node', '--ros-args', '--params-file', 'none.yaml']
     result = call(*node, folder=tmp_path)
-    assert result.returncode == 2
     line = result.stderr.splitlines()[-1]
-    assert line.startswith('error: ') and 'none.yaml' in line
+    assert result.returncode == 2 and line.startswith('error: ') and 'none.yaml' in line
     assert 'Traceback' not in result.stderr
 
 
