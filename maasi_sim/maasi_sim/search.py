@@ -27,6 +27,7 @@ from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
 from maasi_sim.search_result import SearchResult, SearchState
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.targets.tally import numbered
+from maasi_sim.view.event_maker import EventMaker
 from maasi_sim.view.live_view import SearchTrace
 from maasi_sim.world.simulation import simulated_robot, step_of_event
 from maasi_sim.world.world import World
@@ -113,7 +114,7 @@ class _Search:
             name: np.array(robot.start) for name, robot in scenario.robots.items()
         }
         truth = np.asarray(self.world.targets, dtype=float)
-        self.trace.truth(0.0, truth)
+        self.trace.add(EventMaker.truth, 0.0, truth)
         self._radius = scoring_radius(scenario, truth)
         self._result = SearchResult(scenario, self.trace, dict.fromkeys(self._robots, 0))
         # Whether the last score of a step was complete.
@@ -153,7 +154,7 @@ class _Search:
     def _let_leave(self) -> None:
         for name in self._departures.get(self.step, []):
             self._here.pop(name, None)
-            self.trace.leave(self.time, name)
+            self.trace.add(EventMaker.leave, self.time, name)
             for group in self._groups:
                 if name in group.names:
                     group.coordinator.plans[name].leave()
@@ -219,7 +220,7 @@ class _Search:
             counts[name] += 1
         found, truth, scores = self._state()
         if self.world.walk > 0.0:
-            self.trace.truth(self.time, truth)
+            self.trace.add(EventMaker.truth, self.time, truth)
         self._complete = self._complete or (bool(len(truth)) and scores.complete)
         self._result.progress.append(
             SearchState(

@@ -10,12 +10,12 @@ from typing import Any
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
 from maasi_planner.team import Decision
-from maasi_sim.scenario.base import OriginSettings
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.targets.scoring import Scores
 from maasi_sim.targets.tables import columns, found_rows
 from maasi_sim.targets.tally import FoundCount
 from maasi_sim.view.live_view import SearchTrace
+from maasi_sim.view.page_file import write_replay
 
 
 @dataclass(frozen=True)
@@ -110,11 +110,6 @@ class SearchResult:
         return self.scores.match.pairs
 
     @property
-    def origin(self) -> OriginSettings | None:
-        """Of the map on the earth."""
-        return self.scenario.environment.origin
-
-    @property
     def total_measurements(self) -> int:
         """Measurements of all robots."""
         return sum(self.measurements.values())
@@ -132,7 +127,8 @@ class SearchResult:
         ResultsError
             If it cannot be written.
         """
-        self.trace.save_replay(Path(path))
+        path = Path(path)
+        write_replay(self.trace.log(path.stem), path)
 
     def to_dataframe(self, table: str = 'found_targets') -> Any:
         """Return a pandas data frame.
@@ -160,8 +156,9 @@ class SearchResult:
                 'to_dataframe needs pandas, which is not installed: pip install pandas'
             ) from None
         if table == 'found_targets':
-            rows = found_rows(self.found_targets, self.truth, self.pairs, self.origin)
-            frame = pandas.DataFrame(rows, columns=columns(self.truth.shape[1], self.origin))
+            origin = self.scenario.environment.origin
+            rows = found_rows(self.found_targets, self.truth, self.pairs, origin)
+            frame = pandas.DataFrame(rows, columns=columns(self.truth.shape[1], origin))
             return frame.astype({'target': 'Int64', 'error': float})
         rows = []
         for item in self.progress:

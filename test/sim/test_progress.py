@@ -37,6 +37,6 @@ def test_the_share_of_what_is_done_comes_now_and_then():
     for period, said in ((0.0, ['replay: 0 %', 'replay: 50 %']), (1e6, ['replay: 0 %'])):
         stream = io.StringIO()
         display = ProgressDisplay(stream, period=period)
-        display.share('replay', 0.0)
-        display.share('replay', 0.5)
+        for share in (0.0, 0.5):
+            display.share('replay', share)
         assert stream.getvalue().splitlines() == said

@@ -25,7 +25,7 @@ from maasi_msgs.msg import (
     RobotDecision,
 )
 from maasi_sim.run.bag import load_types
-from maasi_sim.run.report_files import END_REASONS, write_report
+from maasi_sim.run.report_files import write_report
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.topics import within
 from maasi_sim.scenario.loading import load_scenario
@@ -33,7 +33,7 @@ from maasi_sim.targets.mission import TargetMission
 from maasi_sim.targets.observer import TargetObserver
 from maasi_sim.targets.report import build_report, target_summary
 from maasi_sim.targets.report_figure import plot_report
-from maasi_sim.targets.scoring import matching_radius, score
+from maasi_sim.targets.scoring import score, scoring_radius
 
 TYPES = load_types()
 
@@ -147,18 +147,14 @@ def run(tmp_path):
     return Run(scenario_of(tmp_path, TARGETS))
 
 
-def test_radius_of_scoring_and_matching_within_it():
+def test_radius_of_scoring_and_matching_within_it(tmp_path):
     # Three times the removal distance, at most half the smallest distance of two targets.
     near = [[0.0, 0.0], [0.2, 0.0], [1.0, 1.0]]
+    scenario = scenario_of(tmp_path, TARGETS)
     for truth, radius in ((TARGETS, 0.15), (near, 0.1), (near[:1], 0.15), (np.zeros((0, 2)), 0.15)):
-        assert matching_radius(0.05, truth) == pytest.approx(radius)
-    for distance, truth, words in (
-        (math.nan, TARGETS, 'removal_distance'),
-        (0.0, TARGETS, 'removal_distance'),
-        (0.05, [[1.0, 1.0], [1.0, 1.0]], 'same place'),
-    ):
-        with pytest.raises(ValueError, match=words):
-            matching_radius(distance, truth)
+        assert scoring_radius(scenario, np.array(truth)) == pytest.approx(radius)
+    with pytest.raises(ValueError, match='same place'):
+        scoring_radius(scenario, np.ones((2, 2)))
     # One to one.
     scores = score([[0.5, 0.51], [0.5, 0.52], [1.5, 0.5]], TARGETS, 0.15)
     assert (scores.match.true_found, scores.match.false_found, scores.match.missed) == (2, 1, 1)
@@ -251,15 +247,6 @@ def test_planners_of_several_robots_are_done_together(two_filters):
     assert (run.observer.settled, run.observer.end_step) == ('nothing left for second', 30)
 
 
-def test_updates_after_the_planner_is_done_do_not_count(run):
-    run.update(0.9)
-    run.give_up(1.0)
-    run.update(1.0)
-    run.update(1.0 + run.scenario.step)
-    report = run.report('planner_done', 1.0, 1.0)
-    assert report['measurements']['mambo'] == 2
-
-
 def test_planner_without_a_robot_is_not_waited_for(two_filters):
     one, two = two_filters
     one.step(0.0, ['mambo', 'second'])
@@ -278,31 +265,33 @@ def test_planner_without_a_robot_is_not_waited_for(two_filters):
 
 def test_planner_of_a_robot_that_cannot_go_on_is_not_waited_for(two_filters):
     one, two = two_filters
-    two.state(0.9, 'second', [0.0, 0.0])
     one.give_up(1.0)
     two.state(1.5, 'second', [0.0, 0.0])
     assert one.observer.settled is None
     two.state(1.6, 'second', [0.0, 0.0], status=5, reason='its battery is empty')
-    assert one.observer.settled == 'nothing left for mambo'
-    assert one.observer.end_step == 32
+    assert (one.observer.settled, one.observer.end_step) == ('nothing left for mambo', 32)
 
 
 def test_what_comes_after_the_end_does_not_count(run):
-    for time, position in zip((0.5, 0.6, 0.7), TARGETS):
+    for time, position in zip((0.5, 0.6, 0.7, 0.8), [*TARGETS, [0.2, 0.2]]):
         run.declare(time, position)
         run.decide(time, {'mambo': position})
         run.state(time, 'mambo', [time, 0.0, 1.0])
         run.update(time)
-    run.declare(0.8, [0.2, 0.2])
-    run.decide(0.8, {'mambo': [2.0, 2.0]})
-    run.state(0.8, 'mambo', [2.0, 2.0, 1.0])
-    run.update(0.8)
     record = run.record('all_found', 5.0, 1.0)
     report = build_report(record)
     numbers = len(report['found']), report['measurements']['mambo'], report['decisions']
     assert numbers == (3, 3, 3)
     assert report['distance']['mambo'] == pytest.approx(0.2)
     assert record.end_time == pytest.approx(0.7)
+
+
+def test_updates_after_the_planner_is_done_do_not_count(run):
+    run.update(0.9)
+    run.give_up(1.0)
+    for time in (1.0, 1.0 + run.scenario.step):
+        run.update(time)
+    assert run.report('planner_done', 1.0, 1.0)['measurements']['mambo'] == 2
 
 
 def test_updates_alone_tell_what_was_found_and_refined_positions_win(run):
@@ -322,13 +311,10 @@ def test_updates_alone_tell_what_was_found_and_refined_positions_win(run):
 def test_completeness_that_is_lost_again_does_not_count(tmp_path):
     run = Run(scenario_of(tmp_path, TARGETS[:1], stop='planner_done'))
     run.declare(0.5, [0.5, 0.5])
-    run.update(0.5)
-    run.found[0].position.x = 1.9
-    run.update(0.6)
-    run.found[0].position.x = 0.5
-    run.update(0.7)
-    report = run.report('planner_done', 1.0, 1.0)
-    assert report['measurements_to_find_all'] == 3
+    for time, x in ((0.5, 0.5), (0.6, 1.9), (0.7, 0.5)):
+        run.found[0].position.x = x
+        run.update(time)
+    assert run.report('planner_done', 1.0, 1.0)['measurements_to_find_all'] == 3
 
 
 def test_report_without_targets_and_of_a_run_in_which_nothing_happened(run, tmp_path):
@@ -344,13 +330,11 @@ def test_report_without_targets_and_of_a_run_in_which_nothing_happened(run, tmp_
 
 
 def test_robots_that_leave_and_come_back_are_events(run):
-    run.step(0.0, ['mambo', 'second'])
-    run.step(0.05, ['second'])
-    run.step(0.1, ['second'])
+    for time, robots in ((0.0, ['mambo', 'second']), (0.05, ['second']), (0.1, ['second'])):
+        run.step(time, robots)
     run.step(0.15, ['mambo', 'second'])
     node = {'time': 0.12, 'node': '/filter_node', 'event': 'restarted'}
-    report = run.report('time_limit', 1.0, 1.0, [node])
-    assert report['events'] == [
+    assert run.report('time_limit', 1.0, 1.0, [node])['events'] == [
         {'time': 0.05, 'agent': 'mambo', 'event': 'lost'},
         node,
         {'time': 0.15, 'agent': 'mambo', 'event': 'joined'},
@@ -358,10 +342,9 @@ def test_robots_that_leave_and_come_back_are_events(run):
 
 
 def test_robots_that_say_they_cannot_go_on_are_events_without_lockstep(run):
-    run.state(0.0, 'mambo', [0.5, 0.5, 1.0])
-    run.state(0.5, 'mambo', [0.5, 0.5, 1.0], status=5, reason='odometry is stale')
-    run.state(0.6, 'mambo', [0.5, 0.5, 1.0], status=5, reason='odometry is stale')
-    run.state(0.9, 'mambo', [0.5, 0.5, 1.0])
+    stale = {'status': 5, 'reason': 'odometry is stale'}
+    for time, said in ((0.0, {}), (0.5, stale), (0.6, stale), (0.9, {})):
+        run.state(time, 'mambo', [0.5, 0.5, 1.0], **said)
     assert run.record().events == [
         {'time': 0.5, 'agent': 'mambo', 'event': 'lost', 'reason': 'odometry is stale'},
         {'time': 0.9, 'agent': 'mambo', 'event': 'joined'},
@@ -374,30 +357,14 @@ def test_written_files_can_be_read_and_the_summary_says_what_matters(run, tmp_pa
     run.update(0.5)
     report = write(run.record('time_limit', 1.0, 0.5), tmp_path)
     assert json.loads((tmp_path / 'report.json').read_text()) == report
-    picture = cv2.imread(str(tmp_path / 'report.png'))
+    picture = cv2.imread(str(tmp_path / 'report.png')).astype(int)
     assert picture.shape[0] > 600 and picture.shape[1] > 1000
     # Something of every kind of mark is there: found (red) and false (violet).
     for colour in ((0x28, 0x27, 0xD6), (0x94, 0x32, 0x7B)):
-        assert (np.abs(picture.astype(int) - colour).max(axis=2) < 12).sum() > 20
+        assert (np.abs(picture - colour).max(axis=2) < 12).sum() > 20
     text = target_summary(report)
-    assert '1 of 3 targets found, 1 false' in text
-    assert END_REASONS['time_limit'] in text
-    assert '2.0 times real time' in text
-
-
-def test_picture_in_space(tmp_path):
-    scenario = load_scenario('ranging_pair_3d')
-    run = Run(scenario)
-    for name in scenario.names():
-        run.state(0.0, name, [1.0, 1.0, 1.0])
-        run.state(1.0, name, [100.0, 50.0, 30.0])
-    run.declare(0.5, list(run.observer.world.targets[0] + 0.5), 'drone1', deviation=1.0)
-    run.update(0.5, ['drone1', 'drone2'])
-    record = run.record()
-    figure = plot_report(record)
-    assert {'drone1', 'drone2', 'true target', 'found target'} <= set(labels_of(figure))
-    views = [(axes.get_xlabel()[:1], axes.get_ylabel()[:1]) for axes in figure.axes[:3]]
-    assert views == [('x', 'y'), ('x', 'z'), ('z', 'y')]
+    for words in ('1 of 3 targets found, 1 false', 'time limit', '2.0 times real time'):
+        assert words in text
 
 
 def labels_of(figure):
@@ -405,9 +372,21 @@ def labels_of(figure):
     figure.canvas.draw()
     (legend,) = figure.legends
     box, whole = legend.get_window_extent(), figure.bbox
-    assert whole.x0 <= box.x0 and box.x1 <= whole.x1
-    assert whole.y0 <= box.y0 and box.y1 <= whole.y1
-    return [text.get_text() for text in legend.get_texts()]
+    assert whole.x0 <= box.x0 and box.x1 <= whole.x1 and whole.y0 <= box.y0 and box.y1 <= whole.y1
+    return {text.get_text() for text in legend.get_texts()}
+
+
+def test_picture_in_space():
+    run = Run(load_scenario('ranging_pair_3d'))
+    for name in ('drone1', 'drone2'):
+        run.state(0.0, name, [1.0, 1.0, 1.0])
+        run.state(1.0, name, [100.0, 50.0, 30.0])
+    run.declare(0.5, list(run.observer.world.targets[0] + 0.5), 'drone1', deviation=1.0)
+    run.update(0.5, ['drone1', 'drone2'])
+    figure = plot_report(run.record())
+    assert {'drone1', 'drone2', 'true target', 'found target'} <= labels_of(figure)
+    views = [(axes.get_xlabel()[:1], axes.get_ylabel()[:1]) for axes in figure.axes[:3]]
+    assert views == [('x', 'y'), ('x', 'z'), ('z', 'y')]
 
 
 def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(run):
@@ -417,7 +396,7 @@ def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(ru
     run.update(0.5)
     figure = plot_report(run.record())
     labels = labels_of(figure)
-    assert {'missed', 'false target'} <= set(labels)
+    assert {'missed', 'false target'} <= labels
     (sigma,) = [label for label in labels if 'sigma' in label]
     assert 'drawn at least' in sigma
     world = figure.axes[0]
@@ -438,7 +417,7 @@ def test_legend_of_many_robots_and_obstacles_is_whole(tmp_path):
     obstacles = [{'centre': [1.0, 1.0], 'radius': 0.1}]
     environment = {'bounds': [[0.0, 2.0], [0.0, 2.0]], 'obstacles': obstacles}
     run = Run(scenario_of(tmp_path, TARGETS, robots=robots, environment=environment))
-    assert {*robots, 'obstacle'} <= set(labels_of(plot_report(run.record())))
+    assert {*robots, 'obstacle'} <= labels_of(plot_report(run.record()))
 
 
 def test_radius_of_the_scenario_wins(tmp_path):

@@ -4,7 +4,6 @@ import pytest
 import yaml
 from node_kinds import KINDS
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.ros.conversions import MarkerBoard
@@ -58,25 +57,13 @@ def publishers(node, topic):
     return [item for item in node.get_publishers_info_by_topic(topic) if item.node_name == own]
 
 
-def marker(namespace, number):
-    return Marker(header=Header(frame_id='map'), ns=namespace, id=number, type=Marker.SPHERE)
-
-
-def actions(array):
-    return [(item.action, item.ns, item.id) for item in array.markers]
-
-
 def test_the_first_markers_clear_and_later_ones_replace_those_before():
     board = MarkerBoard()
-    first = board.replace(MarkerArray(markers=[marker('a', 1), marker('a', 2)]))
-    assert actions(first) == [
-        (Marker.DELETEALL, '', 0),
-        (Marker.ADD, 'a', 1),
-        (Marker.ADD, 'a', 2),
-    ]
-    second = board.replace(MarkerArray(markers=[marker('a', 2), marker('b', 1)]))
-    assert actions(second) == [
-        (Marker.DELETE, 'a', 1),
-        (Marker.ADD, 'a', 2),
-        (Marker.ADD, 'b', 1),
-    ]
+    add, delete = Marker.ADD, Marker.DELETE
+    for names, expected in (
+        ('ab', [(Marker.DELETEALL, ''), (add, 'a'), (add, 'b')]),
+        ('bc', [(delete, 'a'), (add, 'b'), (add, 'c')]),
+    ):
+        markers = [Marker(ns=name, type=Marker.SPHERE) for name in names]
+        made = board.replace(MarkerArray(markers=markers)).markers
+        assert [(item.action, item.ns) for item in made] == expected

@@ -15,37 +15,35 @@ from maasi_sim.view.server import Hub, ViewServer
 from maasi_sim.view.view_node import main
 
 
-def serve(node, names, called):
-    """Offer services, and note which of them were called."""
+def serve(context, name, services, called):
+    """Return a node with services that note that they were called."""
+    node = rclpy.create_node(name, context=context)
 
-    def answer(name, _, response):
-        called.append(name)
-        response.success, response.message = True, name
+    def answer(service, _, response):
+        called.append(service)
+        response.success, response.message = True, service
         return response
 
-    for name in names:
-        node.create_service(Trigger, name, partial(answer, name))
+    for service in services:
+        node.create_service(Trigger, service, partial(answer, service))
+    return node
 
 
 def test_a_stop_of_all_does_not_wait_for_other_commands(domain, context, monkeypatch):
     monkeypatch.setattr(control_node, '_PATIENCE', PATIENCE)
     called, answers = [], []
-    drivers = rclpy.create_node('drivers', context=context)
     stops = ['/mambo/stop', '/rover/stop']
-    serve(drivers, [*stops, '/mambo/release', '/rover/release'], called)
+    drivers = serve(context, 'drivers', [*stops, '/mambo/release', '/rover/release'], called)
     # Its services are there; it answers when it is spun.
-    stuck = rclpy.create_node('stuck', context=context)
-    serve(stuck, ['/ghost/search/pause'], called)
+    stuck = serve(context, 'stuck', ['/ghost/search/pause'], called)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(drivers)
     spinner = threading.Thread(target=executor.spin)
     spinner.start()
     control = Control(domain.number)
-
-    def pause():
-        answers.append(control('pause', 'ghost'))
-
-    others = [threading.Thread(target=pause) for _ in range(3)]
+    others = [
+        threading.Thread(target=lambda: answers.append(control('pause', 'ghost'))) for _ in range(3)
+    ]
     try:
         for other in others:
             other.start()

@@ -37,10 +37,10 @@ def state(seconds, **fields):
 class Taken:
     """Events made of messages."""
 
-    def __init__(self, scene=None, begin=0.0):
+    def __init__(self, scene=None, on_restart=None):
         self.events = []
         self.maker = EventMaker(scene or empty_scene(), self.events.append)
-        self.messages = MessageEvents(self.maker, begin)
+        self.messages = MessageEvents(self.maker, on_restart=on_restart)
 
     def take(self, topic, message):
         package = type(message).__module__.split('.')[0]
@@ -50,8 +50,12 @@ class Taken:
         return [event for event in self.events if event[1] == kind]
 
 
-def test_states_are_one_per_period_except_where_the_robot_says_something_else():
-    taken = Taken()
+@pytest.fixture
+def taken():
+    return Taken()
+
+
+def test_states_are_one_per_period_except_where_the_robot_says_something_else(taken):
     # One that is not finite is left out.
     broken = state(0.0)
     broken.pose.pose.position.x = math.nan
@@ -72,18 +76,16 @@ def step(seconds, *robots):
     return LockstepStep(robots=list(robots), stamp=stamp_to_ros(round(seconds * 1e9)))
 
 
-def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_end():
-    taken = Taken()
+def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_end(taken):
     for seconds in range(7):
         present = ['crawler', 'rover', 'walker'] if seconds < 2 else ['crawler', 'rover']
         taken.take('/lockstep/step', step(float(seconds), *present))
-        taken.take('/rover/state', state(float(seconds), goal_status=AgentState.MOVING))
-        for name in ('crawler', 'walker'):
-            # One falls silent; the other's driver still publishes after it has left.
-            if name == 'walker' or seconds < 2:
-                other = state(float(seconds), goal_status=AgentState.MOVING)
-                other.robot = name
-                taken.take(f'/{name}/state', other)
+        # One falls silent; the other's driver still publishes after it has left.
+        for name in ('rover', 'crawler', 'walker'):
+            if name != 'crawler' or seconds < 2:
+                message = state(float(seconds), goal_status=AgentState.MOVING)
+                message.robot = name
+                taken.take(f'/{name}/state', message)
     taken.maker.end()
     statuses = {
         name: [(event[0], *event[5:]) for event in taken.of('robot') if event[2] == name]
@@ -92,24 +94,30 @@ def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_en
     assert statuses['walker'] == [(0.0, 1, ''), (1.0, 1, ''), (2.0, LEFT, '')]
     assert statuses['crawler'][1:] == [(1.0, 1, ''), (6.0, SILENT, 'not heard for 3 s')]
     assert statuses['rover'][-1] == (6.0, ENDED, '')
-    assert [event[4:] for event in taken.of('log')] == [
-        ['walker', 'left'],
-        ['crawler', 'not heard for 3 s'],
-    ]
+    said = [event[4:] for event in taken.of('log')]
+    assert said == [['walker', 'left'], ['crawler', 'not heard for 3 s']]
 
 
-def test_candidates_that_are_not_allowed_have_no_objective():
-    taken = Taken()
+def test_what_comes_before_the_first_step_is_taken_at_its_time(taken):
+    taken.messages = MessageEvents(taken.maker, waits=True)
+    taken.take('/rover/state', state(9.0))
+    assert taken.events == []
+    for seconds in (10.0, 10.5):
+        taken.take('/lockstep/step', step(seconds, 'rover'))
+        taken.take('/rover/state', state(seconds))
+    assert [event[0] for event in taken.of('robot')] == [0.0, 0.5]
+
+
+def test_candidates_that_are_not_allowed_have_no_objective(taken):
     candidates = [Candidate(objective=-1e30), Candidate(objective=0.5, length=7, measurements=2)]
     robot = RobotDecision(robot='rover', chosen=1, candidates=candidates)
     taken.take('/decisions', PlanDecision(planner='maasi', robots=[robot], explored=0.25))
     (plan,) = taken.of('plan')
-    assert [item[6:] for item in plan[7][0][4]] == [[None, 0, 0], [0.5, 7, 2]]
     assert plan[3:5] == ['maasi', 0.25]
+    assert [item[6:] for item in plan[7][0][4]] == [[None, 0, 0], [0.5, 7, 2]]
 
 
-def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario():
-    taken = Taken()
+def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario(taken):
     grid = OccupancyGrid(data=[0, 100, 50, 50, 0, 0])
     grid.info.resolution, grid.info.width, grid.info.height = 0.5, 3, 2
     grid.info.origin.position.x = grid.info.origin.position.y = -0.25
@@ -137,21 +145,20 @@ def test_found_targets_are_scored_where_the_truth_is_known():
 
 
 def test_time_that_jumps_back_begins_another_run():
-    taken = Taken(begin=None)
-    made = [taken.maker]
+    made = []
 
     def begin():
         made.append(EventMaker(empty_scene(), taken.events.append))
         return made[-1]
 
-    taken.messages = MessageEvents(taken.maker, None, begin)
+    taken = Taken(on_restart=begin)
     taken.take('/rover/state', state(100.0))
     taken.take('/rover/state', state(130.0))
     # What another topic says late, as in a bag that is played fast, begins nothing.
     taken.take('/lockstep/step', step(102.0))
-    assert len(made) == 1
+    assert made == []
     taken.take('/rover/state', state(101.0))
-    assert len(made) == 2
+    assert len(made) == 1
     assert [event[0] for event in taken.events] == [0.0, 30.0, 0.0]
 
 
@@ -169,11 +176,9 @@ def test_topics_are_known_by_type_and_name():
 
 
 def test_a_long_run_is_thinned_until_it_fits_and_says_so():
-    rng = np.random.default_rng(1)
     events = []
-    for number in range(20000):
-        place = [round(float(value), 4) for value in rng.normal(size=4)]
-        events.append([number / 10, 'robot', 'rover', place, 0.5, 1, ''])
+    for number, place in enumerate(np.random.default_rng(1).normal(size=(20000, 4)).round(4)):
+        events.append([number / 10, 'robot', 'rover', place.tolist(), 0.5, 1, ''])
         if number % 100 == 0:
             events.append([number / 10, 'log', '', 'found', 'rover', 'target'])
     log = EventLog({'name': 'long'}, events)
@@ -181,10 +186,11 @@ def test_a_long_run_is_thinned_until_it_fits_and_says_so():
     packed = log.packed(100_000)
     assert len(packed) <= 100_000
     thinned = EventLog.unpacked(packed)
-    assert thinned.scene['thinned'] >= 0.2
-    assert thinned.events[-1] == events[-1]
-    lines = [event for event in thinned.events if event[1] == 'log']
-    assert lines == [event for event in events if event[1] == 'log']
+    assert thinned.scene['thinned'] >= 0.2 and thinned.events[-1] == events[-1]
+    lines, kept = (
+        [event for event in some if event[1] == 'log'] for some in (events, thinned.events)
+    )
+    assert lines == kept
     # Detections and the end are kept.
     seen = [[time, 'seen', 'a', [0, 0, 0], []] for time in (0.0, 0.1, 0.2, 0.3)]
     seen[2][4].append([1, 0, 0, 0, 0, 0])
@@ -194,8 +200,7 @@ def test_a_long_run_is_thinned_until_it_fits_and_says_so():
 def test_scenes_are_the_same_from_a_scenario_and_from_what_a_recording_says_of_it():
     for name in ('mambo_turtlebot_obstacles', 'ranging_pair_3d', 'buildings_four'):
         scenario = load_mission(name).scenario
-        facts = {'name': name, 'seed': 3, 'scenario': scenario.content()}
-        scene = scene_of_facts(facts)
+        scene = scene_of_facts({'name': name, 'seed': 3, 'scenario': scenario.content()})
         assert scene == scene_of(name, scenario, 3)
         assert json.loads(line(scene)) == scene
     assert len(scene['cuboids']) == 32 and len(scene['objects']) == 2
@@ -205,22 +210,19 @@ def test_scenes_are_the_same_from_a_scenario_and_from_what_a_recording_says_of_i
 
 
 def test_the_scene_has_the_geofences_that_drivers_keep_to():
-    changes = {
-        'given': (('robots', 'mambo', 'mambo', 'geofence'), [[0.0, 2.0], [0.0, 2.0], [0.5, 1.5]]),
-    }
-    scene = scene_of('wifi', load_mission('mambo_turtlebot_wifi', changes).scenario)
-    assert scene['robots']['mambo']['fence'] == [[0.0, 2.0], [0.0, 2.0], [0.5, 1.5]]
-    assert 'fence' not in scene['robots']['turtlebot']
+    fence = [[0.0, 2.0], [0.0, 2.0], [0.5, 1.5]]
+    changes = {'given': (('robots', 'mambo', 'mambo', 'geofence'), fence)}
+    robots = scene_of('', load_mission('mambo_turtlebot_wifi', changes).scenario)['robots']
+    assert robots['mambo']['fence'] == fence and 'fence' not in robots['turtlebot']
     changes = {
         'link': (('robots', 'drone', 'link'), 'mavlink'),
         'arm': (('robots', 'drone', 'mavlink', 'arm'), True),
     }
     scenario = load_mission('drone_rov', changes).scenario
     drone = scenario.robots['drone']
-    x, y, z = scene_of('sea', scenario)['robots']['drone']['fence']
-    reach = [-drone.radius, drone.radius]
-    for side, bounds in zip((x, y), scenario.environment.array()):
-        assert side == pytest.approx([bound + more for bound, more in zip(bounds, reach)])
+    *sides, z = scene_of('', scenario)['robots']['drone']['fence']
+    reach = np.array([-drone.radius, drone.radius])
+    assert np.array(sides) == pytest.approx(scenario.environment.array()[:2] + reach)
     assert z[0] <= drone.start[2] < z[1]
 
 
@@ -252,16 +254,13 @@ def test_a_search_in_one_process_leaves_the_same_events(result, tmp_path):
 def test_the_objective_is_made_of_its_terms_with_the_weights_of_the_scene(result):
     log = result.trace.log()
     weights = log.scene['weights']
-    checked = 0
-    for event in log.events:
-        for robot in event[7] if event[1] == 'plan' else []:
-            for _, _, _, control, refinement, exploration, objective, length, _ in robot[4]:
-                if objective is not None:
-                    gain = weights['alpha'] * refinement + weights['beta'] * exploration
-                    expected = (gain - weights['control'] * control) / length
-                    assert objective == pytest.approx(expected, rel=1e-3, abs=1e-6)
-                    checked += 1
-    assert checked > 100
+    plans = [robot for event in log.events if event[1] == 'plan' for robot in event[7]]
+    rows = [row for robot in plans for row in robot[4] if row[6] is not None]
+    assert len(rows) > 100
+    for _, _, _, control, refinement, exploration, objective, length, _ in rows:
+        gain = weights['alpha'] * refinement + weights['beta'] * exploration
+        expected = (gain - weights['control'] * control) / length
+        assert objective == pytest.approx(expected, rel=1e-3, abs=1e-6)
 
 
 def test_the_page_is_one_file_without_addresses(result, tmp_path):

@@ -25,28 +25,26 @@ from maasi_sim.view.view_run import main
 pytestmark = pytest.mark.system
 
 
-class Watched:
+class Watched(Run):
     """A run, and what a browser saw of it while it went on."""
 
     def __init__(self, folder):
         options = ('--seed', 1, '--lockstep', '--time-limit', 30, '--view', '--control')
-        self.process = subprocess.Popen(
+        process = subprocess.Popen(
             [*command('mambo_turtlebot', folder, *options), '--port', '0'],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
         )
-        self.errors, self.answer, self.found, self.decisions = [], '', None, 0
         lines = []
-        for line in self.process.stdout:
-            lines.append(line)
-            if line.startswith('view: '):
-                break
+        while not (lines and lines[-1].startswith('view: ')):
+            lines.append(process.stdout.readline())
+            assert lines[-1], lines
         if CHROMIUM is not None:
             self._watch(lines[-1].split()[1])
-        rest, _ = self.process.communicate(timeout=PATIENCE)
-        self.run = Run(folder, self.process.returncode, ''.join([*lines, rest]))
+        rest, _ = process.communicate(timeout=PATIENCE)
+        super().__init__(folder, process.returncode, ''.join([*lines, rest]))
 
     def _watch(self, address):
         with chromium() as shown:
@@ -54,9 +52,8 @@ class Watched:
             shown.until('maasi.log.duration > 1')
             shown.page.click('#robots tr[data-robot=turtlebot]')
             shown.page.click('button[data-command=pause]')
-            answer = shown.page.locator('#controls [role=status]')
             shown.until("/[^.]$/.test(document.querySelector('#controls [role=status]').innerText)")
-            self.answer = answer.inner_text()
+            self.answer = shown.page.inner_text('#controls [role=status]')
             shown.until('document.body.dataset.connection === "ended"', PATIENCE)
             shown.page.keyboard.press('End')
             shown.settle()
@@ -66,13 +63,8 @@ class Watched:
 
 
 @pytest.fixture(scope='module')
-def watched(tmp_path_factory):
+def run(tmp_path_factory):
     return Watched(tmp_path_factory.mktemp('viewed') / 'run')
-
-
-@pytest.fixture(scope='module')
-def run(watched):
-    return watched.run
 
 
 @pytest.fixture(scope='module')
@@ -89,20 +81,17 @@ def seconds(stamp):
 
 
 def test_every_run_leaves_a_replay(run):
-    assert run.code in (0, 1), run.output
-    assert 'replay:' in run.output
+    assert run.code in (0, 1) and 'replay:' in run.output, run.output
     assert 10_000 < (run.folder / REPLAY).stat().st_size < 5_000_000
 
 
 @needs_chromium
-def test_a_browser_saw_the_run_while_it_went_on(watched):
-    assert watched.found == len(watched.run.report['found'])
-    assert watched.decisions == sum(
-        len(item['robots']) for item in of_topic(watched.run, '/decisions')
-    )
-    assert watched.answer == 'pause: turtlebot'
+def test_a_browser_saw_the_run_while_it_went_on(run):
+    assert run.found == len(run.report['found'])
+    assert run.decisions == sum(len(item['robots']) for item in of_topic(run, '/decisions'))
+    assert run.answer == 'pause: turtlebot'
     # Nobody follows after the end.
-    assert not watched.controls
+    assert not run.controls
 
 
 @needs_chromium
@@ -122,6 +111,7 @@ def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run, address):
         assert shown.number() == len(run.report['found'])
         last = page.screenshot()
         shown.seek(10.0)
+        assert page.screenshot() != last
         for robot in ('mambo', 'turtlebot'):
             when, *_, pose = page.evaluate(f'maasi.log.at("robot", "{robot}", 10.0).slice(0, 4)')
             # One state in a tenth of a second is shown.
@@ -133,15 +123,15 @@ def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run, address):
         assert shown.number() == sum(item['time'] <= 10.0 for item in run.report['found'])
         left = page.inner_text('dt:text-is("expected left") + dd')
         assert float(left) == pytest.approx(expected, rel=0.01)
-        assert page.screenshot() != last
         x, y = page.evaluate('maasi.camera.project(maasi.log.at("robot", "mambo", 10.0)[3])')[:2]
         box = page.locator('#map').bounding_box()
-        page.mouse.click(box['x'] + x, box['y'] + y)
-        shown.settle()
-        assert 'mambo, decision' in page.inner_text('#why')
-        page.click('#robots tr[data-robot=turtlebot]')
-        shown.settle()
-        assert 'turtlebot, decision' in page.inner_text('#why')
+        for click, robot in (
+            (lambda: page.mouse.click(box['x'] + x, box['y'] + y), 'mambo'),
+            (lambda: page.click('#robots tr[data-robot=turtlebot]'), 'turtlebot'),
+        ):
+            click()
+            shown.settle()
+            assert f'{robot}, decision' in page.inner_text('#why')
 
 
 @needs_chromium
@@ -166,52 +156,52 @@ def test_a_click_on_a_decision_shows_its_candidates(run, address):
     decisions = of_topic(run, '/decisions')
     first = decisions[0]['robots'][0]
     with chromium() as shown:
+        page = shown.page
         shown.open(address)
-        shown.page.click(f'#log li.decision:has-text("{first["robot"]}: decision 0")')
+        page.click(f'#log li.decision:has-text("{first["robot"]}: decision 0")')
         shown.settle()
-        rows = shown.page.locator('#why tbody tr')
+        rows = page.locator('#why tbody tr')
         assert rows.count() == len(first['candidates'])
-        chosen = shown.page.inner_text('#why tr.chosen td').strip()
-        assert int(chosen) == first['chosen']
-        assert 'admissible' in shown.page.inner_text('#why .reason')
-        assert shown.page.inner_text('#why .formula') == 'J = (-1.0e-6 C + 0.5 T + 1 E) / K'
+        assert int(page.inner_text('#why tr.chosen td')) == first['chosen']
+        assert 'admissible' in page.inner_text('#why .reason')
+        assert page.inner_text('#why .formula') == 'J = (-1.0e-6 C + 0.5 T + 1 E) / K'
         # Sorted by the objective, and by another column where that is clicked.
         for heading, term in (('', 'objective'), ('E', 'exploration')):
             if heading:
-                shown.page.click(f'#why th:text-is("{heading}")')
+                page.click(f'#why th:text-is("{heading}")')
                 shown.settle()
             values = [item[term] for item in first['candidates']]
             assert int(rows.first.locator('td').first.inner_text()) == np.argmax(values)
         # The arrow goes to the next decision.
-        shown.page.keyboard.press('ArrowUp')
+        page.keyboard.press('ArrowUp')
         shown.settle()
-        later = next(item for item in decisions if seconds(item['header']['stamp']) > 0.0)
-        assert shown.page.evaluate('maasi.time') == pytest.approx(
-            seconds(later['header']['stamp']), abs=1e-3
-        )
+        times = [seconds(item['header']['stamp']) for item in decisions]
+        later = next(time for time in times if time > 0.0)
+        assert page.evaluate('maasi.time') == pytest.approx(later, abs=1e-3)
 
 
 @needs_chromium
 def test_it_plays_by_the_space_bar_also_on_a_phone_in_space_and_in_the_dark(run, address):
     with chromium(390, 844, color_scheme='dark', has_touch=True) as shown:
+        page = shown.page
         shown.open(address)
-        assert shown.page.get_attribute('html', 'data-theme') == 'dark'
-        shown.page.select_option('#speed', '20')
-        shown.page.locator('#map').focus()
-        shown.page.keyboard.press(' ')
+        assert page.get_attribute('html', 'data-theme') == 'dark'
+        page.select_option('#speed', '20')
+        page.locator('#map').focus()
+        page.keyboard.press(' ')
         shown.until('maasi.time > 1.0')
-        shown.page.keyboard.press(' ')
+        page.keyboard.press(' ')
         shown.settle()
-        at = shown.page.evaluate('maasi.time')
-        shown.page.keyboard.press('ArrowLeft')
+        at = page.evaluate('maasi.time')
+        page.keyboard.press('ArrowLeft')
         shown.settle()
-        assert shown.page.evaluate('maasi.time') == pytest.approx(max(at - 1.0, 0.0), abs=0.01)
-        flat = shown.page.locator('#map').screenshot()
-        shown.page.tap('#space')
+        assert page.evaluate('maasi.time') == pytest.approx(max(at - 1.0, 0.0), abs=0.01)
+        flat = page.locator('#map').screenshot()
+        page.tap('#space')
         shown.settle()
-        assert shown.page.locator('#map').screenshot() != flat
+        assert page.locator('#map').screenshot() != flat
         # Nothing is wider than the phone.
-        assert shown.page.evaluate('document.documentElement.scrollWidth') <= 390
+        assert page.evaluate('document.documentElement.scrollWidth') <= 390
 
 
 def test_a_page_is_made_of_a_bag_or_of_the_newest_run(run, tmp_path, monkeypatch, capsys):
@@ -228,26 +218,29 @@ def test_a_page_is_made_of_a_bag_or_of_the_newest_run(run, tmp_path, monkeypatch
         assert (tmp_path / 'page.html').read_text() == (run.folder / REPLAY).read_text()
 
 
-def test_a_recording_without_a_scenario_is_shown(run, tmp_path):
-    types = load_types()
-    writer = BagWriter(tmp_path / 'bag', types)
+def shown_messages(run, without=None):
+    """Return the topics of a bag that are shown, with their types, and their messages."""
     with Bag(run.bag) as bag:
-        kept = {topic: kind for topic, kind in bag.types.items() if is_shown(topic, kind)}
-        for topic, kind in kept.items():
-            writer.add_topic(topic, kind)
-        for topic, _, time, data in bag.raw(kept):
-            writer.write(topic, time, data)
+        kept = {name: kind for name, kind in bag.types.items() if is_shown(name, kind)}
+        kept.pop(without, None)
+        return kept, list(bag.raw(kept))
+
+
+def test_a_recording_without_a_scenario_is_shown(run, tmp_path):
+    kept, messages = shown_messages(run)
+    writer = BagWriter(tmp_path / 'bag', load_types())
+    for topic, kind in kept.items():
+        writer.add_topic(topic, kind)
+    for topic, _, time, data in messages:
+        writer.write(topic, time, data)
     writer.close()
-    log = read_events(tmp_path)
     shares = []
-    whole = read_events(run.folder, shares.append)
+    log, whole = read_events(tmp_path), read_events(run.folder, shares.append)
     assert shares[0] == 0.0 and shares == sorted(shares) and shares[-1] < 1.0
     # The exploration function is in single precision.
     assert np.allclose(log.scene['bounds'], whole.scene['bounds'], atol=1e-3)
-    kinds = ('robot', 'plan', 'found', 'filter', 'truth')
-    assert [count(log.events, kind) for kind in kinds] == [
-        count(whole.events, kind) for kind in kinds
-    ]
+    for kind in ('robot', 'plan', 'found', 'filter', 'truth'):
+        assert count(log.events, kind) == count(whole.events, kind)
 
 
 def test_the_view_node_shows_a_bag_that_is_played_and_begins_again_with_it(run, ros):
@@ -255,36 +248,28 @@ def test_the_view_node_shows_a_bag_that_is_played_and_begins_again_with_it(run, 
     player = rclpy.create_node('player', enable_rosout=False)
     node = ViewNode(view.put_message)
     executor = SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def spin_until(condition):
+        wait_until(condition, lambda: executor.spin_once(0.05), limit=PATIENCE)
+
     try:
-        with Bag(run.bag) as bag:
-            kept = {
-                topic: kind
-                for topic, kind in bag.types.items()
-                if is_shown(topic, kind) and topic != '/rosout'
-            }
-            played = [(topic, data) for topic, _, _, data in bag.raw(kept)]
+        kept, played = shown_messages(run, without='/rosout')
         publishers = {
             topic: player.create_publisher(message_class(kind), topic, RELIABLE)
             for topic, kind in kept.items()
         }
-        executor.add_node(node)
-
-        def spin_until(condition):
-            wait_until(condition, lambda: executor.spin_once(0.05), limit=PATIENCE)
-
         spin_until(lambda: all(item.get_subscription_count() for item in publishers.values()))
         whole = read_events(run.folder)
-        for topic, data in played:
+        for topic, _, _, data in played:
             publishers[topic].publish(data)
             executor.spin_once(0.0)
-        for kind in ('plan', 'found', 'filter', 'seen'):
-            expected = count(whole.events, kind)
-            spin_until(
-                lambda kind=kind, expected=expected: count(view.hub._events, kind) == expected
-            )
+        kinds = ('plan', 'found', 'filter', 'seen')
+        expected = [count(whole.events, kind) for kind in kinds]
+        spin_until(lambda: [count(view.hub._events, kind) for kind in kinds] == expected)
         assert view.maker.latest == pytest.approx(whole.duration, abs=0.2)
         # It is played again: the page begins again.
-        for topic, data in played[: len(played) // 4]:
+        for topic, _, _, data in played[: len(played) // 4]:
             publishers[topic].publish(data)
         spin_until(lambda: 0.0 < view.maker.latest < 0.5 * whole.duration)
     finally:

@@ -22,6 +22,11 @@ def seconds(stamp: Any) -> float:
     return (int(stamp.sec) * 10**9 + int(stamp.nanosec)) / 1e9
 
 
+def point(item: Any) -> tuple[float, float, float]:
+    """Return the coordinates of a `geometry_msgs/Point`."""
+    return float(item.x), float(item.y), float(item.z)
+
+
 def stamp_of(topic: str, kind: Any, data: bytes) -> int:
     """Return the first stamp of a serialised message, 0 if it has none [ns]."""
     first = next(iter(kind.get_fields_and_field_types()))

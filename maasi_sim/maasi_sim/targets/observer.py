@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from typing import Any
 
 import numpy as np
@@ -9,7 +11,7 @@ from rosbags.typesys.store import Typestore
 
 from maasi_filter.models.pose import Pose
 from maasi_sim.run.run_record import UNAVAILABLE, Observer, RunEnd, rows
-from maasi_sim.run.topics import DECISIONS, FOUND, UPDATE, within
+from maasi_sim.run.topics import DECISIONS, FOUND, UPDATE, point, within
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.targets.tally import Tally, TargetRecord
 
@@ -17,8 +19,8 @@ from maasi_sim.targets.tally import Tally, TargetRecord
 class TargetObserver(Observer):
     """Gathers the data of a report from serialised messages, in the order of arrival.
 
-    Filter updates and found targets are decoded at once, as the end of a run depends on them; the
-    rest is decoded by `record`.
+    Decisions, filter updates and found targets are decoded at once, as the end of a run depends on
+    them; the rest is decoded by `record`.
     """
 
     def __init__(self, name: str, scenario: Scenario, seed: int, types: Typestore) -> None:
@@ -27,11 +29,12 @@ class TargetObserver(Observer):
         self._updates = {within(space, UPDATE): space for space in spaces}
         self._arrays = {within(space, FOUND): space for space in spaces}
         self._planners = {within(space, DECISIONS): space for space in spaces}
-        self._decisions: dict[str, list[bytes]] = {topic: [] for topic in self._planners}
+        # Step, robot and place of each.
+        self._waypoints: list[tuple[int, str, tuple[float, float, float]]] = []
         self._detections: dict[str, list[bytes]] = {
             f'/{name}/detections': [] for name in scenario.names()
         }
-        topics = [*self._updates, *self._arrays, *self._decisions, *self._detections]
+        topics = [*self._updates, *self._arrays, *self._planners, *self._detections]
         super().__init__(name, scenario, seed, types, topics)
         self.update_topics = list(self._updates)
         self.world = scenario.world(seed)
@@ -50,9 +53,13 @@ class TargetObserver(Observer):
     def add(self, topic: str, data: bytes) -> None:
         """See `Observer.add`."""
         super().add(topic, data)
-        if topic in self._decisions:
-            self._decisions[topic].append(data)
+        if topic in self._planners:
             decision = self.decode(data, 'PlanDecision')
+            self._waypoints += [
+                (int(decision.step), item.robot, point(item.waypoint))
+                for item in decision.robots
+                if item.chosen >= 0
+            ]
             self._explored[topic] = float(decision.explored)
             self.explored = max(self._explored.values())
             # Of a planner that is settled.
@@ -129,34 +136,19 @@ class TargetObserver(Observer):
                 if tally.completed is not None and update.step > tally.completed.step:
                     break
                 tally.take(space, update, found)
-        end_time = end.time if tally.completed is None else tally.completed.time
+        end_time, last = end.time, math.inf
+        if tally.completed is not None:
+            end_time, last = tally.completed.time, tally.completed.step
         record = TargetRecord(self.name, self.scenario, self.seed, tally, end_time=end_time)
-        waypoints: dict[str, list[Any]] = {name: [] for name in self.scenario.names()}
-        for messages in self._decisions.values():
-            for data in messages:
-                decision = self.decode(data, 'PlanDecision')
-                if tally.completed is not None and decision.step > tally.completed.step:
-                    break
-                for robot in decision.robots:
-                    if robot.chosen >= 0:
-                        waypoints.setdefault(robot.robot, []).append(_point(robot.waypoint))
-        record.waypoints = {name: rows(points, 3) for name, points in waypoints.items()}
         for name, messages in zip(self.scenario.names(), self._detections.values()):
-            arrays = self._until('DetectionArray', messages, end_time)
-            poses = [_pose(item.pose.pose) for item in arrays if item.batch_id]
-            record.measured_from[name] = [pose for pose in poses if pose is not None]
+            ways = [at for step, who, at in self._waypoints if who == name and step <= last]
+            record.waypoints[name] = rows(ways, 3)
+            record.measured_from[name] = []
+            for item in self._until('DetectionArray', messages, end_time):
+                place, turn = point(item.pose.pose.position), item.pose.pose.orientation
+                # An invalid pose is left out.
+                with contextlib.suppress(ValueError):
+                    pose = Pose(np.array(place), np.array([turn.w, turn.x, turn.y, turn.z]))
+                    record.measured_from[name] += [pose] if item.batch_id else []
         self._complete(record, end)
         return record
-
-
-def _point(point: Any) -> tuple[float, float, float]:
-    return float(point.x), float(point.y), float(point.z)
-
-
-def _pose(message: Any) -> Pose | None:
-    """Return a pose; None if it is invalid."""
-    turn = message.orientation
-    try:
-        return Pose(np.array(_point(message.position)), np.array([turn.w, turn.x, turn.y, turn.z]))
-    except ValueError:
-        return None

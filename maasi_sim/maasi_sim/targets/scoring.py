@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,34 +14,24 @@ from maasi_filter.records import FoundTarget
 from maasi_sim.scenario.schema import Scenario
 
 
-def matching_radius(removal_distance: float, truth: ArrayLike) -> float:
-    """Return the distance within which a found target is true [m].
+def scoring_radius(scenario: Scenario, truth: FloatArray) -> float:
+    """Return the distance within which a found target is true [m]; true positions (n, d) [m].
 
-    Three times T_z, at most half the smallest distance between two targets, so that none can
-    be matched with its neighbour. `removal_distance` is T_z [m], `truth` the true positions [m].
+    The scenario's, or three times T_z, at most half the smallest distance between two targets, so
+    that none can be matched with its neighbour.
     """
-    if not (math.isfinite(removal_distance) and removal_distance > 0.0):
-        raise ValueError(
-            f'removal_distance: got {removal_distance}, allowed are finite numbers above 0'
-        )
-    # Deferred: it is the slowest import of a run.
-    from scipy.spatial.distance import pdist
+    if scenario.scoring.radius is not None:
+        return scenario.scoring.radius
+    radius = 3.0 * scenario.removal_distance()
+    if len(truth) > 1:
+        # Deferred: it is the slowest import of a run.
+        from scipy.spatial.distance import pdist
 
-    positions = np.asarray(truth, dtype=float)
-    radius = 3.0 * removal_distance
-    if len(positions) > 1:
-        nearest = float(pdist(positions).min())
+        nearest = float(pdist(truth).min())
         if nearest == 0.0:
             raise ValueError('truth: got two targets at the same place, allowed are different ones')
         radius = min(radius, 0.5 * nearest)
     return radius
-
-
-def scoring_radius(scenario: Scenario, truth: FloatArray) -> float:
-    """Return the scenario's matching radius, or the one that follows from T_z and the targets."""
-    if scenario.scoring.radius is not None:
-        return scenario.scoring.radius
-    return matching_radius(scenario.removal_distance(), truth)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import Cluster, FoundTarget
 from maasi_planner.team import Decision
+from maasi_sim.run.topics import point
 from maasi_sim.targets.scoring import score
 from maasi_sim.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning
 
@@ -33,11 +34,6 @@ def padded(values: ArrayLike) -> FloatArray:
     whole = np.zeros((3,) * given.ndim)
     whole[tuple(map(slice, given.shape))] = given
     return whole
-
-
-def point(item: Any) -> tuple[float, float, float]:
-    """Return the coordinates of a `geometry_msgs/Point`."""
-    return float(item.x), float(item.y), float(item.z)
 
 
 def significant(value: float) -> float:

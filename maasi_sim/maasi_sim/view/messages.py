@@ -7,7 +7,6 @@ so that recordings of `ros2 bag record -a` and teams in a namespace are read as 
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,17 +17,26 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.records import Cluster
 from maasi_planner.team import Decision, RobotDecision
 from maasi_sim.run.bag import Bag, BagError
-from maasi_sim.run.topics import STEP, seconds
+from maasi_sim.run.topics import point, seconds
 from maasi_sim.targets.tally import found_target
 from maasi_sim.view.event_log import Event, EventLog
-from maasi_sim.view.event_maker import EventMaker, point
+from maasi_sim.view.event_maker import EventMaker
 from maasi_sim.view.scene import empty_scene, scene_of_facts
 
+STEP = 'maasi_msgs/msg/LockstepStep'
 MARKERS = 'visualization_msgs/msg/MarkerArray'
 # Messages between two words on the progress.
 _PROGRESS = 1000
-# Of a candidate, besides its place and length.
-_TERMS = ('control_cost', 'target_refinement', 'exploration', 'objective', 'measurements')
+# Fields of a `RobotDecision`, and of the message of a candidate.
+_SAME = ('control_cost', 'target_refinement', 'exploration', 'objective', 'measurements')
+_COLUMNS = {**dict(zip(_SAME, _SAME)), 'lengths': 'length'}
+# Parts of a scene, by the last part of a topic of markers and of their namespace.
+_PARTS = {
+    ('markers', 'obstacles'): 'obstacles',
+    ('search_area', 'obstacles'): 'blocks',
+    ('search_area', 'objects'): 'objects',
+    ('markers', 'cuboids'): 'cuboids',
+}
 # Levels of rcl_interfaces/msg/Log and of diagnostic_msgs/msg/DiagnosticStatus.
 _WARNING, _ERROR = 30, 40
 _FINE, _STALE = 0, 3
@@ -37,7 +45,7 @@ _DIAGNOSTIC_WORDS = {0: 'well again', 1: 'warning', 2: 'error', 3: 'stale'}
 _REWIND = 10.0
 # By type: the method that takes it, and the last parts that the name may have; none: any.
 TOPICS: dict[str, tuple[str, ...]] = {
-    'maasi_msgs/msg/LockstepStep': ('_take_step',),
+    STEP: ('_take_step',),
     'maasi_msgs/msg/AgentState': ('_take_state',),
     'maasi_msgs/msg/DetectionArray': ('_take_detections',),
     'maasi_msgs/msg/FilterUpdate': ('_take_update',),
@@ -65,19 +73,22 @@ def is_shown(topic: str, type_name: str) -> bool:
 class MessageEvents:
     """Take messages, of `rosbags` or of ROS, and hand their events to a maker.
 
-    `begin` is the time of the first step [s], that of the first state if not given; `on_restart` is
-    called when the time jumps back, as a bag that is played again does: nothing is then kept.
+    The run begins at its first step where it `waits`, and what comes before is taken then; else
+    with the first state. `on_restart` is called when the time jumps back, as a bag that is played
+    again does: nothing is then kept.
     """
 
     def __init__(
         self,
         maker: EventMaker,
-        begin: float | None = None,
+        waits: bool = False,
         on_restart: Callable[[], EventMaker] | None = None,
     ) -> None:
         self.maker = maker
-        self._begin = begin
+        self._waits = waits
         self._on_restart = on_restart
+        self._early: list[tuple[str, str, Any]] = []
+        self._begin: float | None = None
         self._team: set[str] | None = None
         # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
@@ -85,7 +96,13 @@ class MessageEvents:
 
     def take(self, topic: str, type_name: str, message: Any) -> None:
         """Take a message of a topic for which `is_shown` is true."""
+        if self._waits and type_name != STEP:
+            self._early.append((topic, type_name, message))
+            return
+        self._waits = False
         getattr(self, TOPICS[type_name][0])(topic, message)
+        while self._early:
+            self.take(*self._early.pop(0))
 
     def _now(self, topic: str, message: Any) -> float:
         """Return the time of a message with the time of the run; begin again if it jumps back.
@@ -167,17 +184,15 @@ class MessageEvents:
     def _take_plan(self, topic: str, message: Any) -> None:
         robots = {}
         for item in message.robots:
-            rows = item.candidates
+            columns = {
+                name: np.array([getattr(row, field) for row in item.candidates])
+                for name, field in _COLUMNS.items()
+            }
+            places = np.array([point(row.position) for row in item.candidates]).reshape(-1, 3)
+            # Planned ways are messages of their own.
+            way, waypoint = np.zeros((0, 3)), np.array(point(item.waypoint))
             robots[item.robot] = RobotDecision(
-                int(item.chosen),
-                np.array(point(item.waypoint)),
-                # Planned ways are messages of their own.
-                positions=np.zeros((0, 3)),
-                yaws=np.zeros(0),
-                candidates=np.array([point(row.position) for row in rows]).reshape(-1, 3),
-                **{name: np.array([getattr(row, name) for row in rows]) for name in _TERMS},
-                lengths=np.array([row.length for row in rows]),
-                reason='',
+                int(item.chosen), waypoint, way, way[:, 0], places, **columns, reason=''
             )
         indices = {item.robot: int(item.decision) for item in message.robots}
         decision = Decision(message.step, robots, message.objective, reason=message.reason)
@@ -225,16 +240,13 @@ class MessageEvents:
         """Take obstacles and buildings of a run without scenario."""
         parts: dict[str, list[Any]] = {}
         for item in message.markers:
-            place, size = np.array(point(item.pose.position)), item.scale
-            box = np.stack([place, place], axis=1) + np.outer([size.x, size.y, size.z], [-0.5, 0.5])
-            if topic.endswith('ground_truth/markers') and item.ns == 'obstacles':
-                circle = [*place[:2].tolist(), 0.5 * float(size.x)]
-                parts.setdefault('obstacles', []).append(circle)
-            elif topic.endswith('search_area') and item.ns in ('objects', 'obstacles'):
-                part = 'objects' if item.ns == 'objects' else 'blocks'
+            part = _PARTS.get((topic.rpartition('/')[2], item.ns.rpartition('/')[2]), '')
+            place, size = point(item.pose.position), np.array(point(item.scale))
+            if part == 'obstacles':
+                parts.setdefault(part, []).append([*place[:2], 0.5 * float(size[0])])
+            elif part:
+                box = np.stack([place - 0.5 * size, place + 0.5 * size], axis=1)
                 parts.setdefault(part, []).append(box.tolist())
-            elif item.ns.endswith('/cuboids'):
-                parts.setdefault('cuboids', []).append(box.tolist())
         # What a scenario says is better.
         news = {part: items for part, items in parts.items() if part not in self.maker.scene}
         if news:
@@ -282,7 +294,9 @@ def read_events(path: Path, progress: Callable[[float], None] | None = None) -> 
             scene = empty_scene(bag.path.name)
         events: list[Event] = []
         maker = EventMaker(scene, events.append)
-        takes = MessageEvents(maker, _begin(bag, shown))
+        takes = MessageEvents(
+            maker, waits=STEP in {shown[topic] for topic in shown if bag.counts[topic]}
+        )
         # Markers hold what a scenario says better.
         known = 'bounds' in scene
         topics = [topic for topic, kind in shown.items() if not (known and kind == MARKERS)]
@@ -294,13 +308,3 @@ def read_events(path: Path, progress: Callable[[float], None] | None = None) -> 
         maker.end()
     # Parts that became known later belong to the scene of a replay.
     return EventLog(maker.scene, [event for event in events if event[1] != 'scene'])
-
-
-def _begin(bag: Bag, shown: dict[str, str]) -> float | None:
-    """Return the time of the first step, where the recording has steps [s]."""
-    steps = [topic for topic in shown if topic.endswith(STEP)]
-    for _, _, _, data in bag.raw(steps):
-        # Header of the serialisation, step, stamp.
-        sec, nanosec = struct.unpack_from('<iI', data, 12)
-        return float(sec) + 1e-9 * float(nanosec)
-    return None
