@@ -10,23 +10,17 @@ from maasi_drivers.agent.robot_topics import BatteryTopic, charge_of
 
 
 @pytest.mark.parametrize(
-    ('voltage', 'charge'), [(12.6, 1.0), (12.3, 1.0), (11.4, 0.5), (10.527, 0.015), (10.5, 0.0)]
-)
-def test_a_turtlebot3_reports_per_cent_between_two_voltages(voltage, charge):
-    """As `update_battery_status` of OpenCR's turtlebot3.cpp; turtlebot3_node passes it on."""
-    percent = (voltage - 3.5 * 3) / (4.1 * 3 - 3.5 * 3) * 100.0
-    assert charge_of(0.01 * int(100.0 * percent + 1e-6), 'percent') == pytest.approx(charge)
-
-
-@pytest.mark.parametrize(
-    ('reading', 'charge'),
+    ('unit', 'readings'),
     [
-        *[(0.0, 0.0), (0.9, 0.9), (1.0, 1.0), (1.1, 1.0)],
-        *[(value, -1.0) for value in (math.nan, math.inf, -math.inf, -0.1, 1e308, 55.0)],
+        # Of 12.6, 12.3, 11.4, 10.527 and 10.5 V, as `update_battery_status` of OpenCR's
+        # turtlebot3.cpp reports them; turtlebot3_node passes it on.
+        ('percent', {116.66: 1.0, 99.99: 0.9999, 50.0: 0.5, 1.5: 0.015, 0.0: 0.0}),
+        ('fraction', {0.0: 0.0, 0.9: 0.9, 1.0: 1.0, 1.1: 1.0}),
+        ('fraction', dict.fromkeys((math.nan, math.inf, -math.inf, -0.1, 1e308, 55.0), -1.0)),
     ],
 )
-def test_a_fraction_is_a_fraction_and_what_is_no_charge_is_unknown(reading, charge):
-    assert charge_of(reading, 'fraction') == charge
+def test_a_charge_is_read_in_its_unit_and_what_is_none_is_unknown(unit, readings):
+    assert [charge_of(reading, unit) for reading in readings] == pytest.approx([*readings.values()])
 
 
 @pytest.mark.parametrize('order', [(0, 1, 2), (2, 0, 1), (1, 2, 0)])

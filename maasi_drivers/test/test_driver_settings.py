@@ -20,17 +20,22 @@ distortion_coefficients: {rows: 1, cols: 5, data: [-0.2, 0.05, 0.001, -0.002, 0.
 """
 
 
-def test_camera_info_replaces_the_intrinsics_and_keeps_the_rest():
+def test_a_calibration_replaces_the_intrinsics_and_keeps_the_rest(tmp_path):
     settings = CameraSettings(marker_diameter=0.05)
     # The centre of the image is the optical centre unless told otherwise.
     matrix = Camera.from_settings(settings).matrix
     assert_allclose(matrix, [[260.0, 0.0, 79.5], [0.0, 260.0, 59.5], [0.0, 0.0, 1.0]])
-    calibrated = settings.with_calibration(160, 120, K, D)
-    view = Camera.from_settings(calibrated)
-    assert_allclose(view.matrix, [[250, 0, 81], [0, 251, 62], [0, 0, 1]])
-    assert_allclose(view.distortion, D)
-    assert calibrated.marker_diameter == 0.05
-    assert calibrated.mount == settings.mount
+    path = tmp_path / 'mambo.yaml'
+    path.write_text(CALIBRATION)
+    for calibrated in (
+        settings.with_calibration(160, 120, K, D),
+        load_calibration(path, settings),
+    ):
+        view = Camera.from_settings(calibrated)
+        assert_allclose(view.matrix, [[250, 0, 81], [0, 251, 62], [0, 0, 1]])
+        assert_allclose(view.distortion, D)
+        assert calibrated.marker_diameter == 0.05
+        assert calibrated.mount == settings.mount
 
 
 @pytest.mark.parametrize(
@@ -55,24 +60,11 @@ def test_an_unfit_camera_info_is_refused(changes, message):
         CameraSettings().with_calibration(**values)
 
 
-def test_a_calibration_file_is_read(tmp_path):
-    path = tmp_path / 'mambo.yaml'
-    path.write_text(CALIBRATION)
-    settings = load_calibration(path, CameraSettings())
-    assert settings.focal_length == [250.0, 251.0]
-    assert settings.principal_point == [81.0, 62.0]
-    assert settings.distortion == D
-
-
 @pytest.mark.parametrize(
     'text',
     [
-        '',
-        'image_width: 160',
-        '[1, 2]',
-        'a: [',
-        CALIBRATION.replace('plumb_bob', 'fisheye'),
-        CALIBRATION.replace('160', 'wide'),
+        *('', 'image_width: 160', '[1, 2]', 'a: ['),
+        *(CALIBRATION.replace(*pair) for pair in (('plumb_bob', 'fisheye'), ('160', 'wide'))),
     ],
 )
 def test_a_wrong_calibration_file_is_named(tmp_path, text):
@@ -85,16 +77,11 @@ def test_a_wrong_calibration_file_is_named(tmp_path, text):
 @pytest.mark.parametrize(
     'values',
     [
-        {'width': 0},
         {'focal_length': [260.0]},
-        {'focal_length': [0.0, 260.0]},
-        {'focal_length': [float('nan'), 260.0]},
         {'distortion': [0.1, 0.2, 0.3]},
-        {'rate': 0.0},
         {'mount': {'rpy': [0.0, 0.0]}},
         {'focal': 3},
         {'segmentation': {'rule': 'magic'}},
-        {'segmentation': {'threshold': -1}},
         {'segmentation': {'threshold': float('nan')}},
         {'segmentation': {'peak_saturation': 0.1}},
         {'segmentation': {'maximum_diameter': 0.5}},

@@ -21,42 +21,19 @@ def goal(x, step=0, number=1, tolerance=0.0):
     return Goal(number, step, np.array([x, 0.0, 1.0]), tolerance)
 
 
-def test_a_ground_robot_without_a_goal_stands_still():
+def test_a_ground_robot_reaches_its_goal_in_the_step_in_which_it_is_there():
     follower = follower_of()
-    command, reached = follower.update(at(0.3))
-    assert_array_equal(command, np.zeros(4))
-    assert reached is None and follower.status == GoalStatus.IDLE
-
-
-def test_a_flying_robot_without_a_goal_goes_back_to_where_it_was_first():
-    follower = follower_of('constant_speed')
-    follower.update(at(0.3))
-    command, _ = follower.update(at(0.4))
-    assert command[0] < -0.01
-
-
-def test_a_goal_is_reached_in_the_step_in_which_the_robot_is_there():
-    follower = follower_of()
+    assert follower.update(at(0.3))[0].tolist() == [0.0] * 4 and follower.status == GoalStatus.IDLE
     target = goal(1.0)
     assert follower.take(target) is None
     command, reached = follower.update(at(0.0))
     assert command[0] > 0.1 and reached is None and follower.status == GoalStatus.MOVING
     command, reached = follower.update(at(0.96))
-    assert reached is target and follower.status == GoalStatus.REACHED
     assert_array_equal(command, np.zeros(4))
-    assert follower.current is None
+    assert reached is target and follower.current is None
     # Pushed away, it does not start again.
     assert follower.update(at(0.5))[1] is None
     assert follower.status == GoalStatus.REACHED
-
-
-def test_a_flying_robot_holds_the_waypoint_that_it_has_reached():
-    follower = follower_of('constant_speed')
-    follower.take(goal(1.0))
-    follower.update(at(0.97))
-    command, _ = follower.update(at(0.8))
-    assert follower.status == GoalStatus.REACHED
-    assert command[0] > 0.05
 
 
 @pytest.mark.parametrize(
@@ -71,50 +48,39 @@ def test_a_goal_may_bring_its_own_tolerance(tolerance, place, status):
     assert follower.status.name == status
 
 
-def test_a_goal_of_a_step_acts_from_the_next_one_on():
+def test_a_goal_of_a_step_acts_from_the_next_one_on_unless_it_is_replaced_or_ended_before():
     follower = follower_of()
-    follower.take(goal(1.0, step=7))
+    first, second = goal(1.0, step=7), goal(-1.0, step=8, number=2)
+    follower.take(first)
     assert_array_equal(follower.update(at(0.0), 7)[0], np.zeros(4))
     assert follower.status == GoalStatus.IDLE
     assert follower.update(at(0.0), 8)[0][0] > 0.1
     assert follower.status == GoalStatus.MOVING
-
-
-def test_a_new_goal_replaces_the_one_before():
-    follower = follower_of()
-    first, second = goal(1.0), goal(-1.0, number=2)
-    follower.take(first)
-    follower.update(at(0.0))
     assert follower.take(second) is first
     assert (first.status, first.reason) == (GoalStatus.ABORTED, 'replaced')
-    follower.update(at(0.0))
-    assert follower.goal is second and follower.status == GoalStatus.MOVING
-
-
-def test_a_goal_that_did_not_act_yet_can_be_ended():
-    follower = follower_of()
-    target = goal(1.0, step=5)
-    follower.take(target)
-    assert follower.end(GoalStatus.CANCELED, 'cancelled') is target
+    assert follower.end(GoalStatus.CANCELED, 'cancelled') is second
     assert follower.end(GoalStatus.CANCELED, 'again') is None
-    assert_array_equal(follower.update(at(0.0), 6)[0], np.zeros(4))
-    assert follower.status == GoalStatus.CANCELED and target.reason == 'cancelled'
+    assert_array_equal(follower.update(at(0.0), 9)[0], np.zeros(4))
+    assert follower.status == GoalStatus.CANCELED and second.reason == 'cancelled'
 
 
-def test_a_flying_robot_holds_where_its_goal_is_cancelled_or_where_it_is_told():
+def test_a_flying_robot_holds_where_it_was_where_it_arrived_or_where_its_goal_is_cancelled():
     follower = follower_of('constant_speed')
     assert follower.target is None
-    follower.update(at(0.0))
+    for place, held in ((0.0, 0.0), (0.4, 0.0)):
+        command = follower.update(at(place))[0]
+        assert (command[0] < -0.01) == (place > held)
     follower.take(goal(1.0))
     follower.update(at(0.2))
     assert_array_equal(follower.target, [1.0, 0.0, 1.0])
     follower.end(GoalStatus.CANCELED, 'cancelled')
     assert_allclose(follower.update(at(0.4))[0], np.zeros(4), atol=1e-12)
-    assert_array_equal(follower.target, [0.4, 0.0, 1.0])
     assert follower.update(at(0.5))[0][0] < 0.0
-    # `let_go` lets a robot that has reached its waypoint hold that, `stay` does not.
+    assert_array_equal(follower.target, [0.4, 0.0, 1.0])
     follower.take(goal(3.0))
-    follower.update(at(3.0))
+    follower.update(at(2.97))
+    assert follower.status == GoalStatus.REACHED and follower.update(at(2.8))[0][0] > 0.05
+    # `let_go` lets a robot that has reached its waypoint hold that, `stay` does not.
     for tell, held in ((follower.let_go, 3.0), (follower.stay, 2.5)):
         tell()
         follower.update(at(2.5))

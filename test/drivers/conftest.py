@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+from contextlib import ExitStack, closing
 from types import SimpleNamespace
 
 import pytest
@@ -31,6 +32,13 @@ def set_back(monkeypatch):
 
 
 @pytest.fixture
+def flights():
+    """Return a function that takes what is to be closed at the end."""
+    with ExitStack() as stack:
+        yield lambda flight: stack.enter_context(closing(flight))
+
+
+@pytest.fixture
 def executor(context):
     executor = SingleThreadedExecutor(context=context)
     yield executor
@@ -40,38 +48,36 @@ def executor(context):
 @pytest.fixture
 def start_node(context, executor):
     """Return a function that has a node take part until the end of the test."""
-    started = []
+    with ExitStack() as stack:
 
-    def start(make, **options):
-        started.append(make(context=context, namespace='/rover', **options))
-        executor.add_node(started[-1])
-        return started[-1]
+        def start(make, **options):
+            node = make(context=context, namespace='/rover', **options)
+            executor.add_node(node)
+            stack.callback(node.destroy_node)
+            if hasattr(node, 'halt'):
+                stack.callback(node.halt)
+            return node
 
-    yield start
-    for node in started:
-        if hasattr(node, 'halt'):
-            node.halt()
-        node.destroy_node()
+        yield start
 
 
 @pytest.fixture
 def make_team(context, executor):
     """Return a function that makes a team around a robot with these settings."""
-    made = []
+    with ExitStack() as stack:
 
-    def make(settings, **options):
-        made.append(Team(context, settings, executor, **options))
-        return made[-1]
+        def make(settings=TURTLEBOT, **options):
+            team = Team(context, settings, executor, **options)
+            stack.callback(team.destroy_node)
+            return team
 
-    yield make
-    for team in made:
-        team.destroy_node()
+        yield make
 
 
 @pytest.fixture
 def team(make_team):
     """Return the team around a TurtleBot."""
-    return make_team(TURTLEBOT)
+    return make_team()
 
 
 def begin(node):
@@ -112,32 +118,16 @@ def play(start_node, make_team):
 @pytest.fixture
 def process(context, tmp_path):
     """Return a function that starts a driver as a process of its own."""
-    running = []
+    with ExitStack() as stack:
 
-    def start(environment=None, program=('turtlebot_driver',), settings=TURTLEBOT, **changes):
-        file = tmp_path / 'parameters.yaml'
-        flat = flatten(DriverSettings.model_validate(settings | changes))
-        file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-        command = [*program, '--ros-args', '--remap', '__ns:=/rover', '--params-file', str(file)]
-        running.append(subprocess.Popen(command, env=os.environ | (environment or {})))
-        return running[-1]
+        def start(environment=None, program=('turtlebot_driver',), settings=TURTLEBOT, **changes):
+            file = tmp_path / 'parameters.yaml'
+            flat = flatten(DriverSettings.model_validate(settings | changes))
+            file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
+            arguments = ['--ros-args', '--remap', '__ns:=/rover', '--params-file', str(file)]
+            made = subprocess.Popen([*program, *arguments], env=os.environ | (environment or {}))
+            stack.callback(made.wait)
+            stack.callback(made.kill)
+            return made
 
-    yield start
-    for item in running:
-        if item.poll() is None:
-            item.kill()
-        item.wait()
-
-
-@pytest.fixture
-def flights():
-    """Return a function that takes what is to be closed at the end."""
-    taken = []
-
-    def take(flight):
-        taken.append(flight)
-        return flight
-
-    yield take
-    for flight in taken:
-        flight.close()
+        yield start

@@ -33,23 +33,22 @@ def execute(handle):
     pose = handle.request.pose
     present[:] = [handle]
     say('goal', pose)
-    x = pose.pose.position.x
+    x, result = pose.pose.position.x, NavigateToPose.Result()
     while 0.5 <= x < 1.0 and not handle.is_cancel_requested and present[0] is handle:
         handle.publish_feedback(NavigateToPose.Feedback())
         time.sleep(0.02)
     if handle.is_cancel_requested:
         handle.canceled()
         say('cancelled', pose)
-        return NavigateToPose.Result()
-    if present[0] is not handle:
+    elif present[0] is not handle:
         handle.abort()
         say('preempted', pose)
-        return NavigateToPose.Result()
-    if x < 0.5:
+    elif x < 0.5:
         handle.succeed()
-        return NavigateToPose.Result()
-    handle.abort()
-    return NavigateToPose.Result(error_code=208)
+    else:
+        handle.abort()
+        result.error_code = 208
+    return result
 
 
 def judge(goal):

@@ -34,10 +34,9 @@ from maasi_planner.motion import RobotState, make_motion
 
 STEP = 0.05
 NANOSECONDS = round(STEP * 1e9)
-BOUNDS = [[-0.3, 2.4], [-0.3, 2.4]]
 TURTLEBOT = {
     'step': STEP,
-    'environment': {'bounds': BOUNDS},
+    'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
     'start': [0.4, 0.3, 0.0],
     'yaw': 0.7,
     'radius': 0.11,
@@ -74,45 +73,40 @@ KINDS = {
 
 
 class Team(Node):
-    """The robot, its camera, and whoever the driver talks to."""
+    """The robot, its camera, and whoever the driver talks to; `deaf`: it hears no commands."""
 
     def __init__(self, context, settings, executor, wants=None, deaf=False):
         super().__init__('robot', context=context, namespace='/rover')
-        self.settings = DriverSettings.model_validate(settings)
-        self.start = Pose.from_yaw(self.settings.start, self.settings.yaw)
-        self.motion = make_motion(self.settings.motion, radius=self.settings.radius)
+        self.settings = settings = DriverSettings.model_validate(settings)
+        self.start = Pose.from_yaw(settings.start, settings.yaw)
+        self.motion = make_motion(settings.motion, radius=settings.radius)
         self.body = self.motion.body(RobotState(self.start))
         self.executor_used = executor
         executor.add_node(self)
-        self.step = -1
-        self.states, self.commands, self.detections = [], [], []
-        self.ready, self.done = [], []
-        lockstep = self.settings.lockstep
-        kind = wants or (Twist if self.settings.command_type == 'twist' else TwistStamped)
-        # Whether commands do not reach it.
+        self.step, self.batch = -1, 0
         self.deaf = deaf
         self.odometry_frame = 'odom'
+        self.states, self.commands, self.detections = [], [], []
+        self.ready, self.done = [], []
+        kind = wants or (Twist if settings.command_type == 'twist' else TwistStamped)
         self.create_subscription(AgentState, 'state', self.states.append, RELIABLE)
         self.create_subscription(kind, 'cmd_vel', self.commands.append, RELIABLE)
         self.create_subscription(DetectionArray, 'detections', self.detections.append, RELIABLE)
         self.create_subscription(LockstepDone, '/lockstep/ready', self.ready.append, LATCHED_ALL)
+        self.create_subscription(LockstepDone, '/lockstep/done', self.done.append, RELIABLE)
         self.odometry = self.create_publisher(Odometry, 'odom', RELIABLE)
         self.battery = self.create_publisher(BatteryState, 'battery_state', RELIABLE)
         self.batches = self.create_publisher(MeasurementBatch, '/measurement_batch', RELIABLE)
         self.images = self.create_publisher(Image, 'camera/image_raw', RELIABLE)
         self.calibrations = self.create_publisher(CameraInfo, 'camera/camera_info', RELIABLE)
         self.ranges = self.create_publisher(RangeArray, 'ranges', RELIABLE)
-        self.used = [self.batches, *([] if deaf else [self.battery])]
-        if not deaf and self.settings.poses == 'odometry':
-            self.used.append(self.odometry)
-        topic = self.settings.image_source == 'topic'
-        self.used += [self.images] * topic if self.settings.camera else [self.ranges]
-        if lockstep:
-            self.steps = self.create_publisher(LockstepStep, '/lockstep/step', RELIABLE)
-            self.create_subscription(LockstepDone, '/lockstep/done', self.done.append, RELIABLE)
-            self.used.append(self.steps)
+        self.steps = self.create_publisher(LockstepStep, '/lockstep/step', RELIABLE)
+        # What a driver with these settings listens to.
+        self.used = [self.batches, *[self.battery] * (not deaf), *[self.steps] * settings.lockstep]
+        self.used += [self.odometry] * (not deaf and settings.poses == 'odometry')
+        topic = settings.image_source == 'topic'
+        self.used += [self.images] * topic if settings.camera else [self.ranges]
         self.go_to = ActionClient(self, GoToWaypoint, 'go_to')
-        self.batch = 0
 
     def until(self, condition, *what):
         wait_until(condition, lambda: self.executor_used.spin_once(timeout_sec=0.02), *what)
@@ -142,35 +136,48 @@ class Team(Node):
         message.header.frame_id = self.odometry_frame
         message.header.stamp = stamp_to_ros(self.step * NANOSECONDS if stamp is None else stamp)
         message.pose.pose = pose_to_ros(compose(inverse(self.start), state.pose))
-        turn = state.pose.rotation().T
         linear, angular = message.twist.twist.linear, message.twist.twist.angular
-        linear.x, linear.y, linear.z = (turn @ state.velocity).tolist()
+        linear.x, linear.y, linear.z = (state.pose.rotation().T @ state.velocity).tolist()
         angular.x, angular.y, angular.z = state.angular_velocity.tolist()
         return message
+
+    def say(self):
+        """Publish the odometry of the next step, and whatever comes of it."""
+        self.step += 1
+        self.odometry.publish(self.odometry_message())
 
     def move(self, steps=1):
         """Go on in time: odometry, and the command for it."""
         for _ in range(steps):
-            self.step += 1
             known = len(self.commands)
-            self.odometry.publish(self.odometry_message())
-            self.until(
-                lambda known=known: (
-                    len(self.commands) > known and self.states[-1:] and self.state.step == self.step
-                ),
-                'no command',
-            )
+            if self.settings.lockstep:
+                self.begin_step(self.step + 1)
+                self.until_done(len(self.states) + 1)
+            else:
+                self.say()
+                self.until(
+                    lambda known=known: (
+                        len(self.commands) > known
+                        and self.states[-1:]
+                        and self.state.step == self.step
+                    ),
+                    'no command',
+                )
             self.body.step(self.command, STEP)
+
+    def begin_step(self, k, robots=('rover',), first='odom'):
+        """Begin a step in lockstep; the odometry comes before or after it."""
+        self.step = k
+        odometry, step = self.odometry_message(), stamp_to_ros(k * NANOSECONDS)
+        if first == 'odom' and 'rover' in robots:
+            self.odometry.publish(odometry)
+        self.steps.publish(LockstepStep(step=k, stamp=step, robots=robots))
+        if first != 'odom':
+            self.odometry.publish(odometry)
 
     def awaken(self):
         """Send odometry until the driver hears it: whether it does is not known from here."""
-
-        def heard():
-            self.step += 1
-            self.odometry.publish(self.odometry_message())
-            return self.states and self.commands
-
-        self.until(heard, 'no driver')
+        self.until(lambda: self.say() or (self.states and self.commands), 'no driver')
         self.until(lambda: self.state.step == self.step, 'no state')
 
     @property
@@ -181,6 +188,11 @@ class Team(Node):
     def command(self):
         return numbers(self.commands[-1])
 
+    @property
+    def place(self):
+        """Where the robot is [m, map]."""
+        return self.body.robot_state().pose.position
+
     # ---- what the team says ------------------------------------------------------------------
 
     def goal(self, position, number=1, frame='map', tolerance=0.0, step=0):
@@ -190,9 +202,10 @@ class Team(Node):
         point.x, point.y, point.z = (float(value) for value in position)
         return goal
 
-    def send(self, *arguments, **options):
+    def send(self, *arguments, live=lambda: None, **options):
+        """Send a goal, and return its handle; `live` is called meanwhile."""
         future = self.go_to.send_goal_async(self.goal(*arguments, **options))
-        self.until(future.done, 'no answer to the goal')
+        self.until(lambda: live() or future.done(), 'no answer to the goal')
         return future.result()
 
     def send_accepted(self, *arguments, **options):
@@ -200,16 +213,24 @@ class Team(Node):
         assert handle.accepted
         return handle, handle.get_result_async()
 
-    def refused(self, *arguments, **options):
-        """Send a goal that is aborted at once; return the reason that its client reads."""
-        _, result = self.send_accepted(*arguments, **options)
-        self.until(result.done, 'the goal is not refused')
-        assert result.result().status == GoalStatus.STATUS_ABORTED
-        assert result.result().result.reason
-        return result.result().result.reason
+    def ended(self, result, live=lambda: None):
+        """Wait for the end of a goal; return its status and reason."""
+        self.until(lambda: live() or result.done(), 'the goal does not end')
+        return result.result().status, result.result().result.reason
 
-    def takes(self, *arguments, live=lambda: None):
-        """Return whether the robot sets out for a goal."""
+    def aborted(self, result, live=lambda: None):
+        """Wait until a goal is aborted; return the reason that its client reads."""
+        status, reason = self.ended(result, live)
+        assert status == GoalStatus.STATUS_ABORTED and reason
+        return reason
+
+    def refused(self, *arguments, **options):
+        """Send a goal that is aborted at once; return the reason."""
+        return self.aborted(self.send_accepted(*arguments, **options)[1])
+
+    def takes(self, *arguments, live=None):
+        """Return whether the robot sets out for a goal; it moves on meanwhile."""
+        live = live or ((lambda: None) if self.deaf else self.move)
         _, result = self.send_accepted(*arguments)
         self.until(
             lambda: live() or result.done() or self.state.goal_status == AgentState.MOVING,
@@ -262,20 +283,9 @@ def image_message(image, stamp=0):
     height, width, _ = image.shape
     message = Image(height=height, width=width, encoding='rgb8', step=3 * width)
     message.data = image.tobytes()
-    message.header.stamp = stamp_to_ros(stamp)
-    return message
+    return stamped(message, stamp)
 
 
 def stamped(message, stamp):
     message.header.stamp = stamp_to_ros(stamp)
     return message
-
-
-def lockstep_step(team, k, robots=('rover',), first='odom'):
-    team.step = k
-    message = LockstepStep(step=k, stamp=stamp_to_ros(k * NANOSECONDS), robots=robots)
-    if first == 'odom' and 'rover' in robots:
-        team.odometry.publish(team.odometry_message())
-    team.steps.publish(message)
-    if first != 'odom':
-        team.odometry.publish(team.odometry_message())

@@ -8,25 +8,15 @@ import pytest
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_allclose, assert_array_equal
 from rclpy.node import Node
-from robot_team import (
-    NANOSECONDS,
-    STEP,
-    image_message,
-    lockstep_step,
-    numbers,
-    rendered,
-    stamped,
-)
+from robot_team import NANOSECONDS, image_message, rendered, stamped
 from sensor_msgs.msg import CameraInfo
 
 from maasi_filter.ros.conversions import pose_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import (
     AgentState,
-    BatchMember,
     DetectionArray,
     LockstepStep,
-    MeasurementBatch,
     RangeArray,
     RangeMeasurement,
 )
@@ -38,53 +28,36 @@ from maasi_msgs.msg import (
 @pytest.mark.parametrize('lockstep', [False, True])
 def test_waypoints_are_followed_without_a_stop_and_the_last_one_is_held(play, kind, lockstep):
     _, team = play(kind, lockstep=lockstep)
-    go = team.move if not lockstep else partial(_lockstep_move, team)
     size = 5.0 if kind == 'ranging' else 1.0
     first = team.start.position + size * np.array([0.4, 0.34, 0.0])
     second = first + size * np.array([0.4, 0.2, 0.0])
-    go()
+    team.move()
     assert team.state.goal_status == AgentState.IDLE and team.state.goal_id == 0
     _, replaced = team.send_accepted(first, number=1, step=team.step)
-    while np.linalg.norm(team.body.robot_state().pose.position - first) > 0.2 * size:
-        go()
-    commands = len(team.commands)
-    slowest = np.linalg.norm(team.body.robot_state().velocity)
+    while np.linalg.norm(team.place - first) > 0.2 * size:
+        team.move()
     _, result = team.send_accepted(second, number=2, step=team.step)
     for _ in range(20):
-        go()
-        slowest = min(slowest, np.linalg.norm(team.body.robot_state().velocity))
+        # Driven and flown on: the controller slows down near a waypoint.
+        assert np.linalg.norm(team.body.robot_state().velocity) > 0.09
+        team.move()
+        assert np.linalg.norm(team.command[:3]) > 0.09
     assert team.state.goal_id == 2 and team.state.goal_status == AgentState.MOVING
-    sent = np.array([numbers(item) for item in team.commands[commands:]])
-    # Driven and flown on at the speed at which it was: the controller slows down near a waypoint.
-    assert np.linalg.norm(sent[:, :3], axis=1).min() > 0.09
-    assert slowest > 0.09
-    team.until(replaced.done)
-    assert replaced.result().status == GoalStatus.STATUS_ABORTED
-    assert replaced.result().result.reason == 'replaced'
+    assert team.aborted(replaced) == 'replaced'
     assert not result.done()
     while team.state.goal_status == AgentState.MOVING:
-        go()
+        team.move()
     assert team.state.goal_status == AgentState.REACHED
     place = pose_from_ros(team.state.pose.pose).position
     assert np.linalg.norm(place - second) <= team.settings.motion.tolerance
-    team.until(result.done, 'no result')
-    assert result.result().status == GoalStatus.STATUS_SUCCEEDED
-    outcome = result.result().result
-    assert outcome.reached and not outcome.reason
-    assert_allclose(pose_from_ros(outcome.pose).position, place, atol=1e-12)
+    assert team.ended(result) == (GoalStatus.STATUS_SUCCEEDED, '')
+    assert result.result().result.reached
+    assert_allclose(pose_from_ros(result.result().result.pose).position, place, atol=1e-12)
     # Nobody says anything more: it stays.
-    for _ in range(100):
-        go()
+    team.move(100)
     assert team.state.goal_status == AgentState.REACHED
-    assert np.linalg.norm(team.body.robot_state().pose.position - second) < 0.1
+    assert np.linalg.norm(team.place - second) < 0.1
     assert np.linalg.norm(team.body.robot_state().velocity) < 0.02
-
-
-def _lockstep_move(team):
-    steps = len(team.states) + 1
-    lockstep_step(team, team.step + 1)
-    team.until_done(steps)
-    team.body.step(team.command, STEP)
 
 
 def test_the_state_is_the_odometry_placed_in_the_map(play):
@@ -92,38 +65,36 @@ def test_the_state_is_the_odometry_placed_in_the_map(play):
     team.send_accepted([1.0, 1.0, 0.0])
     team.move(30)
     before = team.body.robot_state()
-    message = team.odometry_message(30 * NANOSECONDS)
-    message.pose.covariance[0] = 0.04
     team.step = 30
+    message = team.odometry_message()
+    message.pose.covariance[0] = 0.04
     team.odometry.publish(message)
     team.until(lambda: team.state.step == 30 and len(team.commands) == 31)
     state = team.state
     assert state.robot == 'rover' and state.header.frame_id == 'map'
-    assert state.header.stamp == stamp_to_ros(30 * NANOSECONDS)
-    pose = pose_from_ros(state.pose.pose)
+    assert state.header.stamp == stamp_to_ros(30 * NANOSECONDS) == team.commands[-1].header.stamp
+    pose, linear = pose_from_ros(state.pose.pose), state.twist.linear
     assert_allclose(pose.position, before.pose.position, atol=1e-9)
     assert_allclose(pose.yaw, before.pose.yaw, atol=1e-9)
-    linear = state.twist.linear
     assert_allclose([linear.x, linear.y, linear.z], before.velocity, atol=1e-9)
     turn = team.start.rotation()[:2, :2]
     expected = turn @ np.diag([0.04, 0.0]) @ turn.T
     assert_allclose(state.pose.covariance.reshape(6, 6)[:2, :2], expected, atol=1e-12)
-    assert team.commands[-1].header.stamp == state.header.stamp
 
 
 @pytest.mark.parametrize('kind', ['turtlebot', 'ranging'])
 def test_a_cancelled_goal_stops_the_robot(play, kind):
     _, team = play(kind)
+    assert 'no odometry yet' in team.refused(team.start.position)
     team.move()
     handle, result = team.send_accepted(team.start.position + np.array([1.0, 0.0, 0.0]))
     team.move(5)
     assert np.any(team.command != 0.0)
     known = len(team.commands)
     cancelled = handle.cancel_goal_async()
-    team.until(lambda: result.done() and cancelled.done())
+    assert team.ended(result)[0] == GoalStatus.STATUS_CANCELED
+    team.until(lambda: cancelled.done() and len(team.commands) > known)
     assert len(cancelled.result().goals_canceling) == 1
-    assert result.result().status == GoalStatus.STATUS_CANCELED
-    team.until(lambda: len(team.commands) > known)
     assert_array_equal(team.command, np.zeros(4))
     team.move()
     assert team.state.goal_status == AgentState.CANCELED
@@ -148,7 +119,7 @@ def test_a_goal_that_makes_no_sense_is_refused(play, capfd):
     team.move()
     assert team.state.goal_status == AgentState.IDLE
     # On the border, within the robot's radius, is allowed.
-    assert team.takes([2.5, 0.5, 0.0], live=team.move)
+    assert team.takes([2.5, 0.5, 0.0])
 
 
 # ---- odometry that is bad, or of another time ------------------------------------------------
@@ -173,12 +144,9 @@ def test_bad_odometry_is_counted_and_nothing_else(play):
         *path, name = field.split('.')
         setattr(reduce(getattr, path, bad), name, value)
         team.odometry.publish(bad)
-    dropped = {'odometry': 6, 'bad stamp': 2, 'odometry stamp': 2}
+    team.ask(10**15)
+    dropped = {'odometry': 6, 'bad stamp': 2, 'odometry stamp': 2, 'batch': 1}
     team.until(lambda: all(driver.dropped[reason] == n for reason, n in dropped.items()))
-    batch = MeasurementBatch(id=7, members=[BatchMember(robot='rover')])
-    batch.stamp.sec = 10**6
-    team.batches.publish(batch)
-    team.until(lambda: driver.dropped['batch'] == 1)
     for allowed in ('odom', 'rover/odom', '/rover/odom', ''):
         team.odometry_frame = allowed
         team.move()
@@ -194,14 +162,12 @@ def test_a_jump_of_the_stamps_begins_anew(play):
     team.step = 2
     team.move()
     assert team.state.step == 3
-    team.until(result.done)
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert 'back' in result.result().result.reason
+    assert 'back' in team.aborted(result)
     # Of a clock that jumps the driver hears without odometry: its pose is unknown until some comes.
     driver.reset()
     assert 'the robot cannot go on: no odometry' in team.refused([1.0, 1.0, 0.0])
     team.move()
-    assert team.takes([1.0, 1.0, 0.0], live=team.move)
+    assert team.takes([1.0, 1.0, 0.0])
 
 
 # ---- measurements ----------------------------------------------------------------------------
@@ -212,22 +178,21 @@ def test_a_batch_is_answered_with_what_the_image_shows(play):
     team.move()
     pose = team.body.robot_state().pose
     front, left = pose.rotation()[:2, 0], pose.rotation()[:2, 1]
-    inside = pose.position[:2] + 0.12 * front + 0.05 * left
+    offset = 0.12 * front + 0.05 * left
     # In the image, but not in the box.
     outside = pose.position[:2] - 0.13 * front
-    image = rendered(team, [inside.tolist(), outside.tolist()], pose)
+    image = rendered(team, [(pose.position[:2] + offset).tolist(), outside.tolist()], pose)
     team.images.publish(stamped(image, team.step * NANOSECONDS))
     # A batch of others is not answered.
     team.ask(team.step * NANOSECONDS, robots=['other'])
     team.ask(team.step * NANOSECONDS, robots=['other', 'rover'])
     answer = team.answer()
-    assert answer.batch_id == 2 and answer.measurement == 8 and answer.robot == 'rover'
+    assert (answer.batch_id, answer.measurement, answer.robot) == (2, 8, 'rover')
     assert answer.step == team.step and answer.header.frame_id == 'map'
     assert answer.header.stamp == stamp_to_ros(team.step * NANOSECONDS)
     assert_allclose(pose_from_ros(answer.pose.pose).position, pose.position, atol=1e-9)
-    assert len(answer.detections) == 1 and answer.dropped == 1
-    seen = answer.detections[0]
-    offset = inside - pose.position[:2]
+    assert answer.dropped == 1
+    (seen,) = answer.detections
     assert_allclose(seen.range, np.hypot(*offset), atol=2e-3)
     assert_allclose(seen.bearing, np.arctan2(offset[1], offset[0]), atol=0.02)
     assert np.linalg.eigvalsh(np.reshape(seen.covariance, (2, 2))).min() > 0.0
@@ -246,9 +211,8 @@ def test_images_that_cannot_be_used_are_counted_and_the_next_good_one_answers(pl
     team.until(lambda: driver.dropped['image'] == 2)
     team.images.publish(image_message(good, 2))
     team.move()
-    answer = team.answer()
     # Seeing nothing is an answer, too.
-    assert answer.header.stamp.nanosec == 2 and not answer.detections
+    assert team.answer().header.stamp.nanosec == 2 and not team.answer().detections
     team.images.publish(image_message(good, 1))
     team.until(lambda: driver.dropped['image stamp'] == 1)
     said = capfd.readouterr().err
@@ -279,48 +243,38 @@ def test_images_that_cannot_be_used_are_counted_and_the_next_good_one_answers(pl
     assert team.answer(3).batch_id == 3
 
 
+def sweep_of(*rows, **label):
+    names = ('range', 'bearing', 'elevation')
+    return RangeArray(ranges=[RangeMeasurement(**dict(zip(names, row)), **label) for row in rows])
+
+
 def test_ranges_pass_through_as_they_come(play):
     driver, team = play('ranging')
     team.move()
-    sweep = RangeArray()
-    named = {'class_id': 'person', 'score': 0.7, 'identity': 'tag_4'}
-    for values, label in (
-        ([2.0, 0.3, -0.2], named),
-        ([3.0, -2.0, 0.1], {}),
-        ([9.0, 0.0, 0.0], {}),
-        ([1.0, math.nan, 0.0], {}),
-        ([3.0, 0.1, 0.0], named | {'score': 1.5}),
-    ):
-        distance, bearing, elevation = values
-        sweep.ranges.append(
-            RangeMeasurement(range=distance, bearing=bearing, elevation=elevation, **label)
-        )
+    label = {'class_id': 'person', 'score': 0.7, 'identity': 'tag_4'}
+    sweep = sweep_of((2.0, 0.3, -0.2), **label)
+    # The second of these is outside the box, the third is no measurement, the last has no score.
+    sweep.ranges += sweep_of((3.0, -2.0, 0.1), (9.0, 0.0, 0.0), (1.0, math.nan, 0.0)).ranges
+    sweep.ranges += sweep_of((3.0, 0.1, 0.0), **label | {'score': 1.5}).ranges
     team.ranges.publish(sweep)
     team.ask(0)
     answer = team.answer()
-    # The third is outside the box, the fourth is no measurement, the fifth has no score.
-    assert [(item.range, item.bearing, item.elevation) for item in answer.detections] == [
-        (2.0, 0.3, -0.2),
-        (3.0, -2.0, 0.1),
-    ]
+    assert [
+        (item.range, item.bearing, item.elevation, item.class_id, item.score, item.identity)
+        for item in answer.detections
+    ] == [(2.0, 0.3, -0.2, 'person', 0.7, 'tag_4'), (3.0, -2.0, 0.1, '', 0.0, '')]
     assert not any(len(item.covariance) for item in answer.detections)
-    first, second = answer.detections
-    assert (first.class_id, first.score, first.identity) == ('person', 0.7, 'tag_4')
-    assert (second.class_id, second.score, second.identity) == ('', 0.0, '')
     assert answer.dropped == 1 and driver.dropped['range'] == 2
 
 
 def test_ranges_of_a_mounted_sensor_are_turned_by_the_pose(play):
-    _, team = play('ranging', ranging={'frame': 'body', 'rpy': [0.0, 0.0, 0.5]})
+    _, team = play('ranging', ranging={'frame': 'body', 'rpy': [0.0, 0.0, 0.5]}, yaw=0.7)
     team.move()
-    sweep = RangeArray(ranges=[RangeMeasurement(range=2.0, bearing=-0.2, elevation=0.0)])
-    team.ranges.publish(sweep)
+    team.ranges.publish(sweep_of((2.0, -0.2, 0.0)))
     team.ask(0)
-    answer = team.answer()
-    (item,) = answer.detections
-    turn = answer.pose.pose.orientation
-    yaw = 2.0 * math.atan2(turn.z, turn.w)
+    (item,) = team.answer().detections
     assert (item.range, item.elevation) == pytest.approx((2.0, 0.0))
+    yaw = pose_from_ros(team.answer().pose.pose).yaw
     assert item.bearing == pytest.approx(yaw + 0.3)
     assert len(item.covariance) == 9
 
@@ -332,7 +286,7 @@ def test_ranges_of_a_mounted_sensor_are_turned_by_the_pose(play):
 def test_in_lockstep_each_step_has_a_state_a_command_and_an_end(play, first):
     _, team = play(lockstep=True)
     for k in range(5):
-        lockstep_step(team, k, first=first)
+        team.begin_step(k, first=first)
         team.until_done(k + 1)
         assert team.done[-1].node == '/rover/driver' and team.done[-1].step == k
         assert team.state.step == k
@@ -348,7 +302,7 @@ def test_in_lockstep_each_step_has_a_state_a_command_and_an_end(play, first):
         AgentState.MOVING
     ] * 2
     # A step and a batch can come twice: somebody was started again.
-    lockstep_step(team, 4, first=first)
+    team.begin_step(4, first=first)
     team.until_done(6)
     assert team.states[-1] == team.states[-2] and team.commands[-1] == team.commands[-2]
     team.batch -= 1
@@ -358,7 +312,7 @@ def test_in_lockstep_each_step_has_a_state_a_command_and_an_end(play, first):
 
 def test_in_lockstep_nobody_waits_for_bad_odometry_or_a_robot_that_has_left(play):
     driver, team = play(lockstep=True)
-    lockstep_step(team, 0)
+    team.begin_step(0)
     team.until_done(1)
     _, result = team.send_accepted([1.0, 1.0, 0.0])
     bad = team.odometry_message(NANOSECONDS)
@@ -369,11 +323,10 @@ def test_in_lockstep_nobody_waits_for_bad_odometry_or_a_robot_that_has_left(play
     assert team.state.step == 1 and driver.dropped['odometry'] == 1
     assert_array_equal(team.command, np.zeros(4))
     assert team.commands[-1].header.stamp == stamp_to_ros(NANOSECONDS)
-    lockstep_step(team, 2, robots=['other'])
-    team.until(result.done)
-    assert result.result().result.reason == 'left'
+    team.begin_step(2, robots=['other'])
+    assert team.aborted(result) == 'left'
     assert 'the robot has left' in team.refused([1.0, 1.0, 0.0])
-    lockstep_step(team, 3)
+    team.begin_step(3)
     team.until_done(3)
     assert [item.step for item in team.done] == [item.step for item in team.states] == [0, 1, 3]
     assert team.state.goal_status == AgentState.ABORTED and team.state.reason == 'left'

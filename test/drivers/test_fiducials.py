@@ -22,13 +22,8 @@ def photograph(camera, pose, markers, dictionary):
     for number, centre in markers.items():
         sheet = cv2.aruco.generateImageMarker(printed, number, PIXELS)
         half = 0.5 * SIDE
-        floor = np.array(
-            [
-                [x + centre[0], y + centre[1], 0.0]
-                for x, y in ((-half, half), (half, half), (half, -half), (-half, -half))
-            ]
-        )
-        seen = camera.project(floor, pose).astype(np.float32)
+        corners = half * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+        seen = camera.project(corners + np.array([*centre, 0.0]), pose).astype(np.float32)
         end = PIXELS - 0.5
         sheet_corners = np.array([[-0.5, -0.5], [end, -0.5], [end, end], [-0.5, end]], np.float32)
         turn = cv2.getPerspectiveTransform(sheet_corners, seen)

@@ -11,7 +11,7 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from numpy.testing import assert_allclose, assert_array_equal
 from rclpy.parameter import Parameter
-from robot_team import NANOSECONDS, STEP, lockstep_step
+from robot_team import NANOSECONDS, STEP, stamped
 from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
@@ -52,12 +52,15 @@ class Listener:
 
     def buffer(self):
         made = TransformBuffer()
-        for messages, static in ((self.static, True), (self.moving, False)):
-            for item in (item for message in messages for item in message.transforms):
-                stamp = stamp_from_ros(item.header.stamp)
-                made.add(
-                    item.header.frame_id, item.child_frame_id, pose_of(item), stamp, static=static
-                )
+        for item in (item for message in self.static + self.moving for item in message.transforms):
+            place, turn = item.transform.translation, item.transform.rotation
+            made.add(
+                item.header.frame_id,
+                item.child_frame_id,
+                Pose([place.x, place.y, place.z], [turn.w, turn.x, turn.y, turn.z]),
+                stamp_from_ros(item.header.stamp),
+                static=item.child_frame_id != BASE,
+            )
         return made
 
 
@@ -83,9 +86,9 @@ def test_frames_agree_with_the_state(play):
         assert_allclose(found.position, expected.position, atol=1e-9)
         assert_allclose(found.rotation(), expected.rotation(), atol=1e-9)
     assert_allclose(buffer.pose('map', 'rover/odom').position, team.start.position)
-    camera = Camera.from_settings(team.settings.camera)
     optical = buffer.pose(BASE, 'rover/camera_optical')
     assert_allclose(optical.position, team.settings.camera.mount.position, atol=1e-12)
+    camera = Camera.from_settings(team.settings.camera)
     assert_allclose(optical.rotation(), camera.rotation, atol=1e-12)
     # The type is that of a real tf2_msgs.
     expected = get_typestore(Stores.ROS2_JAZZY).hash_rihs01('tf2_msgs/msg/TFMessage')
@@ -103,15 +106,13 @@ def test_who_comes_late_hears_static_frames_and_description(play):
     team.until(lambda: heard.static and texts)
     (message,) = heard.static
     names = {(item.header.frame_id, item.child_frame_id) for item in message.transforms}
-    assert names == {
-        ('map', 'rover/odom'),
-        (BASE, 'rover/camera'),
-        ('rover/camera', 'rover/camera_optical'),
-    }
+    fixed = {(BASE, 'rover/camera'), ('rover/camera', 'rover/camera_optical')}
+    assert names == {('map', 'rover/odom'), *fixed}
     root = ElementTree.fromstring(texts[0].data)
     assert root.tag == 'robot' and root.get('name') == 'rover'
-    links = [link.get('name') for link in root.iter('link')]
-    assert links == [BASE, 'rover/camera', 'rover/camera_optical']
+    assert {link.get('name') for link in root.iter('link')} == {
+        name for pair in fixed for name in pair
+    }
     assert root.find('link/visual/geometry/cylinder').get('radius') == '0.11'
     buffer = heard.buffer()
     for joint in root.iter('joint'):
@@ -124,9 +125,7 @@ def test_in_lockstep_each_step_has_its_transform(play):
     _, team = play(lockstep=True)
     heard = Listener(team)
     team.until(lambda: team.count_subscribers('/tf') == 1 and team.count_publishers('/tf') == 1)
-    for k in range(5):
-        lockstep_step(team, k)
-        team.until_done(k + 1)
+    team.move(5)
     team.until(lambda: len(heard.moving) == 5)
     stamps = [stamp_from_ros(message.transforms[0].header.stamp) for message in heard.moving]
     assert stamps == [k * NANOSECONDS for k in range(5)]
@@ -135,8 +134,7 @@ def test_in_lockstep_each_step_has_its_transform(play):
 def test_with_rate_0_others_publish_the_frames(play):
     _, team = play(tf_rate=0.0)
     team.move(2)
-    assert not team.count_publishers('/tf') and not team.count_publishers('/tf_static')
-    assert not team.count_publishers('robot_description')
+    assert not any(map(team.count_publishers, ('/tf', '/tf_static', 'robot_description')))
 
 
 # ---- poses from tf ---------------------------------------------------------------------------
@@ -170,9 +168,7 @@ class Localised:
 
     def send(self, position):
         """Send a goal while poses go on; return the future of its result."""
-        sent = self.team.go_to.send_goal_async(self.team.goal(position))
-        self.team.until(lambda: self.move() or sent.done())
-        return sent.result().get_result_async()
+        return self.team.send_accepted(position, live=self.move)[1]
 
 
 def test_a_driver_follows_poses_on_tf_and_stops_when_they_go_stale(play):
@@ -186,18 +182,16 @@ def test_a_driver_follows_poses_on_tf_and_stops_when_they_go_stale(play):
     team.until(lambda: robot.move() or team.states)
     goal = team.start.position + np.array([0.15, 0.1, 0.0])
     result = robot.send(goal)
-    team.until(lambda: robot.move() or result.done())
-    assert result.result().status == GoalStatus.STATUS_SUCCEEDED
-    assert np.linalg.norm(team.body.robot_state().pose.position - goal) <= 0.1
-    pose = team.body.robot_state().pose
+    assert team.ended(result, robot.move)[0] == GoalStatus.STATUS_SUCCEEDED
+    assert np.linalg.norm(team.place - goal) <= 0.1
+    place = team.place
     result = robot.send([1.8, 1.8, 0.0])
     team.until(lambda: robot.move() or np.any(team.command != 0.0))
     # Silence.
-    team.until(result.done)
-    assert 'no pose on tf for' in result.result().result.reason
+    assert 'no pose on tf for' in team.aborted(result)
     team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
     assert_array_equal(team.command, np.zeros(4))
-    assert np.linalg.norm(team.body.robot_state().pose.position - pose.position) < 0.5
+    assert np.linalg.norm(team.place - place) < 0.5
     # Transforms that come late are no pose.
     robot.stamp += NANOSECONDS
     team.until(lambda: time.time_ns() - robot.stamp > 3_100_000_000)
@@ -216,15 +210,13 @@ def test_a_driver_takes_poses_of_a_localiser_from_a_topic(play):
     driver, team = play(pose_source='pose', odometry_timeout=1.0)
     assert not team.count_subscribers('odom')
     poses = team.create_publisher(PoseStamped, 'pose', RELIABLE)
-    message = PoseStamped()
     # Not where the robot was put down.
     place = Pose.from_yaw([0.9, 0.4, 0.0], -1.0)
-    message.pose = pose_to_ros(place)
+    message = PoseStamped(pose=pose_to_ros(place))
 
     def say(frame='map'):
         message.header.frame_id = frame
-        message.header.stamp = stamp_to_ros(time.time_ns())
-        poses.publish(message)
+        poses.publish(stamped(message, time.time_ns()))
 
     team.until(lambda: say() or team.states)
     found = pose_from_ros(team.state.pose.pose)
@@ -238,16 +230,11 @@ def test_a_driver_takes_poses_of_a_localiser_from_a_topic(play):
 
 def test_odometry_may_be_in_the_map_already(play):
     driver, team = play(odometry_origin='map')
-
-    def say():
-        team.step += 1
-        team.odometry.publish(team.odometry_message())
-
     # The frame is not the map.
-    team.until(lambda: say() or driver.dropped['odometry'] > 3)
+    team.until(lambda: team.say() or driver.dropped['odometry'] > 3)
     assert not team.states
     team.odometry_frame = 'map'
-    team.until(lambda: say() or team.states)
+    team.until(lambda: team.say() or team.states)
     # What the odometry says is where it is, wherever it was put down.
     odometry = pose_from_ros(team.odometry_message().pose.pose)
     assert_allclose(pose_from_ros(team.state.pose.pose).position, odometry.position, atol=0.02)
@@ -270,16 +257,14 @@ def test_a_goal_in_another_frame_is_reached_where_that_is(play):
     offset = np.array([0.7, 0.4, 0.0])
     expected = DOCK.position + DOCK.rotation() @ offset
     _, result = team.send_accepted(offset, frame='dock')
-    team.until(lambda: team.move() or result.done())
-    assert result.result().status == GoalStatus.STATUS_SUCCEEDED
-    place = team.body.robot_state().pose.position
+    assert team.ended(result, team.move)[0] == GoalStatus.STATUS_SUCCEEDED
+    place = team.place
     assert np.linalg.norm(place - expected) <= team.settings.motion.tolerance + 0.01
     # Relative to the robot itself, as it stands.
     heading = team.body.robot_state().pose.rotation()
     _, result = team.send_accepted([-0.1, 0.0, 0.0], frame=BASE, number=2)
-    team.until(lambda: team.move() or result.done())
-    ended = team.body.robot_state().pose.position
-    away = np.linalg.norm(ended - (place + heading @ [-0.1, 0.0, 0.0]))
+    assert team.ended(result, team.move)[0] == GoalStatus.STATUS_SUCCEEDED
+    away = np.linalg.norm(team.place - (place + heading @ [-0.1, 0.0, 0.0]))
     assert away <= team.settings.motion.tolerance + 0.01
     # What tf does not know, knows outside the bounds, or knows no more, is refused.
     assert "'kitchen' is not known" in team.refused([0.0, 0.0, 0.0], frame='kitchen')
@@ -289,7 +274,7 @@ def test_a_goal_in_another_frame_is_reached_where_that_is(play):
     cart = transform('map', 'cart', DOCK, team.step * NANOSECONDS)
     moving.publish(TFMessage(transforms=[cart, odd]))
     team.until(lambda: driver.dropped['transform'] == 2)
-    assert team.takes([0.0, 0.0, 0.0], live=team.move)
+    assert team.takes([0.0, 0.0, 0.0])
     # Beyond `odometry_timeout`, short of a jump of time.
     team.step += round(35.0 / STEP)
     team.move()
@@ -306,7 +291,7 @@ def test_without_tf2_msgs_there_is_no_tf_and_all_else_works(play, monkeypatch, c
     assert not team.count_publishers('/tf') and team.count_publishers('robot_description') == 1
     assert capfd.readouterr().err.count('tf2_msgs is not installed') == 1
     assert 'allowed is' in team.refused([0.0, 0.0, 0.0], frame='dock')
-    assert team.takes([1.0, 1.0, 0.0], live=team.move)
+    assert team.takes([1.0, 1.0, 0.0])
     for transition in ('deactivate', 'cleanup'):
         assert getattr(driver, f'trigger_{transition}')().name == 'SUCCESS'
     driver.set_parameters([Parameter('pose_source', value='tf')])

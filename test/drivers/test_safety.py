@@ -13,21 +13,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from action_msgs.msg import GoalStatus
 from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import Twist
 from numpy.testing import assert_array_equal
 from robot_team import NANOSECONDS, STEP, TURTLEBOT, image_message, numbers
 from sensor_msgs.msg import BatteryState
 
+from maasi_drivers.agent.agent_driver import STOPPED
 from maasi_drivers.agent.watchdog import PERIOD as WATCH_PERIOD
 from maasi_drivers.guard_node import _STOP_PERIOD
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE
 from maasi_msgs.msg import AgentState
-
-HANGING = Path(__file__).parent / 'hanging_driver.py'
 
 # After a fault the robot has been stopped by then [s].
 LATEST = 1.5
@@ -40,13 +38,18 @@ def noise(seed):
 
 def gives_up(team, result, reason):
     """Check that the robot is stopped, the goal is ended, and that the planner hears why."""
-    team.until(result.done)
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert reason in result.result().result.reason
+    assert reason in team.aborted(result)
     assert team.state.goal_status == AgentState.UNAVAILABLE
     assert reason in team.state.reason
     assert_array_equal(team.command, np.zeros(4))
     assert reason in team.refused([1.0, 1.0, 0.0])
+
+
+def is_stopped(team):
+    """Check that only zeros come from now on."""
+    known = len(team.commands)
+    team.until(lambda: len(team.commands) >= known + 3, 'no zeros')
+    assert not np.any([numbers(item) for item in team.commands[known:]])
 
 
 def steps_until_stopped(team, move=None):
@@ -76,10 +79,9 @@ def test_without_odometry_the_robot_is_stopped(play, fault):
     assert np.any(team.command != 0.0)
 
     def stopped():
+        team.step += fault == 'not finite'
         message = team.odometry_message()
         if fault == 'not finite':
-            team.step += 1
-            message = team.odometry_message()
             message.pose.pose.position.y = math.nan
         if fault != 'silent':
             team.odometry.publish(message)
@@ -89,25 +91,24 @@ def test_without_odometry_the_robot_is_stopped(play, fault):
     first = next(item for item in team.states if item.goal_status == AgentState.UNAVAILABLE)
     assert 0.5 <= float(re.fullmatch('no odometry for (.*) s', first.reason)[1]) < 2.0
     assert (driver.dropped['odometry'] > 3) == (fault == 'not finite')
-    team.until(result.done)
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert 'no odometry for' in result.result().result.reason
-    known = len(team.commands), len(team.states)
-    team.until(lambda: len(team.commands) >= known[0] + 3 and len(team.states) > known[1])
-    assert_array_equal([numbers(item) for item in team.commands[-3:]], np.zeros((3, 4)))
+    assert 'no odometry for' in team.aborted(result)
+    known = len(team.states)
+    is_stopped(team)
+    team.until(lambda: len(team.states) > known)
     assert team.refused([1.0, 1.0, 0.0])
     team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
-    team.step += 1
-    team.odometry.publish(team.odometry_message())
+    team.say()
     team.until(lambda: team.state.step == team.step)
     assert team.state.goal_status == AgentState.ABORTED
-    assert team.takes([1.0, 1.0, 0.0], live=team.move)
+    assert team.takes([1.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
 def test_a_pose_that_hangs_under_a_command_to_move_stops_the_robot(play, kind):
     _, team = play(kind)
-    team.move()
+    # One that stands may have the same pose for long.
+    team.move(40)
+    assert team.state.goal_status == AgentState.IDLE
     _, result = team.send_accepted(team.start.position + np.array([0.8, 0.5, 0.0]))
     team.move(20)
     message = team.odometry_message()
@@ -125,13 +126,7 @@ def test_a_pose_that_hangs_under_a_command_to_move_stops_the_robot(play, kind):
     team.body.step([0.2, 0.0, 0.0, 0.3], 0.5)
     team.move()
     assert team.state.goal_status == AgentState.ABORTED
-    assert team.takes([1.0, 1.0, 1.0 if kind == 'mambo' else 0.0], live=team.move)
-
-
-def test_a_robot_that_stands_may_have_the_same_pose_for_long(play):
-    _, team = play()
-    team.move(60)
-    assert team.state.goal_status == AgentState.IDLE
+    assert team.takes([1.0, 1.0, 1.0 if kind == 'mambo' else 0.0])
 
 
 @pytest.mark.parametrize('fault', ['silent', 'repeats itself'])
@@ -162,7 +157,7 @@ def test_a_camera_that_hangs_stops_the_robot(play, fault):
     for _ in range(3):
         move()
     team.until(lambda: move() or team.state.goal_status == AgentState.ABORTED)
-    assert team.takes([1.0, 1.0, 0.0], live=team.move)
+    assert team.takes([1.0, 1.0, 0.0])
 
 
 def test_a_guard_that_has_gone_is_reported(play, start_guard, capfd):
@@ -175,60 +170,44 @@ def test_a_guard_that_has_gone_is_reported(play, start_guard, capfd):
     assert 'the guard has gone' in capfd.readouterr().err
 
 
-def test_a_goal_before_any_odometry_is_refused(play):
-    _, team = play()
-    assert 'no odometry yet' in team.refused([1.0, 1.0, 0.0])
-    team.move()
-    assert team.takes([1.0, 1.0, 0.0], live=team.move)
-
-
-@pytest.mark.parametrize(
-    ('unit', 'readings', 'problem'),
-    [
-        ('percent', [(1.5, 0.015), (116.7, 1.0), (80.0, 0.8), (15.0, 0.15)], ''),
-        (
-            'fraction',
-            [(0.9, 0.9), (1.1, 1.0), (55.0, -1.0), (0.15, 0.15)],
-            'percentage: read 55, allowed is 0 to 1, or nan: battery_unit is fraction',
-        ),
-    ],
-)
-def test_a_battery_is_read_in_its_unit_and_a_low_one_ends_the_way(
-    play, capfd, monkeypatch, unit, readings, problem
-):
+@pytest.mark.parametrize('unit', ['percent', 'fraction'])
+def test_a_battery_is_read_in_its_unit_and_a_low_one_ends_the_way(play, capfd, monkeypatch, unit):
+    # It is said that no charge comes; what is said of wrong ones would wait for a while then.
     if unit == 'percent':
-        # It is said that no charge comes; what is said of wrong ones would wait for a while then.
         monkeypatch.setattr('maasi_drivers.agent.watchdog._CHARGE_PATIENCE', 0.3)
     driver, team = play(battery_minimum=0.2, battery_unit=unit)
     team.until(lambda: team.move() or 'battery' in driver._warned or unit == 'fraction')
+    full = 100.0 if unit == 'percent' else 1.0
 
     def read(percentage, expected):
         team.battery.publish(BatteryState(percentage=percentage))
         team.until(lambda: team.move() or team.state.battery == pytest.approx(expected))
 
-    for reading in readings[:-1]:
-        read(*reading)
+    read(1.167 * full, 1.0)
+    if unit == 'fraction':
+        read(55.0, -1.0)
+        wrong = 'percentage: read 55, allowed is 0 to 1, or nan: battery_unit is fraction'
+        assert wrong in capfd.readouterr().err
+    read(0.8 * full, 0.8)
     _, result = team.send_accepted([1.5, 1.5, 0.0])
-    read(*readings[-1])
-    assert problem in capfd.readouterr().err
+    read(0.15 * full, 0.15)
     gives_up(team, result, 'battery at 0.15')
     # An unknown charge does not end what a low one began.
     read(math.nan, -1.0)
     assert 'battery at 0.15' in team.state.reason
-    read(0.9 if unit == 'fraction' else 90.0, 0.9)
-    assert team.takes([1.0, 1.0, 0.0], live=team.move)
+    read(0.9 * full, 0.9)
+    assert team.takes([1.0, 1.0, 0.0])
 
 
-@pytest.mark.parametrize('height', [-0.1, 50.0])
-def test_a_flying_robot_in_the_plane_is_not_sent_to_another_height(play, height):
+def test_a_flying_robot_in_the_plane_is_not_sent_to_another_height(play):
     _, team = play('mambo')
     team.move()
-    reason = team.refused([1.2, 1.2, height])
-    assert 'waypoint.pose.position.z' in reason
+    for height in (-0.1, 50.0):
+        assert 'waypoint.pose.position.z' in team.refused([1.2, 1.2, height])
     team.move(20)
-    assert team.body.robot_state().pose.position[2] == pytest.approx(1.0, abs=0.01)
+    assert team.place[2] == pytest.approx(1.0, abs=0.01)
     # Its own height is that of the waypoints, and it may change it a little.
-    assert team.takes([1.2, 1.2, 1.3], live=team.move)
+    assert team.takes([1.2, 1.2, 1.3])
 
 
 @pytest.mark.parametrize('options', [{'wants': Twist}, {'command_type': 'twist'}])
@@ -248,8 +227,7 @@ def test_it_is_said_that_nobody_listens(make_team, process, capfd):
     said = []
 
     def heard():
-        team.step += 1
-        team.odometry.publish(team.odometry_message())
+        team.say()
         said.append(capfd.readouterr().err)
         return 'see the parameter command_type' in ''.join(said)
 
@@ -257,6 +235,37 @@ def test_it_is_said_that_nobody_listens(make_team, process, capfd):
     wanted = 'no subscription of this type; the robot wants geometry_msgs/msg/Twist'
     assert wanted in ''.join(said)
     assert driver.poll() is None
+
+
+@pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
+def test_a_stopped_robot_stands_and_refuses_goals_until_it_is_released(play, kind):
+    driver, team = play(kind)
+    team.move()
+    goal = team.start.position + np.array([0.8, 0.5, 0.0])
+    _, result = team.send_accepted(goal)
+    team.move(20)
+    assert np.any(team.command[:3] != 0.0)
+    known = len(team.commands)
+    assert team.call('stop').success
+    assert team.aborted(result) == STOPPED
+    # At once, not with the next odometry.
+    team.until(lambda: len(team.commands) > known)
+    assert_array_equal(team.command, np.zeros(4))
+    place = team.place
+    team.move(40)
+    assert team.state.goal_status == AgentState.UNAVAILABLE and team.state.reason == STOPPED
+    # A flying robot brakes, and is kept where it was told to stop.
+    assert np.linalg.norm(team.place - place) < 0.15
+    assert STOPPED in team.refused(goal)
+    # Nobody releases it by restarting the node's life cycle.
+    for transition in ('deactivate', 'cleanup', 'configure', 'activate'):
+        assert getattr(driver, f'trigger_{transition}')().name == 'SUCCESS'
+    team.connect()
+    team.awaken()
+    assert STOPPED in team.refused(goal)
+    assert team.call('release').success
+    team.until(lambda: team.move() or team.state.goal_status != AgentState.UNAVAILABLE)
+    assert team.takes(goal)
 
 
 # ---- the driver's process, and the guard of its robot ----------------------------------------
@@ -273,17 +282,10 @@ def drive_without_the_guard(team):
     raise AssertionError('the guard does not leave the robot alone')
 
 
-def is_stopped(team):
-    """Check that only zeros come from now on."""
-    known = len(team.commands)
-    team.until(lambda: len(team.commands) >= known + 3, 'no zeros')
-    assert not np.any([numbers(item) for item in team.commands[known:]])
-
-
 def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(start_guard, process, team):
     """One that hangs lives on with its middleware: only its executor thread does not."""
     guard = start_guard()
-    driver = process(program=[sys.executable, str(HANGING)])
+    driver = process(program=[sys.executable, str(Path(__file__).with_name('hanging_driver.py'))])
     team.connect()
     team.awaken()
     # A driver stops the robot itself where odometry is missing: to its guard it is alive, for
@@ -355,7 +357,5 @@ def test_a_driver_that_is_told_to_end_leaves_zeros(process, team, number):
     driver.send_signal(number)
     team.until(lambda: driver.poll() is not None)
     assert driver.returncode == 0
-    team.until(result.done)
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert result.result().result.reason == 'the driver stops'
+    assert team.aborted(result) == 'the driver stops'
     team.until(lambda: not np.any(team.command))

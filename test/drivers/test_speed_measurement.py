@@ -11,13 +11,7 @@ from numpy.testing import assert_allclose
 from simulated_mambo import TILT, Flight, full_speed, measure
 from waiting import wait_until
 
-from maasi_drivers.measure_mambo import (
-    Leg,
-    MeasurementError,
-    MeasuringFlight,
-    fit_speed,
-    main,
-)
+from maasi_drivers.measure_mambo import Leg, MeasurementError, MeasuringFlight, fit_speed, main
 from maasi_filter.models.pose import Pose
 from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.emulators.mambo.firmware import FlyingState, MamboFirmware
@@ -44,10 +38,13 @@ def test_it_measures_the_speed_and_keeps_within_the_way(drag, delay):
         ({'error': 'the link broke'}, 'the link broke'),
         ('draught', r'allowed are 1\.50 m'),
         ('battery', r'battery: read 0\.15'),
+        ('battery at the start', r'battery: read 0\.15'),
     ],
 )
-def test_a_fault_in_flight_ends_it(fault, text):
-    flight = Flight(arm=False)
+def test_a_fault_ends_it(fault, text):
+    flight = (
+        Flight(arm=False, battery=0.15) if fault == 'battery at the start' else Flight(arm=False)
+    )
     with pytest.raises(MeasurementError, match=text):
         for count, _ in enumerate(MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps()):
             flight.step()
@@ -55,31 +52,23 @@ def test_a_fault_in_flight_ends_it(fault, text):
                 flight.firmware.body.position[1] += 0.01
             elif count == 200 and fault == 'battery':
                 flight.firmware.charge.charge = 0.15
-            elif count == 200:
+            elif count == 200 and isinstance(fault, dict):
                 vars(flight).update(fault)
-    assert flight.firmware.take_offs == 1
+    assert flight.firmware.take_offs == (fault != 'battery at the start')
 
 
-def test_it_does_not_take_off_with_a_low_battery():
-    flight = Flight(arm=False, battery=0.15)
-    with pytest.raises(MeasurementError, match=r'battery: read 0\.15'):
-        for _ in MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps():
-            flight.step()
-    assert flight.firmware.take_offs == 0
-
-
-def leg(places):
-    return Leg(0.0, 0.0, [(0.0, 1.0), (1.0, -1.0)], places)
-
-
-def test_what_says_too_little_or_does_not_fit_is_refused():
-    with pytest.raises(MeasurementError, match='fewer than 6'):
-        fit_speed([leg([(0.5, 0.1)])], TILT)
-    with pytest.raises(MeasurementError, match='misfit'):
-        fit_speed([leg([(0.2 * n, 0.3 * math.sin(2.0 * n)) for n in range(10)])], TILT)
-    # It never left the place.
-    with pytest.raises(MeasurementError, match='speed: known to'):
-        fit_speed([leg([(0.1 * n, 0.0) for n in range(10)])], TILT)
+@pytest.mark.parametrize(
+    ('places', 'text'),
+    [
+        ([(0.5, 0.1)], 'fewer than 6'),
+        ([(0.2 * n, 0.3 * math.sin(2.0 * n)) for n in range(10)], 'misfit'),
+        # It never left the place.
+        ([(0.1 * n, 0.0) for n in range(10)], 'speed: known to'),
+    ],
+)
+def test_what_says_too_little_or_does_not_fit_is_refused(places, text):
+    with pytest.raises(MeasurementError, match=text):
+        fit_speed([Leg(0.0, 0.0, [(0.0, 1.0), (1.0, -1.0)], places)], TILT)
 
 
 # ---- the command -----------------------------------------------------------------------------

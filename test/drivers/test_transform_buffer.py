@@ -44,10 +44,10 @@ def test_chains_are_composed_up_and_down(buffer):
     assert buffer.pose('nowhere', 'nowhere') == Pose(np.zeros(3))
 
 
-@pytest.mark.parametrize('part', [0.0, 0.3, 1.0])
-def test_times_between_are_interpolated_and_nothing_is_extrapolated(buffer, part):
-    found = buffer.pose('odom', 'base', round((1.0 + part) * SECOND))
-    assert_allclose([found.position[0], found.yaw], [1.0 + part, 0.2 + 0.4 * part], atol=1e-6)
+def test_times_between_are_interpolated_and_nothing_is_extrapolated(buffer):
+    for part in (0.0, 0.3, 1.0):
+        found = buffer.pose('odom', 'base', round((1.0 + part) * SECOND))
+        assert_allclose([found.position[0], found.yaw], [1.0 + part, 0.2 + 0.4 * part], atol=1e-6)
     for stamp in (SECOND - 1, 2 * SECOND + 1):
         with pytest.raises(TransformError, match=f'{SECOND} to {2 * SECOND}'):
             buffer.pose('map', 'base', stamp)
@@ -65,29 +65,27 @@ def test_the_latest_is_what_all_transforms_are_known_at():
     assert_allclose(buffer.pose('map', 'base').position, expected, atol=1e-12)
 
 
-def test_unknown_and_unconnected_frames_are_named(buffer):
-    with pytest.raises(TransformError, match="'kitchen' is not known"):
-        buffer.pose('map', 'kitchen')
-    buffer.add('world', 'kitchen', MOUNT, static=True)
-    with pytest.raises(TransformError, match="not connected: their roots are 'world' and 'map'"):
-        buffer.pose('map', 'kitchen')
-
-
-@pytest.mark.parametrize(
-    ('parent', 'child', 'stamp', 'problem'),
-    [
+def test_frames_that_make_no_sense_are_named_and_change_nothing(buffer):
+    before = buffer.pose('map', 'camera')
+    for parent, child, stamp, problem in (
         ('', 'a', 0, 'frame'),
         ('a', 'b' * 201, 0, 'frame'),
         ('a', 'a', 0, 'loop'),
         ('camera', 'odom', 0, 'loop'),
         ('odom', 'base', -1, 'stamp'),
-    ],
-)
-def test_what_makes_no_sense_is_refused_and_changes_nothing(buffer, parent, child, stamp, problem):
-    before = buffer.pose('map', 'camera')
-    with pytest.raises(ValueError, match=problem):
-        buffer.add(parent, child, MOUNT, stamp)
+    ):
+        with pytest.raises(ValueError, match=problem):
+            buffer.add(parent, child, MOUNT, stamp)
+    with pytest.raises(TransformError, match="'kitchen' is not known"):
+        buffer.pose('map', 'kitchen')
+    buffer.add('world', 'kitchen', MOUNT, static=True)
+    with pytest.raises(TransformError, match="not connected: their roots are 'world' and 'map'"):
+        buffer.pose('map', 'kitchen')
     assert buffer.pose('map', 'camera') == before
+    for k in range(4, 2000):
+        buffer.add('odom', f'frame {k}', MOUNT, static=True)
+    with pytest.raises(ValueError, match='2000 frames'):
+        buffer.add('odom', 'one more', MOUNT, static=True)
 
 
 def test_one_stamp_far_off_changes_nothing_and_a_real_jump_is_followed(buffer):
@@ -105,10 +103,3 @@ def test_one_stamp_far_off_changes_nothing_and_a_real_jump_is_followed(buffer):
     with pytest.raises(TransformError, match='base'):
         buffer.pose('odom', 'base')
     assert buffer.pose('base', 'camera') == MOUNT
-
-
-def test_frames_have_a_largest_number(buffer):
-    for k in range(3, 2000):
-        buffer.add('odom', f'frame {k}', MOUNT, static=True)
-    with pytest.raises(ValueError, match='2000 frames'):
-        buffer.add('odom', 'one more', MOUNT, static=True)

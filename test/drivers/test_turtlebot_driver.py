@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_allclose, assert_array_equal
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, numbers, parameters_of
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, numbers, parameters_of, stamped
 from sensor_msgs.msg import LaserScan
 
 from maasi_drivers.drivers import TurtlebotDriver
-from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState
 from maasi_sim.world.sensors import LaserScanner, LaserSettings
@@ -40,11 +40,10 @@ class Scanned:
         self.scanner = LaserScanner(LaserSettings(), bounds, self.centres, self.radii, 1, 'rover')
         self.publisher = team.create_publisher(LaserScan, 'scan', RELIABLE)
         team.until(self.publisher.get_subscription_count)
-        self.least = math.inf
 
     def message(self):
-        team = self.team
-        ranges = self.scanner.scan(team.body.robot_state().pose, max(team.step, 0))
+        step = max(self.team.step, 0)
+        ranges = self.scanner.scan(self.team.body.robot_state().pose, step)
         message = LaserScan(
             angle_max=2.0 * math.pi,
             angle_increment=2.0 * math.pi / len(ranges),
@@ -52,47 +51,33 @@ class Scanned:
             range_max=3.5,
             ranges=ranges.tolist(),
         )
-        message.header.stamp = stamp_to_ros(max(team.step, 0) * NANOSECONDS)
-        return message
+        return stamped(message, step * NANOSECONDS)
 
     def move(self, scan=True):
         self.team.move()
         if scan and self.team.step % 4 == 0:
             self.publisher.publish(self.message())
-        position = self.team.body.robot_state().pose.position[:2]
-        if len(self.centres):
-            gaps = np.hypot(*(self.centres - position).T) - self.radii
-            self.least = min(self.least, float(gaps.min()))
+        gaps = np.hypot(*(self.centres - self.team.place[:2]).T) - self.radii
+        assert gaps.min(initial=math.inf) > self.team.settings.radius
 
 
-def test_the_robot_drives_around_what_its_scan_shows(play):
-    _, team = play(**SCANNING)
-    robot = Scanned(team, [[0.9, 0.9]], [0.12])
-    robot.move()
-    _, result = team.send_accepted([1.4, 1.5, 0.0])
-    for _ in range(600):
-        robot.move()
-        if team.state.goal_status != AgentState.MOVING:
-            break
-    assert team.state.goal_status == AgentState.REACHED
-    assert robot.least > team.settings.radius
-    team.until(result.done)
-
-
-def test_without_a_scan_the_robot_is_stopped(play):
-    _, team = play(**SCANNING)
+def test_without_a_scan_that_makes_sense_the_robot_is_stopped(play):
+    driver, team = play(**SCANNING)
     robot = Scanned(team)
     robot.move()
     _, result = team.send_accepted([1.4, 1.5, 0.0])
     for _ in range(20):
         robot.move()
     assert team.state.goal_status == AgentState.MOVING
+    bad, empty = robot.message(), robot.message()
+    bad.angle_increment, empty.ranges = math.nan, []
+    for message in (bad, empty):
+        robot.publisher.publish(message)
+    team.until(lambda: driver.dropped['scan'] == 2)
     team.until(lambda: robot.move(scan=False) or team.state.goal_status == AgentState.UNAVAILABLE)
     assert (team.step - 20) * STEP <= 1.5
     assert_array_equal(team.command, np.zeros(4))
-    team.until(result.done)
-    assert 'no scan for' in result.result().result.reason
-    assert 'no scan for' in team.state.reason
+    assert 'no scan for' in team.aborted(result) and 'no scan for' in team.state.reason
     team.until(lambda: robot.move() or team.state.goal_status == AgentState.ABORTED)
     assert team.takes([1.4, 1.5, 0.0], live=robot.move)
 
@@ -102,26 +87,9 @@ def test_a_waypoint_that_cannot_be_reached_is_given_up(play):
     robot = Scanned(team, [[0.9, 0.3]], [0.2])
     robot.move()
     _, result = team.send_accepted([0.9, 0.3, 0.0])
-    for _ in range(300):
-        robot.move()
-        if team.state.goal_status != AgentState.MOVING:
-            break
-    team.until(result.done)
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert 'blocked: no nearer to the waypoint for 3 s' in result.result().result.reason
-    assert robot.least > team.settings.radius
+    reason = team.aborted(result, live=robot.move)
+    assert 'blocked: no nearer to the waypoint for 3 s' in reason
     assert_array_equal(team.command, np.zeros(4))
-
-
-def test_scans_that_make_no_sense_are_counted_and_do_not_keep_the_robot_going(play):
-    driver, team = play(**SCANNING)
-    robot = Scanned(team)
-    robot.move()
-    bad, empty = robot.message(), robot.message()
-    bad.angle_increment, empty.ranges = math.nan, []
-    for message in (bad, empty):
-        robot.publisher.publish(message)
-    team.until(lambda: driver.dropped['scan'] == 2)
 
 
 # ---- Nav2 ------------------------------------------------------------------------------------
@@ -191,45 +159,42 @@ def nav2(context, with_nav2):
 
 @pytest.fixture
 def driven(nav2, with_nav2, process, team):
-    """Start a driver that hands its waypoints to Nav2; return the team, Nav2, and the driver."""
+    """Start a driver that hands its waypoints to Nav2; return team, process of Nav2, driver."""
     driver = process(
         environment=with_nav2, navigation='nav2', pose_source='odometry', odometry_timeout=0.5
     )
     team.connect()
     team.awaken()
-    return team, *nav2, driver
+    return team, nav2[1], driver
 
 
+@pytest.fixture
 def stand(team):
     """Let the driver have odometry, but no motion: that is Nav2's."""
-    team.step += 1
-    team.odometry.publish(team.odometry_message())
-    team.executor_used.spin_once(timeout_sec=0.02)
+    return lambda: team.say() or team.executor_used.spin_once(timeout_sec=0.02)
 
 
-def heard(team, said, event):
-    while True:
-        team.until(lambda: stand(team) or not said.empty(), f'Nav2 never said {event}')
-        line = said.get()
-        if line['event'] == event:
-            return line
+@pytest.fixture
+def hear(team, stand, nav2):
+    """Wait until Nav2 says an event; return all that it said up to it."""
+
+    def hear(event):
+        lines = []
+        while not lines or lines[-1]['event'] != event:
+            team.until(lambda: stand() or not nav2[0].empty(), f'Nav2 never said {event}')
+            lines.append(nav2[0].get())
+        return lines
+
+    return hear
 
 
-def send(team, position):
-    """Send a goal, and have odometry come while its answer is awaited."""
-    future = team.go_to.send_goal_async(team.goal(position))
-    team.until(lambda: stand(team) or future.done())
-    return future.result()
-
-
-def send_first(team, position):
+def send_first(team, position, stand):
     """Send a goal until Nav2 is there: the driver may find it later than the team the driver."""
     for _ in range(1000):
-        handle = send(team, position)
-        result = handle.get_result_async()
+        _, result = team.send_accepted(position, live=stand)
         team.until(
             lambda result=result: (
-                stand(team) or result.done() or team.state.goal_status == AgentState.MOVING
+                stand() or result.done() or team.state.goal_status == AgentState.MOVING
             )
         )
         if not result.done() or result.result().result.reached:
@@ -238,98 +203,88 @@ def send_first(team, position):
     raise AssertionError(f'no goal is taken: {team.states[-1:]}')
 
 
-def reason_of_abort(team, result):
-    team.until(lambda: stand(team) or result.done())
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    return result.result().result.reason
+def test_nav2_drives_to_the_waypoints(driven, stand, hear):
+    team, nav2, _ = driven
 
+    def send(x):
+        return team.send_accepted([x, 0.8, 0.0], live=stand)
 
-def test_nav2_drives_to_the_waypoints(driven):
-    team, said, nav2, _ = driven
+    def nothing_is_commanded():
+        since = team.step
+        team.until(lambda: stand() or team.state.step > since + 10)
+        sent = [stamp_from_ros(item.header.stamp) for item in team.commands]
+        assert max(sent) <= since * NANOSECONDS
+
     # Reached.
-    result = send_first(team, [0.3, 0.8, 0.0])
-    line = heard(team, said, 'goal')
+    result = send_first(team, [0.3, 0.8, 0.0], stand)
+    line = hear('goal')[-1]
     assert line['frame'] == 'map'
     assert_allclose(line['position'], [0.3, 0.8, 0.0])
     offset = np.array([0.3, 0.8]) - team.start.position[:2]
     heading = 2.0 * math.atan2(*line['turn'])
     assert_allclose(heading, math.atan2(offset[1], offset[0]), atol=0.02)
-    team.until(lambda: stand(team) or result.done())
+    team.ended(result, stand)
     assert result.result().result.reached
-    # Given up by Nav2.
-    result = send(team, [1.2, 0.8, 0.0]).get_result_async()
-    team.until(lambda: stand(team) or result.done())
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert 'Nav2 gave it up, error 208' in result.result().result.reason
-    # Refused by Nav2.
-    result = send(team, [1.8, 0.8, 0.0]).get_result_async()
-    team.until(lambda: stand(team) or result.done())
-    assert 'Nav2 refuses' in result.result().result.reason
+    # Given up by Nav2, and refused by it.
+    assert 'Nav2 gave it up, error 208' in team.aborted(send(1.2)[1], stand)
+    assert 'Nav2 refuses' in team.aborted(send(1.8)[1], stand)
     # On the way the commands are Nav2's. A new goal preempts; cancelled, it is told so.
-    replaced = send(team, [0.7, 0.8, 0.0]).get_result_async()
-    heard(team, said, 'goal')
-    since = team.step
-    team.until(lambda: stand(team) or team.state.step > since + 10)
-    assert all(stamp_from_ros(item.header.stamp) <= since * NANOSECONDS for item in team.commands)
-    since = team.step
-    handle = send(team, [0.9, 0.8, 0.0])
-    lines = []
-    while not lines or lines[-1]['event'] != 'preempted':
-        team.until(lambda: stand(team) or not said.empty())
-        lines.append(said.get())
+    replaced = send(0.7)[1]
+    hear('goal')
+    nothing_is_commanded()
+    handle, result = send(0.9)
+    lines = hear('preempted')
     # Its own stop of the goal before would be one of the robot.
     assert 'cancelled' not in [line['event'] for line in lines]
     assert lines[-1]['position'][0] == pytest.approx(0.7)
-    team.until(lambda: stand(team) or replaced.done())
-    assert replaced.result().result.reason == 'replaced'
-    team.until(lambda: stand(team) or team.state.step > since + 10)
-    assert all(stamp_from_ros(item.header.stamp) <= since * NANOSECONDS for item in team.commands)
-    result, cancelled = handle.get_result_async(), handle.cancel_goal_async()
-    assert heard(team, said, 'cancelled')['position'][0] == pytest.approx(0.9)
-    team.until(lambda: stand(team) or (cancelled.done() and result.done()))
-    assert result.result().status == GoalStatus.STATUS_CANCELED
+    assert team.aborted(replaced, stand) == 'replaced'
+    nothing_is_commanded()
+    handle.cancel_goal_async()
+    assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.9)
+    assert team.ended(result, stand)[0] == GoalStatus.STATUS_CANCELED
     assert_array_equal(team.command, np.zeros(4))
     # Refused by Nav2 on the way: it stops.
-    send(team, [0.7, 0.8, 0.0])
-    heard(team, said, 'goal')
-    result = send(team, [1.8, 0.8, 0.0]).get_result_async()
-    assert heard(team, said, 'cancelled')['position'][0] == pytest.approx(0.7)
-    assert 'Nav2 refuses' in reason_of_abort(team, result)
+    send(0.7)
+    hear('goal')
+    result = send(1.8)[1]
+    assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.7)
+    assert 'Nav2 refuses' in team.aborted(result, stand)
     # A pose that hangs while the odometry's velocity says that it should not.
-    result = send(team, [0.7, 0.8, 0.0]).get_result_async()
-    heard(team, said, 'goal')
+    result = send(0.7)[1]
+    hear('goal')
     team.body.step([0.2, 0.0, 0.0, 0.0], 1.0)
-    assert heard(team, said, 'cancelled')['position'][0] == pytest.approx(0.7)
-    team.until(lambda: stand(team) or result.done())
-    assert 'the pose has not changed for' in result.result().result.reason
+    assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.7)
+    assert 'the pose has not changed for' in team.aborted(result, stand)
     team.body.step([0.0, 0.0, 0.0, 0.0], 2.0)
-    team.until(lambda: stand(team) or team.state.goal_status == AgentState.ABORTED)
+    team.until(lambda: stand() or team.state.goal_status == AgentState.ABORTED)
     # Nav2 dies on the way.
-    result = send(team, [0.7, 0.8, 0.0]).get_result_async()
-    heard(team, said, 'goal')
+    result = send(0.7)[1]
+    hear('goal')
     nav2.kill()
-    reason = reason_of_abort(team, result)
+    reason = team.aborted(result, stand)
     assert_array_equal(team.command, np.zeros(4))
     # On a busy machine odometry may have been missed first, so it is sent until Nav2 is the reason.
     while 'Nav2' not in reason:
         assert 'no odometry for' in reason
-        handle = send(team, [0.7, 0.8, 0.0])
-        reason = reason_of_abort(team, handle.get_result_async())
+        reason = team.aborted(send(0.7)[1], stand)
     assert 'no answer or feedback of Nav2 for' in reason or 'Nav2 is' in reason
 
 
-def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, start_guard):
-    team, said, _, driver = driven
+def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(
+    driven, nav2, stand, hear, start_guard
+):
+    team, _, driver = driven
+    said, _ = nav2
     guard = start_guard()
-    send_first(team, [0.7, 0.8, 0.0])
-    heard(team, said, 'goal')
+    send_first(team, [0.7, 0.8, 0.0], stand)
+    hear('goal')
     # No odometry.
     team.until(lambda: not said.empty())
     assert said.get()['event'] == 'cancelled'
     team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
-    team.until(lambda: stand(team) or team.state.goal_status == AgentState.ABORTED)
-    send(team, [0.9, 0.8, 0.0])
-    heard(team, said, 'goal')
+    team.until(lambda: stand() or team.state.goal_status == AgentState.ABORTED)
+    team.send([0.9, 0.8, 0.0], live=stand)
+    hear('goal')
     team.until(guard._nav2.service_is_ready)
     driver.kill()
     driver.wait()
@@ -345,13 +300,9 @@ def test_nav2_does_not_drive_a_robot_whose_pose_is_not_known(nav2, with_nav2, pr
     process(environment=with_nav2, navigation='nav2')
     team = make_team(TURTLEBOT | {'navigation': 'nav2'})
     team.connect()
-    reasons = []
-    team.until(
-        lambda: (
-            reasons.append(team.refused([0.7, 0.8, 0.0])) or 'Nav2 is not there' not in reasons[-1]
-        )
-    )
-    assert reasons[-1] == 'no pose on tf yet'
+    while 'Nav2 is not there' in (reason := team.refused([0.7, 0.8, 0.0])):
+        pass
+    assert reason == 'no pose on tf yet'
     assert said.empty()
 
 

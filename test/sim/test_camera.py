@@ -40,9 +40,8 @@ def centroid(image):
 
 def test_an_empty_floor_is_one_colour():
     image = renderer([]).render(DOWN, 0, 0.0)
-    assert image.shape == (120, 160, 3)
     assert image.dtype == np.uint8
-    assert_array_equal(image, np.broadcast_to([120, 120, 117], image.shape))
+    assert_array_equal(image, np.broadcast_to([120, 120, 117], (120, 160, 3)))
 
 
 @pytest.mark.parametrize('seed', range(6))
@@ -81,33 +80,26 @@ def test_a_marker_covers_its_area_up_to_the_border(focal, pixel, share):
     assert coverage(image)[round(pixel[1]), max(round(pixel[0]), 0)] > 0.95
 
 
-def test_above_the_horizon_there_are_no_markers():
+def test_markers_are_seen_only_from_above_and_below_the_horizon():
     view = camera(mount={'position': [0.0, 0.0, 0.2], 'rpy': [0.0, 0.0, 0.0]})
-    ground = Pose.from_yaw([0.0, 0.0, 0.0], 0.0)
-    image = renderer([disc([1.5, 0.0], 0.3, MARKER)], view=view).render(ground, 0, 0.0)
+    image = renderer([disc([1.5, 0.0], 0.3, MARKER)], view=view).render(Pose([0, 0, 0]), 0, 0.0)
     assert (coverage(image)[:59] < 0.02).all()
     assert coverage(image)[60:].max() > 0.9
-
-
-def test_under_the_floor_nothing_is_seen_and_nothing_breaks():
-    image = renderer([disc([0.0, 0.0], 0.3, MARKER)]).render(
-        Pose.from_yaw([0.0, 0.0, -1.0], 0.0), 0, 0.0, (1.0, 0.0, 0.0)
+    under = renderer([disc([0.0, 0.0], 0.3, MARKER)]).render(
+        Pose([0.0, 0.0, -1.0]), 0, 0.0, (1.0, 0.0, 0.0)
     )
-    assert (coverage(image) < 0.02).all()
+    assert (coverage(under) < 0.02).all()
 
 
 def test_what_lies_on_top_hides_what_lies_below():
     shapes = [disc([0, 0], 0.05, [1.0, 0.0, 0.0]), disc([0, 0], 0.02, [0.0, 1.0, 0.0])]
     image = renderer(shapes).render(DOWN, 0, 0.0)
-    assert_array_equal(image[59, 79], [0, 255, 0])
-    assert_array_equal(image[59, 79 + 10], [255, 0, 0])
+    assert_array_equal(image[59, [79, 89]], [[0, 255, 0], [255, 0, 0]])
 
 
 @pytest.mark.parametrize(
     ('velocity', 'rate'),
     [
-        ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        ((0.0, 1.0, 0.0), (0.0, 0.0, 0.0)),
         ((0.6, -0.5, 0.0), (0.0, 0.0, 0.0)),
         ((0.0, 0.0, 1.5), (0.0, 0.0, 0.0)),
         ((0.0, 0.0, 0.0), (0.8, 0.0, 0.0)),
@@ -140,7 +132,6 @@ def test_noise_has_the_deviation_that_is_set_and_is_keyed():
     image = one.render(DOWN, 5, 0.0)
     assert_allclose(image.std(axis=(0, 1)), np.sqrt(9 + 0.1 * 120), rtol=0.03)
     assert_allclose(image.mean(axis=(0, 1)), [119.85, 119.85, 117.3], atol=0.2)
-    assert_array_equal(renderer([], settings).render(DOWN, 5, 0.0), image)
     for other in (
         one.render(DOWN, 6, 0.0),
         renderer([], settings, seed=2).render(DOWN, 5, 0.0),
@@ -148,16 +139,11 @@ def test_noise_has_the_deviation_that_is_set_and_is_keyed():
     ):
         both = np.stack([image[..., 0].ravel(), other[..., 0].ravel()]).astype(float)
         assert abs(np.corrcoef(both)[0, 1]) < 0.02
-
-
-def test_the_order_of_rendering_does_not_matter():
-    settings = RenderSettings()
+    # The order of rendering does not matter, with disturbances of all kinds.
     shapes = [disc([0.1, 0.0], 0.015, MARKER)]
-    other = Pose.from_yaw([0.5, 0.5, 1.2], 1.0)
-    first, second = renderer(shapes, settings), renderer(shapes, settings)
-    a = first.render(DOWN, 1, 0.1)
-    second.render(other, 2, 0.2)
-    assert_array_equal(second.render(DOWN, 1, 0.1), a)
+    first, second = (renderer(shapes, RenderSettings()) for _ in range(2))
+    second.render(Pose.from_yaw([0.5, 0.5, 1.2], 1.0), 2, 0.2)
+    assert_array_equal(second.render(DOWN, 1, 0.1), first.render(DOWN, 1, 0.1))
 
 
 def test_light_vignetting_and_drift_change_brightness_as_set():

@@ -15,10 +15,10 @@ TURTLEBOTS = {
 }
 
 
-def scenario(kind, start=(0.0, 0.0, 0.0)):
+def scenario(kind, height=0.0):
     robot = {
         'type': kind,
-        'start': list(start),
+        'start': [0.0, 0.0, height],
         'candidates': {'grid': [8, 8], 'spacing': 0.24, 'corner': [-0.2, -0.2]},
     }
     values = {
@@ -39,26 +39,19 @@ def test_the_turtlebots_are_there():
 
 @pytest.mark.parametrize('kind', [*TURTLEBOTS, 'mambo'])
 def test_a_marker_in_the_field_of_view_is_in_the_image_as_a_whole(kind):
-    robot = scenario(kind, (0.0, 0.0, 1.0 if kind == 'mambo' else 0.0)).robots['rover']
-    box = robot.sensor.detection
-    assert robot.camera is not None
-    radius = 0.5 * robot.camera.marker_diameter
-    margin = box_view_margin(
-        Camera.from_settings(robot.camera),
-        np.array(box.lower) - radius,
-        np.array(box.upper) + radius,
-        robot.start[2],
-    )
-    assert margin > 0.0
+    robot = scenario(kind, 1.0 if kind == 'mambo' else 0.0).robots['rover']
+    box, radius = robot.sensor.detection, 0.5 * robot.camera.marker_diameter
+    lower, upper = np.array(box.lower) - radius, np.array(box.upper) + radius
+    camera = Camera.from_settings(robot.camera)
+    assert box_view_margin(camera, lower, upper, robot.start[2]) > 0.0
 
 
 @pytest.mark.parametrize('kind', TURTLEBOTS)
 def test_a_turtlebot_keeps_its_limits_and_finds_markers(kind):
     given = scenario(kind)
-    speed, turn = TURTLEBOTS[kind]
     motion = given.robots['rover'].motion
-    assert motion.speed <= speed
-    assert motion.yaw_rate <= turn
+    speed, turn = TURTLEBOTS[kind]
+    assert motion.speed <= speed and motion.yaw_rate <= turn
     result = search(given, seed=2)
     assert result.end_reason == 'all_found'
     assert result.rmse < 0.015

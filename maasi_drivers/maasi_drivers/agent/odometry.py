@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -130,7 +131,6 @@ class PoseHistory:
 
     def __init__(self, length: int = 512) -> None:
         self.length = length
-        self._stamps: list[int] = []
         self._poses: list[StampedPose] = []
 
     @property
@@ -141,20 +141,17 @@ class PoseHistory:
     @property
     def first(self) -> int | None:
         """The earliest stamp kept [ns], or None."""
-        return self._stamps[0] if self._stamps else None
+        return self._poses[0].stamp if self._poses else None
 
     def add(self, pose: StampedPose) -> None:
         """Add a pose, unless its stamp is not after the last one's."""
-        if self._stamps and pose.stamp <= self._stamps[-1]:
+        if self._poses and pose.stamp <= self._poses[-1].stamp:
             return
-        self._stamps.append(pose.stamp)
         self._poses.append(pose)
-        if len(self._stamps) > self.length:
-            del self._stamps[0], self._poses[0]
+        del self._poses[: -self.length]
 
     def clear(self) -> None:
         """Discard everything, as after a jump of the clock."""
-        self._stamps.clear()
         self._poses.clear()
 
     def at(self, stamp: int) -> StampedPose | None:
@@ -163,14 +160,11 @@ class PoseHistory:
         None where the stamp is before the first pose kept or after the last one: nothing is
         extrapolated, the caller waits for the next odometry.
         """
-        index = bisect_left(self._stamps, stamp)
-        if index == len(self._stamps):
+        poses = self._poses
+        if not poses or not poses[0].stamp <= stamp <= poses[-1].stamp:
             return None
-        if self._stamps[index] == stamp:
-            return self._poses[index]
-        if index == 0:
-            return None
-        return interpolate(self._poses[index - 1], self._poses[index], stamp)
+        index = bisect_left(poses, stamp, key=attrgetter('stamp'))
+        return interpolate(poses[max(index - 1, 0)], poses[index], stamp)
 
 
 # Longest time over which a difference is a velocity [ns].

@@ -117,16 +117,14 @@ class RobotFrames:
         self._base = base_frame(robot, self._settings)
         self._odom = f'{robot}/odom'
         self._buffer = TransformBuffer()
-        self._static: list[TransformStamped] = []
+        # By child frame.
+        self._static: dict[str, TransformStamped] = {}
         self._map_from_odom: Pose | None = None
         self._slot: int | None = None
         self._taken: int | None = None
         self._publisher: Publisher | None = None
         self._static_publisher: Publisher | None = None
-        self._moving = TransformStamped(child_frame_id=self._base)
-        self._moving.header.frame_id = self._odom
         self._type = self._message_type()
-        self._message = None if self._type is None else self._type(transforms=[self._moving])
         self._connect()
 
     def _message_type(self) -> Any:
@@ -186,32 +184,33 @@ class RobotFrames:
             self._add_static(settings.frame, self._odom, map_from_odom)
             self._publish_static()
         pose = compose(inverse(map_from_odom), placed.pose)
-        self._know(self._odom, self._base, pose, placed.stamp)
-        self._moving.header.stamp = stamp_to_ros(placed.stamp)
-        _fill(self._moving, pose)
+        moving = self._transform(self._odom, self._base, pose, placed.stamp)
         if self._publisher is not None:
-            self._publisher.publish(self._message)
+            self._publisher.publish(self._type(transforms=[moving]))
 
     def _add_static(self, parent: str, child: str, pose: Pose) -> None:
-        self._know(parent, child, pose)
-        # The stamp of a static transform has no meaning.
-        transform = TransformStamped(child_frame_id=child)
-        transform.header.frame_id = parent
-        _fill(transform, pose)
-        self._static = [item for item in self._static if item.child_frame_id != child]
-        self._static.append(transform)
+        self._static[child] = self._transform(parent, child, pose)
 
-    def _know(self, parent: str, child: str, pose: Pose, stamp: int | None = None) -> None:
+    def _transform(
+        self, parent: str, child: str, pose: Pose, stamp: int | None = None
+    ) -> TransformStamped:
+        """Return a transform, and know it; without a stamp [ns] it is static."""
         try:
             self._buffer.add(parent, child, pose, stamp or 0, static=stamp is None)
         except ValueError as error:
             # For example a peer publishes a parent frame of the same name.
             self._node.drop('transform', f'frames of this robot: {error}')
+        made = TransformStamped(child_frame_id=child)
+        made.header.frame_id, made.header.stamp = parent, stamp_to_ros(stamp or 0)
+        place, turn = made.transform.translation, made.transform.rotation
+        place.x, place.y, place.z = pose.position.tolist()
+        turn.w, turn.x, turn.y, turn.z = pose.orientation.tolist()
+        return made
 
     def _publish_static(self) -> None:
         # All of them each time: only the last message is latched.
-        if self._static_publisher is not None and self._static and self._type is not None:
-            self._static_publisher.publish(self._type(transforms=self._static))
+        if self._static_publisher is not None and self._static:
+            self._static_publisher.publish(self._type(transforms=[*self._static.values()]))
 
     # ---- what others publish -----------------------------------------------------------------
 
@@ -294,9 +293,3 @@ class RobotFrames:
         point.x, point.y, point.z = position.tolist()
         header.frame_id = settings.frame
         return None
-
-
-def _fill(transform: TransformStamped, pose: Pose) -> None:
-    place, turn = transform.transform.translation, transform.transform.rotation
-    place.x, place.y, place.z = pose.position.tolist()
-    turn.w, turn.x, turn.y, turn.z = pose.orientation.tolist()

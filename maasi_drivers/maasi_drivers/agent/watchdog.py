@@ -40,18 +40,12 @@ class StatePublisher:
     def publish(self, placed: StampedPose, step: int) -> None:
         """Publish a pose at a step, with goal and faults."""
         state = self._state
-        state.header.stamp = stamp_to_ros(placed.stamp)
-        state.step = step
-        position, orientation = state.pose.pose.position, state.pose.pose.orientation
-        position.x, position.y, position.z = placed.pose.position.tolist()
-        orientation.w, orientation.x, orientation.y, orientation.z = (
-            placed.pose.orientation.tolist()
-        )
+        state.pose.pose = pose_to_ros(placed.pose)
         state.pose.covariance = placed.covariance.ravel()
         linear, angular = state.twist.linear, state.twist.angular
         linear.x, linear.y, linear.z = placed.velocity.tolist()
         angular.x, angular.y, angular.z = placed.angular_velocity.tolist()
-        self.publish_status()
+        self.publish_status(placed.stamp, step)
 
     def publish_status(self, stamp: int | None = None, step: int | None = None) -> None:
         """Publish goal and faults with the last pose; by default with its stamp [ns] and step."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.sensor_reading import SensorReading, measured
-from maasi_drivers.settings.camera import DETECTORS, CameraSettings, SegmentationSettings
+from maasi_drivers.settings.camera import DETECTORS, CameraSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.detector import Blobs, Detector
 from maasi_drivers.vision.segmentation import segment
@@ -25,12 +25,7 @@ _FLOOR_DEVIATION = 0.005
 class MarkerDetector:
     """The camera as a sensor of range and bearing to markers on the floor (001, section 6.1).
 
-    Parameters
-    ----------
-    settings : CameraSettings
-        Camera, mount, noise and segmentation rule.
-    dimension : {2, 3}
-        Of the search: range and bearing, or with elevation.
+    In 3D of elevation as well.
     """
 
     def __init__(self, settings: CameraSettings, dimension: int = 2) -> None:
@@ -68,26 +63,11 @@ class MarkerDetector:
     def detect(
         self, picture: ImageArray | Blobs, pose: Pose, pose_covariance: FloatArray | None = None
     ) -> SensorReading:
-        """Find the markers in an image.
+        """Find the markers in an image, or in blobs that were found in it.
 
-        Parameters
-        ----------
-        picture : ndarray, shape (h, w, 3), uint8, or Blobs
-            R, G, B, of the size in the settings; or what was found in it.
-        pose : Pose
-            Of the robot in the map frame when the image was taken.
-        pose_covariance : ndarray, shape (6, 6), optional
-            As in ``geometry_msgs/PoseWithCovariance``; without it, the settings' deviations.
-
-        Returns
-        -------
-        SensorReading
-            To first order, with the covariances of pixels and pose (000, eq. (6) to (9)).
-
-        Raises
-        ------
-        ValueError
-            If the image has another size than the calibrated one.
+        To first order, with the covariances of pixels and pose (000, eq. (6) to (9)). Without a
+        covariance (6, 6) of the pose it is that of the settings' deviations. `ValueError` if the
+        image has another size than the calibrated one.
         """
         camera, settings = self.camera, self.settings
         blobs = picture if isinstance(picture, Blobs) else self.segment(picture)
@@ -154,10 +134,6 @@ def read_markers(
 
 
 def warm_up() -> None:
-    """Run segmentation and projection once, so that the first image is not late."""
-    image = np.full((120, 160, 3), 120, dtype=np.uint8)
-    image[58:63, 78:83] = (20, 40, 160)
-    for rule in ('paper', 'robust'):
-        segmentation = SegmentationSettings.model_validate({'rule': rule})
-        detector = MarkerDetector(CameraSettings(segmentation=segmentation))
-        detector.detect(image, Pose.from_yaw([0.0, 0.0, 1.0], 0.0))
+    """Compile, so that the first image is not late."""
+    grey = np.full((120, 160, 3), 120, dtype=np.uint8)
+    MarkerDetector(CameraSettings()).detect(grey, Pose(np.array([0.0, 0.0, 1.0])))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from maasi_drivers.settings.camera import SegmentationSettings
 from maasi_drivers.vision.detector import Blobs
-from maasi_filter.arrays import BoolArray, FloatArray, ImageArray, IntArray
+from maasi_filter.arrays import FloatArray, ImageArray, IntArray
 
 # About how many pixels the colour of the floor is taken from.
 _FLOOR_SAMPLES = 4096
@@ -38,36 +38,22 @@ def _planes(image: ImageArray) -> list[ImageArray]:
     return [np.asarray(plane, dtype=np.uint8) for plane in cv2.split(image)]
 
 
-class _Components(NamedTuple):
-    """The 8-connected components of a mask (h, w), in the order of rows.
+def _components(mask: ImageArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
+    """Return the 8-connected components of a mask (h, w), in the order of rows.
 
-    Labels are component plus one, 0: background; boxes (n, 4): left, top, width, height.
+    Labels (h, w), component plus one, 0: background; boxes (n, 4): left, top, width, height; and
+    the components as blobs with the plain centroids of their pixels.
     """
-
-    labels: NDArray[np.int32]
-    boxes: IntArray
-    areas: IntArray
-    centroids: FloatArray
-
-
-def _components(mask: ImageArray) -> _Components:
     # Labelled pixel by pixel: other algorithms number them in the order of blocks of pixels.
     _, labels, stats, centroids = cv2.connectedComponentsWithStatsWithAlgorithm(
         mask, 8, cv2.CV_32S, cv2.CCL_SAUF
     )
-    numbers = stats[1:].astype(np.int64)
-    boxes = np.ascontiguousarray(numbers[:, :4])
-    return _Components(
-        np.asarray(labels, np.int32),
-        boxes,
-        numbers[:, 4].copy(),
-        np.asarray(centroids[1:], np.float64),
-    )
-
-
-def _border_cut(boxes: IntArray, shape: tuple[int, ...]) -> BoolArray:
+    boxes, areas = stats[1:, :4], stats[1:, 4]
     low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
-    return np.asarray(((low <= 0) | (high >= np.array([shape[1], shape[0]]))).any(axis=1))
+    cut = np.asarray(((low <= 0) | (high >= mask.shape[::-1])).any(axis=1))
+    places, spread = np.asarray(centroids[1:], float), np.zeros((len(areas), 2, 2))
+    blobs = Blobs(places, areas.astype(float), boxes[:, 2:].astype(float), cut, spread)
+    return np.asarray(labels, np.int32), np.asarray(boxes, np.int64), blobs
 
 
 def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
@@ -77,22 +63,17 @@ def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     Shapes and units: image (h, w, 3).
     """
     mask = paper_mask(image, settings.threshold)
-    _, boxes, areas, centroids = _components(mask)
-    blobs = Blobs(
-        centroids,
-        areas.astype(np.float64),
-        boxes[:, 2:].astype(np.float64),
-        _border_cut(boxes, mask.shape),
-        np.zeros((len(areas), 2, 2)),
-    )
-    return blobs.select(areas >= settings.minimum_area * mask.size)
+    blobs = _components(mask)[2]
+    return blobs.select(blobs.areas >= settings.minimum_area * mask.size)
 
 
 def _median(counts: NDArray[Any]) -> float:
     """Return the median of counted whole numbers, interpolated within its bin."""
-    half = 0.5 * counts.sum()
-    value = int(np.flatnonzero((counts > 0) & (np.cumsum(counts) >= half))[0])
-    return value - 0.5 + float(half - counts[:value].sum()) / float(counts[value])
+    total = np.cumsum(counts)
+    half = 0.5 * total[-1]
+    value = int(np.searchsorted(total, half))
+    before = total[value] - counts[value]
+    return value - 0.5 + float(half - before) / float(counts[value])
 
 
 def _blueness(balanced: FloatArray) -> FloatArray:
@@ -140,17 +121,21 @@ def _robust_mask(red, green, blue, gains, threshold, mask):
 
 
 def _compact(
-    image: ImageArray, components: _Components, gains: FloatArray, gates: tuple[float, float, float]
+    image: ImageArray,
+    labels: NDArray[np.int32],
+    boxes: IntArray,
+    gains: FloatArray,
+    gates: tuple[float, float, float],
 ) -> list[int]:
     """Return the components within the gates: least peak blueness, aspect, solidity."""
-    marked = np.flatnonzero(components.labels)
-    if not len(marked):
+    if not len(boxes):
         return []
-    rows, columns = np.divmod(marked, image.shape[1])
-    owners, count = components.labels[rows, columns] - 1, components.areas
+    columns, rows = cv2.findNonZero((labels > 0).view(np.uint8))[:, 0].T
+    owners = labels[rows, columns] - 1
+    count = np.bincount(owners)
     moments = [
         np.bincount(owners, weights=values)
-        for x, y in [(columns - components.boxes[owners, 0], rows - components.boxes[owners, 1])]
+        for x, y in [(columns - boxes[owners, 0], rows - boxes[owners, 1])]
         for values in (x, y, x * x, y * y, x * y)
     ]
     mx, my, xx, yy, xy = (values / count for values in moments)
@@ -168,17 +153,17 @@ def _compact(
 
 
 def _weigh(
-    image: ImageArray, components: _Components, blob: int, gains: FloatArray
+    image: ImageArray, labels: NDArray[np.int32], box: IntArray, blob: int, gains: FloatArray
 ) -> tuple[float, FloatArray, FloatArray] | None:
     """Return area, centroid and its variances (2,), by how much of each pixel is marker.
 
     None where that is much less than the pixels of the component.
     """
-    left, top, width, height = components.boxes[blob].tolist()
+    left, top, width, height = box.tolist()
     # The component's box and three pixels around it.
     first_row, first_column = max(top - 3, 0), max(left - 3, 0)
     window = np.s_[first_row : top + height + 3, first_column : left + width + 3]
-    labels, excess = components.labels[window], _excess(gains * image[window])
+    labels, excess = labels[window], _excess(gains * image[window])
     own, floor = labels == blob + 1, labels == 0
     # The excess of a pixel inside a marker: the mean of the upper half of the component.
     values = np.sort(excess[own])
@@ -224,24 +209,24 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     mask = np.empty(image.shape[:2], dtype=np.uint8)
     red, green, blue = _planes(image)
     _robust_mask(red, green, blue, gains.astype(np.float32), threshold, mask)
-    components = _components(mask)
+    labels, boxes, blobs = _components(mask)
     gates = (
         max(settings.peak_saturation, threshold),
         settings.maximum_aspect,
         settings.minimum_solidity,
     )
     found = []
-    for blob in _compact(image, components, gains, gates):
-        if (measured := _weigh(image, components, blob, gains)) is not None:
+    for blob in _compact(image, labels, boxes, gains, gates):
+        if (measured := _weigh(image, labels, boxes[blob], blob, gains)) is not None:
             found.append((blob, *measured))
-    boxes = components.boxes[[item[0] for item in found]]
+    chosen = np.array([item[0] for item in found], dtype=int)
     covariances = np.zeros((len(found), 2, 2))
     covariances[:, [0, 1], [0, 1]] = np.reshape([item[3] for item in found], (-1, 2))
     return Blobs(
         np.reshape([item[2] for item in found], (-1, 2)),
         np.array([item[1] for item in found]),
-        boxes[:, 2:].astype(np.float64),
-        _border_cut(boxes, image.shape),
+        blobs.extents[chosen],
+        blobs.border_cut[chosen],
         covariances,
     )
 

@@ -28,19 +28,18 @@ _MAXIMUM_SUBSAMPLES = 33
 _TEXTURE_CELL = 0.01
 
 
-class View(NamedTuple):
-    """A camera in the map: centre (3,) [m], turn (3, 3) from camera to map, and its model."""
+class Shot(NamedTuple):
+    """A camera in the map, and the motion of its robot during the exposure.
+
+    Centre (3,) [m], turn (3, 3) from camera to map, and the camera's model; origin of the robot
+    (3,) [m], its velocities in the map (3,) [m/s, rad/s], and the exposure's time [s].
+    """
 
     centre: FloatArray
     turn: FloatArray
     matrix: FloatArray
     distortion: FloatArray
     largest_radius: float
-
-
-class Motion(NamedTuple):
-    """Of the robot during the exposure: origin (3,) [m], map frame [m/s, rad/s], time [s]."""
-
     origin: FloatArray
     velocity: FloatArray
     rotation_rate: FloatArray
@@ -78,9 +77,9 @@ def floor_points(rays, turn, centre, floor_x, floor_y):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def _project(points, view):  # type: ignore[no-untyped-def]
+def _project(points, shot):  # type: ignore[no-untyped-def]
     """Pixels (n, 2) of points (n, 3), as `Camera.project`; in a kernel, for small images."""
-    centre, turn, matrix, k = view.centre, view.turn, view.matrix, view.distortion
+    centre, turn, matrix, k = shot.centre, shot.turn, shot.matrix, shot.distortion
     pixels = np.full((points.shape[0], 2), np.nan)
     for i in range(points.shape[0]):
         dx, dy, dz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
@@ -88,7 +87,7 @@ def _project(points, view):  # type: ignore[no-untyped-def]
         x = (turn[0, 0] * dx + turn[1, 0] * dy + turn[2, 0] * dz) / max(depth, 1e-9)
         y = (turn[0, 1] * dx + turn[1, 1] * dy + turn[2, 1] * dz) / max(depth, 1e-9)
         r2 = x * x + y * y
-        if depth > 1e-9 and r2 < view.largest_radius * view.largest_radius:
+        if depth > 1e-9 and r2 < shot.largest_radius * shot.largest_radius:
             radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
             u = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
             v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
@@ -98,15 +97,15 @@ def _project(points, view):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def place(shapes, rims, floor_x, floor_y, view, motion, margin, boxes, drift):  # type: ignore[no-untyped-def]
+def place(shapes, rims, floor_x, floor_y, shot, margin, boxes, drift):  # type: ignore[no-untyped-def]
     """Find the pixels that each shape may touch, and how far it moves during the exposure.
 
     boxes (n, 4): left, top, right, bottom; empty where the shape is out of view. drift (n, 2): in
     the floor's coordinates of mid exposure [m].
     """
-    centre, matrix = view.centre, view.matrix
-    origin, exposure_time = motion.origin, motion.exposure_time
-    velocity, rotation_rate = motion.velocity, motion.rotation_rate
+    centre, matrix = shot.centre, shot.matrix
+    origin, exposure_time = shot.origin, shot.exposure_time
+    velocity, rotation_rate = shot.velocity, shot.rotation_rate
     height, width = floor_x.shape
     left = bottom = np.inf
     right = top = -np.inf
@@ -143,7 +142,7 @@ def place(shapes, rims, floor_x, floor_y, view, motion, margin, boxes, drift):  
             drift[i, 1] = -exposure_time * (moved_y + (y - centre[1]) / centre[2] * moved_z)
             move = np.sqrt(drift[i, 0] ** 2 + drift[i, 1] ** 2)
             spread = move * max(matrix[0, 0], matrix[1, 1]) / centre[2]
-        pixels = _project(rims[i], view)
+        pixels = _project(rims[i], shot)
         low_x = low_y = np.inf
         high_x = high_y = -np.inf
         lost = False
@@ -386,15 +385,19 @@ class CameraRenderer:
         floor = self._floor_x, self._floor_y
         floor_points(self._rays, turn, centre, *floor)
         floor_albedo(*floor, self._floor_colour, settings.floor_texture, self._albedo)
-        view = View(centre, turn, camera.matrix, camera.distortion, float(camera.largest_radius))
-        motion = Motion(
+        shot = Shot(
+            centre,
+            turn,
+            camera.matrix,
+            camera.distortion,
+            float(camera.largest_radius),
             pose.position,
             np.array(velocity, dtype=float),
             rotation @ np.asarray(angular_velocity, dtype=float),
             float(settings.exposure_time),
         )
         margin = 3.0 + 2.0 * settings.blur
-        place(self._shapes, self._rims, *floor, view, motion, margin, self._boxes, self._drift)
+        place(self._shapes, self._rims, *floor, shot, margin, self._boxes, self._drift)
         paint(self._albedo, *floor, self._shapes, self._boxes, self._drift, settings.blur)
         offsets = noise_stream(self.seed, self.robot, step, 'camera').integers(
             0, len(self._noise) - camera.width, size=(camera.height, 3)
