@@ -1,20 +1,15 @@
 """The command of the fault campaign: selects cases, runs them, summarises the results."""
 
-from __future__ import annotations
-
-import argparse
 import json
 import os
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
 
 from chaos_cases import Case, all_cases
 from chaos_execution import execute
@@ -23,8 +18,7 @@ from chaos_verdict import judge
 from maasi_sim.arguments import Parser, count, whole
 
 PASSED, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
-_SEED = 1
-_GOLDEN = 0.6180339887498949
+GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True)
@@ -37,13 +31,8 @@ class Result:
     ended_after: float
     problems: list[str]
 
-    @property
-    def passed(self) -> bool:
-        """Whether all guarantees held."""
-        return not self.problems
 
-
-def build_parser() -> argparse.ArgumentParser:
+def build_parser():
     """Return the parser of the command line."""
     parser = Parser(
         prog='chaos',
@@ -51,19 +40,14 @@ def build_parser() -> argparse.ArgumentParser:
         'exit code, robots at rest, found targets, recording, report, processes.',
         epilog='Exit codes: 0 all cases passed, 1 some did not, 2 wrong input, 130 interrupted.',
     )
-    parser.add_argument('--list', action='store_true', help='list all cases and exit')
-    parser.add_argument(
-        '--case', nargs='+', action='extend', metavar='NAME', help='only these; * is a wildcard'
-    )
-    parser.add_argument('--seed', type=whole, default=_SEED, metavar='N', help='of all runs')
-    parser.add_argument('--json', type=Path, metavar='FILE', help='write the results')
-    parser.add_argument(
-        '--out', type=Path, metavar='DIR', help='keep the runs (default: a temporary folder)'
-    )
-    parser.add_argument(
-        '--jobs', type=count, default=1, metavar='N', help='cases in parallel (default: 1)'
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add('--list', action='store_true', help='list all cases and exit')
+    add('--case', nargs='+', action='extend', metavar='NAME', help='only these; * is a wildcard')
+    add('--seed', type=whole, default=1, metavar='N', help='of all runs')
+    add('--json', type=Path, metavar='FILE', help='write the results')
+    add('--out', type=Path, metavar='DIR', help='keep the runs (default: a temporary folder)')
+    add('--jobs', type=count, default=1, metavar='N', help='cases in parallel (default: 1)')
+    add(
         '--budget',
         type=float,
         metavar='S',
@@ -72,7 +56,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def chosen_cases(names: Sequence[str] | None) -> list[Case]:
+def chosen_cases(names):
     """Return the cases of some names or patterns; a pattern without any is a ValueError."""
     cases = all_cases()
     for name in names or ():
@@ -82,30 +66,22 @@ def chosen_cases(names: Sequence[str] | None) -> list[Case]:
     return [case for case in cases if any(fnmatchcase(case.name, name) for name in chosen)]
 
 
-def run_case(case: Case, folder: Path, seed: int) -> Result:
-    """Run and check a case."""
-    begin = time.monotonic()
-    outcome = execute(case, folder / case.name, seed)
-    seconds = time.monotonic() - begin
-    return Result(case, outcome.code, seconds, outcome.ended_after, judge(case, outcome))
-
-
-def summary(results: Sequence[Result], seed: int, left_out: int) -> dict[str, Any]:
+def summary(results, seed, left_out):
     """Return the results as plain values."""
-    counts: dict[str, Counter[str]] = {}
+    counts = {}
     for item in results:
         case = item.case
         mode = 'lockstep' if case.lockstep else 'free'
         reaction = 'respawn' if case.respawn else 'end'
         number = 'two' if len(case.nodes) > 1 else 'one'
         kind = f'{case.kind} {mode} {reaction} {case.fault} {case.when} {number}'
-        counts.setdefault(kind, Counter())['passed' if item.passed else 'failed'] += 1
+        counts.setdefault(kind, Counter())['failed' if item.problems else 'passed'] += 1
     return {
         'seed': seed,
-        'passed': sum(item.passed for item in results),
-        'failed': sum(not item.passed for item in results),
+        'passed': sum(not item.problems for item in results),
+        'failed': sum(bool(item.problems) for item in results),
         'left_out': left_out,
-        'counts': {kind: dict(counter) for kind, counter in counts.items()},
+        'counts': counts,
         'cases': [
             {
                 'name': item.case.name,
@@ -120,42 +96,39 @@ def summary(results: Sequence[Result], seed: int, left_out: int) -> dict[str, An
     }
 
 
-def run_all(
-    cases: Sequence[Case],
-    folder: Path,
-    seed: int,
-    jobs: int = 1,
-    budget: float | None = None,
-    file: Path | None = None,
-) -> list[Result]:
+def run_all(cases, folder, options):
     """Run cases, print each result, and write all results after each."""
-    if budget is not None:
+    if options.budget is not None:
         # Spread evenly over the list, wherever the budget ends it.
-        order = sorted(range(len(cases)), key=lambda index: (index * _GOLDEN) % 1.0)
+        order = sorted(range(len(cases)), key=lambda index: (index * GOLDEN) % 1.0)
         cases = [cases[index] for index in order]
-    results: list[Result] = []
-    begin = time.monotonic()
+    results = []
+    first = time.monotonic()
 
-    def work(case: Case) -> None:
-        if budget is not None and time.monotonic() - begin > budget:
+    def work(case):
+        begin = time.monotonic()
+        if options.budget is not None and begin - first > options.budget:
             return
-        result = run_case(case, folder, seed)
-        results.append(result)
-        word = 'passed' if result.passed else 'FAILED'
-        text = f'{word} {case.name}: exit code {result.code}, {result.seconds:.0f} s'
-        print('\n  '.join([text, *result.problems]), flush=True)
-        if file is not None:
-            content = summary(list(results), seed, len(cases) - len(results))
-            part = file.with_name(f'{file.name}.{os.getpid()}.{len(results)}.part')
+        outcome = execute(case, folder / case.name, options.seed)
+        seconds = time.monotonic() - begin
+        problems = judge(case, outcome)
+        results.append(Result(case, outcome.code, seconds, outcome.ended_after, problems))
+        word = 'FAILED' if problems else 'passed'
+        text = f'{word} {case.name}: exit code {outcome.code}, {seconds:.0f} s'
+        print('\n  '.join([text, *problems]), flush=True)
+        if options.json is not None:
+            content = summary(list(results), options.seed, len(cases) - len(results))
+            name = f'{options.json.name}.{os.getpid()}.{len(results)}.part'
+            part = options.json.with_name(name)
             part.write_text(json.dumps(content, indent=1), encoding='utf-8')
-            part.replace(file)
+            part.replace(options.json)
 
-    with ThreadPoolExecutor(jobs) as pool:
+    with ThreadPoolExecutor(options.jobs) as pool:
         list(pool.map(work, cases))
     return results
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments=None):
     """Run the command line and return its exit code."""
     options = build_parser().parse_args(arguments)
     try:
@@ -171,13 +144,11 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix='maasi_chaos_') as temporary:
         folder = Path(temporary) if options.out is None else options.out.resolve()
         try:
-            results = run_all(
-                cases, folder, options.seed, options.jobs, options.budget, options.json
-            )
+            results = run_all(cases, folder, options)
         except KeyboardInterrupt:
             print('error: interrupted', file=sys.stderr)
             return INTERRUPTED
-    passed = sum(item.passed for item in results)
+    passed = sum(not item.problems for item in results)
     left_out = len(cases) - len(results)
     print(
         f'{passed} of {len(results)} cases passed'

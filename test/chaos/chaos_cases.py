@@ -1,16 +1,8 @@
 """The cases of the fault campaign, and the guarantee for each."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
 
 from maasi_sim.emulators.mambo.fake_mambo import free_port
-
-Kind = Literal['search', 'mavlink', 'buildings']
-Fault = Literal['kill', 'pause', 'hang']
-When = Literal['start', 'middle']
 
 SEARCH_NODES = (
     '/sim_node',
@@ -36,7 +28,7 @@ PAUSE = 3.0
 _GRID = {'grid': [6, 6], 'spacing': 0.45, 'corner': [-0.1, -0.1]}
 # One target is in view at the start, so that a result can be lost; the last one is far.
 # Robots pass their waypoints.
-_SEARCH: dict[str, Any] = {
+_SEARCH = {
     'version': 1,
     'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
     'step': 0.05,
@@ -54,7 +46,7 @@ _SEARCH: dict[str, Any] = {
     },
     'planner': {'name': 'maasi', 'measurement': 'periodic'},
 }
-_MAVLINK: dict[str, Any] = {
+_MAVLINK = {
     'version': 1,
     'environment': {'bounds': [[0.0, 40.0], [0.0, 40.0]]},
     'step': 0.1,
@@ -71,7 +63,7 @@ _MAVLINK: dict[str, Any] = {
     'filter': {'method': 'pmb'},
     'planner': {'name': 'maasi', 'measurement': 'periodic'},
 }
-_BUILDINGS: dict[str, Any] = {
+_BUILDINGS = {
     'version': 1,
     'environment': {'bounds': [[0.0, 300.0], [0.0, 300.0], [0.0, 80.0]]},
     'step': 1.0,
@@ -99,15 +91,15 @@ class Case:
     is a search by two robots under topics, by a drone under MAVLink, or of buildings.
     """
 
-    fault: Fault
+    fault: str
     nodes: tuple[str, ...]
-    when: When = 'middle'
+    when: str = 'middle'
     lockstep: bool = False
     respawn: bool = False
-    kind: Kind = 'search'
+    kind: str = 'search'
 
     @property
-    def name(self) -> str:
+    def name(self):
         """Unique name, for the command line."""
         mode = 'lockstep' if self.lockstep else 'free'
         reaction = 'respawn' if self.respawn else 'end'
@@ -115,7 +107,7 @@ class Case:
         return '-'.join((self.kind, mode, reaction, self.fault, self.when, nodes))
 
     @property
-    def ends_the_run(self) -> bool:
+    def ends_the_run(self):
         """Whether exit code 3 is guaranteed; otherwise the run continues to its end, 0 or 1."""
         if self.fault == 'pause':
             return False
@@ -130,9 +122,9 @@ class Case:
             return False
         return self.fault == 'hang' and (self.lockstep or self.when == 'start')
 
-    def scenario(self) -> dict[str, Any]:
+    def scenario(self):
         """Return the content of its scenario file."""
-        limits: dict[str, Any] = {'silence': 8.0, 'start': 120.0, 'time': 12.0}
+        limits = {'silence': 8.0, 'start': 120.0, 'time': 12.0}
         if self.fault == 'hang' and self.when == 'start':
             limits['start'] = 30.0
         if not self.ends_the_run and not self.lockstep:
@@ -153,28 +145,25 @@ class Case:
             'limits': limits,
         }
 
-    def options(self) -> list[str]:
+    def options(self):
         """Return the options of its run."""
         if self.lockstep:
             return ['--lockstep']
         return ['--rate', '3'] if self.kind == 'buildings' else []
 
 
-def _cases(
-    faults: str, struck: Sequence[tuple[str, ...]], modes: str = 'free lockstep', **more: Any
-) -> list[Case]:
+def _cases(faults, struck, modes='free lockstep', respawn=(True, False), **more):
     """Return the cases of faults and nodes in modes; with both reactions, except for pauses."""
-    reactions = more.pop('respawn', (True, False))
     return [
-        Case(fault, nodes, lockstep=mode == 'lockstep', respawn=respawn, **more)  # type: ignore[arg-type]
+        Case(fault, nodes, lockstep=mode == 'lockstep', respawn=reaction, **more)
         for fault in faults.split()
         for mode in modes.split()
-        for respawn in reactions
+        for reaction in respawn
         for nodes in struck
     ]
 
 
-def all_cases() -> list[Case]:
+def all_cases():
     """Return the whole campaign; the most important cases come first."""
     one, vehicles, buildings = (
         [(node,) for node in nodes] for nodes in (SEARCH_NODES, MAVLINK_NODES, BUILDING_NODES)

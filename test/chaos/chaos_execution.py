@@ -1,7 +1,5 @@
 """Run a case of the fault campaign: start it, inject the fault, wait for its end."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -11,14 +9,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from chaos_cases import PAUSE, Case
+from chaos_cases import PAUSE
 
 from maasi_sim.scenario.layering import to_yaml
 
 # Longest wait for the moment of the fault, and for the end of the run after it [s].
-_TRIGGER_PATIENCE, _END_PATIENCE = 120.0, 120.0
-_LOOK_PERIOD = 0.02
-_FOUND = re.compile(r'(\d+) (?:found|visited)')
+TRIGGER_PATIENCE, END_PATIENCE = 120.0, 120.0
+FOUND = re.compile(r'(\d+) (?:found|visited)')
 
 
 @dataclass
@@ -36,18 +33,12 @@ class Outcome:
     left: list[str]
 
 
-def _found(output: Path) -> int:
-    """Return the number of targets found, or cells visited, so far."""
-    return max(map(int, _FOUND.findall(output.read_text())), default=0)
-
-
-def execute(case: Case, folder: Path, seed: int) -> Outcome:
-    """Run a case in a new folder."""
+def execute(case, folder, seed):
+    """Run a case in a new folder; return its outcome."""
     folder.mkdir(parents=True)
-    file, run = folder / 'scenario.yaml', folder / 'run'
+    file, run, output = folder / 'scenario.yaml', folder / 'run', folder / 'output.txt'
     file.write_text(to_yaml(case.scenario()), encoding='utf-8')
     command = [sys.executable, '-m', 'maasi_sim.run.run_scenario', str(file), '--out', str(run)]
-    output = folder / 'output.txt'
     with output.open('w') as stream:
         process = subprocess.Popen(
             [*command, '--seed', str(seed), *case.options()],
@@ -58,10 +49,10 @@ def execute(case: Case, folder: Path, seed: int) -> Outcome:
         )
     struck, at = False, time.monotonic()
     try:
-        victims = _victims(case, run, process, output)
+        victims = victims_of(case, run, process, output)
         at = time.monotonic()
-        struck = bool(victims) and _strike(case, victims)
-        process.wait(_END_PATIENCE)
+        struck = bool(victims) and strike(case, victims)
+        process.wait(END_PATIENCE)
     except subprocess.TimeoutExpired:
         pass
     ended_after = time.monotonic() - at
@@ -71,34 +62,38 @@ def execute(case: Case, folder: Path, seed: int) -> Outcome:
         process.kill()
         process.wait()
     for pid in processes_of(f'{run}/'):
-        _send(pid, signal.SIGKILL)
+        send(pid, signal.SIGKILL)
     return Outcome(run, code, output.read_text(), struck, ended_after, list(left.values()))
 
 
-def _victims(case: Case, run: Path, process: subprocess.Popen[bytes], output: Path) -> list[int]:
+def victims_of(case, run, process, output):
     """Return the processes of the case's nodes at the moment of the fault; none: the run ended."""
-    deadline = time.monotonic() + _TRIGGER_PATIENCE
+    deadline = time.monotonic() + TRIGGER_PATIENCE
     while time.monotonic() < deadline and process.poll() is None:
-        if case.when == 'start' or _found(output) > 0:
-            pids = [pid for node in case.nodes for pid in _pids(run, node)]
+        # Targets found, or cells visited, so far.
+        found = max(map(int, FOUND.findall(output.read_text())), default=0)
+        if case.when == 'start' or found > 0:
+            # A node's parameter file is in its command line.
+            files = [f'{node.strip("/").replace("/", "_")}.yaml' for node in case.nodes]
+            pids = [pid for file in files for pid in processes_of(f'{run}/parameters/{file}')]
             if len(pids) == len(case.nodes):
                 return pids
-        time.sleep(_LOOK_PERIOD)
+        time.sleep(0.02)
     return []
 
 
-def _strike(case: Case, victims: list[int]) -> bool:
+def strike(case, victims):
     number = signal.SIGKILL if case.fault == 'kill' else signal.SIGSTOP
     # All of them, even if the first has ended.
-    done = [_send(pid, number) for pid in victims]
+    done = [send(pid, number) for pid in victims]
     if case.fault == 'pause':
         time.sleep(PAUSE)
         for pid in victims:
-            _send(pid, signal.SIGCONT)
+            send(pid, signal.SIGCONT)
     return all(done)
 
 
-def _send(pid: int, number: signal.Signals) -> bool:
+def send(pid, number):
     try:
         os.kill(pid, number)
     except ProcessLookupError:
@@ -106,13 +101,7 @@ def _send(pid: int, number: signal.Signals) -> bool:
     return True
 
 
-def _pids(run: Path, node: str) -> list[int]:
-    """Return the process of a node: its parameter file is in its command line."""
-    file = run / 'parameters' / f'{node.strip("/").replace("/", "_")}.yaml'
-    return list(processes_of(str(file)))
-
-
-def processes_of(text: str) -> dict[int, str]:
+def processes_of(text):
     """Return the processes with a text in their command line, without this one and zombies."""
     found = {}
     for entry in Path('/proc').glob('[0-9]*'):

@@ -21,12 +21,18 @@ from maasi_sim.run.bag import BagWriter, load_types
 
 pytestmark = pytest.mark.system
 
-SELECTION = [
-    'search-free-respawn-kill-middle-filter_node',
-    'search-free-end-hang-middle-turtlebot_driver',
-    'search-lockstep-respawn-kill-middle-filter_node+planner_node',
-    'search-lockstep-respawn-kill-middle-mambo_driver',
-]
+# Case, and what its run says.
+SELECTION = {
+    'search-free-respawn-kill-middle-filter_node': '/filter_node was killed by SIGKILL; it is '
+    'restarted',
+    'search-free-end-hang-middle-turtlebot_driver': 'had to be killed: /turtlebot/driver',
+    'search-free-respawn-hang-middle-planner_node': '/planner_node hangs: no heartbeat for 4.',
+    'search-lockstep-end-hang-middle-mambo_driver': 'nothing from /mambo/driver',
+    'search-lockstep-end-kill-middle-sim_node': 'ended: /sim_node was killed by SIGKILL',
+    'search-lockstep-respawn-kill-middle-filter_node+planner_node': '',
+    'search-lockstep-respawn-kill-middle-mambo_driver': '',
+}
+ENDS = {1: ('node_hung', ['hung']), 3: ('node_hung', []), 4: ('node_died', ['died'])}
 
 
 def test_a_selection_of_the_campaign_passes(tmp_path):
@@ -46,13 +52,16 @@ def test_a_selection_of_the_campaign_passes(tmp_path):
     results = json.loads(file.read_text())
     assert results['passed'] == len(SELECTION)
     assert not results['failed'] and not results['left_out']
-    by_name = {item['name']: item for item in results['cases']}
-    assert set(by_name) == set(SELECTION)
-    respawned = tmp_path / 'runs' / SELECTION[0] / 'run' / 'report.json'
-    events = json.loads(respawned.read_text())['events']
-    assert [item['node'] for item in events if item['event'] == 'restarted'] == ['/filter_node']
-    hung = json.loads((tmp_path / 'runs' / SELECTION[1] / 'run' / 'report.json').read_text())
-    assert hung['end_reason'] == 'node_hung'
+    assert {item['name'] for item in results['cases']} == set(SELECTION)
+    for number, (name, said) in enumerate(SELECTION.items()):
+        output = (tmp_path / 'runs' / name / 'output.txt').read_text()
+        assert said in output, output
+        report = json.loads((tmp_path / 'runs' / name / 'run' / 'report.json').read_text())
+        events = [item['event'] for item in report['events'] if 'node' in item]
+        if number in ENDS:
+            assert (report['end_reason'], events) == ENDS[number]
+        else:
+            assert events[-1] == 'restarted'
 
 
 def test_wrong_arguments_are_refused(tmp_path, capsys):

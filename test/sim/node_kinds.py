@@ -24,26 +24,24 @@ from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
 from maasi_sim.buildings.cuboid_sim_node import CuboidSimNode
+from maasi_sim.run.processes import find_executable
 from maasi_sim.sim_node import SimNode
 from maasi_sim.sim_settings import SimNodeSettings
 
 BOUNDS = [[-0.3, 2.4], [-0.3, 2.4]]
 SPACE = [[0.0, 30.0], [0.0, 30.0], [0.0, 30.0]]
 BOX = {'kind': 'box', 'lower': [-0.2, -0.2], 'upper': [0.2, 0.2]}
-DRIVER = {
+PATIENT = {'odometry_timeout': 30.0, 'sensor_timeout': 0.0}
+DRIVER = PATIENT | {
     'environment': {'bounds': BOUNDS},
     'start': [0.4, 0.3, 0.0],
-    'odometry_timeout': 30.0,
-    'sensor_timeout': 0.0,
     'motion': {'model': 'unicycle', 'speed': 0.2},
     'sensor': {'detection': BOX},
     'camera': {'focal_length': [120.0, 120.0]},
 }
-RANGING = {
+RANGING = PATIENT | {
     'environment': {'bounds': SPACE},
     'start': [5.0, 5.0, 5.0],
-    'odometry_timeout': 30.0,
-    'sensor_timeout': 0.0,
     'motion': {'model': 'constant_speed', 'speed': 2.0},
     'sensor': {'detection': {'kind': 'box', 'lower': [-4, -4, -6], 'upper': [4, 4, 6]}},
 }
@@ -70,17 +68,20 @@ class Kind:
     namespace: str = ''
 
     @property
+    def package(self):
+        return self.made.__module__.partition('.')[0]
+
+    @property
     def executable(self):
         return re.sub('(?<!^)(?=[A-Z])', '_', self.made.__name__).lower()
 
     @property
     def name(self):
         """Of the node."""
-        executable = self.executable
-        known = {'guard_node': 'guard', 'cuboid_planner_node': 'cuboid_planner'}
-        if executable.endswith('_driver'):
+        if self.executable.endswith('_driver'):
             return 'driver'
-        return known.get(executable, executable.removeprefix('cuboid_'))
+        known = {'guard_node': 'guard', 'cuboid_planner_node': 'cuboid_planner'}
+        return known.get(self.executable, self.executable.removeprefix('cuboid_'))
 
     def parameters(self, **changes):
         model = type(self.settings)
@@ -95,9 +96,13 @@ class Kind:
             parameter_overrides=[Parameter(name, value=value) for name, value in flat.items()],
         )
 
-    def write(self, file, **changes):
+    def command(self, file, namespace='', **changes):
+        """Write the parameter file of a node; return its command line."""
         content = {'/**': {'ros__parameters': self.parameters(**changes)}}
         file.write_text(yaml.safe_dump(content))
+        words = [str(find_executable(self.package, self.executable)), '--ros-args']
+        words += ['--params-file', str(file)]
+        return [*words, '-r', f'__ns:={namespace or self.namespace or "/"}']
 
 
 def driver(settings):

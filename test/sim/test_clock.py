@@ -1,11 +1,9 @@
 """A real `/clock` that goes back: every node lives on, and a robot without a pose stands."""
 
-import os
 import signal
 import subprocess
 import time
 
-import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
@@ -39,7 +37,7 @@ class World(Node):
         self.executor_used.add_node(self)
         self.clock = self.create_publisher(Clock, '/clock', RELIABLE)
         self.stamps = {}
-        self.statuses, self.commands, self.states, self.logs = [], [], [], []
+        self.names, self.commands, self.states, self.logs = [], [], [], []
         self.create_subscription(DiagnosticArray, '/diagnostics', self.take, 10)
         self.create_subscription(
             Log, '/rosout', lambda item: self.logs.append(item.msg), LATCHED_ALL
@@ -47,11 +45,10 @@ class World(Node):
         self.create_subscription(TwistStamped, '/rover/cmd_vel', self.commands.append, RELIABLE)
         self.create_subscription(AgentState, '/rover/state', self.states.append, RELIABLE)
         self.odometry = self.create_publisher(Odometry, '/rover/odom', RELIABLE)
-        self.position = 0.0
 
     def take(self, message):
         for status in message.status:
-            self.statuses.append(status)
+            self.names.append(status.name)
             self.stamps[status.name] = message.header.stamp
 
     def until(self, condition, *what):
@@ -82,14 +79,14 @@ class World(Node):
 
         self.until(stamped, f'diagnostics at {nanoseconds}')
 
-    def move(self, nanoseconds, step=0.0):
-        message = Odometry()
-        message.header.stamp = stamp_to_ros(nanoseconds)
-        message.header.frame_id = 'odom'
-        message.pose.pose.orientation.w = 1.0
-        self.position += step
-        message.pose.pose.position.x = self.position
-        self.odometry.publish(message)
+    def stands(self):
+        """Return whether the last commands are zeros."""
+        return len(self.commands) >= 5 and not any(map(moves, self.commands[-5:]))
+
+
+def moves(command):
+    twist = command.twist
+    return any((twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z))
 
 
 @pytest.fixture
@@ -105,12 +102,9 @@ def start(tmp_path):
     running = []
 
     def make(kind, namespace='', **changes):
-        made, file = KINDS[kind], tmp_path / f'{kind}.yaml'
-        made.write(file, **changes)
-        namespace = namespace or made.namespace or '/'
-        command = [made.executable, '--ros-args', '--params-file', str(file)]
-        command += ['-p', 'use_sim_time:=true', '-r', f'__ns:={namespace}']
-        running.append(subprocess.Popen(command, env=os.environ, stderr=subprocess.PIPE, text=True))
+        command = KINDS[kind].command(tmp_path / f'{kind}.yaml', namespace, **changes)
+        command += ['-p', 'use_sim_time:=true']
+        running.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True))
         return running[-1]
 
     yield make
@@ -118,6 +112,14 @@ def start(tmp_path):
         if process.poll() is None:
             process.kill()
         process.communicate()
+
+
+def interrupted(process):
+    """Return what a node says when it is interrupted."""
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, said
+    return said
 
 
 def is_active(world, name):
@@ -142,9 +144,7 @@ def test_every_type_of_node_lives_through_a_clock_that_goes_back(world, start):
         world.seen_at(time_, nodes)
     assert all(is_active(world, name) for name in nodes)
     for name, process in nodes.items():
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=PATIENCE)
-        assert process.returncode == 0, (name, said)
+        said = interrupted(process)
         assert 'Traceback' not in said, (name, said)
         assert 'clock jumped back by' in said, (name, said)
 
@@ -155,6 +155,7 @@ class Rover:
     def __init__(self, world):
         self.world = world
         self.now = self.step = 100 * SECOND
+        self.position = 0.0
         world.until(world.odometry.get_subscription_count)
         world.until(lambda: world.count_publishers('/rover/cmd_vel'))
         self.client = ActionClient(world, GoToWaypoint, '/rover/go_to')
@@ -167,37 +168,43 @@ class Rover:
         A driver that a busy machine keeps waiting is waited for: hardly any time passes.
         """
         states = self.world.states
-        answered = states and stamp_from_ros(states[-1].header.stamp) >= self.step
-        if answered:
+        if states and stamp_from_ros(states[-1].header.stamp) >= self.step:
             self.now += SECOND // 20
             self.step = self.now
+            self.position += step
         else:
             self.now += 1000
+        message = Odometry()
+        message.header.stamp = stamp_to_ros(self.now)
+        message.header.frame_id = 'odom'
+        message.pose.pose.orientation.w = 1.0
+        message.pose.pose.position.x = self.position
         # Odometry first: it is best effort, and must not be missing when its time has come.
-        self.world.move(self.now, step if answered else 0.0)
+        self.world.odometry.publish(message)
         self.world.tell(self.now)
         return self.world.commands and states
 
-    def go_to(self, x, y):
+    def go(self):
+        """Send it to a waypoint; return the future result once it moves."""
         goal = GoToWaypoint.Goal(goal_id=1)
         goal.waypoint.header.frame_id = 'map'
-        goal.waypoint.pose.position.x, goal.waypoint.pose.position.y = x, y
+        goal.waypoint.pose.position.x, goal.waypoint.pose.position.y = 2.0, 1.0
         handle = self.client.send_goal_async(goal)
         self.world.until(handle.done)
         assert handle.result().accepted
+        self.go_on()
+        self.world.commands.clear()
         return handle.result().get_result_async()
 
-    def close(self):
-        self.client.destroy()
+    def go_on(self):
+        self.world.until(lambda: self.move(0.005) and moves(self.world.commands[-1]))
 
 
 def test_a_robot_stands_when_the_time_jumps_back_and_goes_on_with_a_new_pose(world, start):
     process = start('turtlebot')
     rover = Rover(world)
-    result = rover.go_to(2.0, 1.0)
-    world.until(lambda: rover.move(0.005) and np.any(moving(world.commands[-1:])))
+    result = rover.go()
     # Nothing of the robot comes any more: only the clock, from the start.
-    world.commands.clear()
 
     def go_back():
         # Best effort: one message may be lost.
@@ -205,33 +212,25 @@ def test_a_robot_stands_when_the_time_jumps_back_and_goes_on_with_a_new_pose(wor
         return result.done()
 
     world.until(go_back)
-    world.until(lambda: len(world.commands) >= 5 and not np.any(moving(world.commands[-5:])))
+    world.until(world.stands)
     assert result.result().result.reason == 'the time jumped back'
     world.until(lambda: world.states[-1].goal_status == AgentState.UNAVAILABLE)
     assert 'odometry' in world.states[-1].reason
     rover.now = rover.step = SECOND
     world.until(lambda: rover.move() and world.states[-1].goal_status != AgentState.UNAVAILABLE)
     assert process.poll() is None
-    rover.close()
-
-
-def moving(commands):
-    """Return the velocities of commands."""
-    twists = [item.twist for item in commands]
-    return [(item.linear.x, item.linear.y, item.linear.z, item.angular.z) for item in twists]
+    rover.client.destroy()
 
 
 def test_a_slow_simulated_clock_ends_no_goal_and_leaves_no_robot_moving(world, start):
     start('turtlebot', odometry_timeout=0.5)
     rover = Rover(world)
-    result = rover.go_to(2.0, 1.0)
-    world.until(lambda: rover.move(0.005) and np.any(moving(world.commands[-1:])))
+    result = rover.go()
     # Time and odometry stand still, as on a busy machine; or it is a real robot without odometry.
-    world.commands.clear()
-    world.until(lambda: len(world.commands) >= 5 and not np.any(moving(world.commands[-5:])))
+    world.until(world.stands)
     assert world.states[-1].goal_status == AgentState.MOVING
     assert not result.done()
-    world.until(lambda: rover.move(0.005) and np.any(moving(world.commands[-1:])))
+    rover.go_on()
     assert world.states[-1].goal_status == AgentState.MOVING
     # Now the odometry is silent in simulated time.
 
@@ -244,7 +243,7 @@ def test_a_slow_simulated_clock_ends_no_goal_and_leaves_no_robot_moving(world, s
     world.until(silent)
     assert 'no odometry for' in world.states[-1].reason
     world.until(result.done)
-    rover.close()
+    rover.client.destroy()
 
 
 @pytest.mark.parametrize('clock', [True, False])
@@ -253,10 +252,8 @@ def test_only_a_missing_clock_is_warned_of(world, start, clock):
         world.destroy_publisher(world.clock)
     process = start('guard')
     # Nothing is published on /clock yet, as before the start of a run.
-    world.until(lambda: [item.name for item in world.statuses].count('/rover/guard') >= 6)
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=PATIENCE)
-    assert ('no publisher of /clock' in said) != clock, said
+    world.until(lambda: world.names.count('/rover/guard') >= 6)
+    assert ('no publisher of /clock' in interrupted(process)) != clock
 
 
 def test_a_second_clock_that_says_zero_does_not_start_the_search_again(world, start):
@@ -275,7 +272,4 @@ def test_a_second_clock_that_says_zero_does_not_start_the_search_again(world, st
     world.seen_at(SECOND, nodes)
     world.until(heard)
     world.seen_at(5 * SECOND, nodes)
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, said
-    assert 'the search starts again' not in said
+    assert 'the search starts again' not in interrupted(process)

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,8 @@ from maasi_sim.run import domain as domain_module
 from maasi_sim.run.domain import Domain, DomainError, remove_dead
 
 SHARED = Path('/dev/shm')
+# First word of a port that its creator has made ready.
+READY = (2).to_bytes(4, sys.byteorder)
 NODE = """
 import rclpy
 from std_msgs.msg import Empty
@@ -35,46 +38,50 @@ def folder():
         yield Path(name)
 
 
-def write(folder, *names):
+def write(folder, *names, content=bytes(64)):
     for name in names:
-        (folder / name).write_bytes(bytes(64))
+        (folder / name).write_bytes(content)
     return set(names)
 
 
+@contextmanager
 def started():
-    """Start a node; return its process and its files, once it hears itself."""
+    """Start a node; yield its process and its files, once it hears itself."""
     process = subprocess.Popen(
         [sys.executable, '-c', NODE], stdout=subprocess.PIPE, text=True, start_new_session=True
     )
-    assert process.stdout.readline() == 'heard\n'
-    maps = Path(f'/proc/{process.pid}/maps').read_text().splitlines()
-    files = {line.split()[-1] for line in maps if '/dev/shm/fastrtps' in line}
-    files |= {
-        target
-        for link in Path(f'/proc/{process.pid}/fd').iterdir()
-        if '/dev/shm/fastrtps' in (target := os.readlink(link))
-    }
-    return process, {Path(file) for file in files}
+    try:
+        assert process.stdout.readline() == 'heard\n'
+        maps = Path(f'/proc/{process.pid}/maps').read_text().split()
+        opened = map(os.readlink, Path(f'/proc/{process.pid}/fd').iterdir())
+        yield process, {Path(file) for file in (*maps, *opened) if '/dev/shm/fastrtps' in file}
+    finally:
+        process.kill()
+        process.wait(PATIENCE)
+        process.stdout.close()
 
 
 def test_files_of_a_killed_node_go_and_those_of_a_live_one_stay(domain):
-    killed, files = started()
-    # What it made, whose locks it holds; not ports and segments of others, which it only opened.
-    locks = {path for path in files if re.fullmatch(r'fastrtps_[0-9a-f]{16}_el', path.name)}
-    left = locks | {path.with_name(path.name.removesuffix('_el')) for path in locks}
-    killed.kill()
-    killed.wait(PATIENCE)
+    with started() as (_, files):
+        # What it made, whose locks it holds; not ports and segments that it only opened.
+        locks = {path for path in files if re.fullmatch(r'fastrtps_[0-9a-f]{16}_el', path.name)}
+        left = locks | {path.with_name(path.name.removesuffix('_el')) for path in locks}
     assert left
     # Another process that looks at the same moment has the files open, or removes them.
     wait_until(lambda: not any(path.exists() for path in left), remove_dead)
-    live, used = started()
-    try:
+    with started() as (live, used):
         remove_dead()
         assert used and all(path.exists() for path in used)
         assert live.stdout.readline() == 'heard\n'
-    finally:
-        live.kill()
-        live.wait(PATIENCE)
+        # A port is known by its mark.
+        ports = [path for path in used if re.fullmatch(r'fastrtps_port\d+', path.name)]
+        assert ports
+        for port in ports:
+            with port.open('rb') as file:
+                assert file.read(4) == READY
+        numbers = {int(port.name.removeprefix('fastrtps_port')) for port in ports}
+        # Those below 7400 are common to all domains.
+        assert {(number - 7400) // 250 for number in numbers if number >= 7400} == {domain.number}
 
 
 def test_a_run_removes_them_at_its_start_and_at_its_end():
@@ -98,35 +105,13 @@ def test_a_run_removes_them_at_its_start_and_at_its_end():
 
 def test_ports_that_were_ready_go_only_with_their_domain(folder):
     # Domain 5 has the ports from 7400 + 5 * 250.
-    ready = {'fastrtps_port8650', 'fastrtps_port8899', 'fastrtps_port8900'}
-    for name in ready:
-        (folder / name).write_bytes((2).to_bytes(4, sys.byteorder) + bytes(60))
-    locks = write(folder, 'fastrtps_port8650_el', 'fastrtps_port8900_el', 'fastrtps_port8902_el')
+    own = write(folder, 'fastrtps_port8650', 'fastrtps_port8899', content=READY + bytes(60))
+    own |= write(folder, 'fastrtps_port8650_el')
+    others = write(folder, 'fastrtps_port8900', content=READY + bytes(60))
+    others |= write(folder, 'fastrtps_port8900_el', 'fastrtps_port8902_el')
     assert remove_dead(folder=folder) == []
-    assert set(remove_dead(5, folder)) == {
-        'fastrtps_port8650',
-        'fastrtps_port8650_el',
-        'fastrtps_port8899',
-    }
-    assert {'fastrtps_port8900'} | locks - {'fastrtps_port8650_el'} == {
-        path.name for path in folder.iterdir()
-    }
-
-
-def test_a_port_of_a_live_node_has_the_mark_by_which_it_is_known(domain):
-    process, files = started()
-    try:
-        ports = [path for path in files if re.fullmatch(r'fastrtps_port\d+', path.name)]
-        assert ports
-        for port in ports:
-            with port.open('rb') as file:
-                assert file.read(4) == (2).to_bytes(4, sys.byteorder)
-        numbers = {int(port.name.removeprefix('fastrtps_port')) for port in ports}
-        # Those below 7400 are common to all domains.
-        assert {(number - 7400) // 250 for number in numbers if number >= 7400} == {domain.number}
-    finally:
-        process.kill()
-        process.wait(PATIENCE)
+    assert set(remove_dead(5, folder)) == own
+    assert {path.name for path in folder.iterdir()} == others
 
 
 def test_a_port_goes_as_a_whole_where_nobody_uses_a_part_of_it(folder):
@@ -160,6 +145,9 @@ def test_what_another_user_put_there_is_left(folder, monkeypatch):
 def test_domains_are_not_shared(monkeypatch):
     profiles = 'FASTRTPS_DEFAULT_PROFILES_FILE'
     monkeypatch.delenv(profiles, raising=False)
+    for number in (-1, 102):
+        with pytest.raises(DomainError, match='0 to 101'):
+            Domain(number)
     with Domain() as first, Domain() as second:
         assert first.number != second.number
         assert 1 <= first.number <= 101
@@ -178,19 +166,14 @@ def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_pa
         assert first.number == 57
         with Domain(57, str(tmp_path), team='team/b', shared=True) as second:
             assert second.number == 57
-            with pytest.raises(DomainError, match='namespace /team/b in 57 is used by another'):
-                Domain(57, str(tmp_path), team='team/b', shared=True)
-            with pytest.raises(DomainError, match='namespace /team_a in 57 is used by another'):
-                Domain(57, str(tmp_path), team='team_a', shared=True)
-            with pytest.raises(DomainError, match='domain id: 57 is used by another run'):
-                Domain(57, str(tmp_path), team='team_c')
+            for team, shared, words in (
+                ('team/b', True, 'namespace /team/b in 57 is used by another'),
+                ('team_a', True, 'namespace /team_a in 57 is used by another'),
+                ('team_c', False, 'domain id: 57 is used by another run'),
+            ):
+                with pytest.raises(DomainError, match=words):
+                    Domain(57, str(tmp_path), team=team, shared=shared)
         Domain(57, str(tmp_path), team='team/b', shared=True).release()
-
-
-def test_domains_that_do_not_exist_are_refused():
-    for number in (-1, 102):
-        with pytest.raises(DomainError, match='0 to 101'):
-            Domain(number)
 
 
 def test_a_domain_is_locked_without_a_file():

@@ -29,7 +29,7 @@ def plans_of(scenario, **changes):
 
 
 def read_back(plan, model):
-    """Return the settings that a node makes of its parameter file."""
+    """Return the settings that a node makes of its parameter file, and whether it is simulated."""
     flat = yaml.safe_load(plan.parameter_text())['/**']['ros__parameters']
     simulated = flat.pop('use_sim_time', False)
     return model.model_validate(unflatten(model, flat)), simulated
@@ -46,15 +46,10 @@ def test_the_demo_has_a_sim_two_guarded_drivers_a_filter_and_a_planner():
         '/filter_node': ('maasi_filter', 'filter_node'),
         '/planner_node': ('maasi_planner', 'planner_node'),
     }
-    assert {name for name, plan in plans.items() if plan.says_ready} == {
-        '/sim_node',
-        '/mambo/driver',
-        '/turtlebot/driver',
-        '/filter_node',
-        '/planner_node',
-    }
-    assert [name for name, plan in plans.items() if plan.is_clock] == ['/sim_node']
-    assert plans['/mambo/driver'].file_name == 'mambo_driver'
+    for name, plan in plans.items():
+        assert plan.says_ready == (not name.endswith('guard'))
+        assert plan.is_clock == (name == '/sim_node')
+        assert plan.file_name == name[1:].replace('/', '_')
 
 
 @pytest.mark.parametrize('name', SCENARIOS)
@@ -87,16 +82,17 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
 @pytest.mark.parametrize(
     'lockstep, rate, expected', [(True, None, 0.0), (True, 2.0, 2.0), (False, None, 1.0)]
 )
-def test_the_sim_gets_the_file_and_how_fast_it_goes(lockstep, rate, expected):
+def test_the_sim_gets_the_file_how_fast_it_goes_and_whose_clock_it_is(lockstep, rate, expected):
     plans = plans_of(load_scenario('mambo'), lockstep=lockstep, rate=rate, recorder=False)
     settings, simulated = read_back(plans['/sim_node'], SimNodeSettings)
-    assert settings.scenario == '/s.yaml'
-    assert settings.seed == 4
-    assert settings.lockstep is lockstep
-    assert settings.rate == expected
-    assert settings.recorder is False
+    values = (settings.scenario, settings.seed, settings.lockstep, settings.rate, settings.recorder)
+    assert values == ('/s.yaml', 4, lockstep, expected, False)
     # The clock is its own.
     assert not simulated
+    for plan in plans.values():
+        assert (with_followed_clock(plan) == plan) == (not plan.is_clock)
+    settings, simulated = read_back(with_followed_clock(plans['/sim_node']), SimNodeSettings)
+    assert settings.follow_clock and simulated
 
 
 def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there():
@@ -104,54 +100,35 @@ def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there():
     for name, plan in plans.items():
         moved = in_team(plan, 'north/one')
         assert moved.full_name == f'/north/one{name}'
-        assert f'__ns:=/{moved.namespace}' in moved.command(Path('/lib/x'), Path('/run/p.yaml'))
         assert in_team(plan, '') is plan
-    plan = NodePlan('p', 'e', 'driver', 'a', remaps={'/measurement_batch': '/a/measurement_batch'})
-    assert in_team(plan, 'team').remaps == {'/team/measurement_batch': '/team/a/measurement_batch'}
-
-
-@pytest.mark.parametrize(
-    ('namespace', 'inside', 'full'), [('mambo', '/mambo', '/mambo/driver'), ('', '/', '/driver')]
-)
-def test_command_lines_name_the_node_and_its_parameters(namespace, inside, full):
-    plan = NodePlan('maasi_drivers', 'mambo_driver', 'driver', namespace, {'a.b': 1.5})
-    command = plan.command(Path('/lib/mambo_driver'), Path('/run/p.yaml'))
-    assert command[:2] == ['/lib/mambo_driver', '--ros-args']
-    assert {'__node:=driver', f'__ns:={inside}'} <= set(command)
-    assert command[command.index('--params-file') + 1] == '/run/p.yaml'
-    assert plan.full_name == full
-    assert yaml.safe_load(plan.parameter_text()) == {'/**': {'ros__parameters': {'a.b': 1.5}}}
-
-
-def test_only_the_sim_is_told_whose_clock_it_is():
-    plans = plans_of(load_scenario('mambo'), lockstep=False)
-    for plan in plans.values():
-        assert (with_followed_clock(plan) == plan) == (not plan.is_clock)
-    settings, simulated = read_back(with_followed_clock(plans['/sim_node']), SimNodeSettings)
-    assert settings.follow_clock and simulated
+    plan = NodePlan('p', 'e', 'driver', 'a', {'a.b': 1.5}, remaps={'/batch': '/a/batch'})
+    for moved, space, batch in (
+        (plan, '/a', '/batch:=/a/batch'),
+        (in_team(plan, 'team'), '/team/a', '/team/batch:=/team/a/batch'),
+    ):
+        command = moved.command(Path('/lib/e'), Path('/run/p.yaml'))
+        assert command[:2] == ['/lib/e', '--ros-args']
+        assert {'__node:=driver', f'__ns:={space}', batch} <= set(command)
+        assert command[command.index('--params-file') + 1] == '/run/p.yaml'
+        assert yaml.safe_load(moved.parameter_text()) == {'/**': {'ros__parameters': {'a.b': 1.5}}}
 
 
 def test_independent_robots_have_filter_and_planner_of_their_own():
     overrides = {'planner': (('planner',), {'name': 'maas', 'coordination': 'independent'})}
     scenario = load_scenario('mambo_turtlebot', overrides)
     plans = plans_of(scenario)
-    assert '/filter_node' not in plans
-    assert '/planner_node' not in plans
+    assert not {'/filter_node', '/planner_node'} & plans.keys()
     for name, other in (('mambo', 'turtlebot'), ('turtlebot', 'mambo')):
         search, _ = read_back(plans[f'/{name}/filter_node'], FilterNodeSettings)
-        assert list(search.robots) == [name]
-        assert search.share_with == [other]
+        assert (list(search.robots), search.share_with) == ([name], [other])
         planner, _ = read_back(plans[f'/{name}/planner_node'], PlannerNodeSettings)
         assert list(planner.robots) == [name]
         assert planner.planner == scenario.planner
-        assert planner.others[other].radius == scenario.robots[other].radius
-        assert planner.others[other].start == scenario.robots[other].start
-        command = plans[f'/{name}/driver'].command(Path('/x'), Path('/y'))
-        assert f'/measurement_batch:=/{name}/measurement_batch' in command
-
-
-def test_lawnmowers_share_their_lanes():
-    overrides = {'planner': (('planner',), {'name': 'lawnmower', 'coordination': 'independent'})}
+        for key in ('radius', 'start'):
+            assert getattr(planner.others[other], key) == getattr(scenario.robots[other], key)
+        remaps = {'/measurement_batch': f'/{name}/measurement_batch'}
+        assert plans[f'/{name}/driver'].remaps == remaps
+    overrides['planner'][1]['name'] = 'lawnmower'
     with pytest.raises(ScenarioError, match='coordination'):
         load_scenario('mambo_turtlebot', overrides)
 
@@ -161,14 +138,14 @@ def test_a_linked_robot_has_its_link_and_no_commands_by_topic():
     linked['arm'] = (('robots', 'drone', 'mavlink', 'arm'), True)
     scenario = load_scenario('drone_rov', linked)
     plans = plans_of(scenario, lockstep=False)
-    driver, _ = read_back(plans['/drone/driver'], DriverSettings)
-    assert driver.link == 'mavlink'
-    assert driver.mavlink == scenario.robots['drone'].mavlink
-    # Its autopilot stops it.
-    assert '/drone/guard' not in plans
-    assert '/rov/guard' in plans
-    driver, _ = read_back(plans['/rov/driver'], DriverSettings)
-    assert (driver.link, driver.mavlink) == ('topics', None)
+    for name, link, settings in (
+        ('drone', 'mavlink', scenario.robots['drone'].mavlink),
+        ('rov', 'topics', None),
+    ):
+        driver, _ = read_back(plans[f'/{name}/driver'], DriverSettings)
+        assert (driver.link, driver.mavlink) == (link, settings)
+        # Its autopilot stops it.
+        assert (f'/{name}/guard' in plans) == (link == 'topics')
     for pace in ({'lockstep': True}, {'lockstep': False, 'rate': 2.0}):
         with pytest.raises(ScenarioError, match=r'drone\.link: .* runs in real time'):
             plans_of(scenario, **pace)

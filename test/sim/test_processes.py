@@ -14,20 +14,18 @@ from waiting import PATIENCE, wait_until
 from maasi_sim.run.node_server import ProcessError
 from maasi_sim.run.processes import NodeProcess, find_executable, stop
 
-READY = 'print("ready", flush=True)\n'
-WAIT = 'import signal\n' + READY + 'signal.pause()\n'
 # Ignores the signals that are named.
-DEAF = (
-    'import signal\nfor number in ({}): signal.signal(number, signal.SIG_IGN)\n'
-    + READY
-    + 'while True: signal.pause()\n'
-)
-IGNORE_ALL = DEAF.format('signal.SIGINT, signal.SIGTERM')
+DEAF = """
+import signal
+for number in ({}): signal.signal(number, signal.SIG_IGN)
+print("ready", flush=True)
+while True: signal.pause()
+"""
+WAIT, IGNORE_ALL = DEAF.format(''), DEAF.format('signal.SIGINT, signal.SIGTERM')
 # A run whose nodes ignore all signals.
 RUN = """
 import signal, sys
 from pathlib import Path
-from maasi_sim.run.node_server import ProcessError
 from maasi_sim.run.processes import NodeProcess
 if __name__ == '__main__':
     nodes = [
@@ -41,9 +39,14 @@ if __name__ == '__main__':
 """
 
 
+def stat(pid):
+    """Return state, parent and so on of a process."""
+    return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+
+
 def alive(pid):
     try:
-        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+        return stat(pid)[0] != 'Z'
     except OSError:
         return False
 
@@ -64,12 +67,6 @@ def ended(process):
     process.start()
     wait_until(lambda: not process.running)
     return process
-
-
-def of_suite(tmp_path, *arguments, log='log'):
-    """Return a node of this suite, which inherits what the server has loaded."""
-    command = [str(find_executable('maasi_filter', 'filter_node')), '--ros-args', *arguments]
-    return NodeProcess('/node', command, tmp_path / log, 'maasi_filter')
 
 
 def test_a_process_writes_its_log_also_of_a_restart_and_says_how_it_ended(tmp_path):
@@ -117,8 +114,9 @@ def test_a_node_that_cannot_be_executed_ends_and_says_why(tmp_path):
 
 
 def test_a_node_of_the_suite_is_shown_by_its_command_and_ends_as_it_says(tmp_path, domain):
-    KINDS['filter'].write(tmp_path / 'node.yaml')
-    process = of_suite(tmp_path, '--params-file', str(tmp_path / 'node.yaml'))
+    command = KINDS['filter'].command(tmp_path / 'node.yaml')
+    # It inherits what the server has loaded.
+    process = NodeProcess('/node', command, tmp_path / 'log', 'maasi_filter')
     process.start()
     line = Path(f'/proc/{process.pid}/cmdline')
     wait_until(lambda: line.read_bytes().rstrip(bytes(1)).decode() == ' '.join(process.command))
@@ -130,9 +128,11 @@ def test_a_node_of_the_suite_is_shown_by_its_command_and_ends_as_it_says(tmp_pat
 @pytest.mark.parametrize('log', ['log', 'full'])
 def test_a_node_of_the_suite_that_refuses_its_input_says_so(tmp_path, domain, log):
     (tmp_path / 'full').symlink_to('/dev/full')
-    process = ended(of_suite(tmp_path, '--params-file', str(tmp_path / 'missing.yaml'), log=log))
+    command = KINDS['filter'].command(tmp_path / 'node.yaml')
+    (tmp_path / 'node.yaml').unlink()
+    process = ended(NodeProcess('/node', command, tmp_path / log, 'maasi_filter'))
     assert process.code not in (0, None)
-    assert log == 'full' or 'missing.yaml' in (tmp_path / 'log').read_text()
+    assert log == 'full' or 'node.yaml' in (tmp_path / 'log').read_text()
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_nodes_do_not_outlive_a_killed_run(tmp_path, number):
     )
     pid = int(run.stdout.readline())
     wait_until(lambda: 'ready' in (tmp_path / 'node').read_text())
-    server = int(Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[1])
+    server = int(stat(pid)[1])
     assert alive(pid) and server != run.pid
     run.send_signal(number)
     run.wait(PATIENCE)
@@ -175,11 +175,10 @@ def test_nodes_do_not_outlive_a_killed_run(tmp_path, number):
 
 def test_a_dead_server_is_started_again(tmp_path):
     process = started(python(tmp_path, WAIT))
-    server = int(Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()[1])
+    server = int(stat(process.pid)[1])
     assert os.getsid(server) == server
     os.kill(server, signal.SIGKILL)
-    wait_until(lambda: not process.running)
-    wait_until(lambda: not alive(process.pid))
+    wait_until(lambda: not process.running and not alive(process.pid))
     assert ended(python(tmp_path, 'print(1)')).code == 0
 
 

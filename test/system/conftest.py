@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import pytest
-from scenario_runs import PATIENCE, command, run_scenario
+from scenario_runs import run_scenario, start
 
 
 @pytest.fixture(scope='session')
@@ -16,21 +16,16 @@ def repeated(tmp_path_factory):
     folder = tmp_path_factory.mktemp('repeated')
     options = ('--seed', 3, '--lockstep', '--time-limit', 20)
     first = run_scenario('mambo_turtlebot', folder / 'first', *options)
+    threads = {'NUMBA_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
+    busy = subprocess.Popen([sys.executable, '-c', 'while True: pass'])
     other = ('--seed', 4, '--lockstep', '--time-limit', 5)
-    beside = [
-        subprocess.Popen([sys.executable, '-c', 'while True: pass']),
-        subprocess.Popen(
-            command('mambo_turtlebot', folder / 'other', *other),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        ),
-    ]
     try:
-        threads = {'NUMBA_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
-        second = run_scenario('mambo_turtlebot', folder / 'second', *options, environment=threads)
+        with start('mambo_turtlebot', folder / 'other', *other) as beside:
+            second = run_scenario(
+                'mambo_turtlebot', folder / 'second', *options, environment=threads
+            )
+            beside.finish()
     finally:
-        beside[0].kill()
-        for process in beside:
-            process.wait(PATIENCE)
+        busy.kill()
+        busy.wait()
     return first, second

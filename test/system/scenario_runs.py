@@ -1,14 +1,22 @@
-"""Runs of whole scenarios as processes."""
+"""Runs of whole scenarios as processes, and a node beside one."""
 
 import json
 import os
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+import rclpy
+import yaml
 from chaos_execution import processes_of
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from report_check import check_report
+from reserved_domain import reserved_domain
+from std_srvs.srv import Trigger
 from waiting import wait_until
 
 from maasi_sim.run.bag import Bag
@@ -18,12 +26,40 @@ PATIENCE = 400.0
 
 
 class Run:
-    """A finished run."""
+    """A run: its process while it goes on, then its exit code and output, and what it left."""
 
-    def __init__(self, folder, code, output):
+    def __init__(self, folder, code=None, output='', process=None):
         self.folder = Path(folder)
         self.code = code
         self.output = output
+        self.process = process
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        if self.code is None:
+            self.process.kill()
+            self.finish()
+
+    def wait_for(self, text):
+        """Read the output up to a line with a text."""
+        for line in self.process.stdout:
+            self.output += line
+            if text in line:
+                return
+        raise AssertionError(f'never said {text}: {self.output}')
+
+    def finish(self):
+        """Wait for its end; return itself."""
+        self.output += self.process.communicate(timeout=PATIENCE)[0]
+        self.code = self.process.returncode
+        return self
+
+    def processes(self, node=''):
+        """Return the process of a node, or those of all: files of the run are on their lines."""
+        file = f'parameters/{node.strip("/").replace("/", "_")}.yaml' if node else ''
+        return list(processes_of(f'{self.folder}/{file}'))
 
     @property
     def report(self):
@@ -35,29 +71,46 @@ class Run:
 
 
 def command(scenario, folder, *options):
-    return [
-        sys.executable,
-        '-m',
-        'maasi_sim.run.run_scenario',
-        str(scenario),
-        '--out',
-        str(folder),
-        *map(str, options),
-    ]
+    words = ['-m', 'maasi_sim.run.run_scenario', scenario, '--out', folder, *options]
+    return [sys.executable, *map(str, words)]
 
 
-def run_scenario(scenario, folder, *options, environment=None):
-    done = subprocess.run(
-        command(scenario, folder, *options),
+def started(words, folder, environment=None, **options):
+    """Return the run of a command line."""
+    process = subprocess.Popen(
+        words,
         env={**os.environ, **(environment or {})},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=PATIENCE,
-        check=False,
+        **options,
     )
-    return Run(folder, done.returncode, done.stdout)
+    return Run(folder, process=process)
+
+
+def start(scenario, folder, *options, environment=None):
+    return started(command(scenario, folder, *options), folder, environment)
+
+
+def run_scenario(scenario, folder, *options, environment=None):
+    with start(scenario, folder, *options, environment=environment) as run:
+        return run.finish()
+
+
+def write_scenario(path, targets, start=(1.9, 1.9, 1.0), **changes):
+    """Write the scenario of a small search by a drone; return its path."""
+    candidates = {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]}
+    content = {
+        'version': 1,
+        'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
+        'targets': {'positions': targets},
+        'robots': {'mambo': {'type': 'mambo', 'start': [*start], 'candidates': candidates}},
+        'filter': {'method': 'pmb'},
+        'limits': {'time': 120.0},
+    }
+    path.write_text(yaml.safe_dump(content | changes))
+    return path
 
 
 def wait_for(condition, what):
@@ -88,7 +141,7 @@ def of_topic(run, topic):
 def replay(run, folder):
     """Replay the bag of a run; return the finished process."""
     return subprocess.run(
-        [*command('mambo_turtlebot', folder)[:3], '--replay', str(run.bag)],
+        [*command('', '')[:3], '--replay', str(run.bag)],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -96,3 +149,46 @@ def replay(run, folder):
         timeout=PATIENCE,
         check=False,
     )
+
+
+class Operator:
+    """A node in the domain of a run: it calls services, and hears topics."""
+
+    def __init__(self, domain):
+        self.options = ('--domain-id', domain)
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = rclpy.create_node('operator', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def call(self, service):
+        """Call a service until it does what it is to."""
+        client = self.node.create_client(Trigger, service)
+        while True:
+            self.until(client.service_is_ready, service)
+            answer = client.call_async(Trigger.Request())
+            self.until(answer.done, service)
+            if answer.result().success:
+                return
+
+    def until(self, condition, what):
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.02), what, PATIENCE)
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@contextmanager
+def beside(kind=Operator):
+    """Yield an operator in a domain that is reserved for runs with its options."""
+    with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        for name, value in domain.environment().items():
+            patch.setenv(name, value)
+        made = kind(domain.number)
+        try:
+            yield made
+        finally:
+            made.close()

@@ -2,14 +2,11 @@
 
 import os
 import signal
-import subprocess
 
 import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from reserved_domain import reserved_domain
-from run_operator import Operator
-from scenario_runs import PATIENCE, command
+from scenario_runs import Operator, beside, start
 
 from maasi_msgs.msg import FilterUpdate
 
@@ -39,13 +36,11 @@ OTHERS = {
 class Cycler(Operator):
     """A client of the life cycles of a run's nodes."""
 
-    def __init__(self, domain, run):
-        super().__init__(domain)
-        self.run = run
+    run = None
 
     def until(self, condition, what):
-        super().until(lambda: condition() or self.run.poll() is not None, what)
-        assert self.run.poll() is None, f'{what}: the run has ended'
+        super().until(lambda: condition() or self.run.process.poll() is not None, what)
+        assert self.run.process.poll() is None, f'{what}: the run has ended'
 
     def cycle(self, name, times):
         client = self.node.create_client(ChangeState, f'{name}/change_state')
@@ -68,27 +63,19 @@ class Cycler(Operator):
 
 @pytest.mark.parametrize('scenario, cycles', [('mambo_turtlebot', DEMO), *OTHERS.items()])
 def test_nodes_survive_cycles_back_to_back_and_the_search_goes_on(tmp_path, scenario, cycles):
-    with reserved_domain() as domain:
-        log = tmp_path / 'run.log'
-        options = ('--domain-id', domain.number, '--no-record', '--rate', 1, '--time-limit', 3000)
-        with log.open('w') as output:
-            run = subprocess.Popen(
-                command(scenario, tmp_path / 'run', *options), stdout=output, stderr=output
-            )
-        cycler = Cycler(domain, run)
-        try:
-            searches = not scenario.startswith('buildings')
-            if searches:
-                cycler.hear(FilterUpdate, 'filter_update')
-            for name, times in cycles.items():
-                cycler.cycle(name, int(os.environ.get('MAASI_CYCLES', times)))
-            if searches:
-                cycler.hear(FilterUpdate, 'filter_update')
-            run.send_signal(signal.SIGINT)
-            # Interrupted; 3 if a node had died.
-            assert run.wait(PATIENCE) == 130, log.read_text()
-        finally:
-            cycler.close()
-            run.kill()
-            run.wait()
-            print(log.read_text())
+    options = ('--no-record', '--rate', 1, '--time-limit', 3000)
+    with (
+        beside(Cycler) as cycler,
+        start(scenario, tmp_path / 'run', *cycler.options, *options) as run,
+    ):
+        cycler.run = run
+        searches = not scenario.startswith('buildings')
+        if searches:
+            cycler.hear(FilterUpdate, 'filter_update')
+        for name, times in cycles.items():
+            cycler.cycle(name, int(os.environ.get('MAASI_CYCLES', times)))
+        if searches:
+            cycler.hear(FilterUpdate, 'filter_update')
+        run.process.send_signal(signal.SIGINT)
+        # Interrupted; 3 if a node had died.
+        assert run.finish().code == 130, run.output

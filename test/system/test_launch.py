@@ -4,17 +4,14 @@ Where `launch` is not installed, the process that the launch file starts is run 
 """
 
 import importlib.util
-import json
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-import yaml
 from reserved_domain import reserved_domain
-from scenario_runs import PATIENCE, processes_with
+from scenario_runs import started, write_scenario
 
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.launch_arguments import ARGUMENTS, scenario_options
@@ -49,28 +46,20 @@ def launch(tmp_path):
     temporary = tmp_path / TEMPORARY
     temporary.mkdir()
 
-    def start(**arguments):
-        environment = {**os.environ, 'ROS_DOMAIN_ID': number, 'TMPDIR': str(temporary)}
+    def start(**given):
+        arguments = {name: str(value) for name, value in given.items()}
         if HAS_LAUNCH:
             given = [f'{name}:={value}' for name, value in arguments.items()]
             command = [sys.executable, '-c', LAUNCH, str(LAUNCH_FILE), *given]
         else:
             options = scenario_options({**DEFAULTS, **arguments})[:-1]
             executable = str(find_executable('maasi_sim', 'run_scenario'))
-            command = [executable, *options, f'--domain-id={number}']
-        return subprocess.Popen(
-            command,
-            cwd=tmp_path,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-        )
+            command = [executable, *options, f'--domain-id={domain.number}']
+        environment = {'ROS_DOMAIN_ID': str(domain.number), 'TMPDIR': str(temporary)}
+        folder = tmp_path / 'run'
+        return started(command, folder, environment, cwd=tmp_path, start_new_session=True)
 
     with reserved_domain() as domain:
-        number = str(domain.number)
         yield start
 
 
@@ -79,67 +68,40 @@ def code(run_code):
     return int(run_code != 0) if HAS_LAUNCH else run_code
 
 
-def scenario(path, **changes):
-    content = {
-        'version': 1,
-        'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
-        'targets': {'positions': [[1.9, 1.9]]},
-        'robots': {
-            'mambo': {
-                'type': 'mambo',
-                'start': [1.9, 1.9, 1.0],
-                'candidates': {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
-            }
-        },
-        'filter': {'method': 'pmb'},
-        'limits': {'time': 60.0},
-        **changes,
-    }
-    path.write_text(yaml.safe_dump(content))
-    return str(path)
-
-
 def test_a_launch_records_reports_and_ends_with_the_run(launch, tmp_path):
-    process = launch(
-        scenario=scenario(tmp_path / 'one.yaml'),
-        out=str(tmp_path / 'run'),
-        seed='7',
+    run = launch(
+        scenario=write_scenario(tmp_path / 'one.yaml', [[1.9, 1.9]]),
+        out=tmp_path / 'run',
+        seed=7,
         lockstep='true',
         planner='lawnmower',
         log_level='warn',
-    )
-    output, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, output
-    report = json.loads((tmp_path / 'run' / 'report.json').read_text())
-    assert report['end_reason'] == 'all_found' and report['seed'] == 7
-    with Bag(tmp_path / 'run') as bag:
+    ).finish()
+    assert run.code == 0, run.output
+    assert (run.report['end_reason'], run.report['seed']) == ('all_found', 7)
+    with Bag(run.folder) as bag:
         assert bag.counts['/found_targets'] > 0
         assert bag.scenario()['nodes']['/planner_node']['parameters']['planner.name'] == 'lawnmower'
-    assert '[INFO]' not in (tmp_path / 'run' / 'filter_node.log').read_text()
+    assert '[INFO]' not in (run.folder / 'filter_node.log').read_text()
     assert list((tmp_path / TEMPORARY).iterdir()) == []
 
 
 def test_an_interrupted_launch_ends_the_run(launch, tmp_path):
-    folder = tmp_path / 'run'
-    path = scenario(tmp_path / 'far.yaml', targets={'positions': [[0.0, 0.0]]})
-    process = launch(scenario=path, out=str(folder), record='false', rate='1.0')
-    for line in process.stdout:
-        if 'measurements' in line:
-            break
-    os.killpg(process.pid, signal.SIGINT)
-    output, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == code(130), output
-    assert json.loads((folder / 'report.json').read_text())['end_reason'] == 'interrupted'
-    assert not (folder / 'bag').exists()
-    assert processes_with(str(folder)) == []
+    path = write_scenario(tmp_path / 'far.yaml', [[0.0, 0.0]])
+    run = launch(scenario=path, out=tmp_path / 'run', record='false', rate='1.0')
+    run.wait_for('measurements')
+    os.killpg(run.process.pid, signal.SIGINT)
+    assert run.finish().code == code(130), run.output
+    assert run.report['end_reason'] == 'interrupted'
+    assert not run.bag.exists()
+    assert run.processes() == []
 
 
 def test_a_wrong_argument_ends_the_launch_with_one_clear_error(launch):
-    process = launch(seed='abc')
-    output, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == code(2), output
-    assert "read 'abc', allowed are whole numbers from 0" in output
-    assert 'Traceback' not in output
+    run = launch(seed='abc').finish()
+    assert run.code == code(2), run.output
+    assert "read 'abc', allowed are whole numbers from 0" in run.output
+    assert 'Traceback' not in run.output
     for name in ('lockstep', 'record', 'rviz', 'view', 'follow_clock'):
         with pytest.raises(ValueError, match=f"{name}: read 'maybe', allowed are true and false"):
             scenario_options({**DEFAULTS, name: 'maybe'})

@@ -1,62 +1,16 @@
 """Two teams in one ROS domain, each in its namespace, on one clock."""
 
 import itertools
-import subprocess
 
 import pytest
-import yaml
-from reserved_domain import reserved_domain
 from rosgraph_msgs.msg import Clock
-from run_operator import Operator
-from scenario_runs import PATIENCE, Run, command, replay
+from scenario_runs import beside, replay, start, write_scenario
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
 from maasi_sim.run.bag import Bag
 
 pytestmark = pytest.mark.system
 STEP = 0.05
-
-
-def scenario(path, start, target, **limits):
-    """Write a scenario with a robot of the same name in each team."""
-    content = {
-        'version': 1,
-        'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
-        'targets': {'positions': [target]},
-        'robots': {
-            'mambo': {
-                'type': 'mambo',
-                'start': [*start, 1.0],
-                'candidates': {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
-            }
-        },
-        'filter': {'method': 'pmb'},
-        'limits': {'time': 120.0, **limits},
-    }
-    path.write_text(yaml.safe_dump(content))
-    return path
-
-
-def launched(*words):
-    return subprocess.Popen(
-        words,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def read_until(process, text):
-    for line in process.stdout:
-        if text in line:
-            return
-    raise AssertionError(f'never said {text}')
-
-
-def finished(process, folder):
-    output, _ = process.communicate(timeout=PATIENCE)
-    return Run(folder, process.returncode, output)
 
 
 @pytest.fixture(scope='module')
@@ -66,27 +20,19 @@ def teams(tmp_path_factory):
     The first is paused until the second measures: it would have found all before.
     """
     folder = tmp_path_factory.mktemp('teams')
-    first = scenario(folder / 'first.yaml', [1.9, 1.9], [0.3, 0.4])
-    second = scenario(folder / 'second.yaml', [0.3, 0.3], [0.6, 0.6])
-    with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
-        for name, value in domain.environment().items():
-            patch.setenv(name, value)
-        options = ['--domain-id', domain.number, '--namespace']
-        operator = Operator(domain)
-        leading = launched(*command(first, folder / 'team_a', *options, 'team_a'))
-        # A robot that does not take part yet is not paused.
-        read_until(leading, 'measurements')
-        operator.call('/team_a/search/pause')
-        following = launched(
-            *command(second, folder / 'team_b', *options, 'team_b', '--follow-clock')
-        )
-        read_until(following, 'measurements')
-        operator.call('/team_a/search/resume')
-        operator.close()
-        return {
-            'team_b': finished(following, folder / 'team_b'),
-            'team_a': finished(leading, folder / 'team_a'),
-        }
+    first = write_scenario(folder / 'first.yaml', [[0.3, 0.4]])
+    second = write_scenario(folder / 'second.yaml', [[0.6, 0.6]], (0.3, 0.3, 1.0))
+    with beside() as operator:
+        options = [*operator.options, '--namespace']
+        with start(first, folder / 'team_a', *options, 'team_a') as leading:
+            # A robot that does not take part yet is not paused.
+            leading.wait_for('measurements')
+            operator.call('/team_a/search/pause')
+            options += ['team_b', '--follow-clock']
+            with start(second, folder / 'team_b', *options) as following:
+                following.wait_for('measurements')
+                operator.call('/team_a/search/resume')
+                return {'team_b': following.finish(), 'team_a': leading.finish()}
 
 
 def test_both_teams_find_their_targets(teams):
@@ -100,10 +46,7 @@ def test_both_teams_find_their_targets(teams):
 @pytest.mark.parametrize('team', ['team_a', 'team_b'])
 def test_a_recording_holds_its_own_team_from_its_first_measurement_on(teams, team):
     with Bag(teams[team].bag) as bag:
-        facts = bag.scenario()
-        shared = {'/clock', '/diagnostics', '/rosout', '/scenario'}
-        counts = bag.counts
-        assert {topic for topic in counts if not topic.startswith(f'/{team}/')} == shared
+        facts, counts = bag.scenario(), bag.counts
         names = {
             status.name for item in bag.messages(['/diagnostics']) for status in item.message.status
         }
@@ -112,6 +55,8 @@ def test_a_recording_holds_its_own_team_from_its_first_measurement_on(teams, tea
         asked = {item.message.batch_id for item in bag.messages([f'/{team}/mambo/detections'])}
         steps = [item.message for item in bag.messages([f'/{team}/lockstep/step'])]
         clock = [stamp_from_ros(item.message.clock) for item in bag.messages(['/clock'])]
+    shared = {'/clock', '/diagnostics', '/rosout', '/scenario'}
+    assert {topic for topic in counts if not topic.startswith(f'/{team}/')} == shared
     assert names and all(name.startswith(f'/{team}/') for name in names)
     assert loggers and all(name.startswith(f'{team}.') for name in loggers)
     assert batches[0] == 1
@@ -129,29 +74,24 @@ def test_a_recording_holds_its_own_team_from_its_first_measurement_on(teams, tea
 
 
 def test_a_run_ends_where_the_clock_that_it_follows_stands_still(tmp_path):
-    path = scenario(tmp_path / 'far.yaml', [1.9, 1.9], [0.0, 0.0], silence=4.0)
-    folder = tmp_path / 'run'
-    with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
-        for name, value in domain.environment().items():
-            patch.setenv(name, value)
-        operator = Operator(domain)
+    limits = {'time': 120.0, 'silence': 4.0}
+    path = write_scenario(tmp_path / 'far.yaml', [[0.0, 0.0]], limits=limits)
+    with beside() as operator:
         clock = operator.node.create_publisher(Clock, '/clock', 10)
-        options = ['--domain-id', domain.number, '--follow-clock']
-        run = launched(*command(path, folder, *options))
         ticks = itertools.count(round(1000.0 / STEP))
-        bag = folder / 'bag' / 'bag.mcap'
+        with start(path, tmp_path / 'run', *operator.options, '--follow-clock') as run:
+            file = run.bag / 'bag.mcap'
 
-        def tick():
-            clock.publish(Clock(clock=stamp_to_ros(round(next(ticks) * STEP * 1e9))))
-            return bag.exists() and bag.stat().st_size > 100_000
+            def tick():
+                clock.publish(Clock(clock=stamp_to_ros(round(next(ticks) * STEP * 1e9))))
+                return file.exists() and file.stat().st_size > 100_000
 
-        operator.until(tick, 'the run moves')
-        done = finished(run, folder)
-        operator.close()
-    assert done.code == 3, done.output
-    assert '/clock, which this run follows, stands still for 4 s' in done.output
-    assert done.report['end_reason'] == 'clock_stopped'
-    with Bag(folder) as recorded:
+            operator.until(tick, 'the run moves')
+            run.finish()
+    assert run.code == 3, run.output
+    assert '/clock, which this run follows, stands still for 4 s' in run.output
+    assert run.report['end_reason'] == 'clock_stopped'
+    with Bag(run.folder) as recorded:
         *_, last = recorded.messages(['/mambo/cmd_vel'])
     assert last.message.twist.linear.x == last.message.twist.linear.y == 0.0
 

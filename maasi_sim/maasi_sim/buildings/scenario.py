@@ -14,9 +14,9 @@ from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
 from maasi_planner.buildings.settings import CuboidSettings, DynamicsSettings, SearcherSettings
 from maasi_sim.buildings.mission import CuboidMission
 from maasi_sim.scenario.base import BaseScenario, ScenarioEnvironment
-from maasi_sim.scenario.checks import check_names, doubts_about, event_problems
-from maasi_sim.scenario.layering import Key, Layer, ScenarioError, doubt, refuse, validate
-from maasi_sim.scenario.loading import read_scenario, with_overrides
+from maasi_sim.scenario.checks import check_names, event_problems
+from maasi_sim.scenario.layering import Key, Layer, ScenarioError
+from maasi_sim.scenario.loading import checked, read_scenario
 from maasi_sim.world.odometry import OdometrySettings
 from maasi_sim.world.robots import BatterySettings
 from maasi_sim.world.world import TargetSettings, World
@@ -83,14 +83,7 @@ def check_cuboid_scenario(
     layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None = None
 ) -> CuboidScenario:
     """Return the scenario of a tree of values with all layers merged."""
-    if overrides:
-        # Overrides must not hide errors of the file.
-        validate(CuboidScenario, layer)
-        layer = with_overrides(layer, overrides)
-    scenario = validate(CuboidScenario, layer)
-    refuse(layer, _problems(scenario))
-    doubt(layer, doubts_about(scenario))
-    return scenario
+    return checked(CuboidScenario, layer, overrides, _problems)
 
 
 def load_cuboid_scenario(

@@ -57,24 +57,21 @@ def problems_of(scenario: Scenario) -> Problems:
 
 
 def _world_problems(scenario: Scenario) -> Problems:
-    found = False
-    for index, obstacle in enumerate(scenario.environment.obstacles):
-        if len(obstacle.centre) > scenario.dimension:
-            found = True
-            yield (
-                ('environment', 'obstacles', index, 'centre'),
-                f'read {obstacle.centre}, allowed are {scenario.dimension} coordinates, '
-                'as in environment.bounds',
-            )
+    problems: list[tuple[Key, str]] = [
+        (
+            ('environment', 'obstacles', index, 'centre'),
+            f'read {obstacle.centre}, allowed are {scenario.dimension} coordinates, '
+            'as in environment.bounds',
+        )
+        for index, obstacle in enumerate(scenario.environment.obstacles)
+        if len(obstacle.centre) > scenario.dimension
+    ]
     most, count = _room_for_targets(scenario), scenario.targets.count
     if count is not None and count > most:
-        found = True
-        yield (
-            ('targets', 'separation'),
-            f'read {scenario.targets.separation}, with which about {most} targets can be drawn '
-            f'at most, not {count}',
-        )
-    if found:
+        text = f'read {scenario.targets.separation}, with which about {most} targets can be drawn'
+        problems.append((('targets', 'separation'), f'{text} at most, not {count}'))
+    yield from problems
+    if problems:
         return
     try:
         scenario.world(scenario.seed)
@@ -204,17 +201,9 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
 
 def _mambo_problems(robot: RobotSettings) -> Problems:
     link, model = robot.mambo, robot.motion.model
-    if robot.driver != 'mambo_driver':
-        yield (
-            ('link',),
-            f"read 'mambo_wifi', but driver '{robot.driver}' does not have it; allowed is "
-            "'topics', or driver 'mambo_driver'",
-        )
+    yield from _link_problems(robot, ('mambo_driver',), 'the drone has one link only')
     if model != 'mambo':
         yield ('motion', 'model'), f"read '{model}', allowed with link mambo_wifi is 'mambo'"
-    if robot.guard:
-        text = 'read true, allowed with link mambo_wifi is false: the drone has one link only'
-        yield ('guard',), text
     if link is None:
         text = 'is missing, link mambo_wifi needs it: at least {arm: true, full_speed: ...}'
         yield ('mambo',), text
@@ -229,6 +218,17 @@ def _mambo_problems(robot: RobotSettings) -> Problems:
     yield from _height_problems(robot, 'above', 'mambo', link.ground)
 
 
+def _link_problems(robot: RobotSettings, drivers: Sequence[str], no_guard: str) -> Problems:
+    if robot.driver not in drivers:
+        yield (
+            ('link',),
+            f"read '{robot.link}', but driver '{robot.driver}' does not have it; allowed is "
+            f"'topics', or driver {' or '.join(drivers)}",
+        )
+    if robot.guard:
+        yield ('guard',), f'read true, allowed with link {robot.link} is false: {no_guard}'
+
+
 def _height_problems(robot: RobotSettings, side: str, link: str, ground: float) -> Problems:
     rise = robot.start[2] - ground
     if (rise if side == 'above' else -rise) <= 0.0:
@@ -239,29 +239,20 @@ def _height_problems(robot: RobotSettings, side: str, link: str, ground: float) 
 def _mavlink_problems(name: str, robot: RobotSettings, ports: dict[str, str]) -> Problems:
     """Yield problems of a vehicle; `ports` has the robots of other vehicles by their ports."""
     link, firmware = robot.mavlink, robot.autopilot.firmware
-    if robot.driver not in _MAVLINK:
-        yield (
-            ('link',),
-            f"read 'mavlink', but driver '{robot.driver}' does not have it; allowed is "
-            "'topics', or one of the drivers " + ', '.join(_MAVLINK),
-        )
-    if robot.guard:
-        text = 'read true, allowed with link mavlink is false: its autopilot stops it'
-        yield ('guard',), text
+    yield from _link_problems(robot, _MAVLINK, 'its autopilot stops it')
     if link is None:
         yield ('mavlink',), 'is missing, link mavlink needs it: at least {arm: true}'
         return
     if not link.arm:
         yield ('mavlink', 'arm'), 'read false, allowed is true: nothing would ever fly'
     match = _MAVLINK_URL.match(link.url)
-    other = name if match is None else ports.setdefault(match[1], name)
     if match is None and not robot.external:
         yield (
             ('mavlink', 'url'),
             f"read '{link.url}', allowed is udpin:HOST:PORT, as the vehicle is simulated, "
             'or autopilot: external',
         )
-    if match is not None and other != name:
+    if match is not None and (other := ports.setdefault(match[1], name)) != name:
         text = f'read port {match[1]}, which {other} has as well; allowed is any other'
         yield ('mavlink', 'url'), text
     submarine = link.vehicle == 'submarine'

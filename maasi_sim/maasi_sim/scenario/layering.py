@@ -98,19 +98,18 @@ def read_layer(path: Path) -> Layer:
             'text without control characters'
         )
     loader = _Loader(text)
+    layer = Layer(None, folder=path.parent)
     try:
         node = loader.get_single_node()
         if node is None:
             raise ScenarioError(f'{path}: is empty, a mapping of keys is needed')
-        _check_size(node, path)
-        layer = Layer(None, folder=path.parent)
         layer.data = _build(loader, node, (), layer.origins, path)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f'{path}:{mark.line + 1}' if mark else path
         raise ScenarioError(f'{place}: is not YAML: {error.problem}') from None
     except yaml.YAMLError as error:
-        raise ScenarioError(f'{path}: is not YAML: {_one_line(error)}') from None
+        raise ScenarioError(f'{path}: is not YAML: {" ".join(str(error).split()):.200}') from None
     except RecursionError:
         raise ScenarioError(f'{path}: is nested too deeply') from None
     finally:
@@ -122,62 +121,50 @@ def read_layer(path: Path) -> Layer:
     return layer
 
 
-def _check_size(top: yaml.Node, path: Path) -> None:
-    """Refuse aliases that hold themselves, or that stand for more than anyone would write."""
-    entries = 0
-    above: set[int] = set()
-    waiting: list[tuple[yaml.Node, bool]] = [(top, False)]
-    while waiting:
-        node, leaving = waiting.pop()
-        if leaving:
-            above.discard(id(node))
-            continue
-        entries += 1
-        line = node.start_mark.line + 1
-        if id(node) in above:
-            raise ScenarioError(f'{path}:{line}: an alias stands inside its own anchor')
-        if entries > _MOST_ENTRIES:
-            raise ScenarioError(
-                f'{path}:{line}: read more than {_MOST_ENTRIES} entries, aliases counted as often '
-                'as they stand there'
-            )
-        if isinstance(node, yaml.CollectionNode):
-            above.add(id(node))
-            waiting.append((node, True))
-            for item in node.value:
-                parts = item if isinstance(item, tuple) else (item,)
-                waiting += [(part, False) for part in parts]
+def _build(
+    loader: _Loader,
+    node: yaml.Node,
+    key: Key,
+    origins: dict[Key, str],
+    path: Path,
+    above: tuple[yaml.Node, ...] = (),
+) -> Any:
+    """Return the values of a node, and note where each key stands.
 
-
-def _one_line(error: Exception) -> str:
-    text = ' '.join(str(error).split())
-    return text if len(text) <= 200 else f'{text[:197]}...'
-
-
-def _build(loader: _Loader, node: yaml.Node, key: Key, origins: dict[Key, str], path: Path) -> Any:
-    origins[key] = f'{path}:{node.start_mark.line + 1}'
-    if isinstance(node, yaml.MappingNode):
-        mapping: dict[Any, Any] = {}
-        for key_node, value_node in node.value:
-            name = loader.construct_object(key_node, deep=True)
-            place = f'{path}:{key_node.start_mark.line + 1}'
-            if not isinstance(name, str):
-                raise ScenarioError(
-                    f'{place}: {dotted(key) or "the whole"}: read {_show(name)} as a key, '
-                    'allowed is text'
-                )
-            inner = (*key, name)
-            if name in mapping:
-                raise ScenarioError(f'{place}: {dotted(inner)}: stands there twice')
-            mapping[name] = _build(loader, value_node, inner, origins, path)
-            origins[inner] = place
-        return mapping
+    Refused are aliases that hold themselves, or that stand for more than anyone would write.
+    """
+    place = f'{path}:{node.start_mark.line + 1}'
+    if node in above:
+        raise ScenarioError(f'{place}: an alias stands inside its own anchor')
+    if len(origins) >= _MOST_ENTRIES:
+        raise ScenarioError(
+            f'{place}: read more than {_MOST_ENTRIES} entries, aliases counted as often as they '
+            'stand there'
+        )
+    origins[key] = place
+    above = (*above, node)
     if isinstance(node, yaml.SequenceNode):
         return [
-            _build(loader, item, (*key, index), origins, path)
+            _build(loader, item, (*key, index), origins, path, above)
             for index, item in enumerate(node.value)
         ]
-    return loader.construct_object(node, deep=True)
+    if not isinstance(node, yaml.MappingNode):
+        return loader.construct_object(node, deep=True)
+    mapping: dict[str, Any] = {}
+    for key_node, value_node in node.value:
+        name = loader.construct_object(key_node, deep=True)
+        place = f'{path}:{key_node.start_mark.line + 1}'
+        if not isinstance(name, str):
+            raise ScenarioError(
+                f'{place}: {dotted(key) or "the whole"}: read {_show(name)} as a key, allowed is '
+                'text'
+            )
+        inner = (*key, name)
+        if name in mapping:
+            raise ScenarioError(f'{place}: {dotted(inner)}: stands there twice')
+        mapping[name] = _build(loader, value_node, inner, origins, path, above)
+        origins[inner] = place
+    return mapping
 
 
 def under(key: Key, layer: Layer) -> Layer:
@@ -200,13 +187,8 @@ def merge(*layers: Layer) -> Layer:
 def _merge(below: Any, above: Any) -> Any:
     if not (isinstance(below, dict) and isinstance(above, dict)):
         return above
-    return {
-        **below,
-        **{
-            name: _merge(below[name], value) if name in below else value
-            for name, value in above.items()
-        },
-    }
+    both = {name: _merge(below[name], above[name]) for name in below.keys() & above.keys()}
+    return below | above | both
 
 
 def override(layer: Layer, key: Key, value: Any, origin: str) -> None:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from maasi_filter.plugins import is_reference
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.scenario.checks import doubts_about, problems_of
+from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.scenario.checks import Problems, doubts_about, problems_of
 from maasi_sim.scenario.layering import (
     Key,
     Layer,
@@ -30,6 +31,8 @@ from maasi_sim.scenario.layering import (
 )
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.scenario.visibility import covering_grid
+
+AnyScenario = TypeVar('AnyScenario', bound=BaseScenario)
 
 
 def config_folder() -> Path:
@@ -93,10 +96,10 @@ def read_scenario(path: str | Path) -> Layer:
     return layer
 
 
-def with_overrides(layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None) -> Layer:
+def with_overrides(layer: Layer, overrides: Mapping[str, tuple[Key, Any]]) -> Layer:
     """Return a layer with the values of `load_scenario` that win over it."""
     result = deepcopy(layer)
-    for origin, (key, value) in (overrides or {}).items():
+    for origin, (key, value) in overrides.items():
         if key == ('planner', 'name') and isinstance(result.data.get('planner'), dict):
             # Of the planner that this one replaces.
             result.data['planner'].pop('settings', None)
@@ -149,13 +152,22 @@ def check_scenario(
     layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None = None
 ) -> Scenario:
     """Return the scenario of a tree of values with all layers merged."""
-    layer = _with_candidates(layer)
+    return checked(Scenario, _with_candidates(layer), overrides, problems_of)
+
+
+def checked(
+    model: type[AnyScenario],
+    layer: Layer,
+    overrides: Mapping[str, tuple[Key, Any]] | None,
+    problems: Callable[[AnyScenario], Problems],
+) -> AnyScenario:
+    """Return the scenario of a tree of values, with what wins over them, or raise its problems."""
     if overrides:
         # What wins over the file hides none of its errors.
-        validate(Scenario, layer)
+        validate(model, layer)
         layer = with_overrides(layer, overrides)
-    scenario = validate(Scenario, layer)
-    refuse(layer, problems_of(scenario))
+    scenario = validate(model, layer)
+    refuse(layer, problems(scenario))
     doubt(layer, doubts_about(scenario))
     return scenario
 

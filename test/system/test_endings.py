@@ -1,0 +1,250 @@
+"""How runs end, what they leave, and who is blamed."""
+
+import os
+import re
+import signal
+import sys
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import pytest
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from scenario_runs import beside, command, run_scenario, start, started, write_scenario
+
+from maasi_sim.run import scenario_run
+from maasi_sim.run.bag import Bag
+from maasi_sim.run.ending import DONE, NOT_WRITTEN, Ending
+from maasi_sim.run.report_files import StoredReport
+from maasi_sim.run.run_folder import make_folder
+from maasi_sim.run.run_options import Options, parse
+from maasi_sim.run.scenario_run import ScenarioRun
+from maasi_sim.scenario.layering import ScenarioError
+
+pytestmark = pytest.mark.system
+NEAR, FAR = [[1.9, 1.9]], [[0.0, 0.0]]
+# A planner that fails, or ends the search, as soon as it is asked.
+SCRIPTED = """
+import time
+from pydantic import BaseModel
+from maasi_planner.planners.base import Planner
+
+
+class Scripted(Planner):
+    class Settings(BaseModel):
+        fault: str
+
+    def __init__(self, settings):
+        super().__init__(settings)
+        if self.own.fault == 'waits':
+            time.sleep(1e6)
+
+    def finished(self, team):
+        return 'a scripted end' if self.own.fault == 'ends' else None
+
+    def decide(self, team):
+        raise RuntimeError('a scripted fault')
+"""
+# What would take minutes waits until it is interrupted.
+LONG = """
+import sys, time
+from maasi_sim.run import run_scenario, scenario_run
+
+def wait(*_):
+    print('busy', flush=True)
+    while True:
+        time.sleep(0.05)
+
+scenario_run.store_report = scenario_run.read_events = wait
+sys.exit(run_scenario.main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+def scripted(tmp_path):
+    """Return the function that writes a scenario with the scripted planner."""
+    (tmp_path / 'scripted.py').write_text(SCRIPTED)
+
+    def write(fault, **changes):
+        planner = {'name': 'scripted:Scripted', 'settings': {'fault': fault}}
+        return write_scenario(tmp_path / 'search.yaml', FAR, planner=planner, **changes)
+
+    return write
+
+
+def test_a_run_without_a_home_folder_in_a_poor_environment(tmp_path, monkeypatch):
+    for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR', 'XDG_RUNTIME_DIR', 'XDG_CACHE_HOME'):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv('LC_ALL', 'C')
+    path = write_scenario(tmp_path / 'near.yaml', NEAR)
+    mask = os.umask(0o077)
+    try:
+        run = run_scenario(path, tmp_path / """it's "here" """, '--lockstep')
+    finally:
+        os.umask(mask)
+    assert run.code == 0, run.output
+    assert '1 of 1 targets found' in run.output
+    assert run.report['end_reason'] == 'all_found'
+    assert run.processes() == []
+
+
+def test_a_node_that_dies_again_and_again_is_given_up(tmp_path, scripted):
+    limits = {'time': 60.0, 'restarts': 1}
+    path = scripted('raises', on_exit='respawn', limits=limits)
+    run = run_scenario(path, tmp_path / 'run', '--lockstep')
+    assert run.code == 3, run.output
+    assert '/planner_node exited with 1, after 1 restarts' in run.output
+    # The end of its log.
+    assert 'RuntimeError: a scripted fault' in run.output
+    assert run.report['end_reason'] == 'node_died'
+    assert [(item['node'], item['event']) for item in run.report['events']] == [
+        ('/planner_node', 'restarted'),
+        ('/planner_node', 'died'),
+    ]
+
+
+def test_a_node_that_never_gets_ready_is_named(tmp_path, scripted):
+    run = run_scenario(scripted('waits', limits={'start': 10.0}), tmp_path / 'run')
+    assert run.code == 3, run.output
+    assert '/planner_node is not ready' in run.output
+    assert run.report['end_reason'] == 'not_ready'
+
+
+def test_the_planner_may_end_a_run_before_all_is_found(tmp_path, scripted):
+    run = run_scenario(scripted('ends'), tmp_path / 'run', '--lockstep', '--no-record')
+    assert run.code == 1, run.output
+    assert 'ended: a scripted end' in run.output
+    assert run.report['end_reason'] == 'planner_done'
+
+
+@pytest.mark.parametrize(
+    ('number', 'moment'), [(signal.SIGINT, 'nodes in ROS domain'), (signal.SIGTERM, 'measurements')]
+)
+def test_an_interrupt_leaves_no_process_and_a_readable_recording(tmp_path, number, moment):
+    with start(write_scenario(tmp_path / 'far.yaml', FAR), tmp_path / 'run') as run:
+        run.wait_for(moment)
+        run.process.send_signal(number)
+        run.finish()
+    assert run.code == 130, run.output
+    assert 'Traceback' not in run.output
+    assert run.processes() == []
+    assert run.report['end_reason'] == 'interrupted'
+    with Bag(run.folder) as bag:
+        assert bag.scenario()['name'] == 'far'
+
+
+def test_report_and_replay_of_a_long_run_may_be_skipped(tmp_path):
+    path = write_scenario(tmp_path / 'near.yaml', NEAR)
+    words = [sys.executable, '-c', LONG, *command(path, tmp_path / 'run', '--lockstep')[3:]]
+    with started(words, tmp_path / 'run') as run:
+        run.wait_for('Ctrl-C skips each')
+        for _ in ('report', 'replay'):
+            run.wait_for('busy')
+            run.process.send_signal(signal.SIGTERM)
+            run.process.send_signal(signal.SIGINT)
+        run.finish()
+    assert run.code == 0, run.output
+    assert not (run.folder / 'report.json').exists()
+    with Bag(run.bag) as bag:
+        assert bag.counts['/filter_update'] > 0
+
+
+def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(tmp_path):
+    path = write_scenario(tmp_path / 'near.yaml', NEAR)
+    with beside() as operator:
+        # The simulation of another run.
+        other = Node('sim_node', namespace='/other', context=operator.context)
+        operator.executor.add_node(other)
+        times = []
+        other.create_subscription(Clock, '/clock', times.append, 10)
+        # Slow enough to discover the follower before the end.
+        with start(path, tmp_path / 'run', *operator.options, '--rate', '0.1') as run:
+            run.wait_for('report: ')
+            run.wait_for('the clock goes on for /other')
+            assert run.report['end_reason'] == 'all_found'
+            with Bag(run.folder) as bag:
+                assert bag.counts['/mambo/state'] > 0
+            times.clear()
+            operator.until(lambda: len(times) >= 20, 'the clock')
+            assert [len(run.processes(node)) for node in ('/sim_node', '/filter_node')] == [1, 0]
+            operator.executor.remove_node(other)
+            other.destroy_node()
+            run.finish()
+    assert run.code == 0, run.output
+    assert run.processes() == []
+
+
+def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path, monkeypatch):
+    path = write_scenario(tmp_path / 'near.yaml', NEAR)
+    run = ScenarioRun(Options(path), SimpleNamespace(at_once=lambda *_: nullcontext()))
+    run.ending, run.folder = Ending('all_found', DONE), tmp_path
+    run._scenario = run.mission.scenario
+    run.recorder = SimpleNamespace(gaps=lambda *_: ['a gap'], elapsed=8.0)
+    run.supervisor = SimpleNamespace(events=[])
+    run._check_recording()
+    (gap,) = run.supervisor.events
+    assert run.unwritten == [gap['reason']] == ['a gap']
+    monkeypatch.setattr(scenario_run, 'store_report', lambda *_: StoredReport({}, '', None))
+    run.observer = SimpleNamespace(record=lambda end: end)
+    run._leave_replay = lambda: None
+    assert run._report() == NOT_WRITTEN
+
+
+def test_wrong_input_is_told_before_anything_starts(tmp_path):
+    run = run_scenario(write_scenario(tmp_path / 'wrong.yaml', NEAR, stopp=1), tmp_path / 'run')
+    assert run.code == 2
+    assert 'wrong.yaml' in run.output and "did you mean 'stop'" in run.output
+    assert not run.folder.exists()
+
+
+@pytest.mark.parametrize(
+    'options, words',
+    [
+        (['--domain-id', '-1'], '--domain-id'),
+        (['--seed', '1.5'], '--seed'),
+        (['--rate', '0'], '--rate'),
+        (['--time-limit', 'nan'], '--time-limit'),
+        (['--lokstep'], 'unknown: --lokstep (did you mean --lockstep?)'),
+        (['--follow-clock'], '--follow-clock needs the --domain-id'),
+        (['--follow-clock', '--domain-id', '7', '--lockstep'], 'allowed without --lockstep'),
+        (['--namespace', '1a'], "read '1a', allowed are letters"),
+    ],
+)
+def test_wrong_options_are_named(options, words, capsys):
+    with pytest.raises(SystemExit) as caught:
+        parse(['mambo', *options])
+    assert caught.value.code == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('options', 'words'),
+    [
+        ({'planner': 'masi'}, "--planner: planner.name: unknown planner 'masi'"),
+        ({'namespace': 'team/mambo'}, "read 'team/mambo', allowed is a name that is none of"),
+    ],
+)
+def test_what_does_not_fit_the_scenario_is_named_with_the_option(options, words):
+    with pytest.raises(ScenarioError, match=re.escape(words)):
+        ScenarioRun(Options('mambo', **options), interruption=False)
+
+
+def test_options_win_over_the_scenario():
+    options = Options('mambo', planner='lawnmower', seed=9, time_limit=3.0)
+    scenario = ScenarioRun(options, interruption=False).mission.scenario
+    values = (scenario.planner.name, scenario.limits.time, scenario.seed)
+    assert values == ('lawnmower', 3.0, 9)
+
+
+def test_a_run_gets_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = {make_folder(None) for _ in range(3)}
+    assert len(folders) == 3
+    assert all(folder.parent == tmp_path / 'runs' for folder in folders)
+    assert make_folder(tmp_path / 'run') == tmp_path / 'run'
+    (tmp_path / 'run' / 'report.json').write_text('{}')
+    with pytest.raises(ScenarioError, match='holds a run already'):
+        make_folder(tmp_path / 'run')
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(ScenarioError, match=r'--out: .*file'):
+        make_folder(tmp_path / 'file')
