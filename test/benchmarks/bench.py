@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
-import sys
+from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 AREAS = ('filter', 'planner', 'cuboid', 'drivers', 'system', 'view')
-
-
-def load(area: str) -> ModuleType:
-    """Return the module with the benchmarks of an area."""
-    path = Path(__file__).parent / f'{area}_benchmark.py'
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def show(row: dict[str, Any]) -> str:
@@ -33,7 +20,7 @@ def show(row: dict[str, Any]) -> str:
     return text
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main() -> None:
     """Run the benchmarks of some areas, or of all."""
     parser = argparse.ArgumentParser(prog='bench', description=__doc__)
     parser.add_argument('areas', nargs='*', metavar='AREA', help=f'{", ".join(AREAS)}; all if none')
@@ -43,23 +30,21 @@ def main(arguments: list[str] | None = None) -> int:
         action='store_true',
         help='a tenth of the calls: shows that all works and roughly how fast',
     )
-    options = parser.parse_args(arguments)
-    if options.json is not None and not os.access(options.json.absolute().parent, os.W_OK):
-        parser.error(f'--json: read {options.json}, allowed is a file in a folder that is there')
-    if options.json is not None and options.json.is_dir():
-        parser.error(f'--json: read {options.json}, a folder; allowed is a file')
+    options = parser.parse_args()
+    file = options.json
+    if file and (file.is_dir() or not os.access(file.absolute().parent, os.W_OK)):
+        parser.error(f'--json: read {file}, allowed is a file in a folder that is there')
     for area in options.areas:
         if area not in AREAS:
             parser.error(f'unknown area {area!r}, known are {", ".join(AREAS)}')
     rows: list[dict[str, Any]] = []
     for area in options.areas or AREAS:
-        for row in load(area).run(0.1 if options.quick else 1.0):
+        for row in import_module(f'{area}_benchmark').run(0.1 if options.quick else 1.0):
             rows.append(row)
             print(show(row), flush=True)
-    if options.json is not None:
-        options.json.write_text(json.dumps(rows, indent=2) + '\n', encoding='utf-8')
-    return 0
+    if file:
+        file.write_text(json.dumps(rows, indent=2) + '\n', encoding='utf-8')
 
 
 if __name__ == '__main__':
-    raise SystemExit(main())
+    main()

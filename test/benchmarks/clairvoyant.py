@@ -8,13 +8,14 @@ expected time until all are found, by local search. Available in the search in o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
-from maasi_filter.models.detection import PARAMETERS, detection_probability_at
+from maasi_filter.models.detection import detection_probability_at
 from maasi_planner.planners.base import (
     Planner,
     explain,
@@ -22,7 +23,7 @@ from maasi_planner.planners.base import (
     waiting_places,
 )
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
+from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 
 Routes = list[list[int]]
 
@@ -178,15 +179,8 @@ class Clairvoyant(Planner):
         if len(wanted) > 1 and np.linalg.norm(wanted[0] - view.state.pose.position) < least:
             wanted = wanted[1:]
         for point in [*wanted, *view.candidates]:
-            alone = TeamView(
-                team.step,
-                team.step_time,
-                {name: RobotView(**{**vars(view), 'candidates': point[None, :]})},
-                team.clusters,
-                team.exploration,
-                taken=places,
-            )
-            options = options_of(alone, name, places)
+            robots = {name: replace(view, candidates=point[None, :])}
+            options = options_of(replace(team, robots=robots, taken=places), name, places)
             if not isinstance(options, str):
                 return single_choice(options.points, options.prediction, 0, 'on the best route')
         return stay(view, 'stays: no target can be reached')
@@ -205,9 +199,9 @@ def _best_routes(team: TeamView, targets: FloatArray) -> tuple[Routes, FloatArra
             row[: len(route)] = route
         return float(_expected_end(robots, array, targets, detected, team.dimension, stops))
 
+    # Whichever target a robot reaches first is the next of its route.
     routes: Routes = [[] for _ in range(number)]
-    ends = robots.remaining_path[:, -1].copy()
-    times = robots.free.astype(float)
+    ends, times = robots.remaining_path[:, -1].copy(), robots.free.astype(float)
     left = list(range(len(targets)))
     while left:
         gaps = np.linalg.norm(targets[left][None] - ends[:, None], axis=2) / robots.speed[:, None]
@@ -217,14 +211,11 @@ def _best_routes(team: TeamView, targets: FloatArray) -> tuple[Routes, FloatArra
         routes[r].append(left.pop(int(column)))
     best = cost(routes)
     for _ in range(ROUNDS):
-        before = best
-        for changed in _neighbours(routes):
-            value = cost(changed)
-            if value < best - 1e-9:
-                routes, best = changed, value
-                break
-        if best == before:
+        costs = ((cost(changed), changed) for changed in _neighbours(routes))
+        found = next((item for item in costs if item[0] < best - 1e-9), None)
+        if found is None:
             break
+        best, routes = found
     cost(routes)
     return routes, stops
 
@@ -232,44 +223,37 @@ def _best_routes(team: TeamView, targets: FloatArray) -> tuple[Routes, FloatArra
 def _neighbours(routes: Routes) -> Iterator[Routes]:
     """Yield routes with one target moved, or a part of one reversed."""
     for r, route in enumerate(routes):
-        for i in range(len(route)):
-            rest = [list(other) for other in routes]
-            target = rest[r].pop(i)
+        for i, target in enumerate(route):
+            rest = [[item for item in other if item != target] for other in routes]
             for s, other in enumerate(rest):
                 for j in range(len(other) + 1):
                     if (s, j) != (r, i):
-                        yield [
-                            [*other[:j], target, *other[j:]] if s == q else list(rest[q])
-                            for q in range(len(rest))
-                        ]
+                        yield [*rest[:s], [*other[:j], target, *other[j:]], *rest[s + 1 :]]
             for j in range(i + 2, len(route) + 1):
                 turned = [*route[:i], *route[i:j][::-1], *route[j:]]
-                yield [turned if q == r else list(routes[q]) for q in range(len(routes))]
+                yield [*routes[:r], turned, *routes[r + 1 :]]
 
 
 def _has_cluster(team: TeamView, target: FloatArray) -> bool:
     """Return whether a target was detected: a cluster is near it."""
     d = team.dimension
-    for cluster in team.clusters:
-        offset = cluster.position[:d] - target[:d]
-        if offset @ offset <= 9.0 * float(np.trace(cluster.covariance[:d, :d])):
-            return True
-    return False
+    offsets = [cluster.position[:d] - target[:d] for cluster in team.clusters]
+    return any(
+        offset @ offset <= 9.0 * float(np.trace(cluster.covariance[:d, :d]))
+        for offset, cluster in zip(offsets, team.clusters)
+    )
 
 
 def _robots(team: TeamView, targets: FloatArray) -> _Robots:
     """Return all robots of a team for the simulation."""
     views = [team.robots[name] for name in team.names()]
     tick = min(view.period_steps for view in views)
-    ahead, pauses, speeds, yaws = [], [], [], []
-    parameters = np.zeros((len(views), PARAMETERS))
-    kinds = []
-    for row, view in zip(parameters, views):
-        here = np.array(view.state.pose.position)
+    paths, rows = [], []
+    for view in views:
+        here = view.state.pose.position
         path = view.remaining_path
-        if path is None or not len(path):
-            path = here[None]
-        ahead.append(np.vstack([path[::tick], path[-1]]))
+        path = here[None] if path is None or not len(path) else path
+        paths.append(np.vstack([path[::tick], path[-1]]))
         settings = view.motion.settings
         speed = settings.speed * team.step_time
         goals = targets.copy()
@@ -277,27 +261,25 @@ def _robots(team: TeamView, targets: FloatArray) -> _Robots:
             goals[:, 2] = here[2]
         lengths = view.motion.predict(view.state, goals, team.step_time).lengths
         over = lengths - np.linalg.norm(goals - here, axis=1) / speed
-        pauses.append(max(0.0, float(np.median(over))) / tick)
-        speeds.append(speed * tick)
         travels = settings.model == 'unicycle' or settings.heading == 'travel'
-        yaws.append(np.nan if travels else view.state.pose.yaw)
-        kind, row[:] = view.sensor.detection.kernel()
-        kinds.append(kind)
-    longest = max(map(len, ahead))
+        yaw = np.nan if travels else view.state.pose.yaw
+        period = max(1, round(view.period_steps / tick))
+        pause = max(0.0, float(np.median(over))) / tick
+        rows.append((speed * tick, pause, period, *view.sensor.detection.kernel(), yaw))
+    speeds, pauses, periods, kinds, parameters, yaws = map(np.array, zip(*rows))
+    longest = max(map(len, paths))
     return _Robots(
-        remaining_path=np.stack(
-            [np.pad(path, ((0, longest - len(path)), (0, 0)), mode='edge') for path in ahead]
-        ),
-        free=np.array([len(path) - 1 if len(path) > 2 else 0 for path in ahead], np.int64),
-        speed=np.array(speeds),
-        pause=np.array(pauses),
-        period=np.array([max(1, round(view.period_steps / tick)) for view in views], np.int64),
-        kind=np.array(kinds, np.int64),
-        parameters=parameters,
-        yaw=np.array(yaws),
+        np.stack([np.pad(path, ((0, longest - len(path)), (0, 0)), mode='edge') for path in paths]),
+        np.array([len(path) - 1 if len(path) > 2 else 0 for path in paths], np.int64),
+        speeds,
+        pauses,
+        periods,
+        kinds,
+        parameters,
+        yaws,
     )
 
 
 def clairvoyant(settings: PlannerSettings, missing: Callable[[], FloatArray]) -> Clairvoyant:
-    """Return the clairvoyant of a group, for `search(planner=clairvoyant)`."""
+    """Return the planner of a group; `search` takes a class for one without `missing`."""
     return Clairvoyant(settings, missing)

@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -30,7 +30,7 @@ from maasi_filter.metrics import match_targets
 from maasi_filter.vector_math import squared_distance
 from maasi_sim.experiments.campaign import run_command
 from maasi_sim.experiments.searches import merged
-from maasi_sim.experiments.statistics import paired_difference
+from maasi_sim.experiments.statistics import mean_interval, paired_difference
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
@@ -39,12 +39,7 @@ from maasi_sim.world.sensors import RangingSensor
 
 METHODS = ('ic_phd', 'pmb')
 CUBE = 'ranging_drone_3d'
-# Measurements after which a search in the cube ends; of other scenarios, whose images are many.
-CAP = 400
-CAP_OF_SCENARIOS = 6000
-# A planner that never ends a search.
-PERSISTENT = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
-# A found target in the cube is true within this distance of a true one, one to one, metres.
+# A found target in the cube is true within this distance of a true one, one to one [m].
 RADIUS = 5.0
 HEAD = (
     '| condition | method | complete | false found per run | RMSE [m] | NEES | measurements '
@@ -70,49 +65,48 @@ class Run:
     measurements: int
     step: float
 
-    @property
-    def finished(self) -> bool:
-        """Whether all were found."""
-        return self.found == self.targets
-
     def counted(self, cap: int) -> int:
-        """Return its measurements; `cap` if it did not finish."""
-        return self.measurements if self.finished else cap
+        """Return its measurements; `cap` if it did not find all."""
+        return self.measurements if self.found == self.targets else cap
 
 
-@cache
-def _content(scenario: str) -> dict[str, Any]:
-    return load_scenario(scenario).model_dump(by_alias=True, exclude_unset=True)
-
-
-def _cap(condition: str) -> int:
-    return CAP_OF_SCENARIOS if condition in SCENARIOS else CAP
+def cap_of(condition: str) -> int:
+    """Return the measurements after which a search ends; other scenarios have many images."""
+    return 6000 if condition in SCENARIOS else 400
 
 
 def prepared(
     condition: str, method: str, seed: int, settings: dict[str, Any] | None = None
 ) -> Scenario:
     """Return the scenario of one run, with no limit but the number of measurements."""
-    ours = {'planner': PERSISTENT, 'filter': {'method': method}, 'limits': {'time': 1e4}}
-    scoring = {'scoring': {'radius': RADIUS}} if condition not in SCENARIOS else {}
-    content = merged(_content(SCENARIOS.get(condition, CUBE)), ours, scoring)
+    scenario = load_scenario(SCENARIOS.get(condition, CUBE))
+    ours = {
+        'planner': {'explored_threshold': 1.0, 'gain_threshold': 0.0},
+        'filter': {'method': method},
+        'limits': {'time': 1e4},
+        'scoring': {} if condition in SCENARIOS else {'radius': RADIUS},
+    }
+    content = merged(scenario.model_dump(by_alias=True, exclude_unset=True), ours)
     for change in CONDITIONS[condition]:
         content = change(content, seed) if callable(change) else merged(content, change)
         common = content.pop('every_robot', {})
         content['robots'] = {
             name: merged(robot, common) for name, robot in content['robots'].items()
         }
-    content = merged(content, {'filter': settings or {}})
-    return Scenario.model_validate(content)
+    return Scenario.model_validate(merged(content, {'filter': settings or {}}))
 
 
 def run_one(condition: str, method: str, seed: int, settings: dict[str, Any] | None = None) -> Run:
     """Run one search up to its number of measurements."""
     scenario = prepared(condition, method, seed, settings)
-    measure = RangingSensor.measure
-    returned = RETURNS[condition](measure) if condition in RETURNS else measure
+    measure, besides = RangingSensor.measure, RETURNS.get(condition)
+
+    def returned(sensor: Any, pose: Any, step: int, *rest: Any) -> tuple[Any, Any]:
+        seen = measure(sensor, pose, step, *rest)
+        return besides(sensor, pose, step, *seen) if besides else seen
+
     with patch.object(RangingSensor, 'measure', returned):
-        result = search(scenario, seed, _cap(condition))
+        result = search(scenario, seed, cap_of(condition))
     d = scenario.dimension
     found = np.array([target.position for target in result.found_targets]).reshape(-1, d)
     match = match_targets(found, result.truth, scoring_radius(scenario, result.truth))
@@ -132,77 +126,44 @@ def run_one(condition: str, method: str, seed: int, settings: dict[str, Any] | N
     )
 
 
-def restricted_mean(times: np.ndarray, ended: np.ndarray, cap: float) -> tuple[float, float]:
-    """Return the restricted mean of times (n,) and its standard error (Greenwood's plug-in).
-
-    It is the area under the Kaplan-Meier curve up to `cap`; where `ended` is false the run was cut
-    short at its time.
-    """
-    ended, times = ended & (times <= cap), np.minimum(times, cap)
-    survival, previous, area, steps = 1.0, 0.0, 0.0, []
-    for moment in np.unique(times[ended]):
-        area += survival * (moment - previous)
-        risk, here = (times >= moment).sum(), ((times == moment) & ended).sum()
-        steps.append((risk, here, area))
-        survival *= 1.0 - here / risk
-        previous = moment
-    area += survival * (cap - previous)
-    variance = sum((area - a) ** 2 * n / (m * (m - n)) for m, n, a in steps if m > n)
-    return float(area), math.sqrt(variance * len(times) / max(len(times) - 1, 1))
-
-
 def row(runs: Sequence[Run], others: Sequence[Run] | None, cap: int) -> list[str]:
     """Return the cells of a row, with 95 % intervals; `others` are those of the reference.
 
-    Complete runs: Clopper and Pearson. False found targets: Poisson. Measurements: restricted
-    mean, Kaplan and Meier, for runs that did not finish; their difference is paired by seed.
+    Complete runs: Clopper and Pearson. False found targets: Poisson. Measurements: Student, as all
+    runs that did not find all reached the cap; their difference is paired by seed.
     """
     number = len(runs)
-    complete = sum(run.finished for run in runs)
+    complete = sum(run.found == run.targets for run in runs)
     low, high = binomtest(complete, number).proportion_ci()
     false = sum(run.false_found for run in runs)
     least = chi2.ppf(0.025, 2 * false) / 2 / number if false else 0.0
     most = chi2.ppf(0.975, 2 * false + 2) / 2 / number
     found = max(sum(run.found for run in runs), 1)
-    mean, error = restricted_mean(
-        np.array([float(run.measurements) for run in runs]),
-        np.array([run.finished for run in runs], np.bool_),
-        cap,
-    )
-    difference = '-'
+    ours = [run.counted(cap) for run in runs]
+    mean, difference = mean_interval(ours), '-'
     if others is not None:
-        theirs = {run.seed: run.counted(cap) for run in others}
-        both = [run for run in runs if run.seed in theirs]
-        ours = [run.counted(cap) for run in both]
-        gap = paired_difference(ours, [theirs[run.seed] for run in both])
+        gap = paired_difference(ours, [run.counted(cap) for run in others])
         difference = f'{gap.mean:+.0f} +- {gap.half_width:.0f}'
     return [
         f'{complete}/{number} ({low:.2f} to {high:.2f})',
         f'{false / number:.2f} ({least:.2f} to {most:.2f})',
         f'{math.sqrt(sum(run.squares for run in runs) / found):.2f}',
         f'{sum(run.normalised for run in runs) / found:.2f}',
-        f'{mean:.0f} +- {1.96 * error:.0f}',
+        f'{mean.mean:.0f} +- {mean.half_width:.0f}',
         difference,
         f'{1e3 * float(np.median([run.step for run in runs])):.1f}',
     ]
 
 
-def runs_in(path: Path | None) -> dict[tuple[str, str], dict[int, Run]]:
-    """Return the runs of a file by condition and method, and by seed."""
-    kept: dict[tuple[str, str], dict[int, Run]] = {}
+def runs_in(path: Path | None) -> dict[tuple[str, str, int], Run]:
+    """Return the runs of a file by condition, method and seed."""
+    kept = {}
     if path is not None and path.exists():
         for line in path.read_text(encoding='utf-8').splitlines():
             values = json.loads(line)
-            key = values.pop('condition'), values.pop('method')
-            kept.setdefault(key, {})[values['seed']] = Run(**values)
+            key = values.pop('condition'), values.pop('method'), values['seed']
+            kept[key] = Run(**values)
     return kept
-
-
-def keep(path: Path | None, condition: str, method: str, run: Run) -> None:
-    """Add a run to a file, as a line of JSON."""
-    if path is not None:
-        with path.open('a', encoding='utf-8') as file:
-            file.write(json.dumps({'condition': condition, 'method': method, **asdict(run)}) + '\n')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -254,15 +215,17 @@ def main(arguments: list[str] | None = None) -> int:
         for condition in wanted:
             done: dict[str, list[Run]] = {}
             for method in options.method:
-                there = kept.setdefault((condition, method), {})
-                missing = [seed for seed in seeds if seed not in there]
+                missing = [seed for seed in seeds if (condition, method, seed) not in kept]
                 one = partial(run_one, condition, method, settings=options.filter)
                 for run in pool.map(one, missing):
-                    there[run.seed] = run
-                    keep(options.json, condition, method, run)
-                done[method] = [there[seed] for seed in seeds]
+                    kept[condition, method, run.seed] = run
+                    if options.json is not None:
+                        named = {'condition': condition, 'method': method, **asdict(run)}
+                        with options.json.open('a', encoding='utf-8') as file:
+                            file.write(json.dumps(named) + '\n')
+                done[method] = [kept[condition, method, seed] for seed in seeds]
                 others = done.get('ic_phd') if method != 'ic_phd' else None
-                cells = [condition, method, *row(done[method], others, _cap(condition))]
+                cells = [condition, method, *row(done[method], others, cap_of(condition))]
                 print(f'| {" | ".join(cells)} |', flush=True)
     print(f'{time.perf_counter() - begin:.0f} s', file=sys.stderr)
     return 0

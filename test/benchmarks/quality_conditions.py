@@ -33,11 +33,6 @@ SPACE = SIDE * math.sqrt(3.0) * 2.0 * math.pi * math.pi
 Content = dict[str, Any]
 # A layer over the scenario, its `every_robot` over each robot; or what makes other content of it.
 Change = Content | Callable[[Content, int], Content]
-# In place of `RangingSensor.measure`, from it.
-Measure = Callable[..., tuple[Any, Any]]
-
-# That of the cube's robot, as it is known.
-ODOMETRY = {'position_noise': 0.05, 'heading_noise': 0.001}
 
 
 def robots(**values: Any) -> Content:
@@ -56,14 +51,11 @@ def clutter(per_scan: float, told: bool) -> Content:
     return robots(simulated={'clutter_per_scan': per_scan}, **believed)
 
 
-def simulated(**values: Any) -> Content:
-    """What is true apart from what is believed."""
-    return robots(simulated=values)
-
-
 def untold(**values: Any) -> Content:
     """Errors of the robots' positions that are not in the covariances they report."""
-    return simulated(odometry=ODOMETRY | values)
+    return robots(
+        simulated={'odometry': {'position_noise': 0.05, 'heading_noise': 0.001, **values}}
+    )
 
 
 def pmb(**values: Any) -> Content:
@@ -71,28 +63,19 @@ def pmb(**values: Any) -> Content:
     return {'filter': {'pmb': values}}
 
 
-def walk(deviation: float, told: bool = True) -> Content:
-    """Targets that walk, of which the filter is told or not."""
-    return {'targets': {'walk': deviation}, **(pmb(walk=deviation) if told else {})}
-
-
 def targets(**values: Any) -> Content:
     """Other true targets."""
     return {'targets': values}
 
 
-def pairs(distance: float) -> Change:
-    """Six pairs of targets, `distance` metres apart."""
-
-    def change(content: Content, seed: int) -> Content:
-        generator = np.random.default_rng([seed, 77])
-        centres = generator.uniform(10.0, SIDE - 10.0, (6, 3))
-        way = generator.standard_normal((6, 3))
-        way *= 0.5 * distance / np.linalg.norm(way, axis=1, keepdims=True)
-        positions = np.concatenate([centres + way, centres - way])
-        return content | {'targets': {'positions': positions.tolist()}}
-
-    return change
+def pairs(content: Content, seed: int) -> Content:
+    """Six pairs of targets, 3 m apart."""
+    generator = np.random.default_rng([seed, 77])
+    centres = generator.uniform(10.0, SIDE - 10.0, (6, 3))
+    way = generator.standard_normal((6, 3))
+    way *= 1.5 / np.linalg.norm(way, axis=1, keepdims=True)
+    positions = np.concatenate([centres + way, centres - way])
+    return content | {'targets': {'positions': positions.tolist()}}
 
 
 def two(name: str, start: list[float], **values: Any) -> Change:
@@ -106,41 +89,26 @@ def two(name: str, start: list[float], **values: Any) -> Change:
     return change
 
 
-def duplicates(share: float, apart: float) -> Callable[[Measure], Measure]:
-    """Some detections come twice, `apart` of the noise's deviations from each other."""
-
-    def changed(measure: Measure) -> Measure:
-        def twice(sensor: Any, pose: Any, step: int, targets: Any = None) -> tuple[Any, Any]:
-            values, causes = measure(sensor, pose, step, targets)
-            generator = noise_stream(sensor.seed, sensor.robot, step, 'duplicates')
-            again = generator.random(len(values)) < share
-            errors = generator.standard_normal(values[again].shape) @ sensor._spread.T
-            return (
-                np.concatenate([values, values[again] + apart * errors]),
-                np.concatenate([causes, causes[again]]),
-            )
-
-        return twice
-
-    return changed
+# What sensors return besides: these are called with what `RangingSensor.measure` has returned.
 
 
-def reflections(places: int, share: float) -> Callable[[Measure], Measure]:
-    """Fixed places without a target that return with a share of pi."""
+def duplicates(sensor: Any, pose: Any, step: int, values: Any, causes: Any) -> tuple[Any, Any]:
+    """One in five detections comes twice, 0.3 of the noise's deviations apart."""
+    generator = noise_stream(sensor.seed, sensor.robot, step, 'duplicates')
+    again = generator.random(len(values)) < 0.2
+    errors = generator.standard_normal(values[again].shape) @ sensor._spread.T
+    twice = values[again] + 0.3 * errors
+    return np.concatenate([values, twice]), np.concatenate([causes, causes[again]])
 
-    def changed(measure: Measure) -> Measure:
-        def reflected(sensor: Any, pose: Any, step: int, targets: Any = None) -> tuple[Any, Any]:
-            values, causes = measure(sensor, pose, step, targets)
-            at = np.random.default_rng([sensor.seed, 78]).uniform(10.0, SIDE - 10.0, (places, 3))
-            generator = noise_stream(sensor.seed, sensor.robot, step, 'reflections')
-            seen = generator.random(places) < share * sensor.sensor.detection.probability(at, pose)
-            errors = generator.standard_normal((places, 3)) @ sensor._spread.T
-            returns = (sensor.sensor.measurement.measure(at, pose) + errors)[seen]
-            return np.concatenate([values, returns]), np.append(causes, np.full(len(returns), -1))
 
-        return reflected
-
-    return changed
+def reflections(sensor: Any, pose: Any, step: int, values: Any, causes: Any) -> tuple[Any, Any]:
+    """Five fixed places without a target return with 0.3 of pi."""
+    at = np.random.default_rng([sensor.seed, 78]).uniform(10.0, SIDE - 10.0, (5, 3))
+    generator = noise_stream(sensor.seed, sensor.robot, step, 'reflections')
+    seen = generator.random(5) < 0.3 * sensor.sensor.detection.probability(at, pose)
+    errors = generator.standard_normal((5, 3)) @ sensor._spread.T
+    returns = (sensor.sensor.measurement.measure(at, pose) + errors)[seen]
+    return np.concatenate([values, returns]), np.append(causes, np.full(len(returns), -1))
 
 
 DEGREES, RADIANS = noise('degrees'), noise('radians')
@@ -158,8 +126,8 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
         for per_scan in (0.2, 1.0, 3.0)
         for told in (True, False)
     },
-    'pi 0.7 of believed': (DEGREES, simulated(probability_factor=0.7)),
-    'pi 0.9 of believed': (DEGREES, simulated(probability_factor=0.9)),
+    'pi 0.7 of believed': (DEGREES, robots(simulated={'probability_factor': 0.7})),
+    'pi 0.9 of believed': (DEGREES, robots(simulated={'probability_factor': 0.9})),
     'positions off by 1 m': (DEGREES, robots(odometry={'position_noise': 1.0})),
     'positions off by 3 m': (DEGREES, robots(odometry={'position_noise': 3.0})),
     **{
@@ -177,8 +145,8 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
         for drones in ('', 'two drones, ')
         for estimated in (False, True)
     },
-    'noise 1.5 of believed': (DEGREES, simulated(noise_factor=1.5)),
-    'noise 0.67 of believed': (DEGREES, simulated(noise_factor=0.67)),
+    'noise 1.5 of believed': (DEGREES, robots(simulated={'noise_factor': 1.5})),
+    'noise 0.67 of believed': (DEGREES, robots(simulated={'noise_factor': 0.67})),
     '1 target': (DEGREES, targets(count=1)),
     '3 targets': (DEGREES, targets(count=3)),
     '40 targets': (DEGREES, targets(count=40)),
@@ -190,26 +158,23 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
         DEGREES,
         targets(distribution='clustered', clusters=4, spread=4.0, separation=3.0),
     ),
-    'pairs at 3 m': (DEGREES, pairs(3.0)),
-    'pairs at 3 m, identified': (DEGREES, pairs(3.0), targets(identified=True)),
-    'walk 0.1 m/sqrt(s), told': (DEGREES, walk(0.1)),
-    'walk 0.3 m/sqrt(s), told': (DEGREES, walk(0.3)),
-    'pi 0.5 of believed': (DEGREES, simulated(probability_factor=0.5)),
+    'pairs at 3 m': (DEGREES, pairs),
+    'pairs at 3 m, identified': (DEGREES, pairs, targets(identified=True)),
+    'walk 0.1 m/sqrt(s), told': (DEGREES, targets(walk=0.1), pmb(walk=0.1)),
+    'walk 0.3 m/sqrt(s), told': (DEGREES, targets(walk=0.3), pmb(walk=0.3)),
+    'pi 0.5 of believed': (DEGREES, robots(simulated={'probability_factor': 0.5})),
     'one in five detections twice': (DEGREES,),
     'five reflections': (DEGREES,),
     'positions off by 3 m, not told': (DEGREES, untold(position_noise=3.0)),
     'drift 0.08 m/sqrt(m), not told': (DEGREES, untold(position_drift=0.08)),
-    'walk 0.2 m/sqrt(s), not told': (DEGREES, walk(0.2, told=False)),
+    'walk 0.2 m/sqrt(s), not told': (DEGREES, targets(walk=0.2)),
     'demo': (),
     'mambo': (),
     'drone_rov': (),
     'two TurtleBots': (two('turtlebot', [2.1, 2.1, 0.0], yaw=3.14),),
 }
 # What the sensor returns besides, by condition.
-RETURNS: dict[str, Callable[[Measure], Measure]] = {
-    'one in five detections twice': duplicates(0.2, 0.3),
-    'five reflections': reflections(5, 0.3),
-}
+RETURNS = {'one in five detections twice': duplicates, 'five reflections': reflections}
 # Conditions that are no changes of the cube, by the scenario that they change.
 SCENARIOS = {
     'demo': 'mambo_turtlebot',

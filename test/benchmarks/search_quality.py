@@ -17,7 +17,7 @@ from quality_conditions import SEEDS
 from search_regimes import KINDS, REGIMES, prepared
 
 from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
-from maasi_sim.experiments.experiment import Case, Experiment, Results
+from maasi_sim.experiments.experiment import Case, Experiment
 from maasi_sim.experiments.searches import comparison_of, search_settings
 from maasi_sim.experiments.tables import SearchTable
 
@@ -34,15 +34,6 @@ def comparison(regime: str, kinds: Sequence[str]) -> Experiment:
         settings = search_settings(prepared(regime, kind), how.maker)
         cases.append(Case(kind, settings, runs=how.runs))
     return comparison_of(regime, cases)
-
-
-def tables(every: Sequence[Results]) -> str:
-    """Return the tables of all regimes in Markdown."""
-    return '\n'.join(
-        f'**{item.experiment.name}** (limit {REGIMES[item.experiment.name].limit:g} s)\n\n'
-        f'{SearchTable(item).markdown()}'
-        for item in every
-    )
 
 
 def write(path: Path, text: str) -> None:
@@ -86,7 +77,10 @@ def main(arguments: list[str] | None = None) -> int:
         for regime in wanted
     ]
     problems = carry_out_all(plans, max(options.jobs, 1))
-    text = tables([work.results() for work in plans])
+    text = '\n'.join(
+        f'**{name}** (limit {REGIMES[name].limit:g} s)\n\n{SearchTable(work.results()).markdown()}'
+        for name, work in zip(wanted, plans)
+    )
     head = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer for slow planners).\n'
     print(f'{head}\n{text}')
     if options.document is not None:

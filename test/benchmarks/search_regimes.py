@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from quality_conditions import NOISES
 
@@ -11,21 +10,16 @@ from maasi_sim.experiments.searches import merged
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
 
-# Searches end when all is found or at the limit, not when the planner says that nothing is left.
-_NEVER_DONE = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
-
 GRID_2D = {'grid': [10, 10], 'spacing': 100.0, 'corner': [50.0, 50.0]}
 NEIGHBOURS_3D = {'ring': 6, 'distance': 30.0}
 PAPER = {'objective': 'paper', 'alpha': 0.75, 'beta': 0.75, 'control_weight': 0.0}
 
 
-@dataclass(frozen=True)
-class Regime:
-    """A kind of search.
+class Regime(NamedTuple):
+    """A kind of search; a run that does not find all counts with `limit` [s].
 
-    `limit` is the time that a run has, and counts if not all is found [s]; `change` is merged over
-    the scenario, where `robots` replaces all robots and types come with the first one; `neighbours`
-    are candidates of planners that measure at waypoints only.
+    `change` is merged over the scenario, its robots like the first one of the scenario;
+    `neighbours` are candidates of planners that measure at waypoints only.
     """
 
     scenario: str
@@ -34,13 +28,11 @@ class Regime:
     neighbours: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A planner as it is compared.
+class Kind(NamedTuple):
+    """A planner as it is compared: its settings, and most seeds, fewer where runs take long.
 
-    `change` are settings of the planner; `runs` most seeds, fewer where runs take long; `stops`
-    whether robots stop at every waypoint; `neighbours` whether it chooses among a regime's; `maker`
-    the function that makes the planner, as of `search`, in place of the scenario's.
+    `stops`: robots stop at every waypoint; `neighbours`: it chooses among a regime's; `maker` makes
+    the planner, as of `search`, in place of the scenario's.
     """
 
     change: dict[str, Any]
@@ -52,10 +44,7 @@ class Kind:
 
 def drones(*starts: tuple[float, float, float], **change: Any) -> dict[str, Any]:
     """Return the changes of robots drone1, drone2 and so on."""
-    return {
-        f'drone{number}': {'start': list(start), **change}
-        for number, start in enumerate(starts, start=1)
-    }
+    return {f'drone{n}': {'start': list(start), **change} for n, start in enumerate(starts, 1)}
 
 
 REGIMES: dict[str, Regime] = {
@@ -120,7 +109,9 @@ def prepared(regime: str, kind: str) -> Scenario:
         content['robots'] = dict.fromkeys(robots, like)
     limits = {'limits': {'time': what.limit}, 'filter': {'threads': 1}}
     content = merged(content, change, {'robots': robots}, limits)
-    content['planner'] = merged(content['planner'], _NEVER_DONE, how.change)
+    # Searches end when all is found or at the limit, not when nothing is left to explore.
+    never_done = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
+    content['planner'] = merged(content['planner'], never_done, how.change)
     for robot in content['robots'].values():
         if how.neighbours:
             robot['candidates'] = what.neighbours

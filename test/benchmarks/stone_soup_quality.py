@@ -22,7 +22,6 @@ from stonesoup.base import Property
 from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
 from stonesoup.dataassociator.probability import JPDA
 from stonesoup.deleter.base import Deleter
-from stonesoup.functions import gm_reduce_single
 from stonesoup.hypothesiser.distance import DistanceHypothesiser
 from stonesoup.hypothesiser.probability import PDAHypothesiser
 from stonesoup.initiator.simple import MultiMeasurementInitiator
@@ -30,7 +29,8 @@ from stonesoup.measures import Mahalanobis
 from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
 from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, RandomWalk
 from stonesoup.predictor.kalman import ExtendedKalmanPredictor
-from stonesoup.types.array import CovarianceMatrix, StateVectors
+from stonesoup.tracker.simple import MultiTargetMixtureTracker
+from stonesoup.types.array import CovarianceMatrix
 from stonesoup.types.detection import Detection
 from stonesoup.types.numeric import Probability
 from stonesoup.types.state import GaussianState
@@ -105,30 +105,29 @@ class StoneSoup:
     def __init__(self, scan: AgentMeasurement, bounds: FloatArray, walk: float) -> None:
         self.view = View(scan.sensor, scan.pose)
         space = scan.sensor.measurement_space(bounds)
-        density = max(scan.sensor.clutter, LEAST_CLUTTER / space)
         walks = [RandomWalk(max(walk**2, LEAST_WALK))] * 3
         predictor = ExtendedKalmanPredictor(CombinedLinearGaussianTransitionModel(walks))
-        self.updater = ExtendedKalmanUpdater(None)
-        self.hypothesiser = ViewedHypothesiser(
+        updater = ExtendedKalmanUpdater(None)
+        hypothesiser = ViewedHypothesiser(
             predictor=predictor,
-            updater=self.updater,
-            clutter_spatial_density=density,
+            updater=updater,
+            clutter_spatial_density=max(scan.sensor.clutter, LEAST_CLUTTER / space),
             prob_gate=Probability(0.9999),
             view=self.view,
         )
-        self.associator = JPDA(hypothesiser=self.hypothesiser)
-        self.deleter = MissedDeleter(view=self.view)
+        deleter = MissedDeleter(view=self.view)
         # A detection says where a target is on each axis: the prior is not used.
-        self.initiator = MultiMeasurementInitiator(
+        initiator = MultiMeasurementInitiator(
             prior_state=GaussianState(np.zeros((3, 1)), np.eye(3)),
-            deleter=self.deleter,
+            deleter=deleter,
             data_associator=GNNWith2DAssignment(
-                DistanceHypothesiser(predictor, self.updater, Mahalanobis(), missed_distance=4)
+                DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=4)
             ),
-            updater=self.updater,
+            updater=updater,
             min_points=2,
         )
-        self.tracks: set[Any] = set()
+        associator = JPDA(hypothesiser=hypothesiser)
+        self.tracker = MultiTargetMixtureTracker(initiator, deleter, None, associator, updater)
 
     def step(self, scan: AgentMeasurement, seconds: float) -> None:
         """Process a scan."""
@@ -146,38 +145,12 @@ class StoneSoup:
             Detection(row[order].reshape(3, 1), timestamp=now, measurement_model=model)
             for row in np.asarray(scan.values)
         }
-        found = self.associator.associate(self.tracks, detections, now)
-        used = set()
-        for track, hypotheses in found.items():
-            used |= self._update(track, hypotheses)
-        self.tracks -= self.deleter.delete_tracks(self.tracks)
-        self.tracks |= self.initiator.initiate(detections - used, now)
-
-    def _update(self, track: Any, hypotheses: Any) -> set[Any]:
-        """Update a track with the mixture of its hypotheses; return what it likely caused."""
-        states, weights, used = [], [], set()
-        for hypothesis in hypotheses:
-            weight = float(hypothesis.probability)
-            if hypothesis:
-                states.append(self.updater.update(hypothesis))
-                if weight > 0.1:
-                    used.add(hypothesis.measurement)
-            else:
-                states.append(hypothesis.prediction)
-            weights.append(weight)
-        means = StateVectors([state.state_vector for state in states])
-        covariances = np.stack([state.covar for state in states], axis=2)
-        mean, covariance = gm_reduce_single(means, covariances, np.array(weights))
-        now = hypotheses[0].prediction.timestamp
-        if used:
-            track.append(GaussianStateUpdate(mean, covariance, hypotheses, timestamp=now))
-        else:
-            track.append(GaussianState(mean, covariance, timestamp=now))
-        return used
+        self.tracker.detector_iter = iter([(now, detections)])
+        next(self.tracker)
 
     def estimates(self) -> FloatArray:
         """Return the positions of the tracks, (n, 3), metres."""
-        rows = [np.asarray(track.state.mean, float).ravel() for track in self.tracks]
+        rows = [np.asarray(track.state.mean, float).ravel() for track in self.tracker.tracks]
         return np.array(rows).reshape(-1, 3)
 
 

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import os
+import io
 import re
 import tempfile
 import time
-from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+from unittest.mock import patch
 
 import numpy as np
 from timing import entry, run_scenario
 
-from maasi_sim.run.domain import Domain
-from maasi_sim.run.node_plan import NodePlan
-from maasi_sim.run.processes import NodeProcess, find_executable, stop
-from maasi_sim.run.replay_node import FILTER, REPLAYED, ReplayNode, read_recording
+from maasi_sim.run import replay_node
+from maasi_sim.run.replay_node import Batch, ReplayNode
 
 SECONDS = 40.0
-# For an answer of the filter node [s].
-PATIENCE = 30.0
 
 
 def start_of(folder: Path, begin: float) -> float:
@@ -32,42 +29,30 @@ def start_of(folder: Path, begin: float) -> float:
     return float(found.group(1)) - begin
 
 
-def wait_for(node: ReplayNode, condition: Callable[[], bool]) -> None:
-    """Take what comes until a condition holds."""
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        if time.monotonic() > deadline:
-            raise RuntimeError(f'{FILTER} did not answer for {PATIENCE:g} s')
-        node.spin()
+class TimedNode(ReplayNode):
+    """Notes the times from detections to the update that holds them, over DDS [s]."""
+
+    times: ClassVar[list[float]] = []
+
+    def publish(self, batch: Batch) -> None:
+        """See `ReplayNode.publish`."""
+        self._begin = time.perf_counter()
+        super().publish(batch)
+
+    def spin(self, timeout: float = 0.05) -> None:
+        """See `ReplayNode.spin`."""
+        before = len(self.updates)
+        super().spin(timeout)
+        if len(self.updates) > before:
+            self.times.append(time.perf_counter() - self._begin)
 
 
 def latencies(bag: Path, folder: Path) -> list[float]:
-    """Return the times from detections to the update that holds them, over DDS [s]."""
-    recording = read_recording(bag)
-    facts = recording.facts['nodes'][f'/{FILTER}']
-    parameters = {**facts['parameters'], **REPLAYED}
-    plan = NodePlan(facts['package'], facts['executable'], FILTER, parameters=parameters)
-    file = folder / 'filter_node.yaml'
-    file.write_text(plan.parameter_text(), encoding='utf-8')
-    times = []
-    with Domain(None) as domain:
-        os.environ.update(domain.environment())
-        executable = find_executable(plan.package, plan.executable)
-        command = plan.command(executable, file)
-        process = NodeProcess(plan.full_name, command, folder / 'filter_node.log', plan.package)
-        process.start()
-        node = ReplayNode(domain.number, sorted(recording.facts['scenario']['robots']))
-        try:
-            wait_for(node, lambda: node.ready)
-            for number, batch in enumerate(recording.batches, start=1):
-                begin = time.perf_counter()
-                node.publish(batch)
-                wait_for(node, lambda number=number: len(node.updates) >= number)
-                times.append(time.perf_counter() - begin)
-        finally:
-            node.close()
-            stop([process])
-    return times
+    """Return the times of the batches of a recording."""
+    with patch.object(replay_node, 'ReplayNode', TimedNode), redirect_stdout(io.StringIO()) as said:
+        if replay_node.replay(bag, folder, None, lambda: False) != replay_node.EQUAL:
+            raise RuntimeError(said.getvalue())
+    return TimedNode.times
 
 
 def run(share: float = 1.0) -> list[dict[str, Any]]:
@@ -81,7 +66,7 @@ def run(share: float = 1.0) -> list[dict[str, Any]]:
         start = start_of(folder / 'start', begin)
         floor = run_scenario('mambo_turtlebot', folder / 'floor', share * SECONDS)
         space = run_scenario('ranging_pair_3d', folder / 'space', 2.0 * share * SECONDS)
-        times = latencies(folder / 'floor' / 'bag', folder)
+        times = latencies(folder / 'floor' / 'bag', folder / 'replay')
         return [
             entry('demo_real_time_factor', floor, 'x'),
             entry('ranging_pair_real_time_factor', space, 'x'),

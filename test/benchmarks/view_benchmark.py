@@ -32,24 +32,24 @@ EVENTS, SEEKS = 100_000, 60
 
 def demo(folder: Path, watch: Callable[[str], Any] | None, seconds: float) -> float:
     """Run the demo, watched from its address; return its real-time factor."""
-    if watch is None:
-        return run_scenario('mambo_turtlebot', folder, seconds)
 
     def hear(line: str) -> None:
-        if line.startswith('view: '):
+        if watch and line.startswith('view: '):
             watch(line.split()[1])
 
-    options = ('--view', '--port', '0')
+    options = ('--view', '--port', '0') if watch else ()
     return run_scenario('mambo_turtlebot', folder, seconds, *options, hear=hear)
 
 
-def streams(number: int) -> Callable[[str], None]:
-    """Return what watches a run with so many readers that show nothing."""
+def read(address: str) -> None:
+    """Read the events of a run to their end, and show nothing."""
+    with contextlib.suppress(OSError), urllib.request.urlopen(f'{address}events') as stream:
+        for _ in stream:
+            pass
 
-    def read(address: str) -> None:
-        with contextlib.suppress(OSError), urllib.request.urlopen(f'{address}events') as stream:
-            for _ in stream:
-                pass
+
+def streams(number: int) -> Callable[[str], None]:
+    """Return what watches a run with so many readers."""
 
     def watch(address: str) -> None:
         for _ in range(number):
@@ -127,7 +127,7 @@ def seeks(folder: Path) -> Iterator[dict[str, Any]]:
     yield entry('seek_largest', float(np.max(times)), 'ms')
 
 
-def results(share: float) -> Iterator[dict[str, Any]]:
+def run(share: float = 1.0) -> Iterator[dict[str, Any]]:
     """Yield the results; `share` of the simulated time."""
     kinds: dict[str, Callable[[str], Any] | None] = {
         'none': None,
@@ -157,8 +157,3 @@ def results(share: float) -> Iterator[dict[str, Any]]:
             yield entry('page_usable_after', max(usable), 's')
         if CHROMIUM is not None:
             yield from seeks(folder)
-
-
-def run(share: float = 1.0) -> list[dict[str, Any]]:
-    """Run the benchmarks; `share` of the simulated time."""
-    return list(results(share))

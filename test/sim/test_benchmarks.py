@@ -1,11 +1,21 @@
-"""The command of the benchmarks: what it refuses before it measures, and a quick measurement."""
+"""Benchmark commands, tables of search quality, and the reference that knows the targets."""
 
 import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import search_quality
+import search_regimes
+from clairvoyant import _expected_end, _Robots, clairvoyant
+
+from maasi_filter.models.detection import BoxDetection
+from maasi_sim.experiments.searches import find_times
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.search import search
 
 BENCH = Path(__file__).parents[1] / 'benchmarks' / 'bench.py'
 
@@ -30,3 +40,65 @@ def test_quick_figures(tmp_path):
     rows = json.loads(file.read_text())
     assert len(rows) == len(done.stdout.splitlines()) == 4
     assert all(row['value'] > 0.0 for row in rows)
+
+
+def test_each_target_has_the_time_at_which_so_many_were_found():
+    progress = [SimpleNamespace(time=t, true_found=n) for t, n in ((1.0, 0), (2.0, 2), (5.0, 3))]
+    result = SimpleNamespace(truth=[0] * 4, progress=progress)
+    assert find_times(result, 9.0).tolist() == [2.0, 2.0, 5.0, 9.0]
+
+
+@pytest.mark.parametrize('regime', search_regimes.REGIMES)
+def test_every_regime_has_every_planner(regime):
+    """All scenarios are valid, what is compared differs, and the reference stands first."""
+    cases = search_quality.comparison(regime, list(search_regimes.KINDS)).cases(False)
+    assert len({case.digest() for case in cases}) == len(search_regimes.KINDS)
+    assert cases[0].name == search_quality.REFERENCE
+
+
+def test_a_regime_is_run_and_its_table_written_between_marks(tmp_path, capsys):
+    page = tmp_path / 'page.md'
+    page.write_text(f'above\n{search_quality.BEGIN}\nold\n{search_quality.END}\nbelow\n')
+    arguments = ['one drone', '--planner', 'maasi', '--runs', '1', '--jobs', '1']
+    arguments += ['--out', str(tmp_path), '--document', str(page)]
+    assert search_quality.main(arguments) == 0
+    said = capsys.readouterr().out
+    assert '**one drone** (limit 400 s)' in said and '| maasi | 1 |' in said
+    above, _, rest = page.read_text().partition(f'{search_quality.BEGIN}\n')
+    table, _, below = rest.partition(search_quality.END)
+    assert (above, below) == ('above\n', '\nbelow\n')
+    assert table.startswith('Block `development`') and table in said
+
+
+@pytest.mark.parametrize(('seen', 'ends'), [(True, (2.0, 5.0)), (False, (3.0, 7.0))])
+def test_expected_end_of_a_sure_sensor(seen, ends):
+    """A robot moves 1 m each tick, sees 0.5 m far, and needs two detections of each target."""
+    kind, parameters = BoxDetection([-0.5, -0.5], [0.5, 0.5], 1.0).kernel()
+    robot = _Robots(
+        remaining_path=np.zeros((1, 1, 3)),
+        free=np.zeros(1, np.int64),
+        speed=np.ones(1),
+        pause=np.zeros(1),
+        period=np.ones(1, np.int64),
+        kind=np.array([kind], np.int64),
+        parameters=parameters[None],
+        yaw=np.zeros(1),
+    )
+    targets = np.array([[3.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
+    stops, routes = np.zeros((1, 3)), np.array([[0, 1, -1]])
+    # The cost is the time to find all plus the mean time to find, both without the last tick.
+    cost = _expected_end(robot, routes, targets, np.full(2, seen), 2, stops)
+    assert cost == pytest.approx(ends[1] + 0.5 * sum(ends))
+    assert stops[0] == pytest.approx([3.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize('name', ['ranging_drone_3d', 'mambo'])
+def test_knowing_the_targets_helps_on_average(name):
+    scenario = load_scenario(name)
+    ours, known = 0, 0
+    for seed in (20_000, 20_003):
+        ours += search(scenario, seed).steps
+        result = search(scenario, seed, planner=clairvoyant)
+        assert result.complete
+        known += result.steps
+    assert known < 0.9 * ours
