@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -44,7 +44,7 @@ class Log:
         """Add an event."""
         self.tables.setdefault(kind, []).append(row)
 
-    def planned(self, step: int, decision: Any) -> None:
+    def planned(self, _: Coordinator, decision: Any, step: int, *rest: Any) -> None:
         """Note what a planner decided at a step, if anything."""
         self._step = step
         for name, robot in [] if decision is None else decision.robots.items():
@@ -58,14 +58,14 @@ class Log:
                 bits=bits(robot.waypoint, robot.positions, robot.yaws, robot.objective),
             )
 
-    def updated(self, search_filter: SearchFilter, members: list[str], result: Any) -> None:
+    def updated(self, search_filter: SearchFilter, result: Any, measured: Any, *rest: Any) -> None:
         """Note a filter update of the step at which was planned last."""
         self.size = float(np.ptp(search_filter.bounds, axis=1).max())
         found = search_filter.own_found_targets()
         self.add(
             'updates',
             step=self._step,
-            members=members,
+            members=[item.robot for item in measured],
             clusters=len(result.clusters),
             found=len(found),
             expected=float(result.expected_number),
@@ -82,7 +82,7 @@ class Log:
             position = target.position.tolist()
             self.add('found', step=self._step, robot=target.robot, position=position)
 
-    def flown(self, record: Any) -> None:
+    def flown(self, _: CuboidMission, record: Any, *rest: Any) -> None:
         """Note a whole search of buildings."""
         self.size = float(np.ptp(record.mission.area, axis=1).max())
         for step in range(record.steps + 1):
@@ -119,49 +119,39 @@ def bits(*values: Any) -> str:
 def noted() -> Iterator[Log]:
     """Note what the filters, planners and searches of buildings in this process do meanwhile."""
     log = Log()
-    plan, fly = Coordinator.plan, CuboidMission.run
 
-    def noting(update: Callable[..., Any]) -> Callable[..., Any]:
-        def noted_update(self: Any, measurements: Any, *arguments: Any, **options: Any) -> Any:
-            result = update(self, measurements, *arguments, **options)
-            log.updated(self, [item.robot for item in measurements], result)
+    def noting(method: Callable[..., Any], note: Callable[..., None]) -> Callable[..., Any]:
+        def noted_method(self: Any, *arguments: Any) -> Any:
+            result = method(self, *arguments)
+            note(self, result, *arguments)
             return result
 
-        return noted_update
+        return noted_method
 
-    def noted_plan(self: Any, step: int, *arguments: Any, **options: Any) -> Any:
-        decision = plan(self, step, *arguments, **options)
-        log.planned(step, decision)
-        return decision
-
-    def noted_flight(self: Any, *arguments: Any, **options: Any) -> Any:
-        record = fly(self, *arguments, **options)
-        log.flown(record)
-        return record
-
-    with (
-        patch.object(IcPhdFilter, 'step', noting(IcPhdFilter.step)),
-        patch.object(PmbFilter, 'step', noting(PmbFilter.step)),
-        patch.object(Coordinator, 'plan', noted_plan),
-        patch.object(CuboidMission, 'run', noted_flight),
-    ):
+    with ExitStack() as stack:
+        for kind, name, note in (
+            (IcPhdFilter, 'step', log.updated),
+            (PmbFilter, 'step', log.updated),
+            (Coordinator, 'plan', log.planned),
+            (CuboidMission, 'run', log.flown),
+        ):
+            stack.enter_context(patch.object(kind, name, noting(getattr(kind, name), note)))
         yield log
 
 
 def run_scenario(path: Path, seed: int) -> Recording:
     """Run a scenario in this process and return what it did."""
-    seeded = {'seed': (('seed',), seed)}
-    scenario = load_mission(path, seeded).scenario
+    layers: dict[str, Any] = {'seed': (('seed',), seed)}
+    scenario = load_mission(path, layers).scenario
     if isinstance(scenario, CuboidScenario):
         # A limit on wall time would make a decision depend on the machine.
-        unhurried = {'time': (('planner', 'time_limit'), 1e9)}
-        scenario = load_mission(path, {**seeded, **unhurried}).scenario
-        assert isinstance(scenario, CuboidScenario)
+        layers['time'] = ('planner', 'time_limit'), 1e9
+        scenario = load_mission(path, layers).scenario
         with noted() as log:
-            record = mission_of(scenario).run(STEP_LIMIT)
+            record = mission_of(scenario).run(STEP_LIMIT)  # type: ignore[arg-type]
         return log.recording({'steps': record.steps, 'complete': record.complete, **record.how})
-    limit = min(TIME_LIMIT, scenario.limits.time)
-    scenario = load_mission(path, {**seeded, 'limit': (('limits', 'time'), limit)}).scenario
+    layers['limit'] = ('limits', 'time'), min(TIME_LIMIT, scenario.limits.time)
+    scenario = load_mission(path, layers).scenario
     with noted() as log:
         result = search(scenario, seed)  # type: ignore[arg-type]
     end = {
