@@ -102,12 +102,7 @@ class DetectionSettings(Settings):
 
     @model_validator(mode='after')
     def _box(self) -> DetectionSettings:
-        if len(self.lower) != len(self.upper):
-            raise ValueError('lower, upper: allowed are lists of the same length')
-        if any(low >= high for low, high in zip(self.lower, self.upper)):
-            raise ValueError(
-                f'lower, upper: got {self.lower}, {self.upper}, allowed is lower below upper'
-            )
+        BoxDetection(self.lower, self.upper)
         return self
 
     def build(self, dimension: int = 3) -> DetectionModel:

@@ -26,7 +26,7 @@ from maasi_filter.settings import unsuitable_lengths, unused_settings
         (DetectionSettings, {'size': [25.0]}, 'size'),
         (DetectionSettings, {'size': [25.0, -1.0]}, 'size'),
         (DetectionSettings, {'lower': [0.3, -0.2]}, 'lower'),
-        (DetectionSettings, {'lower': [-0.2, -0.2, -0.2]}, 'length'),
+        (DetectionSettings, {'lower': [-0.2, -0.2, -0.2]}, 'each'),
         (NoiseSettings, {'range': 0.0}, 'range'),
         (NoiseSettings, {'angles': 'gradians'}, 'angles'),
         (EnvironmentSettings, {'bounds': [[0.0, 1.0]]}, 'bounds'),

@@ -153,7 +153,7 @@ WRONG = [
     ([('robots.mambo.sensor.period', 0.12)], 'robots.mambo.sensor.period', ['multiples of step']),
     ([('robots.mambo.camera.rate', 30.0)], 'robots.mambo.camera.rate', ['multiples of step']),
     ([('robots.mambo.sensor.detection', {'lower': [0.0, 0.0, 0.0], 'upper': [1.0, 1.0]})],
-     'robots.mambo.sensor.detection', ['same length']),
+     'robots.mambo.sensor.detection', ['2 or 3 numbers each']),
     ([('robots.mambo.driver', 'ranging_driver')], 'robots.mambo.camera', ['has none']),
     ([('events', [{'at': 5.0, 'robot': 'mamba', 'do': 'leave'}])], 'events[0].robot', ["'mambo'"]),
     ([('events', [{'at': 5.0, 'robot': 'mambo', 'do': 'back'}])], 'events[0].do', ['is there']),

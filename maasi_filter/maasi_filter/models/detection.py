@@ -25,10 +25,10 @@ from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.vector_math import exponential
 
-CUSTOM = 3
+EXPONENTIAL, GAUSSIAN, BOX, CUSTOM = 0, 1, 2, 3
+PARAMETERS = 9
 # Entries of the parameters; those before are as of the radial models.
 REACH, NUMBER, ADDRESS = 4, 5, 6
-
 
 # Functions with the addresses of function and values, and the number of these; what kernels may
 # still call, by its address, must not be freed.
@@ -50,22 +50,6 @@ def _call(typing_context, address, forward, left, up):  # type: ignore[no-untype
         return builder.call(function, [*arguments[1:], values, entries[2]])
 
     return types.float64(types.int64, types.float64, types.float64, types.float64), generate
-
-
-@njit(cache=True, error_model='numpy')
-def custom_probability(  # type: ignore[no-untyped-def]
-    parameters, dx, dy, dz, cos_yaw, sin_yaw
-):
-    """Return pi of a function of one's own at an offset [m, map axes] from the sensor."""
-    reach = parameters[REACH]
-    if dx * dx + dy * dy + dz * dz > reach * reach:
-        return 0.0
-    forward = cos_yaw * dx + sin_yaw * dy
-    left = cos_yaw * dy - sin_yaw * dx
-    address = np.int64(parameters[ADDRESS])
-    value = parameters[0] * _call(address, forward, left, dz)  # type: ignore[call-arg]
-    # What is not a number is not above 0 either.
-    return min(value, 1.0) if value > 0.0 else 0.0
 
 
 def register(function: Callable[..., float], values: FloatArray) -> tuple[int, int]:
@@ -113,12 +97,6 @@ def _compiled(function: Callable[..., float]) -> Any:
     return call
 
 
-EXPONENTIAL = 0
-GAUSSIAN = 1
-BOX = 2
-PARAMETERS = 9
-
-
 @njit(cache=True, error_model='numpy')
 def detection_probability_at(
     kind: int,
@@ -134,25 +112,24 @@ def detection_probability_at(
     `kind` is EXPONENTIAL (000, eq. (3), (4)), GAUSSIAN (003, section 2.2) or BOX (000, eq. (25)
     and (34)), or CUSTOM, a user's own function; `parameters` come from the model's `kernel()`.
     """
+    x, y = dx, dy
+    if kind == CUSTOM or (kind == BOX and parameters[8] > 0.5):
+        x = cos_yaw * dx + sin_yaw * dy
+        y = cos_yaw * dy - sin_yaw * dx
+    if kind == CUSTOM:
+        if dx * dx + dy * dy + dz * dz > parameters[REACH] * parameters[REACH]:
+            return 0.0
+        value = parameters[0] * _call(np.int64(parameters[ADDRESS]), x, y, dz)  # type: ignore[call-arg]
+        # What is not a number is not above 0 either.
+        return min(value, 1.0) if value > 0.0 else 0.0
     if kind == BOX:
-        x = dx
-        y = dy
-        if parameters[8] > 0.5:
-            x = cos_yaw * dx + sin_yaw * dy
-            y = cos_yaw * dy - sin_yaw * dx
         inside = min(x - parameters[1], parameters[4] - x)
         inside = min(inside, min(y - parameters[2], parameters[5] - y))
         inside = min(inside, min(dz - parameters[3], parameters[6] - dz))
         edge = parameters[7]
         if edge > 0.0:
-            if inside >= edge:
-                return parameters[0]
-            if inside <= -edge:
-                return 0.0
-            return parameters[0] * 0.5 * (1.0 + inside / edge)
+            return parameters[0] * min(max(0.5 * (1.0 + inside / edge), 0.0), 1.0)
         return parameters[0] if inside >= 0.0 else 0.0
-    if kind == CUSTOM:
-        return custom_probability(parameters, dx, dy, dz, cos_yaw, sin_yaw)
     square = (dx * parameters[1]) ** 2 + (dy * parameters[2]) ** 2 + (dz * parameters[3]) ** 2
     if kind == GAUSSIAN:
         return parameters[0] * math.exp(-0.5 * square)
@@ -168,22 +145,14 @@ def fill_probabilities(  # type: ignore[no-untyped-def]
         for i in range(number):
             out[i] = detection_probability_at(kind, parameters, x[i], y[i], z[i], cos_yaw, sin_yaw)
         return
-    gain = parameters[0]
-    p = parameters[1]
-    q = parameters[2]
-    r = parameters[3]
-    if kind == GAUSSIAN:
-        for i in range(number):
-            u = x[i] * p
-            v = y[i] * q
-            w = z[i] * r
-            out[i] = gain * exponential(-0.5 * (u * u + v * v + w * w))
-    else:
-        for i in range(number):
-            u = x[i] * p
-            v = y[i] * q
-            w = z[i] * r
-            out[i] = gain * exponential(-0.5 * math.sqrt(u * u + v * v + w * w))
+    gain, p, q, r = parameters[0], parameters[1], parameters[2], parameters[3]
+    gaussian = kind == GAUSSIAN
+    for i in range(number):
+        u = x[i] * p
+        v = y[i] * q
+        w = z[i] * r
+        square = u * u + v * v + w * w
+        out[i] = gain * exponential(-0.5 * (square if gaussian else math.sqrt(square)))
 
 
 def _check_probability(probability: float) -> float:

@@ -21,6 +21,7 @@ from maasi_filter.models.detection import (
     register,
 )
 from maasi_filter.plugins import PluginError
+from maasi_filter.unexplored_map import interpolate_at
 
 # Cells from the robot to the reach, on each axis, by dimension.
 _CELLS = {2: 256, 3: 48}
@@ -85,8 +86,7 @@ class OwnDetection(DetectionModel):
             values = self._numbers(self.values(), 'values')
             # At some places, where an exception would still be seen.
             places = np.random.default_rng(1).uniform(-reach, reach, (_TRIALS, 3))
-            places[:, dimension:] = 0.0
-            places[0] = 0.0
+            places[:, dimension:] = places[0] = 0.0
             results = [function(*place, values) for place in places.tolist()]
             self._probabilities(results, (_TRIALS,), 'compiled')
         self._parameters = np.zeros(PARAMETERS)
@@ -140,40 +140,18 @@ class OwnDetection(DetectionModel):
         return found
 
     def _table(self, reach: float) -> FloatArray:
-        """Return half the number of cells on each axis, cells per metre, and pi at the nodes."""
+        """Return the numbers of `_interpolated`: corner, step and shape of a grid, and pi on it."""
         cells = _CELLS[self.dimension]
         axis = np.linspace(-reach, reach, 2 * cells + 1)
         height = axis if self.dimension == 3 else np.zeros(1)
         grids = [grid.ravel() for grid in np.meshgrid(axis, axis, height, indexing='ij')]
         table = self._probabilities(self.evaluate(*grids), grids[0].shape, 'evaluate')
-        return np.concatenate([[cells, cells / reach, self.dimension], table])
+        return np.concatenate([[-reach] * 3, [reach / cells] * 3, [len(axis), len(height)], table])
 
 
 @njit(cache=True, error_model='numpy')
-def _interpolated(  # type: ignore[no-untyped-def]
-    forward, left, up, values
-):
+def _interpolated(forward, left, up, values):  # type: ignore[no-untyped-def]
     """Return pi between the nodes of a table of `OwnDetection`."""
-    cells = np.int64(values[0])
-    scale = values[1]
-    solid = values[2] > 2.5
-    width = 2 * cells + 1
-    depth = width if solid else 1
-    u = min(max(forward * scale + cells, 0.0), 2.0 * cells)
-    v = min(max(left * scale + cells, 0.0), 2.0 * cells)
-    w = min(max(up * scale + cells, 0.0), 2.0 * cells) if solid else 0.0
-    i = min(np.int64(u), width - 2)
-    j = min(np.int64(v), width - 2)
-    k = min(np.int64(w), width - 2) if solid else 0
-    u -= i
-    v -= j
-    w -= k
-    total = 0.0
-    for a in range(2):
-        for b in range(2):
-            share = (u if a else 1.0 - u) * (v if b else 1.0 - v)
-            node = 3 + ((i + a) * width + j + b) * depth + k
-            total += share * (1.0 - w) * values[node]
-            if solid:
-                total += share * w * values[node + 1]
-    return total
+    width, depth = np.int64(values[6]), np.int64(values[7])
+    grid = values[8:].reshape((width, width, depth))
+    return interpolate_at(grid, values[:3], values[3:6], forward, left, up)
