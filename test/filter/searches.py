@@ -7,15 +7,14 @@ from scipy.stats import multivariate_normal
 
 from maasi_filter import (
     AgentMeasurement,
-    BoxDetection,
     DetectionSettings,
     FilterSettings,
     NoiseSettings,
     Pose,
     SensorSettings,
-    make_filter,
     wrap_angle,
 )
+from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.state_file import pack
 
 CUBE = np.array([[0.0, 260.0]] * 3)
@@ -24,6 +23,9 @@ FLOOR = np.array([[-0.3, 2.4]] * 2)
 FLOOR_LENGTHS = {'found_radius': 0.02, 'removal_distance': 0.05, 'jitter_deviation': 0.003}
 DEGREES = NoiseSettings(range=1.5, bearing=0.175, elevation=0.295, as_='variance', angles='degrees')
 RADIANS = NoiseSettings(range=1.5, bearing=0.175, elevation=0.295)
+# A small problem for the multi-Bernoulli filter.
+SIDE = 100
+PLANE = np.array([[0.0, SIDE]] * 2)
 
 
 def same(one, other):
@@ -94,25 +96,48 @@ def separated(generator, number, lower, upper, apart, dimension):
     return np.array(targets)
 
 
-def mow_floor(seed, settings=None):
-    """Search the floor along a lawnmower, there and back; return the filter and the targets.
+def plane_sensor(probability=0.9, clutter=0.0, range_noise=3.0, bearing=0.08):
+    """Return a sensor for the plane."""
+    return SensorSettings(
+        detection=DetectionSettings(
+            kind='gaussian', probability=probability, size=[60.0, 60.0, 60.0]
+        ),
+        noise=NoiseSettings(range=range_noise, bearing=bearing),
+        clutter=clutter,
+    ).build('robot', 2)
 
-    The true field of view is a hard box.
-    """
-    generator = np.random.default_rng([seed, 1])
-    targets = separated(generator, 12, -0.2, 2.3, 0.15, 2)
-    sensor = floor_sensor()
-    true_view = BoxDetection([-0.2, -0.2], [0.2, 0.2], 1.0)
-    search = make_filter(settings or FilterSettings(), FLOOR, np.random.default_rng([seed, 2]))
-    path = []
-    for row, y in enumerate(np.arange(-0.15, 2.41, 0.3)):
-        line = np.arange(-0.3, 2.41, 0.1)
-        path += [(x, y) for x in (line if row % 2 == 0 else line[::-1])]
-    for step, (x, y) in enumerate(path + path[::-1]):
-        pose = Pose([x, y, 1.0])
-        seen = targets[true_view.probability(targets, pose) > 0.0]
-        values = sensor.measurement.measure(seen, pose)
-        values += generator.standard_normal(values.shape) * [0.016, 0.052]
-        values[:, 1] = wrap_angle(values[:, 1])
-        search.step([AgentMeasurement('mambo', pose, sensor, values, None, step)], 1, float(step))
-    return search, targets
+
+def plane_filter(seed=0, particles=1000, **settings):
+    """Return a filter on the plane, e on nodes 2 m apart."""
+    return PmbFilter(
+        FilterSettings(
+            method='pmb',
+            exploration_spacing=2.0,
+            pmb={'particles': particles},
+            **{'expected_targets': 3.0, **settings},
+        ),
+        PLANE,
+        np.random.default_rng(seed),
+    )
+
+
+def measured(sensor, position, values, step=0, robot='robot'):
+    """Return a measurement of a robot at a position."""
+    d = sensor.dimension
+    pose = Pose(np.asarray(position, float))
+    return AgentMeasurement(robot, pose, sensor, np.reshape(values, (-1, d)), None, step)
+
+
+def cells():
+    """Return the centres (n, 2) of cells of 1 m^2 of the plane."""
+    axis = np.arange(SIDE) + 0.5
+    return np.stack(np.meshgrid(axis, axis, indexing='ij'), axis=-1).reshape(-1, 2)
+
+
+def densities(sensor, position, values):
+    """Return pi (n,) and g (m, n) at the cells, pi as the filter caps it."""
+    pose = Pose(np.asarray(position, float))
+    probability = np.minimum(sensor.detection.probability(cells(), pose), 0.98)
+    values = np.reshape(values, (-1, 2))
+    logs = log_density(sensor, values, cells(), pose)
+    return probability, np.exp(logs)

@@ -10,7 +10,6 @@ from searches import (
     FLOOR_LENGTHS,
     cube_sensor,
     floor_sensor,
-    mow_floor,
     observe,
     separated,
 )
@@ -24,6 +23,7 @@ from maasi_filter import (
     Pose,
     Sensor,
     SensorSettings,
+    make_filter,
     match_targets,
     warm_up,
 )
@@ -95,7 +95,7 @@ def test_seeing_nothing_lowers_mass_and_exploration_by_what_was_missed():
     particles, weights = search.particles, search.weights
     explored = search.exploration.values.copy()
     pose = Pose([110.0, 100.0, 100.0])
-    search.step([AgentMeasurement('drone', pose, sensor, np.empty((0, 3)))], 1, 1.0)
+    search.step([drone(np.empty((0, 3)), pose.position)], 1, 1.0)
     missed = 1.0 - sensor.detection.probability(particles, pose)
     np.testing.assert_array_equal(search.weights, weights * missed)
     nodes = search.exploration.nodes()
@@ -124,27 +124,16 @@ def test_a_first_detection_is_a_cluster_of_mass_one_and_not_yet_found():
     np.testing.assert_allclose(result.clusters[0].position, expected, atol=0.5)
 
 
-def test_a_thousand_detections_at_once_are_all_used():
-    generator = np.random.default_rng(0)
-    sensor = cube_sensor()
-    pose = Pose([130.0, 130.0, 130.0])
-    values = sensor.measurement.measure(generator.uniform(0.0, 260.0, (1000, 3)), pose)
-    search = cube_search()
-    for step in range(2):
-        result = search.step([AgentMeasurement('drone', pose, sensor, values)], 1, step)
-    assert set(result.dropped) <= {'found'}
-    assert len(search.particles) <= 10_000
-    assert 700.0 < result.expected_number + len(search.found_targets) < 3000.0
-
-
-def test_detections_that_nothing_explains_are_counted():
+@pytest.mark.parametrize('method', ['ic_phd', 'pmb'])
+def test_detections_that_nothing_explains_are_counted(method):
     sensor = cube_sensor()
     sensor.maximum_range = 250.0
     values = [[260.0, 0.3, 0.1], [200.0, np.pi, 0.0], [20.0, 0.0, 0.0]]
-    result = cube_search().step([drone(values, sensor=sensor)], 1, 0.0)
+    search = make_filter(FilterSettings(method=method), CUBE, np.random.default_rng(0))
+    result = search.step([drone(values, sensor=sensor)], 1, 0.0)
     assert result.dropped == {'range': 1, 'outside': 1}
     assert result.expected_number == pytest.approx(1.0, abs=0.1)
-    search = IcPhdFilter(FilterSettings(), FLOOR, np.random.default_rng(0))
+    search = make_filter(FilterSettings(method=method), FLOOR, np.random.default_rng(0))
     member = drone([[0.6, 0.0], [0.1, 0.0]], [1.0, 1.0, 1.0], sensor=floor_sensor())
     assert search.step([member], 1, 0.0).dropped == {'unseen': 1}
 
@@ -165,22 +154,6 @@ def test_bad_sensors_are_refused():
         Sensor('bad', good.detection, good.measurement, np.zeros((3, 3)))
     with pytest.raises(ValueError, match='clutter'):
         Sensor('bad', good.detection, good.measurement, np.eye(3), clutter=np.nan)
-
-
-@pytest.mark.parametrize('preset', ['paper_000', 'paper_001', 'paper_002', 'paper_003'])
-def test_the_papers_presets_find_a_target(preset):
-    generator = np.random.default_rng(11)
-    target = np.array([[130.0, 140.0, 120.0]])
-    sensor = cube_sensor()
-    search = IcPhdFilter(FilterSettings(preset=preset), CUBE, np.random.default_rng(0))
-    for step in range(40):
-        angle = 0.4 * step
-        offset = 15.0 * np.array([np.cos(angle), np.sin(angle), np.sin(0.7 * angle)])
-        pose = Pose(target[0] + offset)
-        values = observe(generator, sensor, target, pose)
-        search.step([AgentMeasurement('drone', pose, sensor, values)], 1, step)
-    assert len(search.found_targets) >= 1
-    assert np.linalg.norm(search.found_targets[0].position - target[0]) < 2.0
 
 
 @settings(max_examples=25, deadline=None)
@@ -234,49 +207,22 @@ def test_warm_up_leaves_nothing_to_compile():
     generator = np.random.default_rng(0)
     targets = generator.uniform(100.0, 160.0, (3, 3))
     visit(cube_search(), targets, flight(generator, 10, robots=2), generator)
-    mow_floor(0)
+    search = IcPhdFilter(FilterSettings(**FLOOR_LENGTHS), FLOOR, generator)
+    for step in range(10):
+        search.step([drone([[0.1, 0.3]], [1.0, 1.0, 1.0], sensor=floor_sensor())], 1, step)
+    assert search.found_targets
     assert [len(kernel.signatures) for kernel in kernels] == before
     assert sum(before) >= 6
 
 
-def test_the_floor_is_searched_without_false_targets():
-    for seed in range(2):
-        search, targets = mow_floor(seed, settings=FilterSettings(**FLOOR_LENGTHS))
-        found = np.array([target.position for target in search.found_targets])
-        match = match_targets(found, targets, 0.06)
-        assert (match.true_found, match.false_found) == (12, 0)
-        assert match.rmse < 0.02
-
-
-def test_false_detections_nobody_told_of_are_not_found():
-    """The floor of the clutter intensity keeps stray particles from explaining them."""
-    generator = np.random.default_rng(5)
-    search = cube_search(1)
-    sensor = cube_sensor()
-    for step, row in enumerate(flight(generator, 80)):
-        pose = Pose(row[0])
-        false = sensor.measurement.measure(
-            np.clip(row[0] + generator.normal(0.0, 40.0, (1, 3)), 0.0, 260.0), pose
-        )
-        search.step([AgentMeasurement('drone', pose, sensor, false)], 1, float(step))
-    assert len(search.found_targets) <= 1
-
-
 def test_the_target_is_of_the_robot_that_measured_it():
     """Both robots measure at each step; one of them sees the target."""
-    poses = {'a': Pose([110.0, 110.0, 110.0]), 'b': Pose([150.0, 150.0, 150.0])}
-    target = np.array([[114.0, 115.0, 112.0]])
-    search, sensor = cube_search(), cube_sensor()
+    near, far = [110.0] * 3, [150.0] * 3
+    values = cube_sensor().measurement.measure([[114.0, 115.0, 112.0]], Pose(near))
+    search = cube_search()
     for step in range(12):
-        values = sensor.measurement.measure(target, poses['a'])
-        search.step(
-            [
-                AgentMeasurement('a', poses['a'], sensor, values, None, 100 + step),
-                AgentMeasurement('b', poses['b'], sensor, values[:0], None, 200 + step),
-            ],
-            1,
-            float(step),
-        )
+        seen = drone(values, near, 'a', index=100 + step)
+        search.step([seen, drone(values[:0], far, 'b', index=200 + step)], 1, float(step))
     (found,) = search.found_targets
     assert found.robot == 'a'
     assert 100 <= found.measurement < 112

@@ -1,9 +1,7 @@
-"""Births, resampling, K-means and removal of the PHD filter, by quadrature and by hand."""
+"""Parts of the PHD filter, by quadrature, dense sums and by hand."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from searches import log_density
 
 from maasi_filter import ExponentialDetection, Pose, Sensor
@@ -17,6 +15,7 @@ from maasi_filter.ic_phd.births import (
     uniform_births,
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
+from maasi_filter.ic_phd.corrector import make_scan, phd_correct
 from maasi_filter.ic_phd.filter import kept_measurements
 from maasi_filter.records import FoundTarget
 
@@ -45,15 +44,6 @@ def test_births_weigh_what_the_constant_intensity_predicts(dimension):
     chance = sensor.detection.probability(grid, POSE)
     expected = (12.0 / 100.0**dimension * missed * chance * likelihood).sum()
     assert births.sum() == pytest.approx(expected, rel=0.02)
-
-
-def test_births_outside_the_bounds_count_nothing():
-    bounds = np.array([[0.0, 100.0]] * 2)
-    z = np.array([[60.0, np.pi]])
-    _, births = measurement_births(
-        z, sensor_of(2), POSE, bounds, 12.0, 500, np.random.default_rng(0)
-    )
-    assert births.sum() == 0.0
 
 
 def test_uniform_births_fill_the_environment():
@@ -91,6 +81,46 @@ def test_noise_in_space_is_that_of_drawn_measurements(dimension):
     np.testing.assert_allclose(spread, expected, atol=0.05 * np.trace(expected))
 
 
+# The corrector.
+
+
+def case(dimension, seed=0, particles=500, detections=4):
+    """Return a sensor, its pose, a cloud with weights, detections, and a background."""
+    generator = np.random.default_rng(seed)
+    root = generator.normal(0.0, 0.1, (dimension, dimension)) + 0.4 * np.eye(dimension)
+    detection = ExponentialDetection(0.9, [10.0] * dimension)
+    sensor = Sensor.ranging('any', detection, root @ root.T)
+    pose = Pose.from_yaw(generator.normal(0.0, 3.0, 3), 0.5)
+    positions = generator.normal(0.0, 10.0, (particles, dimension))
+    weights = generator.random(particles) * 0.01
+    values = sensor.measurement.measure(positions[:detections], pose) + 0.05
+    return sensor, pose, positions, weights, values, np.geomspace(1e-6, 1.0, detections)
+
+
+@pytest.mark.parametrize('detections', [1, 4, 40])
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_the_corrector_is_equation_13(dimension, detections):
+    """The factor and C(z) of (13) and (16), summed densely."""
+    parts = case(dimension, particles=5000, detections=detections)
+    sensor, pose, positions, weights, values, background = parts
+    scan = make_scan(values, sensor, pose)
+    factor, normaliser = phd_correct(positions, weights, scan, background)
+    probability = sensor.detection.probability(positions, pose)
+    psi = probability * np.exp(log_density(sensor, values, positions, pose))
+    expected = background + (psi * weights).sum(axis=1)
+    np.testing.assert_allclose(normaliser, expected, rtol=1e-9)
+    missed = 1.0 - probability
+    np.testing.assert_allclose(factor, missed + (psi / expected[:, None]).sum(axis=0), rtol=1e-9)
+
+
+def test_no_particles_leave_a_detection_to_the_background():
+    sensor, pose, positions, weights, values, background = case(3)
+    scan = make_scan(values, sensor, pose)
+    factor, normaliser = phd_correct(positions[:0], weights[:0], scan, background)
+    assert factor.shape == (0,)
+    np.testing.assert_array_equal(normaliser, background)
+
+
 # Resampling.
 
 
@@ -104,22 +134,6 @@ def test_copies_are_in_proportion_to_the_weights():
         counts += np.bincount(index, minlength=7)
     np.testing.assert_array_equal(counts[weights == 0.0], 0.0)
     np.testing.assert_allclose(counts / 400, 50 * weights / 10.0, rtol=0.05)
-
-
-@settings(max_examples=50, deadline=None)
-@given(
-    st.lists(st.floats(0.0, 1e3), min_size=1, max_size=60),
-    st.integers(1, 200),
-    st.integers(0, 1000),
-)
-def test_only_particles_with_weight_are_drawn(weights, number, seed):
-    weights = np.array(weights)
-    if not weights.sum() > 1e-200:
-        return
-    index = resample(weights, number, np.random.default_rng(seed))
-    assert index.shape == (number,)
-    # Of a weight that does not change the sum nothing can be told.
-    assert (weights[index] > 0.0).all()
 
 
 def test_first_copies_stay_and_further_ones_move_within_the_bounds():

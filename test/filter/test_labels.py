@@ -1,11 +1,8 @@
 """Classes, scores and identities of detections and found targets."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from pmb_problems import plane_filter, plane_sensor
-from searches import floor_sensor, observe, play, same
+from searches import floor_sensor, observe, plane_filter, plane_sensor, play
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose
 from maasi_filter.ic_phd.filter import IcPhdFilter
@@ -61,15 +58,6 @@ def test_a_detection_far_from_the_target_of_its_identity_is_taken_as_clutter():
     assert not any(item.labels.identity == 'left' for item in search.components if not item.target)
     for target, place in zip(search.found_targets, before):
         assert np.linalg.norm(target.position - place) < 0.5
-
-
-def test_labels_do_not_depend_on_the_order_of_detections():
-    scans = pair_scans(20)
-    turned = [
-        replace(scan, values=scan.values[::-1], labels=list(scan.labels)[::-1]) for scan in scans
-    ]
-    one = play(plane_filter(found_radius=1.0), scans)
-    same(one, play(plane_filter(found_radius=1.0), turned))
 
 
 def test_the_papers_filter_reports_the_label_of_the_nearest_detection():

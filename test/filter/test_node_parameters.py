@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import reduce
 
 import pytest
 import yaml
@@ -29,9 +30,8 @@ SETTINGS = FilterNodeSettings.model_validate(
 def make(context):
     nodes = []
 
-    def start(flat=None):
-        flat = flatten(SETTINGS) if flat is None else flat
-        overrides = [Parameter(name, value=value) for name, value in flat.items()]
+    def start():
+        overrides = [Parameter(name, value=value) for name, value in flatten(SETTINGS).items()]
         nodes.append(FilterNode(context=context, parameter_overrides=overrides))
         return nodes[-1]
 
@@ -44,11 +44,11 @@ def make(context):
 def process(domain, tmp_path):
     running = []
 
-    def start(content=None, before=()):
+    def start(flat=None, before=()):
         command = [*before, sys.executable, '-m', 'maasi_filter.filter_node', '--ros-args']
-        if content is not None:
+        if flat is not None:
             file = tmp_path / f'parameters{len(running)}.yaml'
-            file.write_text(yaml.safe_dump(content))
+            file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
             command += ['--params-file', str(file)]
         environment = os.environ | domain.environment()
         running.append(
@@ -63,48 +63,42 @@ def process(domain, tmp_path):
         item.communicate()
 
 
-class Tool:
-    """What `ros2 param` does, by the services of the node."""
+@pytest.fixture
+def dump(context):
+    """Return a function that does what `ros2 param dump` does: parameters nested by the dots."""
+    node = Node('tool', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    client = AsyncParameterClient(node, '/filter_node')
 
-    def __init__(self, context):
-        self.node = Node('tool', context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.client = AsyncParameterClient(self.node, '/filter_node')
-
-    def result(self, future):
-        wait_until(future.done, lambda: self.executor.spin_once(timeout_sec=0.05))
+    def result(future):
+        wait_until(future.done, lambda: executor.spin_once(timeout_sec=0.05))
         return future.result()
 
-    def dump(self):
-        """Return all parameters as `ros2 param dump` writes them: nested by the dots."""
-        assert self.client.wait_for_services(timeout_sec=PATIENCE)
-        names = self.result(self.client.list_parameters()).result.names
-        values = self.result(self.client.get_parameters(names)).values
+    def dumped():
+        assert client.wait_for_services(timeout_sec=PATIENCE)
+        names = result(client.list_parameters()).result.names
         nested = {}
-        for name, value in zip(names, values):
+        for name, value in zip(names, result(client.get_parameters(names)).values):
             *path, last = name.split('.')
-            place = nested
-            for part in path:
-                place = place.setdefault(part, {})
+            place = reduce(lambda place, part: place.setdefault(part, {}), path, nested)
             value = parameter_value_to_python(value)
+            assert value is not None
             place[last] = value if not hasattr(value, 'tolist') else value.tolist()
-        return {'/filter_node': {'ros__parameters': nested}}
+        return nested
 
-    def close(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-
-
-@pytest.fixture
-def tool(context):
-    made = Tool(context)
-    yield made
-    made.close()
+    yield dumped
+    executor.shutdown()
+    node.destroy_node()
 
 
-def has_none(value):
-    return value is None or (isinstance(value, dict) and any(map(has_none, value.values())))
+def ended(node, *, ask=False):
+    """Return the exit code of a process, which may be asked to end, and what it said."""
+    if ask:
+        node.terminate()
+    _, said = node.communicate(timeout=PATIENCE)
+    assert 'Traceback' not in said
+    return node.returncode, said
 
 
 def test_numbers_have_real_ranges(make):
@@ -135,8 +129,7 @@ def test_rates_and_timeouts_can_be_set_while_the_node_runs(make):
 
 
 def test_what_a_preset_resolves_to_can_be_read(make):
-    flat = flatten(SETTINGS)
-    node = make(flat)
+    node = make()
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     assert node.get_parameter('filter.particles').value == 5000
     assert node.filter.settings.resolved().particles == 5000
@@ -148,49 +141,33 @@ def test_what_a_preset_resolves_to_can_be_read(make):
     assert node.filter.settings.resolved().found_radius == 0.5
 
 
-def test_a_dump_loads_again_and_is_the_same(process, tool):
+def test_a_dump_loads_again_and_foreign_keys_are_named(process, dump):
     flat = {**flatten(SETTINGS), 'environment.bounds': ['0.0 2.0', '0.0 2.0']}
-    first = process({'/**': {'ros__parameters': flat}})
-    dumped = tool.dump()
-    assert not has_none(dumped)
-    first.terminate()
-    assert first.wait(timeout=PATIENCE) == 0
-    second = process(dumped)
-    again = tool.dump()
-    assert again == dumped
-    second.terminate()
-    _, said = second.communicate(timeout=PATIENCE)
-    assert second.returncode == 0 and 'is not known' not in said, said
-
-
-def test_foreign_keys_are_named_and_ignored(process, tool):
-    flat = flatten(SETTINGS) | {'filter.partikles': 10, 'start_type_description_service': True}
-    node = process({'/**': {'ros__parameters': flat}})
-    tool.dump()
-    node.terminate()
-    _, said = node.communicate(timeout=PATIENCE)
-    assert node.returncode == 0
+    foreign = {'filter.partikles': 10, 'start_type_description_service': True}
+    first = process(flat | foreign)
+    dumped = dump()
+    code, said = ended(first, ask=True)
+    assert code == 0
     assert 'parameter filter.partikles: is not known, and ignored; did you mean' in said
     assert 'start_type_description_service' not in said
+    second = process(dumped)
+    assert dump() == dumped
+    code, said = ended(second, ask=True)
+    assert code == 0 and 'is not known' not in said, said
 
 
 def test_a_node_without_parameters_says_in_one_sentence_what_it_needs(process):
-    node = process()
-    _, said = node.communicate(timeout=PATIENCE)
-    assert node.returncode == 2
+    code, said = ended(process())
+    assert code == 2
     last = said.splitlines()[-1]
     assert last.startswith('error: parameters environment.bounds, robots: needed, but not set')
-    assert 'Traceback' not in said
 
 
 def test_wrong_parameters_are_named_with_what_was_read(process):
-    flat = flatten(SETTINGS) | {'step': -0.5, 'filter.particles': 'many'}
-    node = process({'/**': {'ros__parameters': flat}})
-    _, said = node.communicate(timeout=PATIENCE)
-    assert node.returncode == 2
+    code, said = ended(process(flatten(SETTINGS) | {'step': -0.5, 'filter.particles': 'many'}))
+    assert code == 2
     assert 'parameter step: Input should be greater than 0, read -0.5' in said
     assert 'parameter filter.particles: ' in said and "read 'many'" in said
-    assert 'Traceback' not in said
 
 
 def test_a_node_started_alone_says_that_the_loopback_interface_is_down(process):
@@ -198,6 +175,5 @@ def test_a_node_started_alone_says_that_the_loopback_interface_is_down(process):
     alone = ['unshare', '--map-root-user', '--net']
     if subprocess.run([*alone, 'true'], capture_output=True).returncode:
         pytest.skip('no network namespaces here')
-    node = process({'/**': {'ros__parameters': flatten(SETTINGS)}}, alone)
-    said = iter(node.stderr.readline, '')
+    said = iter(process(flatten(SETTINGS), alone).stderr.readline, '')
     assert any('the loopback interface cannot be used' in line for line in said)

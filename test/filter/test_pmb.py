@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exact_pmbm import ExactPmbm
-from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, plane_sensor
+from searches import PLANE, SIDE, cells, densities, measured, plane_filter, plane_sensor
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, UnexploredMap, wrap_angle
 from maasi_filter.measurement_check import check_measurements
@@ -20,6 +20,8 @@ from maasi_filter.records import FoundTarget, Label
 TARGET = np.array([[60.0, 45.0]])
 # Where the robot measures from, in turn.
 PLACES = [(30.0, 30.0), (50.0, 70.0), (80.0, 20.0), (40.0, 50.0)]
+# Enough for one target not to be taken for another.
+PRECISE = plane_sensor(range_noise=0.5, bearing=0.01)
 
 
 def observe(generator, sensor, targets, position):
@@ -27,6 +29,15 @@ def observe(generator, sensor, targets, position):
     values = sensor.measurement.measure(targets, Pose(np.asarray(position, float)))
     noise = np.sqrt(np.diagonal(sensor.covariance))
     return values + noise * generator.standard_normal(values.shape)
+
+
+def look(search, sensor, targets, places, first=0, seed=0):
+    """Let a robot see all targets from one place after the other; return the last result."""
+    generator = np.random.default_rng(seed)
+    for step, place in enumerate(places, start=first):
+        values = observe(generator, sensor, targets, place)
+        result = search.step([measured(sensor, place, values, step)], 1, float(step))
+    return result
 
 
 def moments(mass):
@@ -57,17 +68,18 @@ def test_one_target_without_clutter_is_the_bayesian_posterior():
     )
 
 
-def test_existence_after_misses_is_that_of_bayes():
-    generator = np.random.default_rng(4)
-    sensor = plane_sensor(clutter=1e-4)
+def test_existence_is_that_of_bayes_after_a_detection_and_after_misses():
+    sensor = plane_sensor(clutter=2e-4)
     search = plane_filter(particles=4000)
-    place = PLACES[0]
-    values = observe(generator, sensor, TARGET, place)
+    place, values = PLACES[0], [[30.0, 0.5]]
     search.step([measured(sensor, place, values)], 1, 0.0)
-    (item,) = search.components
-    r = item.existence
     probability, likelihood = densities(sensor, place, values)
     density = probability * likelihood[0]
+    intensity = 3.0 / SIDE**2 * density.sum()
+    kappa = max(2e-4, LEAST_PER_SCAN / sensor.measurement_space(PLANE))
+    (item,) = search.components
+    assert item.existence == pytest.approx(intensity / (intensity + kappa), rel=0.03)
+    r = item.existence
     for step in range(1, 6):
         density = density / density.sum()
         expected = (density * (1.0 - probability)).sum()
@@ -94,20 +106,6 @@ def test_unseen_targets_are_thinned_as_the_exploration_function_says():
     (member,) = check_measurements([measured(sensor, PLACES[0], value)], 1, 0.0, settings, 2)
     scan = make_scan(member, 1.0, search.exploration, 3.0, 20_000, np.random.default_rng(0))
     assert scan.intensity[0] == pytest.approx(expected, rel=0.02)
-
-
-def test_first_detection_exists_with_the_share_of_clutter():
-    sensor = plane_sensor(clutter=2e-4)
-    search = plane_filter(particles=4000)
-    value = [[30.0, 0.5]]
-    search.step([measured(sensor, PLACES[0], value)], 1, 0.0)
-    probability, likelihood = densities(sensor, PLACES[0], value)
-    intensity = 3.0 / SIDE**2 * (probability * likelihood[0]).sum()
-    space = sensor.measurement_space(PLANE)
-    kappa = max(2e-4, LEAST_PER_SCAN / space)
-    assert search.components[0].existence == pytest.approx(
-        intensity / (intensity + kappa), rel=0.03
-    )
 
 
 def test_clutter_is_learnt_as_a_gamma_prior_says():
@@ -164,28 +162,6 @@ def test_close_to_the_exact_mixture(targets, tolerance):
     assert max(worst) < 3.0 * tolerance
 
 
-def test_moves_leave_the_density_invariant():
-    """Particles of one detection, moved on without new data, keep its moments."""
-    sensor = plane_sensor(bearing=0.3)
-    search = plane_filter(particles=2000)
-    value = [[40.0, 0.5]]
-    search.step([measured(sensor, PLACES[0], value)], 1, 0.0)
-    density = search.components[0].density
-    probability, likelihood = densities(sensor, PLACES[0], value)
-    mean, covariance = moments(probability * likelihood[0])
-    density.particles = density.particles[
-        np.random.default_rng(1).choice(2000, 2000, p=density.weights)
-    ]
-    density.weights = np.full(2000, 1.0 / 2000)
-    for _ in range(20):
-        products, last = density._logs(density.particles)
-        density._move(1.0, products, last, search.generator)
-    density._update_moments()
-    scale = np.sqrt(np.diagonal(covariance).max())
-    np.testing.assert_allclose(density.mean, mean, atol=0.1 * scale)
-    np.testing.assert_allclose(density.covariance, covariance, atol=0.12 * scale**2)
-
-
 def test_precise_detection_of_a_sparse_cloud_makes_no_duplicate():
     coarse = plane_sensor(range_noise=20.0, bearing=0.6)
     fine = plane_sensor(range_noise=0.02, bearing=0.0005)
@@ -202,13 +178,8 @@ def test_precise_detection_of_a_sparse_cloud_makes_no_duplicate():
 
 def test_two_targets_three_metres_apart_stay_two():
     targets = np.array([[60.0, 45.0], [63.0, 45.0]])
-    sensor = plane_sensor(range_noise=0.5, bearing=0.01)
-    generator = np.random.default_rng(0)
     search = plane_filter(particles=300)
-    for step in range(8):
-        place = PLACES[step % 4]
-        values = observe(generator, sensor, targets, place)
-        search.step([measured(sensor, place, values, step)], 1, step)
+    look(search, PRECISE, targets, PLACES * 2)
     positions = np.array([target.position for target in search.found_targets])
     assert len(positions) == 2
     assert np.abs(positions[positions[:, 0].argsort()] - targets).max() < 1.0
@@ -234,19 +205,12 @@ def test_a_detection_that_comes_twice_is_one_by_the_resolution_of_the_sensor(
 @pytest.mark.parametrize(('misses', 'existence'), [(37, None), (1, 0.6)])
 def test_found_target_that_is_missed_again_and_again_is_withdrawn(misses, existence):
     """As a reflection, or as it hardly exists."""
-    sensor = plane_sensor(range_noise=0.5, bearing=0.01)
-    generator = np.random.default_rng(0)
     search = plane_filter(particles=300)
-    for step in range(3):
-        values = observe(generator, sensor, TARGET, PLACES[0])
-        search.step([measured(sensor, PLACES[0], values, step)], 1, step)
+    look(search, PRECISE, TARGET, PLACES[:1] * 3)
     assert len(search.found_targets) == 1
     search.components[0].existence = existence or search.components[0].existence
-    changed = False
-    for step in range(3, 3 + misses):
-        result = search.step([measured(sensor, (58.0, 45.0), [], step)], 1, step)
-        changed |= result.found_changed and not search.found_targets
-    assert changed
+    results = [look(search, PRECISE, TARGET[:0], [(58.0, 45.0)], 3 + n) for n in range(misses)]
+    assert any(result.found_changed for result in results)
     assert search.found_targets == []
 
 
@@ -279,17 +243,15 @@ def answering(share, targets, scans=80, seed=0, later=None):
     After 20 scans the shares are those of `later`.
     """
     generator = np.random.default_rng(seed)
-    # Precise enough for one place not to be taken for another.
-    sensor = plane_sensor(range_noise=0.5, bearing=0.01)
     search = plane_filter(seed=seed, expected_targets=5.0)
     for step in range(scans):
         place = generator.uniform(20.0, 80.0, 2)
         pose = Pose(place)
         share = later if later and step == 20 else share
-        chance = np.asarray(share) * sensor.detection.probability(targets, pose)
+        chance = np.asarray(share) * PRECISE.detection.probability(targets, pose)
         seen = targets[generator.random(len(targets)) < chance]
-        values = observe(generator, sensor, seen, place)
-        search.step([measured(sensor, place, values, step)], 1, step)
+        values = observe(generator, PRECISE, seen, place)
+        search.step([measured(PRECISE, place, values, step)], 1, step)
     found = np.array([target.position for target in search.found_targets]).reshape(-1, 2)
     gaps = np.linalg.norm(targets[:, None] - found[None], axis=2)
     return search, (gaps < 3.0).any(axis=1).tolist()
@@ -321,13 +283,9 @@ def test_found_target_that_answers_too_rarely_is_withdrawn():
 
 
 def test_walking_targets_widen_and_spread_what_is_unexplored():
-    sensor = plane_sensor(range_noise=0.5, bearing=0.01)
-    generator = np.random.default_rng(0)
-    settings = {'pmb': {'particles': 1000, 'walk': 0.5}}
-    search = PmbFilter(FilterSettings(method='pmb', **settings), PLANE, generator)
-    for step in range(3):
-        values = observe(generator, sensor, TARGET, PLACES[0])
-        search.step([measured(sensor, PLACES[0], values, step)], 1, float(step))
+    settings = FilterSettings(method='pmb', pmb={'particles': 1000, 'walk': 0.5})
+    search = PmbFilter(settings, PLANE, np.random.default_rng(0))
+    look(search, PRECISE, TARGET, PLACES[:1] * 3)
     before = search.found_targets[0].covariance
     total = search.exploration.values.sum()
     search.step([], 1, 12.0)

@@ -25,13 +25,6 @@ def drawn(generator, factor, number):
     return sensor.measurement.measure(TARGET, POSE) + noise
 
 
-@pytest.mark.parametrize('factor', [0.5, 1.0, 2.25])
-def test_the_innovation_of_a_target_known_exactly_tells_the_factor(factor):
-    member = checked(drawn(np.random.default_rng(0), factor, 4000))
-    squares = innovations(member, TARGET, np.zeros((1, 3, 3)))[3] / 3.0
-    assert np.mean(squares) == pytest.approx(factor, rel=0.05)
-
-
 def test_errors_of_the_position_that_are_told_are_no_noise():
     generator = np.random.default_rng(1)
     sensor = cube_sensor()
