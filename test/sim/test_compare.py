@@ -108,21 +108,17 @@ def test_other_settings_and_other_code_are_noticed(
     assert command(scenario, out, '--time-limit', '5', seeds=1) == 2
     said = capsys.readouterr().err
     assert '2 searches there are of other settings' in said and '--again' in said
+    # What a cluster sends.
+    task = campaign.plan(searches.compared(scenario, PLANNERS), tmp_path / 'new', 1).tasks[0]
     monkeypatch.setattr(searches, 'code_digest', lambda: 'another')
+    assert 'another version of the code' in campaign.execute(pickle.loads(pickle.dumps(task)))
+    del executed[:]
     assert command(scenario, out, seeds=1) == 2
     assert not executed
     assert command(scenario, out, '--again', seeds=1) == 0
     assert len(executed) == 2
     assert command(scenario, out, seeds=1) == 0
     assert len(executed) == 2
-
-
-def test_worker_of_other_code_is_noticed(scenario, tmp_path, monkeypatch):
-    work = campaign.plan(searches.compared(scenario, PLANNERS), tmp_path, 1)
-    # What a cluster sends.
-    task = pickle.loads(pickle.dumps(work.tasks[0]))
-    monkeypatch.setattr(searches, 'code_digest', lambda: 'another')
-    assert 'another version of the code' in campaign.execute(task)
 
 
 def test_planner_of_ones_own_is_compared_and_its_changes_are_noticed(

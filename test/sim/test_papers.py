@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import os
-import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import yaml
-from waiting import wait_until
+from distributed import LocalCluster
+from small_field import SMALL_FIELD
 
 from maasi_sim.experiments import reproduce, searches
 from maasi_sim.experiments.campaign import Workers, plan
@@ -35,10 +31,15 @@ def test_small_version_writes_what_makes_sense(name, tmp_path):
     for case in work.cases.values():
         run = load_run(work.file(case.name, 0))
         assert run.seed == experiment.seed(0) and run.columns
-        if 'mission' in case.settings:
-            check_mission(experiment, run, case.settings)
-        else:
+        if 'scenario' in case.settings:
             check_search(run, case.settings)
+        elif name != '004-table1':
+            summary = run.summary
+            assert summary['complete'] and summary['visited'] == summary['cuboids'] > 0
+            assert summary['collisions'] == 0 and summary['outside'] == 0
+            assert run.columns['visited'][-1] == summary['cuboids']
+            shots = {shot['cuboid'] for shot in run.details['snapshots']}
+            assert shots == set(range(summary['cuboids']))
     with (folder / 'runs.csv').open() as stream:
         assert len(list(csv.DictReader(stream))) == len(work.cases)
     configuration = yaml.safe_load((folder / 'configuration.yaml').read_text())
@@ -47,48 +48,22 @@ def test_small_version_writes_what_makes_sense(name, tmp_path):
     assert configuration['choices']
     assert all(item['reason'] for item in configuration['choices'])
     table = (folder / 'table.csv').read_text()
-    for case in work.cases.values():
-        assert case.name in table
+    assert all(case.name in table for case in work.cases.values())
     picture = (folder / 'figure.png').read_bytes()
     assert picture.startswith(b'\x89PNG') and len(picture) > 5000
-
-
-def check_mission(experiment, run, settings):
-    summary, columns = run.summary, run.columns
-    if experiment.name == '004-table1':
-        assert summary['cuboids'] == 32
-        assert run.timing['distributed'] > 0.0 and run.timing['centralized'] > 0.0
-        return
-    assert summary['complete'] and summary['visited'] == summary['cuboids'] > 0
-    assert summary['collisions'] == 0 and summary['outside'] == 0
-    assert (np.diff(columns['visited']) >= 0).all()
-    assert columns['visited'][-1] == summary['cuboids'] and summary['steps'] == columns['step'][-1]
-    assert columns['active'].max() <= len([name for name in columns if name.endswith('_x')])
-    assert {shot['cuboid'] for shot in run.details['snapshots']} == set(range(summary['cuboids']))
 
 
 def check_search(run, settings):
     columns, summary = run.columns, run.summary
     scenario = settings['scenario']
     low, high = np.array(scenario['environment']['bounds'], float).T
-    assert (np.diff(columns['measurements']) > 0).all()
-    # Robots with filters of their own have a row each.
-    assert (np.diff(columns['step']) >= 0).all()
     assert columns['time'] == pytest.approx(columns['step'] * scenario['step'])
     assert (columns['true_found'] <= columns['found']).all()
-    assert (columns['true_found'] <= summary['targets']).all()
-    assert summary['measurements'] == columns['measurements'][-1]
     # The last measurements are of all robots that measure at that step.
+    assert summary['measurements'] == columns['measurements'][-1]
     assert summary['measurements'] < settings['most_measurements'] + len(scenario['robots'])
-    assert summary['targets'] == len(run.details['truth'])
-    assert summary['found'] == columns['true_found'][-1]
+    assert summary['found'] == columns['true_found'][-1] <= len(run.details['truth'])
     assert summary['false_found'] == len(run.details['found']) - summary['found']
-    assert summary['end_reason'] in (
-        'all_found',
-        'planner_done',
-        'time_limit',
-        'measurement_limit',
-    )
     members = np.zeros(len(columns['step']))
     for robot in scenario['robots']:
         place = np.stack([columns[f'{robot}_{axis}'] for axis in 'xyz'], axis=1)
@@ -96,60 +71,22 @@ def check_search(run, settings):
         assert (inside >= low - 0.5).all() and (inside <= high + 0.5).all()
         members += columns[f'{robot}_measures']
     np.testing.assert_array_equal(np.cumsum(members), columns['measurements'])
-    if summary['found']:
-        assert 0.0 <= summary['rmse'] <= settings['scenario']['scoring']['radius']
-
-
-@contextlib.contextmanager
-def running(*arguments, folder):
-    """Run a command of Dask until the end of the block, its output in a file."""
-    with (folder / f'{arguments[0]}.log').open('w') as log:
-        process = subprocess.Popen(
-            [sys.executable, '-m', 'dask', *map(str, arguments)],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            cwd=folder,
-            start_new_session=True,
-        )
-        try:
-            yield
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
 
 
 def test_cluster_makes_the_same_runs(tmp_path):
-    # The documented two commands, on ports that are free.
-    address = tmp_path / 'scheduler.json'
-    scheduler = ('--host', '127.0.0.1', '--port', '0', '--no-dashboard')
-    worker = ('--nworkers', '1', '--nthreads', '1', '--no-dashboard')
-    with (
-        running('scheduler', *scheduler, '--scheduler-file', address, folder=tmp_path),
-        running('worker', '--scheduler-file', address, *worker, folder=tmp_path),
-    ):
-        # The file is there before its content.
-        wait_until(
-            lambda: address.exists() and address.read_text().endswith('}'),
-            what=(tmp_path / 'scheduler.log').read_text,
-        )
-        where = yaml.safe_load(address.read_text())['address']
-        arguments = ['000-fig7', '--small', '--out', str(tmp_path / 'there'), '--cluster', where]
-        assert reproduce.main(arguments) == 0
-    arguments = ['000-fig7', '--small', '--out', str(tmp_path / 'here'), '--workers', '1']
-    assert reproduce.main(arguments) == 0
-    steps = [(tmp_path / place / '000-fig7' / 'steps.csv') for place in ('here', 'there')]
-    assert steps[0].read_text() == steps[1].read_text()
-    assert steps[0].read_text().count('\n') > 30
+    command = ['000-fig7', '--small', '--out']
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        there = [*command, str(tmp_path / 'there'), '--cluster', cluster.scheduler_address]
+        assert reproduce.main(there) == 0
+    assert reproduce.main([*command, str(tmp_path / 'here'), '--workers', '1']) == 0
+    here, there = (tmp_path / place / '000-fig7' / 'steps.csv' for place in ('here', 'there'))
+    assert here.read_text() == there.read_text()
+    assert here.read_text().count('\n') > 30
 
 
 def test_maps_of_one_figure_are_those_of_its_neighbour():
-    # Paths are drawn of a run of the curves, and the same drones search the same maps.
-    assert KNOWN['000-fig5'].seed(0) == KNOWN['000-fig4'].seed(0)
-    assert KNOWN['000-fig7'].seed(0) == KNOWN['000-fig6'].seed(0)
-    assert KNOWN['000-fig12'].seed(0) == KNOWN['000-fig11'].seed(0)
-    assert KNOWN['000-table1'].seed(0) != KNOWN['000-fig4'].seed(0)
+    # Paths are drawn of a run of the curves.
+    assert KNOWN['000-fig5'].seed(0) == KNOWN['000-fig4'].seed(0) != KNOWN['000-table1'].seed(0)
 
 
 def test_robot_that_leaves_measures_no_more():
@@ -195,23 +132,21 @@ def test_litter_lies_low_and_high():
 def test_explored_share_is_that_of_the_planner():
     # One measurement in the middle of a floor: pi averaged over it.
     detection = {'kind': 'exponential', 'probability': 0.9, 'size': [0.5, 0.5]}
-    values = {
-        'version': 1,
+    robot = {
+        'start': [1.0, 1.0, 0.0],
+        'sensor': {'period': 1.0, 'detection': detection},
+        'odometry': {'position_noise': 0.0, 'position_drift': 0.0},
+    }
+    change = {
         'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
         'step': 1.0,
-        'targets': {'count': 0},
-        'robots': {
-            'robot': {
-                'type': 'ranging_drone',
-                'start': [1.0, 1.0, 0.0],
-                'candidates': {'points': [[1.0, 1.0]]},
-                'sensor': {'period': 1.0, 'detection': detection},
-                'odometry': {'position_noise': 0.0, 'position_drift': 0.0},
-            }
-        },
-        'stop': 'planner_done',
-        'limits': {'time': 3.0},
+        'robots': {'drone': robot},
     }
+    values = searches.merged(SMALL_FIELD, change) | {
+        'targets': {'count': 0},
+        'stop': 'planner_done',
+    }
+    values['robots']['drone']['candidates'] = {'points': [[1.0, 1.0]]}
     case = searches.search_case('one', values, 1)
     outcome = searches.run_exploring(case.settings, 1)
     axis = np.linspace(0.0, 2.0, 401)
