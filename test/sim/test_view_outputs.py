@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from browsers import chromium, needs_chromium
 
+from maasi_sim.buildings.picture import NAMED
 from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import load_types
 from maasi_sim.run.rviz_view import shown_topics
@@ -126,7 +127,7 @@ def test_robots_have_the_colours_of_the_page():
     assert tuple(re.findall(r'#\w+', robots.upper())) == video._ROBOTS
     named = re.search(r'const NAMED = (\{.*\});', text).group(1)
     colours = {name: colour.upper() for name, colour in re.findall(r"(\w+): '(#\w+)'", named)}
-    assert colours == video._NAMED
+    assert colours == NAMED
 
 
 def test_a_video_of_another_kind_is_refused(tmp_path, capsys):

@@ -13,15 +13,16 @@ from maasi_planner.buildings.preplanning import CoveragePlan
 
 # Palette for colour-blind readers (Okabe and Ito).
 COLOURS = ('#CC79A7', '#D62728', '#009E73', '#0072B2', '#E69F00', '#56B4E9', '#8C564B')
+# Of robots that are called by a colour.
+NAMED = {'purple': '#7B3294', 'red': '#D62728', 'green': '#2CA02C', 'blue': '#0072B2'}
 OBJECT, OBSTACLE, OPEN, VISITED = '#B9B9C9', '#8A8478', '#D55E00', '#56B4E9'
 _SIDES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 
 def colours_of(names: Collection[str]) -> dict[str, str]:
     """Return a colour for each robot; one that is called by a colour has that."""
-    named = {'purple': '#7B3294', 'red': '#D62728', 'green': '#2CA02C', 'blue': '#0072B2'}
     return {
-        name: named.get(name, COLOURS[index % len(COLOURS)])
+        name: NAMED.get(name, COLOURS[index % len(COLOURS)])
         for index, name in enumerate(sorted(names))
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec, SubplotSpec
+from matplotlib.patches import Ellipse
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
@@ -41,6 +43,16 @@ class MapView:
         """Return places (n, d) [m, map] in this view, (2, n)."""
         array = np.asarray(places, dtype=float).reshape(-1, width)
         return array[:, list(self.plane)].T
+
+
+def ellipse(
+    place: tuple[float, float], covariance: FloatArray, sigmas: float, least: float, **style: Any
+) -> Ellipse:
+    """Return the ellipse of so many deviations of a place [m]; half axes are at least so long."""
+    values, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    widths = 2.0 * np.maximum(sigmas * np.sqrt(np.maximum(values, 0.0)), least)
+    angle = math.degrees(math.atan2(directions[1, 0], directions[0, 0]))
+    return Ellipse(place, *widths, angle=angle, fill=False, **style)
 
 
 @dataclass(frozen=True)

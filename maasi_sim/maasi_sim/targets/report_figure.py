@@ -9,14 +9,23 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Ellipse, Rectangle
+from matplotlib.patches import Circle, Rectangle
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import reason_of_end
-from maasi_sim.run.report_panels import COLOURS, MARGIN, PALE, UNSEEN, MapView, Plot, draw_report
+from maasi_sim.run.report_panels import (
+    COLOURS,
+    MARGIN,
+    PALE,
+    UNSEEN,
+    MapView,
+    Plot,
+    draw_report,
+    ellipse,
+)
 from maasi_sim.targets.report import build_report, to_find_all
 from maasi_sim.targets.tally import TargetRecord
 
@@ -129,21 +138,11 @@ def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> No
     least = _LEAST[width] * float(np.ptp(bounds, axis=1).max())
     enlarged = False
     for number, target in enumerate(found):
-        plane = np.ix_(view.plane, view.plane)
-        lengths, turn = _axes_of(target.covariance[plane])
-        enlarged |= bool((lengths < least).any())
-        drawn = 2.0 * np.maximum(lengths, least)
-        axes.add_patch(
-            Ellipse(
-                (target.position[view.plane[0]], target.position[view.plane[1]]),
-                *drawn,
-                angle=math.degrees(math.atan2(turn[1, 0], turn[0, 0])),
-                fc='none',
-                ec=_FALSE if number in wrong else _FOUND,
-                lw=1.3,
-                zorder=5,
-            )
-        )
+        covariance = target.covariance[np.ix_(view.plane, view.plane)]
+        enlarged |= _SIGMAS * math.sqrt(max(np.linalg.eigvalsh(covariance)[0], 0.0)) < least
+        place = (target.position[view.plane[0]], target.position[view.plane[1]])
+        style: dict[str, Any] = {'ec': _FALSE if number in wrong else _FOUND, 'lw': 1.3}
+        axes.add_patch(ellipse(place, covariance, _SIGMAS, least, zorder=5, **style))
     sigmas = f'{_SIGMAS:g} sigma' + (f', drawn at least {least:.2g} m' if enlarged else '')
     marks: tuple[tuple[FloatArray, str, dict[str, Any], str], ...] = (
         (truth, 'D', {'mfc': 'none', 'mec': _TRUE, 'ms': 11, 'mew': 1.2}, 'true target'),
@@ -156,12 +155,6 @@ def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> No
         if len(places) or label == sigmas:
             points = view.points(places, width)
             axes.plot(*points, marker, ls='none', zorder=7, label=label, **style)
-
-
-def _axes_of(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return half axes of the ellipse of so many sigma, and their directions as columns."""
-    values, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    return _SIGMAS * np.sqrt(np.maximum(values, 0.0)), directions
 
 
 def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
@@ -181,13 +174,9 @@ def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
     axes.set_ylabel('targets')
     if by_time:
         # Beside the title: inside the axes it would cover curves.
-        above: dict[str, Any] = {
-            'loc': 'lower right',
-            'bbox_to_anchor': (1.0, 1.0),
-            'ncol': 3,
-            'handlelength': 1.6,
-        }
-        axes.legend(**above, fontsize=8.5, columnspacing=1.2, borderaxespad=0.1, frameon=False)
+        above: dict[str, Any] = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'ncol': 3}
+        close = {'handlelength': 1.6, 'columnspacing': 1.2, 'borderaxespad': 0.1}
+        axes.legend(**above, **close, fontsize=8.5, frameon=False)
 
 
 def _rows(record: TargetRecord) -> list[tuple[str, str]]:

@@ -12,11 +12,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Ellipse, Polygon
+from matplotlib.patches import Circle, Ellipse, Polygon, Rectangle
 from matplotlib.path import Path as Outline
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_sim.buildings.picture import draw_box
+from maasi_sim.buildings.picture import NAMED, OBJECT, OBSTACLE, OPEN, VISITED, draw_box
+from maasi_sim.run.report_panels import ellipse
 from maasi_sim.run.run_folder import write_whole
 from maasi_sim.view.event_log import Event, EventLog, Scene
 from maasi_sim.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
@@ -24,10 +25,9 @@ from maasi_sim.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 # Pictures per second, and size [in] at a resolution [px/in].
 RATE = 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80
-_FOUND, _POTENTIAL, _SEEN, _OPEN, _VISITED = '#009E73', '#E69F00', '#CC79A7', '#D55E00', '#56B4E9'
+_FOUND, _POTENTIAL, _SEEN = '#009E73', '#E69F00', '#CC79A7'
 # Of robots, as on the page.
 _ROBOTS = ('#0072B2', '#D55E00', '#8C564B', '#56B4E9', '#7F7F7F', '#CC79A7')
-_NAMED = {'purple': '#7B3294', 'red': '#D62728', 'green': '#2CA02C', 'blue': '#0072B2'}
 # The last picture is shown for so long [s].
 _HOLD = 2.0
 # Detections are shown for so long [s].
@@ -153,7 +153,7 @@ def _draw(axes: Any, now: Moments, bounds: NDArray[np.float64]) -> None:
     _draw_targets(axes, now, size)
     for index, name in enumerate(now.robots):
         if name in now.last['robot']:
-            _draw_robot(axes, now, name, _NAMED.get(name, _ROBOTS[index % len(_ROBOTS)]), bounds)
+            _draw_robot(axes, now, name, NAMED.get(name, _ROBOTS[index % len(_ROBOTS)]), bounds)
     axes.set_title(now.title())
 
 
@@ -177,11 +177,11 @@ def _draw_floor(axes: Any, now: Moments) -> None:
 
 def _draw_boxes(axes: Any, now: Moments) -> None:
     """Draw buildings and cuboids, and lines between robots of which one hears the other."""
-    for key, colour, alpha in (('objects', '#B9B9C9', 0.35), ('blocks', '#8A8478', 0.6)):
+    for key, colour, alpha in (('objects', OBJECT, 0.35), ('blocks', OBSTACLE, 0.6)):
         for box in now.scene.get(key, []):
             draw_box(axes, np.array(box), colour, alpha, '')
     for number, box in enumerate(now.scene.get('cuboids', [])):
-        style = (_VISITED, 0.12) if number in now.visited else (_OPEN, 0.35)
+        style = (VISITED, 0.12) if number in now.visited else (OPEN, 0.35)
         draw_box(axes, np.array(box), *style, '')
     places = {name: way[-1] for name, way in now.ways.items()}
     for name, event in now.last['cuboid'].items():
@@ -219,11 +219,8 @@ def _mark(
     axes.plot(*np.array(place)[:, None], 'o', color=colour, ms=4, alpha=alpha)
     if len(place) == 2:
         xx, xy, _, yy, *_ = covariance
-        values, vectors = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-        widths = 2.0 * deviations * np.sqrt(np.maximum(values[::-1], 0.0))
-        angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
-        style: Any = {'fill': False, 'color': colour, 'alpha': alpha}
-        axes.add_patch(Ellipse((place[0], place[1]), *widths, angle=angle, **style))
+        spread, style = np.array([[xx, xy], [xy, yy]]), {'color': colour, 'alpha': alpha}
+        axes.add_patch(ellipse((place[0], place[1]), spread, deviations, 0.0, **style))
 
 
 def _draw_robot(
@@ -248,7 +245,12 @@ def _draw_robot(
     _plot(axes, place, size, '', marker=marker, color=colour, **style)
     axes.text(*place[:size], f'   {name}', fontsize=9, weight='bold')
     if 'fence' in robot:
-        _draw_fence(axes, robot['fence'], colour, size)
+        (left, right), (low, high), _ = robot['fence']
+        if size == 3:
+            draw_box(axes, np.array(robot['fence']), colour, 0.05, '')
+        else:
+            style = {'fill': False, 'ec': colour, 'ls': '-.', 'lw': 0.9, 'alpha': 0.7}
+            axes.add_patch(Rectangle((left, low), right - left, high - low, **style))
 
 
 def _arrow(yaw: float) -> Outline:
@@ -272,14 +274,3 @@ def _view(view: dict[str, Any], place: list[float], yaw: float, colour: str) -> 
     (left, low), (right, high) = view['lower'][:2], view['upper'][:2]
     corners = np.array([[left, low], [right, low], [right, high], [left, high]])
     return Polygon(corners @ _turn(yaw if view['turns'] else 0.0) + place[:2], **style)
-
-
-def _draw_fence(axes: Any, fence: list[list[float]], colour: str, size: int) -> None:
-    """Draw the edges of a geofence (3, 2) [m]."""
-    (left, right), (low, high), heights = fence
-    style = {'color': colour, 'lw': 0.9, 'alpha': 0.7}
-    corners = [(left, low), (right, low), (right, high), (left, high)]
-    for z in heights if size == 3 else heights[:1]:
-        _plot(axes, [(*corner, z) for corner in [*corners, corners[0]]], size, '-.', **style)
-    for corner in corners if size == 3 else []:
-        _plot(axes, [(*corner, z) for z in heights], size, '-.', **style)
