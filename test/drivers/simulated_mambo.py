@@ -1,13 +1,13 @@
 """A Mambo's pilot over the fake's firmware, without a network and in simulated time."""
 
 import math
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 
 from maasi_drivers.links.mambo.link import PositionEvent
 from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
-from maasi_drivers.measure_mambo import MeasuredSpeed, MeasuringFlight, fit_speed
+from maasi_drivers.measure_mambo import MeasuringFlight, fit_speed
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import make_motion
@@ -139,18 +139,6 @@ FIELD = np.array([[-0.3, 2.4], [-0.3, 2.4]])
 WAYPOINTS = [[2.2, 2.2], [-0.1, 2.2], [2.2, -0.1], [-0.1, -0.1], [1.05, 1.05], [1.43, 1.05]]
 
 
-@dataclass
-class Flown:
-    """How a flight over the field went."""
-
-    measured: MeasuredSpeed
-    overshoot: float = 0.0  # farthest beyond a waypoint, in the direction of the leg [m]
-    outside: float = -math.inf  # farthest outside the field; negative: inside [m]
-    way: float = 0.0  # flown [m]
-    straight: float = 0.0  # from waypoint to waypoint [m]
-    time: float = 0.0  # until it has stayed at the last one for a second [s]
-
-
 def measure(drag, delay, way=1.0, legs=6):
     """Return what a measuring flight says, and how far it went from its place [m]."""
     flight = Flight(drag=drag, firmware_delay=delay, arm=False)
@@ -163,8 +151,12 @@ def measure(drag, delay, way=1.0, legs=6):
 
 
 def measure_and_fly(drag, delay):
-    """Return how a Mambo flies over the field with what its measuring flight says."""
-    flown = Flown(measure(drag, delay)[0])
+    """Return how a Mambo flies over the field with what its measuring flight says.
+
+    Farthest beyond a waypoint and outside the field, way flown and from waypoint to waypoint [m].
+    """
+    flown = SimpleNamespace(overshoot=0.0, outside=-math.inf, way=0.0, straight=0.0)
+    flown.measured = measure(drag, delay)[0]
     speed, late = flown.measured.full_speed, flown.measured.delay
     flight = Flight(drag=drag, firmware_delay=delay, full_speed=speed, delay=late).up()
     began = flight.time

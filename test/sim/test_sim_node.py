@@ -431,6 +431,7 @@ def test_a_linked_robot_is_cut_off_while_it_is_away(make_team, tmp_path):
     content['robots']['drone']['mavlink']['url'] = url
     settings = MavlinkSettings.model_validate({'arm': True, 'url': url})
     link = VehicleLink(settings, [0.0, 0.0, 1.0], tmp_path / 'origin.json')
+    link.open()
 
     def permitted():
         with link.lock:

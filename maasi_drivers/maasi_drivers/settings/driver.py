@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -21,7 +21,13 @@ from maasi_filter.settings import (
 from maasi_planner.settings import MotionSettings
 
 BatteryUnit = Literal['fraction', 'percent']
-CommandType = Literal['auto', 'stamped', 'twist']
+CommandType = Annotated[
+    Literal['auto', 'stamped', 'twist'],
+    Field(
+        description='Type of cmd_vel: TwistStamped, Twist, or the type that it subscribes to; auto '
+        'is stamped in lockstep'
+    ),
+]
 LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink']
 # The same in lockstep, where robots wait for their drivers: a busy machine may delay
 # a driver, and zeros in between would change the run [s].
@@ -227,11 +233,7 @@ class DriverSettings(NodeSettings):
         'stopped; none: three periods of the sensor, at least 1 s; 0: disabled; not in '
         'lockstep [s]',
     )
-    command_type: CommandType = Field(
-        default='auto',
-        description='Type of cmd_vel: TwistStamped, Twist, or the type that it subscribes to; auto '
-        'is stamped in lockstep',
-    )
+    command_type: CommandType = 'auto'
     battery_unit: BatteryUnit = Field(
         default='fraction',
         description='Unit of battery_state.percentage: fraction, 0 to 1 as its definition says, or '
@@ -303,8 +305,4 @@ class GuardSettings(NodeSettings):
         'in lockstep [s of wall time]',
     )
 
-    command_type: CommandType = Field(
-        default='auto',
-        description='Type of cmd_vel: TwistStamped, Twist, or the type that it subscribes to; auto '
-        'is stamped in lockstep',
-    )
+    command_type: CommandType = 'auto'

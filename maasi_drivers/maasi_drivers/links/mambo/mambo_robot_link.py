@@ -54,8 +54,6 @@ class MamboRobotLink(RobotLink):
         super().__init__(driver)
         self._mambo = driver.settings.mambo or MamboSettings()
         self._phase = Phase.CONNECTING
-        self._link: MamboLink | None = None
-        self._pilot: MamboPilot | None = None
         self._speed = PoseSpeed()
 
     def prepare(self) -> None:
@@ -80,7 +78,7 @@ class MamboRobotLink(RobotLink):
     def connect(self) -> None:
         """Connect; it takes off once the driver is active."""
         driver, link = self.driver, self._link
-        assert link is not None
+        self.activate()
         link.connect()
         driver.create_wall_timer(min(driver.settings.step, POLL_PERIOD), self._update)
         driver.offer_arm(self._arm, lambda: link.airborne)
@@ -88,49 +86,38 @@ class MamboRobotLink(RobotLink):
             OdometryTopic(driver)
         elif self._mambo.pose == 'pose':
             PoseTopic(driver, self._take_pose)
-        driver.expect(lambda: self._pilot is not None and self._pilot.phase is Phase.FLYING)
+        driver.expect(lambda: self._pilot.phase is Phase.FLYING)
 
     def close(self) -> None:
         """Leave the drone to its firmware."""
-        self._pilot = None
-        if self._link is not None:
-            self._link.close()
-            self._link = None
+        self._link.close()
 
     def activate(self) -> None:
         """Begin a flight."""
-        if self._link is not None:
-            self._phase = Phase.CONNECTING
-            self._pilot = MamboPilot(
-                self._link, self._motion, self._mambo, self.driver.start_pose, self.fence
-            )
+        self._phase = Phase.CONNECTING
+        self._pilot = MamboPilot(
+            self._link, self._motion, self._mambo, self.driver.start_pose, self.fence
+        )
 
     def _arm(self) -> str:
         """Let the drone take off; return why not, empty where it may."""
-        if self._pilot is None:
-            return 'the driver is not active'
         return self._pilot.permit(time.monotonic())
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
         """Fly a velocity command."""
-        if self._pilot is not None:
-            try:
-                self._pilot.fly(np.array(command))
-            except ValueError as error:
-                self.driver.drop('command', str(error))
+        try:
+            self._pilot.fly(np.array(command))
+        except ValueError as error:
+            self.driver.drop('command', str(error))
 
     def hold(self) -> None:
         """Have the drone hover."""
-        if self._pilot is not None:
-            self._pilot.hover()
+        self._pilot.hover()
 
     def stop(self) -> None:
         """Land, and wait until the drone reports that it does."""
-        pilot, link = self._pilot, self._link
-        if pilot is None or link is None:
-            return
-        self._pilot = None
-        pilot.end('the driver stops')
+        link = self._link
+        self._pilot.end('the driver stops')
         end = time.monotonic() + _LANDING_TIME
         while link.connected and link.airborne and link.flying_state != 'landing':
             if time.monotonic() > end:
@@ -143,8 +130,7 @@ class MamboRobotLink(RobotLink):
 
     def latch_stop(self) -> None:
         """Have the drone land as `MamboPilot.stop` does; on the ground it stays there."""
-        if self._pilot is not None:
-            self._pilot.stop(time.monotonic())
+        self._pilot.stop(time.monotonic())
 
     def poll(self) -> None:
         """Report why the drone does not start."""
@@ -153,8 +139,6 @@ class MamboRobotLink(RobotLink):
     def status(self) -> dict[str, Any]:
         """Return the state of drone and flight."""
         link = self._link
-        if link is None:
-            return {}
         return {
             'flight': self._phase.value,
             'drone': link.flying_state,
@@ -167,10 +151,9 @@ class MamboRobotLink(RobotLink):
     def _update(self) -> None:
         driver = self.driver
         now, pilot, link = time.monotonic(), self._pilot, self._link
-        if link is not None:
-            link.keep_alive()
+        link.keep_alive()
         driver.arrivals.observe(now, driver.get_clock().now().nanoseconds)
-        if pilot is None or link is None or not driver.active:
+        if not driver.active:
             return
         pilot.update(now)
         self._judge(pilot)
@@ -204,7 +187,7 @@ class MamboRobotLink(RobotLink):
 
     def observe(self, placed: StampedPose) -> None:
         """Hand a pose of another system to the pilot."""
-        if self._pilot is not None and self._mambo.pose != 'events':
+        if self._mambo.pose != 'events':
             self._pilot.take_pose(
                 time.monotonic(), RobotState(placed.pose, placed.velocity, placed.angular_velocity)
             )
@@ -229,21 +212,18 @@ class MamboRobotLink(RobotLink):
     def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
         """Return the command for the state at which it takes effect, and the goal reached."""
         pilot = self._pilot
-        if pilot is not None and pilot.phase is Phase.FLYING and pilot.has_pose:
+        if pilot.phase is Phase.FLYING and pilot.has_pose:
             robot = pilot.ahead()
         return super().steer(robot, step)
 
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
         """Return whether pose and images must change: a command on the ground moves nothing."""
-        grounded = self._pilot is not None and self._pilot.phase is not Phase.FLYING
-        return not grounded and super().is_moving(placed, command)
+        return self._pilot.phase is Phase.FLYING and super().is_moving(placed, command)
 
     def goal_taken(self, goal: Goal) -> None:
         """Keep the drone in the air."""
-        if self._pilot is not None:
-            self._pilot.goal_taken()
+        self._pilot.goal_taken()
 
     def goal_cancelled(self) -> None:
         """Land the drone if no other goal follows."""
-        if self._pilot is not None:
-            self._pilot.goal_cancelled(time.monotonic())
+        self._pilot.goal_cancelled(time.monotonic())

@@ -199,7 +199,7 @@ class MamboPilot:
         if self.phase not in (Phase.CONNECTING, Phase.GROUND):
             return 'it is in the air already'
         unheard = self.problem if self.phase is Phase.CONNECTING else ''
-        silent = self._lost_text(now) if self._is_silent(now) else ''
+        silent = self._missing(now) if self._is_silent(now) else ''
         return self.link.error or self._unfit() or self._low_battery() or unheard or silent
 
     def _unfit(self) -> str:
@@ -305,7 +305,7 @@ class MamboPilot:
                 what = 'state' if state != 'landed' else 'battery'
                 return f'on the ground: nothing heard of its {what} yet'
             if not self.has_pose:
-                return f'on the ground: {self._lost_text(now) or "no position yet"}'
+                return f'on the ground: {self._missing(now) or "no position yet"}'
             self.link.take_off()
         # In the air it was brought by an earlier driver.
         return self._begin(Phase.TAKING_OFF, now)
@@ -321,7 +321,7 @@ class MamboPilot:
             return self.end(low)
         if lost is not None:
             self.hover()
-            text = self._lost_text(now)
+            text = self._missing(now)
             return self.end(text) if lost >= self.settings.land_after else text
         flying_state, timeout = self.link.flying_state, self.settings.take_off_timeout
         late = now - self._since > timeout
@@ -360,19 +360,23 @@ class MamboPilot:
         charge, minimum = self.link.battery, self.settings.battery_minimum
         return f'battery at {charge:.2f}, below {minimum:.2f}' if 0.0 <= charge < minimum else ''
 
-    def _ages(self, now: float) -> dict[str, float]:
-        """Return since when link, position, and its changes are missing [s], by what is said."""
-        return {
-            'link lost: nothing from the Mambo': now - self.link.heard_at,
-            'no position': now - self._placed_at,
-            'the position has not changed': now - self._moved_at,
-        }
+    def _missing(self, now: float) -> str:
+        """Return what has been missing for longer than the timeout, or nothing."""
+        for text, since in (
+            ('link lost: nothing from the Mambo', self.link.heard_at),
+            ('no position', self._placed_at),
+            ('the position has not changed', self._moved_at),
+        ):
+            age = now - since
+            if age > self.settings.link_timeout:
+                return f'{text} for {f"{age:.1f} s" if math.isfinite(age) else "all the time"}'
+        return ''
 
     def _check_pose(self, now: float) -> float | None:
         """Return for how long one of them has been missing, beyond the timeout [s]."""
         timeout = self.settings.link_timeout
         self._stuck |= now - self._moved_at > timeout and now - self._placed_at <= timeout
-        if max(self._ages(now).values()) <= timeout:
+        if not self._missing(now):
             self._lost_since = None
             return None
         if self._lost_since is None:
@@ -381,9 +385,3 @@ class MamboPilot:
 
     def _is_silent(self, now: float) -> bool:
         return now - self.link.heard_at > self.settings.link_timeout
-
-    def _lost_text(self, now: float) -> str:
-        for text, age in self._ages(now).items():
-            if age > self.settings.link_timeout:
-                return f'{text} for {f"{age:.1f} s" if math.isfinite(age) else "all the time"}'
-        return ''

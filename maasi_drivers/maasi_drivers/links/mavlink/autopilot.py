@@ -48,7 +48,6 @@ class ModeChange(NamedTuple):
 class _Command:
     number: int
     parameters: tuple[float, ...]
-    on_accepted: Callable[[], None] | None
     sent: float = -math.inf
     tries: int = 0
 
@@ -73,6 +72,8 @@ class Autopilot:
         self.estimate = Estimate(settings, place, on_restart)
         #: Commands that were not answered yet.
         self.commands: deque[_Command] = deque()
+        #: Numbers of those that were accepted in this phase of the flight.
+        self.accepted: set[int] = set()
         self._settings = settings
         self._sender = sender
         self._log = log
@@ -207,21 +208,16 @@ class Autopilot:
             interval = 1e6 / (rate or self._settings.position_rate)
             self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (number, interval))
 
-    def request_mode(self, mode: int, on_accepted: Callable[[], None] | None = None) -> None:
+    def request_mode(self, mode: int) -> None:
         """Request a custom mode."""
         assert self.firmware is not None
         numbers = (mode >> 16 & 0xFF, mode >> 24 & 0xFF) if self.firmware.px4 else (mode, 0)
         flag = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-        self.command(mavlink.MAV_CMD_DO_SET_MODE, (flag, *numbers), on_accepted)
+        self.command(mavlink.MAV_CMD_DO_SET_MODE, (flag, *numbers))
 
-    def command(
-        self,
-        number: int,
-        parameters: tuple[float, ...],
-        on_accepted: Callable[[], None] | None = None,
-    ) -> None:
+    def command(self, number: int, parameters: tuple[float, ...]) -> None:
         """Send a command until it is answered, after those before it; report a refusal."""
-        self.commands.append(_Command(number, parameters, on_accepted))
+        self.commands.append(_Command(number, parameters))
 
     def _take_answer(self, message: Any, now: float) -> None:
         if not self.commands or self.commands[0].number != message.command:
@@ -235,8 +231,7 @@ class Autopilot:
         """Take the result of the oldest command; None: it was not answered."""
         command = self.commands.popleft()
         if result == mavlink.MAV_RESULT_ACCEPTED:
-            if command.on_accepted is not None:
-                command.on_accepted()
+            self.accepted.add(command.number)
             return
         known = mavlink.enums['MAV_RESULT'].get(result)
         why = f'result {result}' if known is None else known.name.removeprefix('MAV_RESULT_')

@@ -69,8 +69,11 @@ class VehicleLink:
         self.vehicle = Vehicle(settings, start, self._sender, memory)
         self.lock = threading.Lock()
         self._end = threading.Event()
-        self._open()
         self._thread = threading.Thread(target=self._run, name='mavlink', daemon=True)
+
+    def open(self) -> None:
+        """Open the wire, and begin to work."""
+        self._open()
         self._thread.start()
 
     def finish(self, ending: Ending, patience: float) -> bool:
@@ -91,7 +94,8 @@ class VehicleLink:
     def close(self) -> None:
         """Stop sending, and close the wire."""
         self._end.set()
-        self._thread.join(timeout=2.0)
+        if self._thread.is_alive():
+            self._thread.join(timeout=2.0)
         self._shut()
 
     def _open(self) -> None:

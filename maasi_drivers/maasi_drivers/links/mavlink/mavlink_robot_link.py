@@ -49,7 +49,6 @@ class MavlinkRobotLink(RobotLink):
         self._mavlink = settings.mavlink or MavlinkSettings()
         if self._localised:
             self._mavlink = self._mavlink.model_copy(update={'origin': 'local'})
-        self._link: VehicleLink | None = None
         if not self._localised:
             driver.pose_name = 'LOCAL_POSITION_NED'
         self._local_poses = PoseHistory()
@@ -66,28 +65,28 @@ class MavlinkRobotLink(RobotLink):
 
     # ---- link and life cycle -----------------------------------------------------------------
 
+    def prepare(self) -> None:
+        """Make the link; it remembers the origin of a flight."""
+        folder = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
+        name = f'{self.driver.namespace.replace("/", "_")}_flight_origin.json'
+        memory = folder / 'maasi' / name
+        self._link = VehicleLink(self._mavlink, self.driver.settings.start, memory)
+
     def connect(self) -> None:
         """Open the connection; the vehicle is armed only once the driver is active."""
-        driver = self.driver
-        folder = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
-        name = f'{driver.namespace.replace("/", "_")}_flight_origin.json'
-        link = VehicleLink(self._mavlink, driver.settings.start, folder / 'maasi' / name)
-        self._link = link
+        driver, vehicle = self.driver, self._link.vehicle
+        self._link.open()
         driver.create_wall_timer(POLL_PERIOD, self._update)
-        driver.offer_arm(self._arm, lambda: link.vehicle.in_air)
-        driver.expect(lambda: link.vehicle.flying)
+        driver.offer_arm(self._arm, lambda: vehicle.in_air)
+        driver.expect(lambda: vehicle.flying)
 
     def close(self) -> None:
         """Close the connection."""
-        if self._link is not None:
-            self._link.close()
-            self._link = None
+        self._link.close()
 
     def _arm(self) -> str:
         """Let the vehicle take off; return why not, empty where it may."""
         driver, link = self.driver, self._link
-        if link is None:
-            return 'the driver is not active'
         if self._localised and (driver.history.latest is None or ODOMETRY in driver.health):
             return f'no {driver.pose_name}'
         with link.lock:
@@ -123,8 +122,6 @@ class MavlinkRobotLink(RobotLink):
 
     def stop(self) -> None:
         """Have the vehicle hold its position or land, and wait until it confirms."""
-        if self._link is None:
-            return
         self._ending = True
         if not self._link.finish(self._mavlink.at_end, _STOP_TIME):
             self.driver.get_logger().error(
@@ -139,9 +136,8 @@ class MavlinkRobotLink(RobotLink):
 
     def latch_stop(self) -> None:
         """End the permission to take off, and a take-off."""
-        if self._link is not None:
-            with self._link.lock:
-                self._link.vehicle.stop()
+        with self._link.lock:
+            self._link.vehicle.stop()
 
     def poll(self) -> None:
         """Report why the vehicle does not start."""
@@ -153,8 +149,6 @@ class MavlinkRobotLink(RobotLink):
 
     def status(self) -> dict[str, Any]:
         """Return the state of the vehicle."""
-        if self._link is None:
-            return {}
         with self._link.lock:
             vehicle = self._link.vehicle
             return {
@@ -165,8 +159,6 @@ class MavlinkRobotLink(RobotLink):
             }
 
     def _send_target(self, position: FloatArray, yaw: float) -> None:
-        if self._link is None:
-            return
         goal = compose(self._map_from_local.inverse(), Pose.from_yaw(self._inside(position), yaw))
         with self._link.lock:
             self._link.vehicle.set_target(goal.position + self._local_origin, goal.yaw)
@@ -175,8 +167,6 @@ class MavlinkRobotLink(RobotLink):
 
     def _update(self) -> None:
         driver, link = self.driver, self._link
-        if link is None:
-            return
         with link.lock:
             vehicle, estimate = link.vehicle, link.vehicle.estimate
             vehicle.active = driver.active and not self._ending
@@ -201,8 +191,6 @@ class MavlinkRobotLink(RobotLink):
 
     def _log_reports(self) -> None:
         """Log the reports of the vehicle."""
-        if self._link is None:
-            return
         with self._link.lock:
             reports = self._link.vehicle.reports()
         logger = self.driver.get_logger()

@@ -40,6 +40,7 @@ class Phase(Enum):
 COMMANDED = (Phase.STARTING, Phase.ARMING, Phase.RISING, Phase.FLYING, Phase.ENDING)
 
 
+_MODE, _TAKE_OFF = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_NAV_TAKEOFF
 # Period of requests for the final mode [s].
 _ENDING_PERIOD = 0.3
 # Period of attempts to arm; the autopilot reports refusals [s].
@@ -77,12 +78,10 @@ class Vehicle:
         self._yaw: float | None = None
         # Smallest distance to its height so far [m], and the time at which it became less.
         self._least_left, self._nearer_at = math.inf, -math.inf
-        self._take_off_accepted = False
         self._detail = ''
         self._phase_at = self._tried_at = -math.inf
         self._fix_needed = False
         self._ending: Ending | None = None
-        self._ending_accepted = False
         # Why it lands by itself.
         self._reason = ''
         # Restarted after a flight: its local frame may be anywhere.
@@ -111,7 +110,7 @@ class Vehicle:
         """Whether nothing is left to command when the driver ends."""
         if self.phase not in COMMANDED or not self._autopilot.armed:
             return True
-        return self.phase is Phase.ENDING and self._ending_accepted
+        return self.phase is Phase.ENDING and _MODE in self._autopilot.accepted
 
     @property
     def fault(self) -> str:
@@ -205,7 +204,7 @@ class Vehicle:
         if self.phase is Phase.ENDING and self._ending == ending:
             return
         if self._autopilot.armed and self.phase in COMMANDED:
-            self._ending, self._ending_accepted = ending, False
+            self._ending = ending
             self._reason = f', {reason}' if reason else ''
             self._autopilot.commands.clear()
             what = 'it lands' if ending == 'land' else 'it holds its position'
@@ -232,8 +231,9 @@ class Vehicle:
         elif mode not in self._own_modes(change.before):
             self._let_go(mode)
         elif self.phase is Phase.ENDING:
-            self._ending_accepted = mode == self._ending_mode
-            if self._ending_accepted:
+            self._autopilot.accepted.discard(_MODE)
+            if mode == self._ending_mode:
+                self._autopilot.accepted.add(_MODE)
                 self._autopilot.commands.clear()
         elif self.phase is Phase.RELEASED:
             name = firmware.mode_name(mode)
@@ -413,7 +413,6 @@ class Vehicle:
             self.estimate.origin[2] = self._target[2]
             self._place.keep(self.estimate.origin, self.estimate.booted)
         self._least_left, self._nearer_at = math.inf, now
-        self._take_off_accepted = False
         self._enter(Phase.RISING)
 
     def _rise(self, now: float) -> None:
@@ -435,12 +434,9 @@ class Vehicle:
             self.finish('land', reason)
         elif not by_command:
             self._target[2] = top
-        elif not self._take_off_accepted and self._is_due(now, _ARMING_PERIOD):
+        elif _TAKE_OFF not in self._autopilot.accepted and self._is_due(now, _ARMING_PERIOD):
             take_off = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.height)
-            self._autopilot.command(mavlink.MAV_CMD_NAV_TAKEOFF, take_off, self._on_take_off)
-
-    def _on_take_off(self) -> None:
-        self._take_off_accepted = True
+            self._autopilot.command(_TAKE_OFF, take_off)
 
     def _begin_flying(self) -> None:
         position = self._position()
@@ -454,12 +450,10 @@ class Vehicle:
 
     def _end(self, now: float) -> None:
         # Not again once accepted: a pilot may have taken another mode since the last heartbeat.
-        if not self._ending_accepted and self._is_due(now, _ENDING_PERIOD):
-            self._autopilot.request_mode(self._ending_mode, self._on_ending_accepted)
-
-    def _on_ending_accepted(self) -> None:
-        self._ending_accepted = self.phase is Phase.ENDING
+        if _MODE not in self._autopilot.accepted and self._is_due(now, _ENDING_PERIOD):
+            self._autopilot.request_mode(self._ending_mode)
 
     def _enter(self, phase: Phase, detail: str = '') -> None:
+        self._autopilot.accepted.clear()
         self.phase, self._detail = phase, detail
         self._phase_at = self._tried_at = -math.inf

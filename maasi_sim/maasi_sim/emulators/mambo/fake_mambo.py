@@ -111,11 +111,11 @@ HANDSHAKE_PORT = 44444
 #: Port of commands, announced in the handshake.
 COMMAND_PORT = 6000
 
-PING, COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS = 0, 10, 11, 12
+COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS = 10, 11, 12
 EVENTS, ACKED_EVENTS = 126, 127
 _ID = struct.Struct('<BBH')
 
-_SENSOR_PERIOD, _PING_PERIOD = 0.5, 1.0
+_SENSOR_PERIOD = 0.5
 # Period and number of retransmissions of a frame without acknowledgement.
 _RETRY_PERIOD, _RETRIES = 0.15, 5
 _STEP = 0.02
@@ -169,10 +169,9 @@ class FakeMambo:
         # Frames that wait to be acknowledged: frame, tries left, time of the next try.
         self._unacked: dict[int, tuple[Frame, int, float]] = {}
         self._done: dict[int, int] = {}
-        self._sensors_at = self._ping_at = 0.0
+        self._sensors_at = 0.0
         self._stuck: Pose | None = None
         self._said: tuple[int, int] | None = None
-        firmware.on_change = self._tell_state
         self._door = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._air = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -237,13 +236,11 @@ class FakeMambo:
         """Advance by `dt` seconds, and send due messages."""
         firmware = self.firmware
         firmware.advance(dt)
+        self._tell_state()
         now = firmware.time
         if now - self._sensors_at >= _SENSOR_PERIOD - 1e-9:
             self._send_sensors(now - self._sensors_at)
             self._sensors_at = now
-        if now - self._ping_at >= _PING_PERIOD - 1e-9:
-            self._ping_at = now
-            self._send(DATA, PING, struct.pack('<Q', round(1e9 * now)))
         for sequence, (frame, tries, due) in list(self._unacked.items()):
             if now >= due:
                 self._unacked[sequence] = (frame, tries - 1, now + _RETRY_PERIOD)
@@ -378,14 +375,11 @@ def build_parser() -> argparse.ArgumentParser:
     add('type', 'robot type (default: %(default)s)', default='mambo', metavar='NAME')
     add('seed', 'of the noise', type=whole, default=1, metavar='N')
     add('charge', 'of the battery at the start, 0 to 1', type=float, default=1.0, metavar='X')
-    add('drag', 'of its body [1/s] (%(default)s)', type=float, default=settings.drag, metavar='D')
-    add(
-        'delay',
-        'from a command to its tilt set-point [s] (%(default)s)',
-        type=float,
-        default=settings.delay,
-        metavar='S',
-    )
+    for name, unit, what, default in (
+        ('drag', '1/s', 'of its body', settings.drag),
+        ('delay', 's', 'from a command to its tilt set-point', settings.delay),
+    ):
+        add(name, f'{what} [{unit}] (%(default)s)', type=float, default=default, metavar='X')
     add(
         'lost-link',
         'behaviour when its controller is silent (%(default)s)',

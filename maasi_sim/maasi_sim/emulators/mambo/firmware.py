@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Literal, NamedTuple
@@ -174,7 +174,6 @@ class MamboFirmware:
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     seed: int = 1
     name: str = 'mambo'
-    on_change: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         self.floor = float(self.start.position[2])
@@ -190,7 +189,6 @@ class MamboFirmware:
         # Piloting commands, and the time at which they take effect.
         self._piloted: deque[tuple[float, Piloting]] = deque([(-math.inf, Piloting())])
         self._heard_at = -math.inf
-        self._percent = self.percent
 
     @property
     def percent(self) -> int:
@@ -222,17 +220,17 @@ class MamboFirmware:
         """Take off, if it stands on the floor with a battery that is not empty."""
         if self.flying_state == FlyingState.LANDED and not self._critical:
             self.take_offs += 1
-            self._set(FlyingState.TAKING_OFF)
+            self.flying_state = FlyingState.TAKING_OFF
 
     def land(self) -> None:
         """Land where it is."""
         if self.flying_state in AIRBORNE:
-            self._set(FlyingState.LANDING)
+            self.flying_state = FlyingState.LANDING
 
     def emergency(self) -> None:
         """Cut the motors."""
         self._rest()
-        self._set(FlyingState.EMERGENCY)
+        self.flying_state = FlyingState.EMERGENCY
 
     def pilot(self, piloting: Piloting) -> None:
         """Take a piloting command, which holds until the next one or its time is up."""
@@ -261,10 +259,7 @@ class MamboFirmware:
                 # It stands on the floor instead of sinking into it.
                 self._rest()
                 if self.flying_state == FlyingState.LANDING:
-                    self._set(FlyingState.LANDED)
-        if self.percent != self._percent:
-            self._percent = self.percent
-            self.on_change()
+                    self.flying_state = FlyingState.LANDED
 
     @property
     def _critical(self) -> bool:
@@ -277,12 +272,12 @@ class MamboFirmware:
             return
         silent = self.time - self._heard_at > settings.landing_timeout
         if (silent and settings.lost_link == 'land') or self._critical:
-            self._set(FlyingState.LANDING)
+            self.flying_state = FlyingState.LANDING
         elif state != FlyingState.TAKING_OFF:
             moves = any(self._current())
-            self._set(FlyingState.FLYING if moves else FlyingState.HOVERING)
+            self.flying_state = FlyingState.FLYING if moves else FlyingState.HOVERING
         elif self.height >= settings.take_off_height:
-            self._set(FlyingState.HOVERING)
+            self.flying_state = FlyingState.HOVERING
 
     def _current(self) -> Piloting:
         piloted = self._piloted
@@ -304,8 +299,3 @@ class MamboFirmware:
 
     def _rest(self) -> None:
         self.body.rest_at(Pose.from_yaw([*self.body.position[:2], self.floor], self.body.yaw))
-
-    def _set(self, state: FlyingState) -> None:
-        if state != self.flying_state:
-            self.flying_state = state
-            self.on_change()
