@@ -119,9 +119,9 @@ def _unseen(
 def _misses(measured: Measurements, first: int, places: FloatArray) -> FloatArray:
     """Return the product of 1 - pi of planned measurements from `first` on, at places, (G, L)."""
     out = np.ones((measured.own.shape[0], places.shape[1]))
-    until = np.full(places.shape[1], NEVER)
+    until, at = np.full(places.shape[1], NEVER), (places[0], places[1], places[2])
     for g in range(out.shape[0]):
-        apply_misses(places, until, out[g], measured, g, first, measured.own[g])
+        apply_misses(at, until, out[g], measured, g, first, measured.own[g])
     return out
 
 

@@ -35,7 +35,7 @@ class CandidateTable(NamedTuple):
     terms: Terms
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def candidate_value(table: CandidateTable, g: int, chosen: IntArray) -> tuple[float, float, float]:
     """Return T, E and J (17), (26) of g, given the others' choices (R,), -1 for none."""
     # Chosen candidates whose measurements g gets no credit for.

@@ -6,7 +6,12 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_planner.objective.predicted_measurements import Measurements, apply_misses, chances
+from maasi_planner.objective.predicted_measurements import (
+    Measurements,
+    Places,
+    apply_misses,
+    chances,
+)
 from maasi_planner.objective.terms import CACHE_ROWS, Terms
 
 Grid = tuple[FloatArray, FloatArray, FloatArray]
@@ -20,10 +25,8 @@ def _cell(position: float, lower: float, step: float, nodes: int) -> tuple[int, 
     return cell, u - cell
 
 
-@njit(cache=True)
-def _nodes_around(
-    at: FloatArray, grid: Grid, number: int, value: FloatArray, place: FloatArray
-) -> int:
+@njit(cache=True, forceinline=True)
+def _nodes_around(at: FloatArray, grid: Grid, number: int, value: FloatArray, place: Places) -> int:
     """Add the nodes around a place with their weight times e, if above 0; return the new number."""
     values, lower, step = grid
     depth = 2 if values.shape[2] > 1 else 1
@@ -39,9 +42,9 @@ def _nodes_around(
                 weight = weight * (w if k > k0 else 1.0 - w) * values[i, j, k]
                 if weight > 0.0:
                     value[number] = weight
-                    place[0, number] = lower[0] + i * step[0]
-                    place[1, number] = lower[1] + j * step[1]
-                    place[2, number] = lower[2] + k * step[2] if depth == 2 else 0.0
+                    place[0][number] = lower[0] + i * step[0]
+                    place[1][number] = lower[1] + j * step[1]
+                    place[2][number] = lower[2] + k * step[2] if depth == 2 else 0.0
                     number += 1
     return number
 
@@ -58,15 +61,16 @@ def _unseen_nodes(
     total, most = planned.own.shape[0], 8 * max(planned.own) if planned.own.shape[0] else 0
     count = np.zeros(total, np.int64)
     value, time = np.empty((total, most)), np.empty((total, most), np.int64)
-    place = np.empty((total, 3, most))
+    place = np.empty((3, total, most))
     for g in range(total):
-        number, worth, at, when = 0, value[g], place[g], time[g]
+        number, worth, when = 0, value[g], time[g]
+        at = place[0, g], place[1, g], place[2, g]
         for e in range(first, planned.own[g]):
             before = number
             number = _nodes_around(planned.places[g, e], grid, number, worth, at)
             when[before:number] = planned.times[g, e]
         count[g] = number
-        worth, at, when, left = worth[:number], at[:, :number], when[:number], np.ones(number)
+        worth, when, left = worth[:number], when[:number], np.ones(number)
         until = when if own_counts else when - 1
         apply_misses(at, until, left, planned, g, 0, planned.own[g])
         worth *= left

@@ -23,6 +23,8 @@ from maasi_planner.team import RobotView
 
 # After every measurement [steps].
 NEVER = 1 << 60
+# x, y and z (n,) [m]: each on its own, so that loops over them become vector instructions.
+Places = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class Measurements(NamedTuple):
@@ -182,7 +184,7 @@ def reach_of(detection: DetectionModel) -> float:
 
 @njit(cache=True)
 def apply_misses(
-    places: FloatArray,
+    places: Places,
     until: IntArray,
     left: FloatArray,
     measured: Measurements,
@@ -190,7 +192,7 @@ def apply_misses(
     first: int,
     last: int,
 ) -> None:
-    """Multiply left (n,) at places (3, n) by 1 - pi of measurements of trajectory g.
+    """Multiply left (n,) at places by 1 - pi of measurements of trajectory g.
 
     At a place those from `first` to before `last` count that are taken by its time in `until` (n,),
     which does not decrease.
@@ -210,16 +212,16 @@ def apply_misses(
         cosine, sine = measured.turns[g, e]
         if reach < np.inf:
             for i in range(begin, number):
-                dx, dy = places[0, i] - x0, places[1, i] - y0
+                dx, dy = places[0][i] - x0, places[1][i] - y0
                 if left[i] > 0.0 and abs(dx) <= reach and abs(dy) <= reach:
                     left[i] *= 1.0 - detection_probability_at(
-                        kind, parameters, dx, dy, places[2, i] - z0, cosine, sine
+                        kind, parameters, dx, dy, places[2][i] - z0, cosine, sine
                     )
             continue
         # Slices: an index that might be negative keeps loops from becoming vector instructions.
         width = number - begin
         x, y, z, chance = room[0, :width], room[1, :width], room[2, :width], room[3, :width]
-        px, py, pz, after = places[0, begin:], places[1, begin:], places[2, begin:], left[begin:]
+        px, py, pz, after = places[0][begin:], places[1][begin:], places[2][begin:], left[begin:]
         for i in range(width):
             x[i] = px[i] - x0
             y[i] = py[i] - y0

@@ -20,7 +20,7 @@ class Terms(NamedTuple):
 
     E is what others leave of value (G, n), of which filled[g] numbers are used: their product with
     what each other candidate leaves. That is row slot (G, G) of cache (S, n), or where that is
-    negative comes from its measurements until time (G, n) [steps from now] at place (G, 3, n) [m],
+    negative comes from its measurements until time (G, n) [steps from now] at place (3, G, n) [m],
     and is kept, as the search needs it many times; used (1,) counts rows.
 
     T is refinement (G,), and of C clusters with mass (C,) and covariance (C, d, d) the information
@@ -32,7 +32,7 @@ class Terms(NamedTuple):
     value: FloatArray
     slot: IntArray
     cache: FloatArray
-    place: FloatArray = np.zeros((0, 3, 0))
+    place: FloatArray = np.zeros((3, 0, 0))
     time: IntArray = np.zeros((0, 0), np.int64)
     used: IntArray = np.zeros(1, np.int64)
     mass: FloatArray = np.zeros(0)
@@ -48,8 +48,9 @@ def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArr
     if slot >= 0:
         return terms.cache[slot, :count]
     out = np.ones(count)
-    until, number = terms.time[g, :count], planned.number[other]
-    apply_misses(terms.place[g, :, :count], until, out, planned, other, 0, number)
+    until, number, place = terms.time[g, :count], planned.number[other], terms.place
+    at = place[0, g, :count], place[1, g, :count], place[2, g, :count]
+    apply_misses(at, until, out, planned, other, 0, number)
     if terms.used[0] < terms.cache.shape[0]:
         terms.cache[terms.used[0], :count] = out
         terms.slot[g, other] = terms.used[0]
@@ -57,7 +58,7 @@ def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArr
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def exploration_given(terms: Terms, planned: Measurements, g: int, others: IntArray) -> float:
     """Return E of candidate g, given others that count before it."""
     left = terms.value[g, : terms.filled[g]].copy()
@@ -85,7 +86,7 @@ def _log_det(matrix: FloatArray) -> float:
     return math.log(max(det, 1.0))
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def refinement_given(terms: Terms, g: int, others: IntArray) -> float:
     """Return T of candidate g, given the candidates `others` that count before it."""
     total = terms.refinement[g]
