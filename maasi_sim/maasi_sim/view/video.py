@@ -249,8 +249,8 @@ def _draw_robot(
         if size == 3:
             draw_box(axes, np.array(robot['fence']), colour, 0.05, '')
         else:
-            style = {'fill': False, 'ec': colour, 'ls': '-.', 'lw': 0.9, 'alpha': 0.7}
-            axes.add_patch(Rectangle((left, low), right - left, high - low, **style))
+            line: Any = {'fill': False, 'ec': colour, 'ls': '-.', 'lw': 0.9, 'alpha': 0.7}
+            axes.add_patch(Rectangle((left, low), right - left, high - low, **line))
 
 
 def _arrow(yaw: float) -> Outline:
