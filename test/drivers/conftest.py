@@ -76,12 +76,10 @@ def make_team(context, executor):
 
 @pytest.fixture
 def team(make_team):
-    """Return the team around a TurtleBot."""
     return make_team()
 
 
 def begin(node):
-    """Have a node of a life cycle begin its work."""
     assert node.trigger_configure().name == 'SUCCESS'
     assert node.trigger_activate().name == 'SUCCESS'
     return node
@@ -89,7 +87,6 @@ def begin(node):
 
 @pytest.fixture
 def start_guard(start_node):
-    """Return a function that starts the guard of the robot."""
     return lambda lockstep=False: begin(
         start_node(GuardNode, parameter_overrides=[Parameter('lockstep', value=lockstep)])
     )
@@ -97,11 +94,7 @@ def start_guard(start_node):
 
 @pytest.fixture
 def play(start_node, make_team):
-    """
-    Return a function that starts a driver in this process, and the team around it.
-
-    Its kind: a name in KINDS, or class and settings.
-    """
+    """Return a function that starts a driver, by a name in KINDS or by class and settings."""
 
     def start(kind='turtlebot', wants=None, deaf=False, **changes):
         made, settings = KINDS[kind] if isinstance(kind, str) else kind

@@ -142,7 +142,6 @@ class Team(Node):
         return message
 
     def say(self):
-        """Publish the odometry of the next step, and whatever comes of it."""
         self.step += 1
         self.odometry.publish(self.odometry_message())
 
@@ -190,7 +189,6 @@ class Team(Node):
 
     @property
     def place(self):
-        """Where the robot is [m, map]."""
         return self.body.robot_state().pose.position
 
     # ---- what the team says ------------------------------------------------------------------

@@ -121,16 +121,6 @@ def test_who_comes_late_hears_static_frames_and_description(play):
         assert_allclose(buffer.pose(parent, child).position, origin, atol=1e-12)
 
 
-def test_in_lockstep_each_step_has_its_transform(play):
-    _, team = play(lockstep=True)
-    heard = Listener(team)
-    team.until(lambda: team.count_subscribers('/tf') == 1 and team.count_publishers('/tf') == 1)
-    team.move(5)
-    team.until(lambda: len(heard.moving) == 5)
-    stamps = [stamp_from_ros(message.transforms[0].header.stamp) for message in heard.moving]
-    assert stamps == [k * NANOSECONDS for k in range(5)]
-
-
 def test_with_rate_0_others_publish_the_frames(play):
     _, team = play(tf_rate=0.0)
     team.move(2)

@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from maasi_drivers.agent.odometry import MapOdometry
 from maasi_drivers.settings.camera import CameraSettings
-from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings, SensorSettings
 from maasi_planner.motion import RobotState
@@ -160,19 +159,6 @@ def test_an_empty_battery_stops_a_robot_and_brings_a_drone_down():
     assert where[2] == 0.0
     drive(drone, 20, (0.3, 0.0, 0.5, 0.0), first=401)
     assert_array_equal(drone.state.pose.position, where)
-
-
-def test_moving_and_tilting_the_camera_still_shows_them():
-    one = robot()
-    detector = MarkerDetector(one.equipment.camera)
-    errors = []
-    one.command((0.25, 0.1, 0.0, 0.4))
-    for step in range(1, 12):
-        one.step(step, 0.05)
-        seen = detector.detect(one.image(step, 0.05 * step), one.state.pose)
-        errors += list(np.linalg.norm(seen.positions - [1.1, 1.05], axis=1))
-    assert len(errors) >= 10
-    assert max(errors) < 0.003
 
 
 def test_a_robot_that_follows_is_where_its_leader_is():

@@ -10,7 +10,6 @@ from operator import attrgetter
 import numpy as np
 import pytest
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
@@ -107,7 +106,6 @@ class Member(Node):
 
     @property
     def places(self):
-        """Where its odometry says that it was, in each message [m]."""
         return [message.pose.pose.position.x for message in self.of('odom')]
 
     def say_ready(self):
@@ -262,20 +260,6 @@ def test_every_topic_comes_at_its_rate_with_the_stamps_of_the_steps(make_team):
     first, *markers = team.filter.seen['/ground_truth/markers'][0].markers
     assert first.action == Marker.DELETEALL
     assert [marker.ns for marker in markers] == ['truth', 'truth', 'obstacles']
-
-
-def test_its_diagnostics_are_stamped_with_the_time_that_it_publishes(make_team):
-    team = make_team()
-    team.filter.listen('/diagnostics', DiagnosticArray, 10)
-    shown = team.filter.seen['/diagnostics']
-    team.spin_until(lambda: shown)
-    assert seconds(shown[0].header.stamp) == 0.0
-    team.say_ready()
-    team.run(2)
-    count = len(shown)
-    team.spin_until(lambda: len(shown) > count + 1)
-    # The filter may not have been told of the last step.
-    assert 0.0 < seconds(shown[-1].header.stamp) < seconds(team.filter.steps[-1].stamp) + 1.5 * STEP
 
 
 def test_nothing_is_published_until_everybody_is_there(make_team, monkeypatch):
