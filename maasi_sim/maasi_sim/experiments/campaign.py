@@ -22,10 +22,18 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from maasi_sim.arguments import count
-from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Results, Run
+from maasi_sim.experiments.experiment import (
+    Case,
+    Experiment,
+    Outcome,
+    Results,
+    Run,
+    WrongInput,
+)
 from maasi_sim.experiments.runs import DamagedRun, NoRoom, load_run, run_of, to_text, write_file
 from maasi_sim.machine import code_digest, machine_difference, this_machine
 from maasi_sim.run.progress import ProgressDisplay
+from maasi_sim.scenario.layering import ScenarioError
 
 Item = TypeVar('Item')
 
@@ -38,16 +46,13 @@ EXIT_CODES = (
 PATIENCE = 20.0
 # One thread for each worker; the number of workers sets the load.
 _ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS')
+_MIXED = '--mixed-workers allows it'
 # Wall time between two lines of progress without a terminal [s].
 _QUIET_PERIOD = 10.0
 
 
 class WorkersLost(RuntimeError):
     """The workers are lost; their finished runs are kept."""
-
-
-class MixedWorkers(ValueError):
-    """Processors or versions differ, and mixing was not requested."""
 
 
 @dataclass
@@ -250,18 +255,18 @@ def plan(
 
 
 def one_machine(workers: Workers, campaigns: Sequence[Campaign]) -> dict[str, str]:
-    """Return the machine that all workers and stored runs have in common; raise MixedWorkers."""
+    """Return the machine that all workers and stored runs have in common; raise WrongInput."""
     first, machine = next(iter(workers.machines.items()))
     for name, other in workers.machines.items():
         difference = machine_difference(machine, other)
         if difference:
-            raise MixedWorkers(f'worker {name} differs from worker {first}: {difference}')
+            raise WrongInput(f'worker {name} differs from worker {first}: {difference}; {_MIXED}')
     for work in campaigns:
         for (case, number), run in work.done.items() if work.tasks else ():
             difference = machine_difference(machine, run.machine)
             if difference:
                 file = work.file(case, number)
-                raise MixedWorkers(f'{file} was made on another machine: {difference}')
+                raise WrongInput(f'{file} was made on another machine: {difference}; {_MIXED}')
     return machine
 
 
@@ -283,7 +288,7 @@ def add_worker_options(parser: argparse.ArgumentParser, cluster: str) -> None:
     )
 
 
-def run_command(command: Callable[[], int], *wrong_input: type[Exception]) -> int:
+def run_command(command: Callable[[], int]) -> int:
     """Run a command that can be interrupted, and return its exit code; errors are printed."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -293,10 +298,8 @@ def run_command(command: Callable[[], int], *wrong_input: type[Exception]) -> in
     signal.signal(signal.SIGINT, interrupt)
     try:
         return command()
-    except wrong_input as error:
+    except (WrongInput, ScenarioError) as error:
         text, code = str(error), WRONG_INPUT
-    except MixedWorkers as error:
-        text, code = f'{error}; --mixed-workers allows it', WRONG_INPUT
     except (NoRoom, WorkersLost) as error:
         text, code = f'{error}; the runs until now are kept', STOPPED
     except KeyboardInterrupt:

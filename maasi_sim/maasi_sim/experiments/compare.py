@@ -21,17 +21,13 @@ from maasi_sim.experiments.campaign import (
     plan,
     run_command,
 )
+from maasi_sim.experiments.experiment import WrongInput
 from maasi_sim.experiments.figures import as_png, draw_comparison
 from maasi_sim.experiments.runs import runs_text, write_file
 from maasi_sim.experiments.searches import compared
 from maasi_sim.experiments.tables import SearchTable, compared_facts, compared_page, compared_text
-from maasi_sim.scenario.layering import ScenarioError
 
 _RUNS = Path('runs')
-
-
-class WrongRequest(ValueError):
-    """An invalid request."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -99,7 +95,7 @@ def _seed(text: str) -> int:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     options = build_parser().parse_args(arguments)
-    return run_command(lambda: compare(options), ScenarioError, WrongRequest)
+    return run_command(lambda: compare(options))
 
 
 def compare(options: argparse.Namespace) -> int:
@@ -110,7 +106,7 @@ def compare(options: argparse.Namespace) -> int:
     ]
     names = [item.name for item in comparisons]
     if len(set(names)) < len(names):
-        raise WrongRequest(f'SCENARIO: read {", ".join(names)}, allowed are different names')
+        raise WrongInput(f'SCENARIO: read {", ".join(names)}, allowed are different names')
     wanted = {
         'first_seed': options.first_seed,
         'seeds': options.seeds,
@@ -165,7 +161,7 @@ def _refuse_others(campaigns: Sequence[Campaign], out: Path) -> None:
         for file in (work.file(task.case.name, task.number) for task in work.tasks)
     )
     if other:
-        raise WrongRequest(
+        raise WrongInput(
             f'--out: {out}: {other} searches there are of other settings, or of another version '
             'of the code; allowed is another folder, or --again to repeat them'
         )

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+class WrongInput(ValueError):
+    """What was asked for is unknown, or does not fit what is there."""
+
+
 @dataclass(frozen=True)
 class OpenPoint:
     """Something that the paper leaves open, the value taken here, and the reason."""

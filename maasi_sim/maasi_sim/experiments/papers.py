@@ -17,7 +17,14 @@ from typing import Any
 import yaml
 
 from maasi_sim.experiments import buildings, figures, searches
-from maasi_sim.experiments.experiment import Case, Comparison, Experiment, OpenPoint, Published
+from maasi_sim.experiments.experiment import (
+    Case,
+    Comparison,
+    Experiment,
+    OpenPoint,
+    Published,
+    WrongInput,
+)
 from maasi_sim.experiments.searches import merged, search_case
 
 QUANTITIES = {item.name: item for item in (*searches.QUANTITIES, *buildings.QUANTITIES)}
@@ -44,10 +51,6 @@ PAPERS = ('000', '001', '002', '003', '004')
 _FOLDER = Path(__file__).with_name('papers')
 
 
-class UnknownExperiment(ValueError):
-    """There is no experiment of this name."""
-
-
 def experiments() -> dict[str, Experiment]:
     """Return all experiments by name, in the order of the papers."""
     return {item.name: item for number in PAPERS for item in paper_experiments(number)}
@@ -62,7 +65,7 @@ def find(name: str) -> Experiment:
         item for item in known if item[:3] == name[:3]
     ]
     hint = f'; nearest are {", ".join(near)}' if near else ''
-    raise UnknownExperiment(f"unknown experiment '{name}'{hint}; --list names all")
+    raise WrongInput(f"unknown experiment '{name}'{hint}; --list names all")
 
 
 @cache

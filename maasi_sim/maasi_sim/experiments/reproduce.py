@@ -18,13 +18,9 @@ from maasi_sim.experiments.campaign import (
     plan,
     run_command,
 )
-from maasi_sim.experiments.experiment import Experiment
+from maasi_sim.experiments.experiment import Experiment, WrongInput
 from maasi_sim.experiments.outputs import write_document, write_outputs
-from maasi_sim.experiments.papers import UnknownExperiment, experiments, find
-
-
-class UnknownCase(ValueError):
-    """There is no case of this name."""
+from maasi_sim.experiments.papers import experiments, find
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -76,7 +72,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not (options.names or options.list or options.document):
         parser.error('give names of experiments, --list, or --document FILE')
-    return run_command(lambda: _reproduce(options), UnknownExperiment, UnknownCase)
+    return run_command(lambda: _reproduce(options))
 
 
 def _reproduce(options: argparse.Namespace) -> int:
@@ -91,7 +87,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     for name in options.case or []:
         if name not in known:
             allowed = ', '.join(sorted(known))
-            raise UnknownCase(f"unknown case '{name}'; allowed are {allowed}")
+            raise WrongInput(f"unknown case '{name}'; allowed are {allowed}")
     problems = _run(wanted, options) if wanted else []
     if options.document is not None:
         shown = write_document(options.document, options.out, options.seed, options.small)
