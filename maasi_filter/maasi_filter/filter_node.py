@@ -169,7 +169,12 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         settings = self.settings
         try:
             saved, progress = load_state(file)
-            self._check_bounds(saved)
+            bounds = settings.environment.array()
+            if not np.array_equal(saved.bounds, bounds):
+                raise SettingsError(
+                    f'{file}: bounds: got {saved.bounds.tolist()}, allowed are those of the '
+                    f'environment, {bounds.tolist()}'
+                )
         except (StateFileError, SettingsError) as error:
             if not settings.save_batches:
                 raise SettingsError(f'parameter save_file: {error}') from None
@@ -193,14 +198,6 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self.get_logger().warning(
             f'restarted after batch {progress.batch} with {found}, from {file}'
         )
-
-    def _check_bounds(self, saved: SearchFilter) -> None:
-        bounds = self.settings.environment.array()
-        if not np.array_equal(saved.bounds, bounds):
-            raise SettingsError(
-                f'{self.settings.save_file}: bounds: got {saved.bounds.tolist()}, allowed are '
-                f'those of the environment, {bounds.tolist()}'
-            )
 
     def set_up(self) -> None:
         """Compile and connect."""

@@ -95,7 +95,7 @@ def _walk(
         if by_name is not None:
             yield ParameterField(full, place, info)
             for item in given.get(full) or []:
-                inner = f'{_robot(full)}.{item}'
+                inner = f'{full.removesuffix("s")}.{item}'
                 yield ParameterField(inner, (*place, item), info, part=True)
                 yield from _walk(by_name, given, f'{inner}.', (*place, item))
         elif nested is None:
@@ -121,7 +121,7 @@ def flatten(settings: BaseModel, prefix: str = '') -> dict[str, ParameterValue]:
             if value:
                 flat[key] = sorted(value)
             for item in sorted(value):
-                flat.update(flatten(value[item], f'{_robot(key)}.{item}.'))
+                flat.update(flatten(value[item], f'{key.removesuffix("s")}.{item}.'))
         elif not isinstance(value, (list, tuple)):
             flat[key] = value
         elif len(value):
@@ -193,9 +193,9 @@ def _from_list(key: str, value: Sequence[Any], annotation: Any) -> list[Any]:
 
 
 def _from_text(key: str, item: Any, annotation: Any) -> Any:
-    element = _element(annotation)
+    element = _argument(annotation, list)
     model = _nested(element)
-    if not isinstance(item, str) or (model is None and _element(element) is None):
+    if not isinstance(item, str) or (model is None and _argument(element, list) is None):
         return item
     try:
         numbers = [float(word) for word in item.split()]
@@ -226,23 +226,14 @@ def _argument(annotation: Any, kind: type) -> Any:
     return found[0] if found else None
 
 
-def _element(annotation: Any) -> Any:
-    return _argument(annotation, list)
-
-
 def _width(annotation: Any) -> int | None:
     """Return the length of the lists in a list, if it is fixed."""
-    element = _element(annotation)
-    if _element(element) is None:
+    element = _argument(annotation, list)
+    if _argument(element, list) is None:
         return None
     parts = FieldInfo.from_annotation(element).metadata
     lengths = [getattr(part, 'min_length', getattr(part, 'max_length', None)) for part in parts]
     return lengths[0] if len(lengths) == 2 and lengths[0] == lengths[1] else None
-
-
-def _robot(robots: str) -> str:
-    """Return the prefix of the parameters of one item of a table."""
-    return robots.removesuffix('s')
 
 
 def _nested(annotation: Any) -> type[BaseModel] | None:

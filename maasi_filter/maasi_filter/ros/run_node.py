@@ -56,14 +56,6 @@ def executor_of(node: Node, context: Context | None = None) -> Executor:
 _SIGNAL_PERIOD = 0.1
 
 
-def _configure(node: LockstepLifecycleNode[Any]) -> bool:
-    """Configure a node; return whether it is configured."""
-    done = node.trigger_configure() == TransitionCallbackReturn.SUCCESS
-    if not done:
-        print(f'error: {node.problem}', file=sys.stderr)
-    return done
-
-
 def _print_help(text: str) -> None:
     try:
         print(text, flush=True)
@@ -106,7 +98,8 @@ def run(
         node = make_node()
         executor = executor_of(node)
         if node.get_parameter('autostart').value and not asked:
-            if not _configure(node):
+            if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+                print(f'error: {node.problem}', file=sys.stderr)
                 return 2 if node.problem else 1
             if not asked and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
                 return 1
