@@ -1,9 +1,6 @@
 """The executor of a node: nothing that comes is left lying, and an error ends the node."""
 
 import pytest
-from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import Parameter, ParameterValue
-from rcl_interfaces.srv import GetParameterTypes, SetParameters
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -100,32 +97,4 @@ def test_an_endpoint_that_does_not_fit_is_named(pair, monkeypatch):
     wait_until(lambda: node._unconnected.look() == expected)
     pair.talker.destroy_subscription(odd)
     wait_until(lambda: node._unconnected.look() == expected[1:])
-    node.destroy_node()
-
-
-def test_requests_on_which_rclpy_raises_are_answered_and_counted(pair):
-    """An undeclared parameter, a value of an unknown type, no such transition."""
-    node = LockstepLifecycleNode('searcher', NodeSettings, context=pair.talker.context)
-    executor = executor_of(node, node.context)
-
-    def ask(kind, service, request):
-        client = pair.talker.create_client(kind, f'searcher/{service}')
-        pair.until(client.service_is_ready, executor=executor)
-        answer = client.call_async(request)
-        pair.until(answer.done, executor=executor)
-        return answer.result()
-
-    types = GetParameterTypes.Request(names=['nothing'])
-    value = Parameter(name='seed', value=ParameterValue(type=77))
-    transition = ChangeState.Request()
-    transition.transition.id = 200
-    ask(GetParameterTypes, 'get_parameter_types', types)
-    ask(SetParameters, 'set_parameters', SetParameters.Request(parameters=[value]))
-    assert not ask(ChangeState, 'change_state', transition).success
-    assert node.dropped['bad request'] == 3
-    # Good ones are answered as before.
-    types.names = ['use_sim_time']
-    assert list(ask(GetParameterTypes, 'get_parameter_types', types).types) == [1]
-    assert node.dropped['bad request'] == 3
-    executor.shutdown()
     node.destroy_node()

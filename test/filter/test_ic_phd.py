@@ -105,6 +105,17 @@ def test_seeing_nothing_lowers_mass_and_exploration_by_what_was_missed():
     )
 
 
+def test_births_of_a_robot_count_what_the_robots_before_it_missed():
+    sensor, here, values = cube_sensor(), [100.0] * 3, [[20.0, 0.3, 0.1]]
+    # So much that the mass of births is in proportion to their intensity.
+    sensor.clutter = 1.0
+    own, other = drone(values, here, 'b', sensor), drone(np.empty((0, 3)), here, 'a', sensor)
+    alone, second = (cube_search().step(members, 1, 0.0) for members in ([own], [other, own]))
+    place = sensor.measurement.inverse(values, Pose(here))
+    missed = 1.0 - sensor.detection.probability(place, Pose(here))[0]
+    assert second.expected_number == pytest.approx(missed * alone.expected_number, rel=0.05)
+
+
 def test_nobody_measuring_changes_nothing_but_survival():
     search = cube_search(survival_probability=0.9)
     search.step([drone([[20.0, 0.3, 0.1]])], 1, 0.0)

@@ -44,22 +44,6 @@ def test_targets_closer_than_the_noise_are_told_apart_by_identity():
         assert found[name].label.score == pytest.approx(1.0)
 
 
-def test_a_detection_far_from_the_target_of_its_identity_is_taken_as_clutter():
-    search = play(plane_filter(found_radius=1.0), pair_scans(60))
-    before = [target.position.copy() for target in search.found_targets]
-    pose = Pose([20.0, 20.0, 0.0])
-    sensor, labels = plane_sensor(), [Label(identity='left')]
-    for step in range(5):
-        misread = AgentMeasurement(
-            'robot', pose, sensor, np.array([[10.0, 0.3]]), None, step, labels=labels
-        )
-        search.step([misread], 1, 100.0 + step)
-    assert len(search.found_targets) == 2
-    assert not any(item.labels.identity == 'left' for item in search.components if not item.target)
-    for target, place in zip(search.found_targets, before):
-        assert np.linalg.norm(target.position - place) < 0.5
-
-
 def test_the_papers_filter_reports_the_label_of_the_nearest_detection():
     generator = np.random.default_rng(3)
     sensor = floor_sensor()
