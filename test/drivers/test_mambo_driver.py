@@ -186,20 +186,6 @@ def test_what_is_waited_for_is_short_enough():
     assert firmware.command_timeout <= LATEST
 
 
-def test_what_is_lost_has_it_hover_then_land(fly):
-    flight = fly()
-    _, result = flight.on_its_way()
-    flight.drone.cut()
-    reason = 'link lost: nothing from the Mambo for'
-    flight.gives_up(result, reason)
-    flight.until_it_is(FlyingState.LANDED)
-    # The drone may have landed by itself before its driver gives up.
-    flight.until(lambda: flight.reason.startswith((f'landing: {reason}', f'landed: {reason}')))
-    flight.drone.cut(False)
-    flight.until(lambda: flight.reason.startswith(f'landed: {reason}'))
-    assert flight.drone.firmware.take_offs == 1
-
-
 @pytest.mark.parametrize('lost_link', ['hover', 'land'])
 def test_it_flies_without_sensor_stamps_and_notices_a_lost_link(fly, monkeypatch, lost_link):
     drone = BluetoothMambo(monkeypatch, firmware(lost_link))

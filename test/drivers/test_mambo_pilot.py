@@ -85,14 +85,18 @@ def test_it_stays_inside_the_field_with_what_the_measuring_flight_says(drag, del
     assert flown.way <= 1.1 * flown.straight
 
 
-def test_a_velocity_that_cannot_be_stopped_before_the_geofence_is_not_flown():
+@pytest.mark.parametrize(('end', 'speed'), [(2.5, 0.8), (14.0, 3.0)])
+def test_a_velocity_that_cannot_be_stopped_before_the_geofence_is_not_flown(end, speed):
     flight = Flight(drag=0.3, firmware_delay=0.3, delay=0.4).up()
+    flight.pilot.fence = FENCE.copy()
+    flight.pilot.fence[0, 1] = end
     for _ in range(400):
         flight.step()
         # Along the map's x axis.
-        flight.pilot.fly(np.array([0.8 * math.cos(HOME.yaw), -0.8 * math.sin(HOME.yaw), 0.0, 0.0]))
-        assert flight.where[0] < FENCE[0, 1] + 0.02
-    assert flight.where[0] > 2.3 and flight.pilot.phase is Phase.FLYING
+        along = speed * np.array([math.cos(HOME.yaw), -math.sin(HOME.yaw), 0.0, 0.0])
+        flight.pilot.fly(along)
+        assert flight.where[0] < end + 0.02
+    assert flight.where[0] > end - 0.2 and flight.pilot.phase is Phase.FLYING
 
 
 @pytest.mark.parametrize('pose', ['events', 'pose'])
@@ -298,7 +302,6 @@ def test_a_permission_ends_with_the_link():
     assert flight.pilot.phase is Phase.GROUND
     flight.cut_down = True
     flight.step(60)
-    assert 'link lost' in flight.pilot.permit(flight.time)
     flight.cut_down = False
     flight.step(20)
     state = flight.firmware.state
@@ -307,6 +310,10 @@ def test_a_permission_ends_with_the_link():
         flight.step()
     assert flight.pilot.phase is Phase.GROUND and UNTIL_ARM in flight.pilot.problem
     assert flight.firmware.take_offs == 0
+    # Nor is there one while it is not heard.
+    flight.cut_down = True
+    flight.step(60)
+    assert 'link lost' in flight.pilot.permit(flight.time)
     flight.connected = False
     other = MamboPilot(flight, flight.motion, flight.pilot.settings, HOME, FENCE)
     assert other.permit(flight.time) == 'connecting to the Mambo'

@@ -67,6 +67,8 @@ def test_it_is_armed_rises_flies_to_a_target_and_stays_there(firmware):
     play.run(4.0)
     assert play.mode in ('GUIDED', 'OFFBOARD') and play.fault == ''
     assert_allclose(play.body.position, [0.0, 0.0, play.height], atol=0.1)
+    # Where nobody turns it, it keeps its heading.
+    assert play.body.yaw == pytest.approx(0.3)
     assert bool(play.commands(TAKE_OFF)) == (firmware == 'arducopter')
     target = np.array([1.0, -2.0, play.height + 0.3])
     play.vehicle.set_target(target, -1.0)
@@ -276,6 +278,15 @@ def test_an_autopilot_that_restarts_in_the_air_is_left_alone():
     assert play.permit() == restarted
 
 
+def test_a_disarmed_vehicle_is_not_armed_by_a_request_without_an_answer():
+    play = Play()
+    play.autopilot._sender.command_ack_send = lambda *_: None
+    play.until(lambda: play.phase is Phase.RISING)
+    play.autopilot.disarm('Disarming motors')
+    play.run(8.0)
+    assert play.phase is Phase.STOPPED and not play.autopilot.armed
+
+
 @firmwares
 def test_nothing_takes_off_before_the_service_is_called(firmware):
     play = Play(firmware, permitted=False)
@@ -413,11 +424,15 @@ def test_a_permission_needs_a_vehicle_that_is_heard_and_ends_with_the_link():
     assert play.permit() == '' and 'no position estimate yet' in play.fault
     play.to_driver.cut = True
     play.run(2.0)
-    assert 'nothing heard' in play.permit()
     play.to_driver.cut = False
     play.run(25.0)
     assert play.fault == NOT_ARMED and not play.commands(ARM)
     play.permitted().fly()
+    play.vehicle.finish('land')
+    play.until(lambda: not play.autopilot.armed)
+    play.to_driver.cut = True
+    play.run(2.0)
+    assert 'nothing heard' in play.permit()
 
 
 def test_two_batteries_are_two():

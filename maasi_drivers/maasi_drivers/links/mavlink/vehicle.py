@@ -407,6 +407,8 @@ class Vehicle:
             self._autopilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 
     def _begin_rising(self, now: float) -> None:
+        # A request to arm without an answer would arm it again after a pilot disarmed it.
+        self._autopilot.commands.clear()
         self._target = self._position()
         if self._firmware.kind == 'copter':
             # On the ground; the barometer may have drifted since the estimator started.
