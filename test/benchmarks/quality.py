@@ -22,7 +22,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from quality_conditions import CONDITIONS, RETURNS, SCENARIOS, SEEDS
+from quality_conditions import CONDITIONS, RETURNS, SCENARIOS, wanted
 from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
@@ -166,14 +166,10 @@ def runs_in(path: Path | None) -> dict[tuple[str, str, int], Run]:
     return kept
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main() -> int:
     """Run the searches and print the table."""
     parser = argparse.ArgumentParser(prog='quality', description=__doc__)
-    parser.add_argument('conditions', nargs='*', help='names, or parts of names; none: all')
     parser.add_argument('--method', nargs='*', choices=METHODS, default=METHODS)
-    parser.add_argument('--seeds', choices=sorted(SEEDS), default='development')
-    parser.add_argument('--runs', type=int, default=20, metavar='N', help='first N of the block')
-    parser.add_argument('--jobs', type=int, default=1, metavar='N', help='processes')
     parser.add_argument(
         '--json',
         type=Path,
@@ -186,25 +182,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         '--stone-soup', action='store_true', help="GOSPA beside Stone Soup's JPDA tracker instead"
     )
-    options = parser.parse_args(arguments)
-    wanted = [
-        name
-        for name in CONDITIONS
-        if not options.conditions
-        or name in options.conditions
-        or any(part in name for part in options.conditions if part not in CONDITIONS)
-    ]
-    if not wanted:
-        parser.error(f'conditions: read {options.conditions}, known are {", ".join(CONDITIONS)}')
-    if not 1 <= options.runs <= len(SEEDS[options.seeds]):
-        parser.error(f'--runs: read {options.runs}, allowed is 1 to {len(SEEDS[options.seeds])}')
-    seeds = SEEDS[options.seeds][: options.runs]
+    options, conditions, seeds = wanted(parser, CONDITIONS, runs=20, jobs=1)
     warm_up()
     if options.stone_soup:
         # Stone Soup takes seconds to import.
         from stone_soup_quality import print_table
 
-        print_table(wanted, seeds, prepared)
+        print_table(conditions, seeds, prepared)
         return 0
     kept = runs_in(options.json)
     print(HEAD, flush=True)
@@ -212,7 +196,7 @@ def main(arguments: list[str] | None = None) -> int:
     # An interrupt is for the parent: it ends the pool.
     ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
     with ProcessPoolExecutor(max(options.jobs, 1), initializer=ignore) as pool:
-        for condition in wanted:
+        for condition in conditions:
             done: dict[str, list[Run]] = {}
             for method in options.method:
                 missing = [seed for seed in seeds if (condition, method, seed) not in kept]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from typing import Any
 
@@ -182,3 +183,26 @@ SCENARIOS = {
     'drone_rov': 'drone_rov',
     'two TurtleBots': 'mambo_turtlebot',
 }
+
+
+def wanted(
+    parser: argparse.ArgumentParser, known: Iterable[str], runs: int, jobs: int
+) -> tuple[argparse.Namespace, list[str], range]:
+    """Parse the command line with what is common; return options, names and seeds."""
+    parser.add_argument('names', nargs='*', help='names, or parts of names; none: all')
+    parser.add_argument('--seeds', choices=sorted(SEEDS), default='development')
+    parser.add_argument('--runs', type=int, default=runs, metavar='N', help='first N of the block')
+    parser.add_argument('--jobs', type=int, default=jobs, metavar='N', help='processes')
+    options = parser.parse_args()
+    parts = [part for part in options.names if part not in known]
+    names = [
+        name
+        for name in known
+        if not options.names or name in options.names or any(part in name for part in parts)
+    ]
+    if not names:
+        parser.error(f'names: read {options.names}, known are {", ".join(known)}')
+    block = SEEDS[options.seeds]
+    if not 1 <= options.runs <= len(block):
+        parser.error(f'--runs: read {options.runs}, allowed is 1 to {len(block)}')
+    return options, names, block[: options.runs]

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from quality_conditions import SEEDS
+from quality_conditions import wanted
 from search_regimes import KINDS, REGIMES, prepared
 
 from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
@@ -43,16 +43,10 @@ def write(path: Path, text: str) -> None:
     path.write_text(f'{before}{BEGIN}\n{text}{END}{after}', encoding='utf-8')
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main() -> int:
     """Run the searches and print the tables."""
     parser = argparse.ArgumentParser(prog='search_quality', description=__doc__)
-    parser.add_argument('regimes', nargs='*', help='parts of their names; none: all of them')
     parser.add_argument('--planner', nargs='*', choices=tuple(KINDS), default=list(KINDS))
-    parser.add_argument('--seeds', choices=sorted(SEEDS), default='development')
-    parser.add_argument('--runs', type=int, default=16, metavar='N', help='first N of the block')
-    parser.add_argument(
-        '--jobs', type=int, default=os.cpu_count(), metavar='N', help='processes, default: cores'
-    )
     parser.add_argument(
         '--out',
         type=Path,
@@ -61,25 +55,15 @@ def main(arguments: list[str] | None = None) -> int:
         help='folder of the runs; those there are kept',
     )
     parser.add_argument('--document', type=Path, metavar='FILE', help='write the tables into it')
-    options = parser.parse_args(arguments)
-    wanted = [
-        name
-        for name in REGIMES
-        if not options.regimes or any(part in name for part in options.regimes)
-    ]
-    block = SEEDS[options.seeds]
-    if not wanted:
-        parser.error(f'regimes: read {options.regimes}, known are {", ".join(REGIMES)}')
-    if not 1 <= options.runs <= len(block):
-        parser.error(f'--runs: read {options.runs}, allowed is 1 to {len(block)}')
+    options, regimes, seeds = wanted(parser, REGIMES, runs=16, jobs=os.cpu_count() or 1)
     plans = [
-        plan(comparison(regime, options.planner), options.out, options.runs, first=block[0])
-        for regime in wanted
+        plan(comparison(regime, options.planner), options.out, len(seeds), first=seeds[0])
+        for regime in regimes
     ]
     problems = carry_out_all(plans, max(options.jobs, 1))
     text = '\n'.join(
         f'**{name}** (limit {REGIMES[name].limit:g} s)\n\n{SearchTable(work.results()).markdown()}'
-        for name, work in zip(wanted, plans)
+        for name, work in zip(regimes, plans)
     )
     head = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer for slow planners).\n'
     print(f'{head}\n{text}')

@@ -56,12 +56,13 @@ def test_every_regime_has_every_planner(regime):
     assert cases[0].name == search_quality.REFERENCE
 
 
-def test_a_regime_is_run_and_its_table_written_between_marks(tmp_path, capsys):
+def test_a_regime_is_run_and_its_table_written_between_marks(tmp_path, capsys, monkeypatch):
     page = tmp_path / 'page.md'
     page.write_text(f'above\n{search_quality.BEGIN}\nold\n{search_quality.END}\nbelow\n')
     arguments = ['one drone', '--planner', 'maasi', '--runs', '1', '--jobs', '1']
     arguments += ['--out', str(tmp_path), '--document', str(page)]
-    assert search_quality.main(arguments) == 0
+    monkeypatch.setattr(sys, 'argv', ['search_quality', *arguments])
+    assert search_quality.main() == 0
     said = capsys.readouterr().out
     assert '**one drone** (limit 400 s)' in said and '| maasi | 1 |' in said
     above, _, rest = page.read_text().partition(f'{search_quality.BEGIN}\n')
