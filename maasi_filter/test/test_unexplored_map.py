@@ -42,13 +42,6 @@ def test_interpolation_is_multilinear_and_clamped(dimension):
     np.testing.assert_allclose(exploration.at(positions), reference(inside), atol=1e-12)
 
 
-def test_a_copy_is_independent():
-    exploration = UnexploredMap(BOUNDS, 12.0)
-    other = exploration.copy()
-    exploration.update(MODEL, Pose([10.0, 10.0, 10.0]))
-    assert (other.values == 1.0).all()
-
-
 @pytest.mark.parametrize(
     ('bounds', 'spacing', 'word'),
     [

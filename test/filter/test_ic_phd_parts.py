@@ -84,41 +84,27 @@ def test_noise_in_space_is_that_of_drawn_measurements(dimension):
 # The corrector.
 
 
-def case(dimension, seed=0, particles=500, detections=4):
-    """Return a sensor, its pose, a cloud with weights, detections, and a background."""
-    generator = np.random.default_rng(seed)
-    root = generator.normal(0.0, 0.1, (dimension, dimension)) + 0.4 * np.eye(dimension)
-    detection = ExponentialDetection(0.9, [10.0] * dimension)
-    sensor = Sensor.ranging('any', detection, root @ root.T)
-    pose = Pose.from_yaw(generator.normal(0.0, 3.0, 3), 0.5)
-    positions = generator.normal(0.0, 10.0, (particles, dimension))
-    weights = generator.random(particles) * 0.01
-    values = sensor.measurement.measure(positions[:detections], pose) + 0.05
-    return sensor, pose, positions, weights, values, np.geomspace(1e-6, 1.0, detections)
-
-
 @pytest.mark.parametrize('detections', [1, 4, 40])
 @pytest.mark.parametrize('dimension', [2, 3])
 def test_the_corrector_is_equation_13(dimension, detections):
     """The factor and C(z) of (13) and (16), summed densely."""
-    parts = case(dimension, particles=5000, detections=detections)
-    sensor, pose, positions, weights, values, background = parts
+    generator = np.random.default_rng(0)
+    root = generator.normal(0.0, 0.1, (dimension, dimension)) + 0.4 * np.eye(dimension)
+    detection = ExponentialDetection(0.9, [10.0] * dimension)
+    sensor = Sensor.ranging('any', detection, root @ root.T)
+    pose = Pose.from_yaw(generator.normal(0.0, 3.0, 3), 0.5)
+    positions = generator.normal(0.0, 10.0, (5000, dimension))
+    weights = generator.random(5000) * 0.01
+    values = sensor.measurement.measure(positions[:detections], pose) + 0.05
+    background = np.geomspace(1e-6, 1.0, detections)
     scan = make_scan(values, sensor, pose)
     factor, normaliser = phd_correct(positions, weights, scan, background)
-    probability = sensor.detection.probability(positions, pose)
+    probability = detection.probability(positions, pose)
     psi = probability * np.exp(log_density(sensor, values, positions, pose))
     expected = background + (psi * weights).sum(axis=1)
     np.testing.assert_allclose(normaliser, expected, rtol=1e-9)
     missed = 1.0 - probability
     np.testing.assert_allclose(factor, missed + (psi / expected[:, None]).sum(axis=0), rtol=1e-9)
-
-
-def test_no_particles_leave_a_detection_to_the_background():
-    sensor, pose, positions, weights, values, background = case(3)
-    scan = make_scan(values, sensor, pose)
-    factor, normaliser = phd_correct(positions[:0], weights[:0], scan, background)
-    assert factor.shape == (0,)
-    np.testing.assert_array_equal(normaliser, background)
 
 
 # Resampling.

@@ -73,11 +73,3 @@ def test_certain_detections_stay_apart():
     np.testing.assert_allclose(found.caused, np.eye(2), atol=1e-6)
     assert np.isfinite(found.missed).all()
     assert (found.missed >= 0.0).all()
-
-
-@pytest.mark.parametrize('shape', [(0, 0), (3, 0), (0, 2)])
-def test_nothing_to_associate(shape):
-    found = associate(np.zeros(shape), np.ones(shape[1]))
-    np.testing.assert_array_equal(found.missed, np.ones(shape[0]))
-    np.testing.assert_array_equal(found.new, np.ones(shape[1]))
-    assert found.caused.shape == shape

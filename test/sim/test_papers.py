@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import yaml
 from distributed import LocalCluster
-from small_field import SMALL_FIELD
 
-from maasi_sim.experiments import reproduce, searches
+from maasi_sim.experiments import reproduce
 from maasi_sim.experiments.campaign import Workers, plan
 from maasi_sim.experiments.outputs import write_outputs
 from maasi_sim.experiments.papers import experiments
@@ -104,54 +103,3 @@ def test_robot_that_leaves_measures_no_more():
     content = {**content, 'events': [leave, back]}
     with pytest.raises(ValueError, match='only leave'):
         experiment.run({'scenario': content, 'most_measurements': 20}, 3)
-
-
-def test_terrain_is_self_affine():
-    # The mean square difference grows with the distance to the power 2 H.
-    heights = searches.self_affine_map(np.random.default_rng(4), 512)
-    assert heights.mean() == pytest.approx(0.0, abs=1e-9)
-    assert heights.std() == pytest.approx(1.0)
-    lags = np.array([2, 4, 8, 16])
-    squares = [((np.roll(heights, lag, 0) - heights) ** 2).mean() for lag in lags]
-    slope = np.polyfit(np.log(lags), np.log(squares), 1)[0]
-    assert slope == pytest.approx(2.0 * searches.HURST, abs=0.15)
-
-
-def test_litter_lies_low_and_high():
-    generator = np.random.default_rng(5)
-    bounds = np.array([[-30.0, 250.0], [-30.0, 250.0]])
-    heights = searches.chunk(generator, 280.0, 57)
-    targets = searches.littered(heights, bounds, 14, 15.0, 10.0, generator)
-    assert targets.shape == (14, 2)
-    assert (targets >= -20.0).all() and (targets <= 240.0).all()
-    index = np.round((targets + 30.0) / 5.0).astype(int)
-    rank = (heights.ravel()[:, None] < heights[index[:, 0], index[:, 1]]).mean(axis=0)
-    assert rank[:7].mean() < 0.25 and rank[7:].mean() > 0.75
-
-
-def test_explored_share_is_that_of_the_planner():
-    # One measurement in the middle of a floor: pi averaged over it.
-    detection = {'kind': 'exponential', 'probability': 0.9, 'size': [0.5, 0.5]}
-    robot = {
-        'start': [1.0, 1.0, 0.0],
-        'sensor': {'period': 1.0, 'detection': detection},
-        'odometry': {'position_noise': 0.0, 'position_drift': 0.0},
-    }
-    change = {
-        'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
-        'step': 1.0,
-        'robots': {'drone': robot},
-    }
-    values = searches.merged(SMALL_FIELD, change) | {
-        'targets': {'count': 0},
-        'stop': 'planner_done',
-    }
-    values['robots']['drone']['candidates'] = {'points': [[1.0, 1.0]]}
-    case = searches.search_case('one', values, 1)
-    outcome = searches.run_exploring(case.settings, 1)
-    axis = np.linspace(0.0, 2.0, 401)
-    distance = np.hypot(axis[:, None] - 1.0, axis[None, :] - 1.0)
-    expected = (0.9 * np.exp(-distance)).mean()
-    assert outcome.summary['measurements'] == 1
-    assert outcome.summary['explored'] == pytest.approx(expected, abs=0.02)
-    assert list(outcome.columns['explored']) == [outcome.summary['explored']]
