@@ -71,9 +71,16 @@ def test_scenario_is_found_again(types, tmp_path):
     text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
     for words in ("seed: '3'", 'durability: transient_local', 'reliability: reliable'):
         assert words in text
-    BagWriter(tmp_path / 'other', types).close()
-    with Bag(tmp_path / 'other') as bag, pytest.raises(BagError, match='holds no scenario'):
-        bag.scenario()
+
+
+def stored(types, folder, kind, message):
+    """Return the message of a bag to which one image was written."""
+    with BagWriter(folder / 'bag', types, images=kind) as writer:
+        writer.add_topic('/image', 'sensor_msgs/msg/Image')
+        writer.write_message('/image', 5, message)
+    with Bag(folder) as bag:
+        (item,) = bag.messages()
+    return item
 
 
 @pytest.mark.parametrize('encoding', ['bgr8', 'rgb8', 'mono8'])
@@ -82,12 +89,8 @@ def test_images_come_back(types, tmp_path, encoding, kind, padding):
     pixels = np.full((24, 32, 3), 120, np.uint8)
     cv2.circle(pixels, (16, 12), 6, (220, 40, 30), -1)
     pixels = pixels[:, :, 0] if encoding == 'mono8' else pixels
-    with BagWriter(tmp_path / 'bag', types, images=kind) as writer:
-        writer.add_topic('/mambo/camera/image_raw', 'sensor_msgs/msg/Image')
-        writer.write_message('/mambo/camera/image_raw', 5, image(types, pixels, encoding, padding))
-    with Bag(tmp_path) as bag:
-        (item,) = bag.messages()
-    assert item.topic == '/mambo/camera/image_raw/compressed'
+    item = stored(types, tmp_path, kind, image(types, pixels, encoding, padding))
+    assert item.topic == '/image/compressed'
     assert item.message.format.startswith(f'{encoding}; {kind}')
     assert item.message.header.stamp.sec == 1
     read = cv2.imdecode(item.message.data, cv2.IMREAD_UNCHANGED)
@@ -100,36 +103,26 @@ def test_images_come_back(types, tmp_path, encoding, kind, padding):
 )
 def test_images_that_cannot_be_compressed_are_stored_as_they_are(types, tmp_path, height, encoding):
     message = image(types, np.zeros((height, 16), np.uint8), encoding)
-    with BagWriter(tmp_path / 'bag', types, images='png') as writer:
-        writer.add_topic('/image', 'sensor_msgs/msg/Image')
-        writer.write_message('/image', 5, message)
-    with Bag(tmp_path) as bag:
-        (item,) = bag.messages()
-    assert item.topic == '/image'
-    assert item.message.encoding == encoding
+    item = stored(types, tmp_path, 'png', message)
+    assert (item.topic, item.message.encoding) == ('/image', encoding)
 
 
-def test_an_existing_folder_is_not_overwritten(types, tmp_path):
+def test_what_cannot_be_written_is_named(types, tmp_path):
     with pytest.raises(BagError, match='exists already'):
         BagWriter(tmp_path, types)
-
-
-def test_unknown_type_and_topic_are_named(types, tmp_path):
-    with BagWriter(tmp_path / 'bag', types) as writer:
-        with pytest.raises(BagError, match='unknown message type other_msgs/msg/Thing'):
-            writer.add_topic('/thing', 'other_msgs/msg/Thing')
-        with pytest.raises(BagError, match='/elsewhere: not announced'):
-            writer.write('/elsewhere', 0, b'')
-
-
-def test_a_write_error_is_raised_not_swallowed(types, tmp_path):
     writer = BagWriter(tmp_path / 'bag', types)
+    with pytest.raises(BagError, match='unknown message type other_msgs/msg/Thing'):
+        writer.add_topic('/thing', 'other_msgs/msg/Thing')
+    with pytest.raises(BagError, match='/elsewhere: not announced'):
+        writer.write('/elsewhere', 0, b'')
+    # An error of the thread is raised, not swallowed.
     writer.add_topic('/image', 'sensor_msgs/msg/Image')
     writer.write('/image', 0, b'no message')
-    with pytest.raises(BagError, match='writing failed'):
-        writer.wait()
-    with pytest.raises(BagError, match='writing failed'):
-        writer.close()
+    for end in (writer.wait, writer.close):
+        with pytest.raises(BagError, match='writing failed'):
+            end()
+    with Bag(tmp_path / 'bag') as bag, pytest.raises(BagError, match='holds no scenario'):
+        bag.scenario()
 
 
 @pytest.mark.parametrize('name', ['missing', 'file', 'empty'])
@@ -172,14 +165,9 @@ def test_a_recording_cut_anywhere_gives_what_is_before_the_cut(whole, tmp_path, 
     assert counts == sorted(counts)
     # The last cuts are within the index.
     assert counts[0] == 0 and counts[-1] == 60 and len(set(counts)) >= 3
-
-
-def test_what_is_damaged_inside_is_said(whole, tmp_path):
-    shutil.copytree(whole, tmp_path / 'bag')
-    file = tmp_path / 'bag' / 'bag.mcap'
-    data = bytearray(file.read_bytes())
-    data[50000:51000] = bytes(1000)
-    file.write_bytes(data)
+    damaged = bytearray(data)
+    damaged[50000:51000] = bytes(1000)
+    (folder / 'bag.mcap').write_bytes(damaged)
     with Bag(tmp_path) as bag, pytest.raises(BagError, match='is damaged'):
         list(bag.messages())
 

@@ -51,10 +51,10 @@ def alive(pid):
         return False
 
 
-def python(tmp_path, code, name='/node', **environment):
+def python(tmp_path, code, name='/node'):
     log = tmp_path / f'{name.strip("/")}.log'
     command = [sys.executable, '-u', '-c', textwrap.dedent(code)]
-    return NodeProcess(name, command, log, environment=environment)
+    return NodeProcess(name, command, log)
 
 
 def started(process):
@@ -96,14 +96,13 @@ def test_output_and_environment_are_its_own(tmp_path, monkeypatch):
             tmp_path,
             """
             import os, sys
-            print(os.environ['ROS_DOMAIN_ID'], os.environ['OF_THE_RUN'], sys.stdin.read() == '')
+            print(os.environ['OF_THE_RUN'], sys.stdin.read() == '')
             print(os.getsid(0) == os.getpid(), file=sys.stderr)
             os.system('echo of a child of the node')
             """,
-            ROS_DOMAIN_ID='44',
         )
     )
-    assert process.last_words().splitlines() == ['44 run True', 'True', 'of a child of the node']
+    assert process.last_words().splitlines() == ['run True', 'True', 'of a child of the node']
 
 
 def test_a_node_that_cannot_be_executed_ends_and_says_why(tmp_path):

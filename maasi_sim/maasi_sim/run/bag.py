@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from time import monotonic
@@ -74,31 +74,21 @@ def topic_qos(reliable: bool = True, latched: bool = False, depth: int = 10) -> 
     )
 
 
-def interface_folder(package: str) -> Path:
-    """Return the folder of a package's `.msg` files, installed or in this repository."""
-    places = [Path(__file__).resolve().parents[3] / package / 'msg']
-    try:
+def load_types() -> Typestore:
+    """Return the message types of Jazzy and of `maasi_msgs`, installed or in this repository."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    folder = Path(__file__).resolve().parents[3] / 'maasi_msgs' / 'msg'
+    with contextlib.suppress(ImportError, LookupError, OSError):
         from ament_index_python.packages import get_package_share_directory
 
-        places.insert(0, Path(get_package_share_directory(package)) / 'msg')
-    except (ImportError, LookupError, OSError):
-        pass
-    for place in places:
-        if place.is_dir():
-            return place
-    raise BagError(f'package {package}: no message definitions in {", ".join(map(str, places))}')
-
-
-def load_types(packages: Collection[str] = ('maasi_msgs',)) -> Typestore:
-    """Return the message types of Jazzy and of `packages`."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for package in packages:
-        types = {}
-        for path in sorted(interface_folder(package).glob('*.msg')):
-            types.update(
-                get_types_from_msg(path.read_text(encoding='utf-8'), f'{package}/msg/{path.stem}')
-            )
-        store.register(types)
+        installed = Path(get_package_share_directory('maasi_msgs')) / 'msg'
+        folder = installed if installed.is_dir() else folder
+    if not folder.is_dir():
+        raise BagError(f'package maasi_msgs: no message definitions in {folder}')
+    types = {}
+    for path in folder.glob('*.msg'):
+        types |= get_types_from_msg(path.read_text('utf-8'), f'maasi_msgs/msg/{path.stem}')
+    store.register(types)
     return store
 
 

@@ -14,7 +14,6 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Mapping
 from multiprocessing import forkserver, resource_tracker, util
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -107,17 +106,15 @@ def _die_with(parent: int) -> None:
         os._exit(1)
 
 
-def node_process(
-    package: str, command: list[str], log: Path, environment: Mapping[str, str]
-) -> BaseProcess:
+def node_process(package: str, command: list[str], log: Path) -> BaseProcess:
     """Return the process of a node with its output in a log, not started yet.
 
     A node of another package than ours is executed. The command is the path of the executable and
-    its arguments, also shown by `ps`; `environment` has all variables.
+    its arguments, also shown by `ps`. It has the environment of this process.
     """
     name = Path(command[0]).name
     script = name if package in _PACKAGES and hasattr(maasi_entry, name) else ''
-    return _context.Process(target=_run, args=(script, command, log, dict(environment)))
+    return _context.Process(target=_run, args=(script, command, log, dict(os.environ)))
 
 
 def _run(script: str, command: list[str], log: Path, environment: dict[str, str]) -> None:

@@ -6,8 +6,8 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -34,14 +34,13 @@ class NodeProcess:
     """A node that runs as a process and cannot outlive this one.
 
     Its log is kept over restarts. A node of a package of this suite inherits what the node server
-    has loaded. The environment is on top of this process's own.
+    has loaded.
     """
 
     name: str
     command: list[str]
     log: Path
     package: str = ''
-    environment: Mapping[str, str] = field(default_factory=dict)
     restarts: int = 0
     _process: BaseProcess | None = None
 
@@ -50,8 +49,7 @@ class NodeProcess:
         # The node itself opens it.
         with contextlib.suppress(OSError):
             self.log.touch()
-        environment = {**os.environ, **self.environment}
-        self._process = node_process(self.package, self.command, self.log, environment)
+        self._process = node_process(self.package, self.command, self.log)
         try:
             start_server()
             self._process.start()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import time
@@ -217,12 +218,8 @@ class ReplayNode:
         rclpy.try_shutdown(context=self.context)
 
 
-class _Interrupted(Exception):
-    """A signal has arrived."""
-
-
-class _FilterError(Exception):
-    """A filter does not answer: text and process."""
+class _Stopped(Exception):
+    """The replay cannot go on: exit code, and what to say."""
 
 
 def differences(recorded: list[Any], found: list[Any]) -> list[str]:
@@ -251,28 +248,21 @@ def replay(
     """
     recording = read_recording(path)
     folder = make_folder(out, '_replay')
-    with Domain(domain_id) as domain:
+    with Domain(domain_id) as domain, contextlib.ExitStack() as ends:
         os.environ.update(domain.environment())
-        processes = [
-            _process(recording.facts, namespace, folder) for namespace in recording.namespaces
-        ]
+        processes = [_process(recording.facts, name, folder) for name in recording.namespaces]
+        ends.callback(stop, processes)
+        for process in processes:
+            process.start()
+        robots = sorted(recording.facts['scenario']['robots'])
+        node = ReplayNode(domain.number, robots, recording.namespaces)
+        ends.callback(node.close)
         try:
-            for process in processes:
-                process.start()
-            robots = sorted(recording.facts['scenario']['robots'])
-            node = ReplayNode(domain.number, robots, recording.namespaces)
-            try:
-                return _feed(node, recording, processes, interrupted)
-            except _Interrupted:
-                return INTERRUPTED
-            except _FilterError as error:
-                text, process = error.args
-                print(f'error: {text}\n--- {process.log}\n{process.last_words()}', file=sys.stderr)
-                return FAILED
-            finally:
-                node.close()
-        finally:
-            stop(processes)
+            return _feed(node, recording, processes, interrupted)
+        except _Stopped as stopped:
+            code, *words = stopped.args
+            print(*words, end='', file=sys.stderr)
+            return int(code)
 
 
 def _process(facts: dict[str, Any], namespace: str, folder: Path) -> NodeProcess:
@@ -295,16 +285,20 @@ def _feed(
 ) -> int:
     first_difference = None
 
+    def fail(text: str, process: NodeProcess) -> None:
+        words = f'error: {text}\n--- {process.log}\n{process.last_words()}\n'
+        raise _Stopped(FAILED, words)
+
     def wait_for(condition: Callable[[], bool], what: str, patience: float = _PATIENCE) -> None:
         deadline = time.monotonic() + patience
         while not condition():
             if interrupted():
-                raise _Interrupted
+                raise _Stopped(INTERRUPTED)
             for process in processes:
                 if not process.running:
-                    raise _FilterError(f'{process.name} {process.how_it_ended()}', process)
+                    fail(f'{process.name} {process.how_it_ended()}', process)
             if time.monotonic() > deadline:
-                raise _FilterError(f'{what} for {patience:g} s', processes[0])
+                fail(f'{what} for {patience:g} s', processes[0])
             node.spin()
 
     wait_for(lambda: node.ready, 'the filter was not ready', _START_PATIENCE)
