@@ -53,10 +53,10 @@ class Session:
         self.clock = self.node.create_publisher(Clock, '/clock', RELIABLE)
         self.odometry = self.node.create_publisher(Odometry, '/rover/odom', RELIABLE)
 
-    def turn(self):
+    def turn(self, limit=None):
         self.recorder.discover()
         self.recorder.wait(0.02)
-        self.recorder.drain()
+        self.recorder.drain(limit)
 
     def until(self, condition):
         wait_until(condition, self.turn)
@@ -110,6 +110,21 @@ def test_no_stamp_is_ahead_of_the_time_of_its_message(session):
     assert [stamp for stamp, _ in read] == [2 * 10**9, 2 * 10**9 + 1, 1_700_000_000 * 10**9]
     assert all(stamp <= log_time < 3 * 10**9 for stamp, log_time in read[:2]), read
     assert 2 * 10**9 <= read[2][1] < 3 * 10**9
+
+
+def test_what_belongs_to_the_step_at_the_limit_is_dropped_also_before_that_step(session):
+    steps = session.node.create_publisher(LockstepStep, '/lockstep/step', RELIABLE)
+    session.connect(steps, session.odometry)
+    for number in (3, 4):
+        steps.publish(LockstepStep(step=number, stamp=stamp_to_ros(number * 10**8)))
+        wait_until(lambda n=number: session.recorder.step == n, lambda: session.turn(2 * 10**8))
+    for stamp in (5 * 10**8, 4 * 10**8):
+        message = Odometry()
+        message.header.stamp = stamp_to_ros(stamp)
+        session.odometry.publish(message)
+    seen = session.recorder.last_seen
+    wait_until(lambda: '/rover/odom' in seen, lambda: session.turn(2 * 10**8))
+    assert [stamp for stamp, _ in session.odometry_in_bag()] == [4 * 10**8]
 
 
 def test_the_share_explored_is_that_of_the_planners_diagnostics(session):

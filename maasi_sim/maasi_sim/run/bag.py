@@ -85,7 +85,7 @@ def load_types() -> Typestore:
         folder = installed if installed.is_dir() else folder
     if not folder.is_dir():
         raise BagError(f'package maasi_msgs: no message definitions in {folder}')
-    types = {}
+    types: dict[str, Any] = {}
     for path in folder.glob('*.msg'):
         types |= get_types_from_msg(path.read_text('utf-8'), f'maasi_msgs/msg/{path.stem}')
     store.register(types)

@@ -268,9 +268,11 @@ class Recorder:
         others = self._take([topic for topic in self._subscriptions if topic not in self._in_order])
         taken += [item for item in others if self._is_own(*item)]
         taken += updates + steps
-        over = limit is not None and self._elapsed >= limit
-        if over and self.step is not None and not self._finished:
-            self._last_step = self.step - 1
+        if limit is not None and self.step is not None and not self._finished:
+            # Messages of the step at the limit may come before that step.
+            step, following = (self._elapsed_at(self.step + ahead) for ahead in (0, 1))
+            if following >= limit:
+                self._last_step = self.step - (step >= limit)
         taken = self._until_last_step(taken)
         now = time.monotonic()
         for topic, data in taken:
@@ -311,6 +313,9 @@ class Recorder:
     @property
     def _elapsed(self) -> int:
         return 0 if self._begun is None else self.time - self._begun
+
+    def _elapsed_at(self, step: int) -> int:
+        return stamp_of_step(step, self._step_length) - (self._begun or 0)
 
     def _is_own(self, topic: str, data: bytes) -> bool:
         """Return whether a message on a topic shared by all teams is the team's own."""
