@@ -295,17 +295,18 @@ def test_updates_after_the_planner_is_done_do_not_count(run):
 
 
 def test_updates_alone_tell_what_was_found_and_refined_positions_win(run):
+    run.update(0.4, latched=False)
     run.declare(0.5, [0.6, 0.5])
     run.update(0.5, latched=False)
-    assert run.observer.found == 1 and run.record().tally.scores().match.true_found == 1
+    assert run.observer.found == 1 and run.record().tally.progress[-1].true_found == 1
     run.found[0].position.x = 0.501
     run.update(0.6)
+    # A filter that was restarted publishes an update again.
+    run.batch, run.found[0].position.x = 1, 0.6
+    run.update(0.5, latched=False)
     (found,) = run.record().tally.found
     assert found.position[0] == pytest.approx(0.501)
-    # A filter that was restarted publishes its last update again.
-    run.batch -= 1
-    run.update(0.6)
-    assert run.observer.measurements == 2
+    assert run.observer.measurements == 3
 
 
 def test_completeness_that_is_lost_again_does_not_count(tmp_path):
@@ -393,6 +394,7 @@ def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(ru
     run.state(0.5, 'mambo', [0.5, 0.5, 1.0])
     run.declare(0.5, [0.51, 0.5], deviation=1e-6)
     run.declare(0.5, [1.0, 1.0], deviation=0.1)
+    run.found[1].covariance[:5] = 0.01, 0.003, 0.0, 0.003, 0.004
     run.update(0.5)
     figure = plot_report(run.record())
     labels = labels_of(figure)
@@ -401,9 +403,14 @@ def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(ru
     assert 'drawn at least' in sigma
     world = figure.axes[0]
     drawn = [patch for patch in world.patches if 'Ell' in repr(patch)]
-    widths = {to_hex(patch.get_edgecolor()): patch.width for patch in drawn}
-    small, large = pytest.approx(2 * 0.012 * 2.0), pytest.approx(2 * 3 * 0.1)
-    assert widths == {'#d62728': small, '#7b3294': large}
+    small, large = sorted(drawn, key=lambda patch: patch.width)
+    colours = [to_hex(patch.get_edgecolor()) for patch in (small, large)]
+    assert colours == ['#d62728', '#7b3294']
+    assert small.width == pytest.approx(2 * 0.012 * 2.0)
+    # Its axis is a principal one of the covariance.
+    axis = np.array([math.cos(math.radians(large.angle)), math.sin(math.radians(large.angle))])
+    spread = np.array([[0.01, 0.003], [0.003, 0.004]])
+    assert spread @ axis == pytest.approx((large.width / 6.0) ** 2 * axis)
     (missed,) = [line for line in world.lines if line.get_label() == 'missed']
     assert sorted(zip(*missed.get_data())) == [(1.0, 1.5), (1.5, 0.5)]
 
