@@ -70,10 +70,11 @@ def test_a_video_shows_where_a_robot_points_what_it_sees_and_where_it_goes(tmp_p
     scene = scene_of('plane', load_mission('mambo').scenario)
     robot = scene['robots']['mambo']
 
-    def still(yaw=0.0):
+    def still(yaw=0.0, detections=()):
         row = ['mambo', 0, 0, [2.0, 0.5, 1.0], [], '']
         events = [
             [0.0, 'robot', 'mambo', [0.5, 0.5, 1.0, yaw], 1.0, 1, ''],
+            [0.0, 'seen', 'mambo', [0.5, 0.5, 1.0], detections],
             [0.0, 'plan', '', 'maasi', 0.0, 0.0, '', [row]],
         ]
         return frames(EventLog(scene, events), tmp_path / 'still.mp4')[0]
@@ -81,8 +82,9 @@ def test_a_video_shows_where_a_robot_points_what_it_sees_and_where_it_goes(tmp_p
     whole = still()
     assert robot.pop('view')['kind'] == 'box'
     unseeing, turned = still(), still(2.0 * np.pi / 3.0)
+    seeing = still(0.0, [[1.0, 0.5, 0.0, 0.1, 0.1, 0.0]])
     robot['fence'] = [[0.4, 2.0], [0.4, 2.0], [0.0, 2.0]]
-    for other, least in ((whole, 20), (turned, 50), (still(), 50)):
+    for other, least in ((whole, 20), (turned, 50), (seeing, 50), (still(), 50)):
         assert np.abs(unseeing - other).max() > least
     # A robot and its waypoint in the robot's colour, which is blue.
     assert np.diff(np.flatnonzero(bluish(unseeing).any(axis=0))).max() > 100
