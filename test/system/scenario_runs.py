@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -15,11 +15,11 @@ from chaos_execution import processes_of
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from report_check import check_report
-from reserved_domain import reserved_domain
 from std_srvs.srv import Trigger
 from waiting import wait_until
 
 from maasi_sim.run.bag import Bag
+from maasi_sim.run.domain import DOMAINS, Domain, DomainError
 
 # Far more than any of the runs takes, for a machine that is busy with something else.
 PATIENCE = 400.0
@@ -179,6 +179,20 @@ class Operator:
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
+
+
+@contextmanager
+def reserved_domain():
+    """Reserve a domain for a run that is told which to use, and locks it itself.
+
+    It is one of the last, so that no run that takes the first free one gets it.
+    """
+    for number in reversed(DOMAINS):
+        with suppress(DomainError):
+            domain = Domain(number, 'reserved for a test')
+            break
+    with domain:
+        yield domain
 
 
 @contextmanager

@@ -81,23 +81,15 @@ class Domain:
         wanted = {} if shared else {f'{number}': f'{number}'}
         wanted[f'{number} {team}'] = f'namespace /{team} in {number}'
         for name, words in wanted.items():
-            lock = self._lock(name)
-            if lock is None:
+            # A digest, as the names of sockets are short.
+            digest = hashlib.sha256(f'{self._purpose} {name}'.encode()).hexdigest()
+            self._locks.append(socket.socket(socket.AF_UNIX))
+            try:
+                self._locks[-1].bind(f'\0maasi {digest}')
+            except OSError:
                 self._unlock()
                 return words
-            self._locks.append(lock)
         return ''
-
-    def _lock(self, name: str) -> socket.socket | None:
-        # A digest, as the names of sockets are short.
-        digest = hashlib.sha256(f'{self._purpose} {name}'.encode()).hexdigest()
-        lock = socket.socket(socket.AF_UNIX)
-        try:
-            lock.bind(f'\0maasi {digest}')
-        except OSError:
-            lock.close()
-            return None
-        return lock
 
     def environment(self) -> dict[str, str]:
         """Return the variables that keep nodes in this domain, and on this host.

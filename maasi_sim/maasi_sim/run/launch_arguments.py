@@ -23,6 +23,7 @@ ARGUMENTS = {
     'rviz': ('false', 'whether RViz shows the search; true or false'),
 }
 _OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'namespace', 'log_level')
+_FLAGS = ('lockstep', 'follow_clock', 'view')
 _ENDINGS = {
     1: 'not all targets were found',
     2: 'wrong input',
@@ -45,24 +46,21 @@ def scenario_options(given: Mapping[str, str]) -> list[str]:
 
     The nodes are in the ROS domain of the launch, so that other tools see them.
     """
-    options = [given['scenario'].strip()]
+    values = {name: text.strip() for name, text in given.items()}
     # Joined by '=': a value that begins with '-' stays a value.
-    for name in _OPTIONS:
-        if given[name].strip():
-            options.append(f'--{name.replace("_", "-")}={given[name].strip()}')
-    if is_true(given, 'lockstep'):
-        options.append('--lockstep')
-    if is_true(given, 'follow_clock'):
-        options.append('--follow-clock')
+    words = [f'{name}={values[name]}' for name in _OPTIONS if values[name]]
+    words += [name for name in _FLAGS if is_true(given, name)]
     if not is_true(given, 'record'):
-        options.append('--no-record')
-    if is_true(given, 'view'):
-        options.append('--view')
-        if given['port'].strip():
-            options.append(f'--port={given["port"].strip()}')
+        words.append('no_record')
+    if is_true(given, 'view') and values['port']:
+        words.append(f'port={values["port"]}')
     is_true(given, 'rviz')
-    options.append(f'--domain-id={os.environ.get("ROS_DOMAIN_ID") or 0}')
-    return options
+    words.append(f'domain_id={os.environ.get("ROS_DOMAIN_ID") or 0}')
+    options = [word.partition('=') for word in words]
+    return [
+        values['scenario'],
+        *(f'--{name.replace("_", "-")}{sign}{value}' for name, sign, value in options),
+    ]
 
 
 def ending(code: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -28,17 +29,15 @@ def make_folder(out: Path | None, suffix: str = '') -> Path:
                 raise ScenarioError(f'--out: {out} holds a run already, allowed is another folder')
             return out.resolve()
         stamp = datetime.now().strftime('%Y%m%d_%H%M%S') + suffix
-        for number in range(1, 1000):
+        for number in itertools.count(1):
             folder = Path('runs') / (stamp if number == 1 else f'{stamp}_{number}')
-            try:
+            with contextlib.suppress(FileExistsError):
                 folder.mkdir(parents=True)
-            except FileExistsError:
-                continue
-            return folder.resolve()
+                break
+        return folder.resolve()
     except OSError as error:
         kind = ResultsError if error.errno in _FULL else ScenarioError
         raise kind(f'--out: {error.filename}: {error.strerror}') from None
-    raise ScenarioError(f'--out: runs/{stamp} exists a thousand times')
 
 
 def write_text(path: Path, text: str) -> None:

@@ -70,13 +70,12 @@ class ScenarioRun:
     def __init__(self, options: Options, interruption: Interruption) -> None:
         self.options = options
         self.interruption = interruption
-        overrides: dict[str, tuple[Key, Any]] = {}
-        if options.planner is not None:
-            overrides['--planner'] = (('planner', 'name'), options.planner)
-        if options.time_limit is not None:
-            overrides['--time-limit'] = (('limits', 'time'), options.time_limit)
-        if options.seed is not None:
-            overrides['--seed'] = (('seed',), options.seed)
+        given: dict[str, tuple[Key, Any]] = {
+            '--planner': (('planner', 'name'), options.planner),
+            '--time-limit': (('limits', 'time'), options.time_limit),
+            '--seed': (('seed',), options.seed),
+        }
+        overrides = {name: item for name, item in given.items() if item[1] is not None}
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter('always', ScenarioWarning)
             self.mission = load_mission(options.scenario, overrides)
