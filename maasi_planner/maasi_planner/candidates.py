@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,16 +63,11 @@ class CandidateSet:
                 f'grid: got {numbers}, allowed in {self.dimension}D are {self.dimension} numbers'
             )
         spacing = np.broadcast_to(np.array(settings.spacing, dtype=float), (self.dimension,))
-        size = spacing * (np.array(numbers) - 1)
         if settings.corner is not None:
             corner = np.array(settings.corner, dtype=float)
         else:
-            corner = self.bounds.mean(axis=1) - 0.5 * size
-        axes = [
-            corner[axis] + spacing[axis] * np.arange(numbers[axis])
-            for axis in range(self.dimension)
-        ]
-        return np.stack([grid.ravel() for grid in np.meshgrid(*axes, indexing='ij')], axis=1)
+            corner = self.bounds.mean(axis=1) - 0.5 * (spacing * (np.array(numbers) - 1))
+        return corner + spacing * np.indices(numbers).reshape(self.dimension, -1).T
 
     def _complete(self, points: FloatArray) -> FloatArray:
         if points.ndim != 2 or points.shape[1] not in (self.dimension, 3):
@@ -82,9 +77,8 @@ class CandidateSet:
             )
         inside = points[:, : self.dimension]
         slack = 1e-9 * (1.0 + np.abs(self.bounds))
-        outside = (inside < self.bounds[:, 0] - slack[:, 0]) | (
-            inside > self.bounds[:, 1] + slack[:, 1]
-        )
+        low, high = (self.bounds + slack * [-1.0, 1.0]).T
+        outside = (inside < low) | (inside > high)
         if outside.any():
             first = points[outside.any(axis=1)][0]
             raise ValueError(
@@ -178,7 +172,7 @@ class Viewer:
 
 def unseen_parts(
     bounds: ArrayLike,
-    viewers: Mapping[str, Viewer] | Sequence[Viewer],
+    viewers: Iterable[Viewer],
     margin: float = 0.0,
     probability: float = 0.01,
     cells: int = 80,
@@ -190,8 +184,7 @@ def unseen_parts(
     grid = UnexploredMap(box, size / (cells if len(box) == 2 else min(cells, 40)))
     values, lower, step = grid.kernel()
     seen = np.zeros(values.shape, dtype=np.bool_)
-    members = list(viewers.values()) if isinstance(viewers, Mapping) else list(viewers)
-    for viewer in members:
+    for viewer in viewers:
         places, yaws = _poses(viewer, size)
         detection = viewer.sensor.detection
         kernel, reach = detection.kernel(), reach_of(detection)

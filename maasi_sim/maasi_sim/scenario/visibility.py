@@ -32,14 +32,14 @@ def never_seen(scenario: Scenario) -> str:
     bounds = scenario.environment.array()
     margin = scenario.targets.margin if scenario.targets.positions is None else 0.0
     # What is seen from the waypoints need not be checked on the paths between them.
-    standing = {name: _viewer(scenario, name, _FAR) for name in scenario.names()}
-    steady = {name: viewer for name, viewer in standing.items() if viewer.yaw is not None}
+    standing = [_viewer(scenario, name, _FAR) for name in scenario.names()]
+    steady = [viewer for viewer in standing if viewer.yaw is not None]
     if steady and not unseen_parts(bounds, steady, margin):
         return ''
-    moving = {
-        name: _viewer(scenario, name, robot.motion.speed * max(robot.sensor.period, scenario.step))
+    moving = [
+        _viewer(scenario, name, robot.motion.speed * max(robot.sensor.period, scenario.step))
         for name, robot in scenario.robots.items()
-    }
+    ]
     return unseen_parts(bounds, moving, margin).describe()
 
 
