@@ -45,6 +45,11 @@ class SearchRobotSettings(SearcherSettings):
         """False: the sim moves it."""
         return False
 
+    @property
+    def takes_off(self) -> bool:
+        """False: it flies from the start."""
+        return False
+
 
 class CuboidPlanner(CuboidSettings):
     """The planner of each robot, and what is searched."""

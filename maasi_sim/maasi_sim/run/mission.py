@@ -31,18 +31,6 @@ class Mission(Protocol[Record]):
     def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
         """Return the nodes to start."""
 
-    def cameras(self) -> list[str]:
-        """Return the robots whose images are shown."""
-        return []
-
-    def taking_off(self) -> list[str]:
-        """Return the simulated robots that take off by their drivers' service `arm`."""
-        return []
-
-    def external(self) -> list[str]:
-        """Return the robots moved by another program, which take off on the user's command."""
-        return []
-
     def warning(self) -> str:
         """Return a warning about the scenario, or an empty text; takes a while."""
         return ''

@@ -21,7 +21,9 @@ def view_text(mission: Mission[Any], namespace: str = '') -> str:
     for display in displays:
         if 'Topic' in display:
             display['Topic']['Value'] = team + display['Topic']['Value']
-    for robot in mission.cameras():
+    for robot, settings in sorted(mission.scenario.robots.items()):
+        if getattr(settings, 'camera', None) is None:
+            continue
         topic = f'{team}/{robot}/camera/image_raw'
         displays.append(_camera(f'Camera of {robot}', topic, shown=True))
         # What a bag holds.

@@ -189,8 +189,8 @@ class ScenarioRun:
             return
         self._armed_at = time.monotonic()
         ready = set(map(self.supervisor.without_team, self.recorder.ready))
-        names = [name for name in self.mission.taking_off() if f'/{name}/driver' not in ready]
-        self.recorder.arm(names)
+        names = [name for name, robot in self._scenario.robots.items() if robot.takes_off]
+        self.recorder.arm([name for name in names if f'/{name}/driver' not in ready])
 
     def _check_recording(self) -> None:
         """Note which topics with a message at each step lack a recording of their beginning."""
@@ -298,11 +298,12 @@ class ScenarioRun:
         team = self.options.namespace
         where = f' --namespace {team}' if team else ''
         domain = self.recorder.context.get_domain_id()
-        for name in self.mission.external():
-            self.display.say(
-                f'{name} is external: it takes off when you call its service arm (search_command '
-                f'arm --robot {name}{where}, with ROS_DOMAIN_ID={domain})'
-            )
+        for name, robot in self._scenario.robots.items():
+            if robot.external and robot.link != 'topics':
+                self.display.say(
+                    f'{name} is external: it takes off when you call its service arm '
+                    f'(search_command arm --robot {name}{where}, with ROS_DOMAIN_ID={domain})'
+                )
 
     def _follow(self) -> Ending:
         """Monitor the run until it ends, and return its ending."""

@@ -44,20 +44,6 @@ class TargetMission:
         """See `Mission.plan_nodes`."""
         return plan_nodes(self.scenario, run)
 
-    def cameras(self) -> list[str]:
-        """See `Mission.cameras`."""
-        robots = sorted(self.scenario.robots.items())
-        return [name for name, robot in robots if robot.camera is not None]
-
-    def taking_off(self) -> list[str]:
-        """See `Mission.taking_off`."""
-        return [name for name, robot in self.scenario.robots.items() if robot.takes_off]
-
-    def external(self) -> list[str]:
-        """See `Mission.external`."""
-        robots = self.scenario.robots.items()
-        return [name for name, robot in robots if robot.external and robot.link != 'topics']
-
     def warning(self) -> str:
         """See `Mission.warning`."""
         settings = self.scenario.filter
