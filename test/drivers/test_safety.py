@@ -16,7 +16,7 @@ import pytest
 from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import Twist
 from numpy.testing import assert_array_equal
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, image_message, numbers
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, image_message, numbers, stamped
 from sensor_msgs.msg import BatteryState
 
 from maasi_drivers.agent.agent_driver import STOPPED
@@ -103,6 +103,31 @@ def test_without_odometry_the_robot_is_stopped(play, fault):
     assert team.takes([1.0, 1.0, 0.0])
 
 
+def hanging(team):
+    """Return what publishes the present odometry with the stamp of the next step."""
+    message = team.odometry_message()
+
+    def hang():
+        team.step += 1
+        team.odometry.publish(stamped(message, team.step * NANOSECONDS))
+        team.until(lambda: team.state.step == team.step)
+
+    return hang
+
+
+def test_a_pose_that_hangs_does_not_steer_a_robot_back_to_where_it_hovers(play):
+    _, team = play('mambo')
+    team.move()
+    _, result = team.send_accepted(team.start.position + np.array([0.1, 0.0, 0.0]))
+    team.ended(result, team.move)
+    # A gust.
+    team.body.step([0.4, 0.0, 0.0, 0.0], 1.0)
+    hang = hanging(team)
+    assert steps_until_stopped(team, hang) <= LATEST
+    hang()
+    assert_array_equal(team.command, np.zeros(4))
+
+
 @pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
 def test_a_pose_that_hangs_under_a_command_to_move_stops_the_robot(play, kind):
     _, team = play(kind)
@@ -111,15 +136,7 @@ def test_a_pose_that_hangs_under_a_command_to_move_stops_the_robot(play, kind):
     assert team.state.goal_status == AgentState.IDLE
     _, result = team.send_accepted(team.start.position + np.array([0.8, 0.5, 0.0]))
     team.move(20)
-    message = team.odometry_message()
-
-    def hang():
-        team.step += 1
-        message.header.stamp = stamp_to_ros(team.step * NANOSECONDS)
-        team.odometry.publish(message)
-        team.until(lambda: team.state.step == team.step)
-
-    assert steps_until_stopped(team, hang) <= LATEST
+    assert steps_until_stopped(team, hanging(team)) <= LATEST
     team.until(lambda: not np.any(team.command))
     gives_up(team, result, 'the pose has not changed for')
     # It is pushed, and says so: it can be trusted.

@@ -190,7 +190,7 @@ class AgentDriver(RobotNode):
             'goal': f'{self._state.goal_id}: {self.follower.status.name}',
             'fault': self.health.text,
             'battery': f'{self._state.charge:.2f}',
-            'open batches': self._responder.open_batches,
+            'open batches': len(self._responder.queue),
             **{f'detections left out: {key}': number for key, number in left_out.items()},
             **self.link.status(),
         }

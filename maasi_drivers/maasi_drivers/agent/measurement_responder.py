@@ -6,6 +6,8 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.sensor_input import SensorInput
@@ -122,7 +124,8 @@ class MeasurementResponder:
         self._driver = driver
         self._sensor = sensor
         self._watchdog = watchdog
-        self._queue = MeasurementQueue(driver.history, sensor.offset)
+        #: Batches without an answer yet.
+        self.queue = MeasurementQueue(driver.history, sensor.offset)
         self._answer: DetectionArray | None = None
         self.left_out: Counter[str] = Counter()
         self._publisher = driver.create_publisher(DetectionArray, 'detections', RELIABLE)
@@ -131,14 +134,9 @@ class MeasurementResponder:
         )
         driver.expect_subscribers(self._publisher, names={'filter_node'})
 
-    @property
-    def open_batches(self) -> int:
-        """Batches without an answer yet."""
-        return len(self._queue)
-
     def reset(self) -> None:
         """Discard what belongs to another time."""
-        self._queue.clear()
+        self.queue.clear()
         self._answer = None
 
     def take_frame(self, topic: str, stamp: int, data: Any, repeated: bool) -> None:
@@ -146,7 +144,7 @@ class MeasurementResponder:
         driver = self._driver
         if not driver.active or self._is_ahead('image stamp', f'{topic}.header.stamp', stamp):
             return
-        latest = self._queue.latest
+        latest = self.queue.latest
         if latest is not None and stamp <= latest:
             if latest - stamp <= JUMP:
                 driver.drop(
@@ -157,14 +155,14 @@ class MeasurementResponder:
             driver.get_logger().warning(
                 f'{topic}.header.stamp jumped back by {1e-9 * (latest - stamp):.3f} s'
             )
-            self._queue.clear()
+            self.queue.clear()
         self._watchdog.note_frame(topic, repeated)
-        self._queue.add_frame(stamp, data)
+        self.queue.add_frame(stamp, data)
         self.serve()
 
     def serve(self) -> None:
         """Answer the batches whose image and pose are known."""
-        while (found := self._queue.next()) is not None:
+        while (found := self.queue.next()) is not None:
             request, stamp, data, pose = found
             try:
                 reading = self._sensor.detect(data, pose)
@@ -172,7 +170,7 @@ class MeasurementResponder:
                 # No empty answer: a miss is information. The next image answers instead.
                 self._driver.drop('image', str(error))
                 continue
-            self._queue.answered(request)
+            self.queue.answered(request)
             self._publish(request, stamp, pose, reading)
 
     def _on_batch(self, message: MeasurementBatch) -> None:
@@ -197,7 +195,7 @@ class MeasurementResponder:
         for member in message.members:
             if member.robot == driver.robot:
                 request = MeasurementRequest(int(message.id), stamp, int(member.measurement))
-                if (old := self._queue.add_request(request)) is not None:
+                if (old := self.queue.add_request(request)) is not None:
                     driver.drop('batch', f'batch {old.batch}: no image for it, too many newer ones')
                 self.serve()
                 return
@@ -221,28 +219,25 @@ class MeasurementResponder:
         self, request: MeasurementRequest, stamp: int, pose: StampedPose, reading: SensorReading
     ) -> None:
         driver = self._driver
-        values, covariances, labels = reading.values, reading.covariances, reading.labels
-        dropped = sum(reading.dropped.values())
-        self.left_out.update(reading.dropped)
-        beyond = len(values) - MOST_DETECTIONS
+        beyond = len(reading.values) - MOST_DETECTIONS
         if beyond > 0:
             driver.drop(
                 'too many detections',
-                f'{self._sensor.name}: {len(values)} detections, allowed are {MOST_DETECTIONS}',
+                f'{self._sensor.name}: {len(reading.values)} detections, allowed are '
+                f'{MOST_DETECTIONS}',
                 beyond,
             )
-            values = values[:MOST_DETECTIONS]
-            covariances = None if covariances is None else covariances[:MOST_DETECTIONS]
-            labels = labels[:MOST_DETECTIONS]
-            dropped += beyond
+            first = np.arange(len(reading.values)) < MOST_DETECTIONS
+            reading = reading.only(first, 'too many')
+        self.left_out.update(reading.dropped)
         answer = DetectionArray(
             batch_id=request.batch,
             step=driver.step_of(stamp),
             robot=driver.robot,
             measurement=request.measurement,
             sensor=driver.sensor.name,
-            detections=detections_to_ros(values, covariances, labels),
-            dropped=dropped,
+            detections=detections_to_ros(reading.values, reading.covariances, reading.labels),
+            dropped=sum(reading.dropped.values()),
         )
         answer.header.stamp = stamp_to_ros(stamp)
         answer.header.frame_id = driver.settings.frame

@@ -29,11 +29,6 @@ class Sweep:
     labels: tuple[Label, ...] = ()
 
 
-def selected(labels: tuple[Label, ...], keep: BoolArray) -> tuple[Label, ...]:
-    """Return the labels where `keep` (m,) is true."""
-    return tuple(label for label, kept in zip(labels, keep.tolist()) if kept)
-
-
 # Variance of an angle of which nothing is known: uniform over the circle [rad^2].
 _ANY_ANGLE = np.pi**2 / 3.0
 
@@ -96,14 +91,18 @@ class SensorReading:
             return self
         inside = sensor.detection.probability(self.positions, pose) > 0.0
         inside &= self.values[:, 0] <= sensor.maximum_range
-        outside = int(np.count_nonzero(~inside))
-        if not outside:
+        return self.only(inside, 'outside the field of view')
+
+    def only(self, keep: BoolArray, reason: str) -> SensorReading:
+        """Return the detections where `keep` (m,) is true; the rest is counted under a reason."""
+        left_out = int(np.count_nonzero(~keep))
+        if not left_out:
             return self
         return replace(
             self,
-            values=self.values[inside],
-            covariances=None if self.covariances is None else self.covariances[inside],
-            positions=self.positions[inside],
-            dropped=self.dropped | {'outside the field of view': outside},
-            labels=selected(self.labels, inside),
+            values=self.values[keep],
+            covariances=None if self.covariances is None else self.covariances[keep],
+            positions=self.positions[keep],
+            dropped=self.dropped | {reason: left_out},
+            labels=tuple(label for label, kept in zip(self.labels, keep.tolist()) if kept),
         )

@@ -57,8 +57,8 @@ class CameraInput(SensorInput[Picture]):
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
-        self._video: VideoSource | None = None
-        self._feed: FeedReceiver | None = None
+        # None where images come from a topic.
+        self._source: VideoSource | FeedReceiver | None = None
         self._calibration: tuple[object, ...] | None = None
         self._checksum: int | None = None
 
@@ -109,11 +109,10 @@ class CameraInput(SensorInput[Picture]):
         view = np.frombuffer(grey.tobytes(), np.uint8).reshape(grey.shape)
         height = max(settings.start[2], 0.1)
         self._detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0))
-        if settings.image_source != 'topic':
-            driver.create_wall_timer(_POLL_PERIOD, self._poll_source)
         quality = sensor_reader(settings.lockstep)
         driver.create_subscription(CameraInfo, 'camera/camera_info', self._on_calibration, quality)
         if settings.image_source != 'topic':
+            driver.create_wall_timer(_POLL_PERIOD, self._poll_source)
             return
         # Reliable images are sent again when lost: on a slow network that delays the next ones.
         if settings.image_reliability == 'reliable':
@@ -127,10 +126,9 @@ class CameraInput(SensorInput[Picture]):
 
     def close(self) -> None:
         """Close video or feed."""
-        for source in (self._video, self._feed):
-            if source is not None:
-                source.close()
-        self._video = self._feed = None
+        if self._source is not None:
+            self._source.close()
+        self._source = None
 
     # ---- image to detections -----------------------------------------------------------------
 
@@ -157,13 +155,17 @@ class CameraInput(SensorInput[Picture]):
 
     def _open_source(self) -> None:
         if self.driver.settings.image_source == 'video':
-            self._video = VideoSource(self.driver.settings.video)
+            self._source = VideoSource(self.driver.settings.video)
             return
         peer = self.driver.feed_peer
         address, port = self.driver.settings.feed_address, self.driver.settings.feed_port
+
+        def drop(reason: str, text: str, number: int) -> None:
+            self.driver.drop(f'feed: {reason}', f'feed: {text}', number)
+
         try:
             sender = None if peer is None else peer.address
-            self._feed = FeedReceiver(port, address, sender, self._drop_packets)
+            self._source = FeedReceiver(port, address, sender, drop)
         except OSError as error:
             raise OSError(
                 f'feed_address, feed_port: UDP port {port} of {address}: {error.strerror}, allowed '
@@ -172,10 +174,10 @@ class CameraInput(SensorInput[Picture]):
 
     def _poll_source(self) -> None:
         self.driver.arrivals.observe(time.monotonic(), self.driver.get_clock().now().nanoseconds)
-        if self._video is not None:
-            self._take_video(self._video)
-        if self._feed is not None:
-            self._take_feed(self._feed)
+        if isinstance(self._source, VideoSource):
+            self._take_video(self._source)
+        elif self._source is not None:
+            self._take_feed(self._source)
 
     def _take_video(self, source: VideoSource) -> None:
         if source.error:
@@ -196,9 +198,8 @@ class CameraInput(SensorInput[Picture]):
 
     def _take_feed(self, feed: FeedReceiver) -> None:
         camera, peer = self.camera, self.driver.feed_peer
-        for item in feed.take():
-            packet, stamp = item.packet, self.driver.arrivals.stamp(item.taken)
-            if stamp is None:
+        for packet, taken in feed.take():
+            if (stamp := self.driver.arrivals.stamp(taken)) is None:
                 continue
             if (packet.width, packet.height) != (camera.width, camera.height):
                 self.driver.drop(
@@ -210,9 +211,6 @@ class CameraInput(SensorInput[Picture]):
             if packet.pose is not None and peer is not None:
                 peer.on_pose(stamp, packet.pose)
             self.driver.take_frame('feed', stamp, lambda blobs=packet.blobs: blobs)
-
-    def _drop_packets(self, reason: str, text: str, number: int) -> None:
-        self.driver.drop(f'feed: {reason}', f'feed: {text}', number)
 
     # ---- image source: topic ------------------------------------------------------------------
 

@@ -194,14 +194,6 @@ def _check(numbers: np.ndarray, marks: np.ndarray, width: int, height: int) -> N
             raise FeedError(f'blob {index}: read {read}, allowed are {what}')
 
 
-@dataclass(frozen=True)
-class ReceivedPacket:
-    """A packet, and when its image was taken by the monotonic clock of this host [s]."""
-
-    packet: FeedPacket
-    taken: float
-
-
 class FeedReceiver:
     """Receives a feed; poll it often.
 
@@ -232,8 +224,11 @@ class FeedReceiver:
         """Stop listening."""
         self._socket.close()
 
-    def take(self) -> list[ReceivedPacket]:
-        """Return what has come since the last call, in order."""
+    def take(self) -> list[tuple[FeedPacket, float]]:
+        """Return what has come since the last call, in order.
+
+        With each packet when its image was taken, by the monotonic clock of this host [s].
+        """
         packets = []
         for _ in range(_MOST_AT_ONCE):
             try:
@@ -251,7 +246,7 @@ class FeedReceiver:
                 self._on_drop('bad packet', str(error), 1)
                 continue
             if self._is_new(packet.sequence, now):
-                packets.append(ReceivedPacket(packet, now - packet.age))
+                packets.append((packet, now - packet.age))
         return packets
 
     def _is_new(self, sequence: int, now: float) -> bool:
