@@ -42,6 +42,16 @@ def test_interpolation_is_multilinear_and_clamped(dimension):
     np.testing.assert_allclose(exploration.at(positions), reference(inside), atol=1e-12)
 
 
+def test_diffusion_spreads_a_peak_by_its_variance():
+    exploration = UnexploredMap([[0.0, 100.0]] * 2, 1.0)
+    exploration.values[...] = 0.0
+    exploration.values[50, 50] = 1.0
+    exploration.diffuse(4.0)
+    squares = (exploration.axes()[0] - 50.0) ** 2
+    assert squares @ exploration.values.sum(axis=1) == pytest.approx(4.0)
+    assert exploration.values.sum() == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize(
     ('bounds', 'spacing', 'word'),
     [

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from searches import floor_sensor, observe, plane_filter, plane_sensor, play
+from searches import floor_sensor, measured, observe, plane_filter, plane_sensor, play
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose
 from maasi_filter.ic_phd.filter import IcPhdFilter
@@ -71,6 +71,14 @@ def test_the_class_is_that_of_the_largest_sum_of_scores():
         tally.add(Label(name, score), share)
     assert tally.label.class_id == 'b'
     assert tally.label.score == pytest.approx(1.0 / 1.5)
+
+
+def test_an_identity_belongs_to_one_even_if_a_scan_has_it_twice():
+    search = plane_filter()
+    scan = measured(plane_sensor(), (50.0, 50.0), [[10.0, 0.0], [20.0, 2.0]])
+    scan.labels = [Label(identity='x')] * 2
+    search.step([scan], 1, 0.0)
+    assert sorted(item.labels.identity for item in search.components) == ['', 'x']
 
 
 @pytest.mark.parametrize('score', [-0.1, 1.1, float('nan')])
