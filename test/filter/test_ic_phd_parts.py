@@ -141,7 +141,7 @@ def test_kmeans_separates_clouds_and_keeps_a_warm_start():
     centres = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
     label = np.repeat(np.arange(3), 200)
     particles = centres[label] + generator.normal(size=(600, 2))
-    weights = np.full(600, 3.0 / 600)
+    weights = np.full(600, 6.0 / 600)
     found, means = kmeans(particles, weights, 3, generator, centres)
     np.testing.assert_array_equal(found, label)
     _, cold_means = kmeans(particles, weights, 3, generator, np.empty((0, 2)))
@@ -150,7 +150,7 @@ def test_kmeans_separates_clouds_and_keeps_a_warm_start():
     assert list(clusters) == [0, 1, 2]
     for c, cluster in clusters.items():
         member = particles[label == c]
-        assert cluster.mass == pytest.approx(1.0)
+        assert cluster.mass == pytest.approx(2.0)
         np.testing.assert_allclose(cluster.covariance, np.cov(member.T, bias=True), atol=1e-9)
         assert cluster.radius == pytest.approx(np.sqrt(np.trace(np.cov(member.T, bias=True))))
 
