@@ -83,12 +83,6 @@ class EventLog:
             period = max(2.0 * period, 2.0 * STATE_PERIOD)
             log = EventLog({**self.scene, 'thinned': period}, thin(self.events, period))
 
-    @staticmethod
-    def unpacked(text: str) -> EventLog:
-        """Return the log that `packed` returned."""
-        lines = gzip.decompress(base64.b64decode(text)).decode().split('\n')
-        return EventLog(json.loads(lines[0]), [json.loads(item) for item in lines[1:]])
-
 
 class Thinning:
     """Decides which events are kept so that those of a kind and owner are a period apart.
