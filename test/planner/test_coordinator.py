@@ -71,9 +71,9 @@ def test_who_arrives_plans_alone_and_starts_its_period_anew():
     coordinator = started()
     robots = there(a=(2.0, 2.0)) | there(free=False, b=(8.5, 8.5))
     # The planner is told where the other one goes, and when it measures next.
-    view = coordinator._team(6, robots, ['a'], ()).robots['b']
-    assert view.phase == 2
-    assert view.remaining_path == pytest.approx(coordinator.plans['b'].positions[6:])
+    view = coordinator._team(5, robots, ['a'], ()).robots['b']
+    assert view.phase == 3
+    assert view.remaining_path == pytest.approx(coordinator.plans['b'].positions[5:])
     assert list(coordinator.plan(6, robots).robots) == ['a']
     assert coordinator.plans['a'].decision == 1
     assert coordinator.plans['b'].decision == 0

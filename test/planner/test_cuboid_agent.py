@@ -88,9 +88,10 @@ def test_rewards_are_drawn_with_the_probabilities_of_11_to_14():
     assert (np.delete(rates, [4, 7]) == 1.0).all()
     # As printed, (13) does not hold while the battery is good: only (12) is left.
     printed = CuboidMethodSettings(condition='printed')
-    fails = hazard.failure(25 + 5 - 1)
-    rate = np.mean([rewards(printed, hazard, 3, others, draws)[7] for draws in many])
-    assert rate == pytest.approx((1 - own) * fails, abs=0.03)
+    rates = np.mean([rewards(printed, hazard, 3, others, draws) for draws in many], axis=0)
+    for cuboid, steps in ((4, (27, 33)), (7, (29,))):
+        fails = math.prod(hazard.failure(step) for step in steps)
+        assert rates[cuboid] == pytest.approx((1 - own) * fails, abs=0.03)
 
 
 def test_assignment_shares_the_nearest_cuboids():

@@ -289,7 +289,7 @@ def test_robots_are_not_sent_to_one_place(name):
     team, _ = one_robot(planning=2, radius=0.1)
     team.clusters = [cluster([1.0, 0.5])]
     for view in team.robots.values():
-        view.candidates = np.array([[0.5, 0.5, 0.0], [1.0, 0.5, 0.0], [0.5, 1.4, 0.0]])
+        view.candidates = np.array([[0.7, 0.5, 0.0], [1.0, 0.5, 0.0], [0.5, 1.4, 0.0]])
     decision = make_planner(name).decide(team)
     one, two = (robot.waypoint for robot in decision.robots.values())
     assert np.linalg.norm(one - two) >= 0.4 - 1e-9
