@@ -155,6 +155,8 @@ def test_radius_of_scoring_and_matching_within_it(tmp_path):
         assert scoring_radius(scenario, np.array(truth)) == pytest.approx(radius)
     with pytest.raises(ValueError, match='same place'):
         scoring_radius(scenario, np.ones((2, 2)))
+    given = scenario_of(tmp_path, TARGETS, scoring={'radius': 0.3})
+    assert scoring_radius(given, np.array(near)) == 0.3
     # One to one.
     scores = score([[0.5, 0.51], [0.5, 0.52], [1.5, 0.5]], TARGETS, 0.15)
     assert (scores.match.true_found, scores.match.false_found, scores.match.missed) == (2, 1, 1)
@@ -176,6 +178,15 @@ def test_report_of_a_complete_run(run, tmp_path):
     run.update(0.9, ['mambo'])
     assert run.observer.completed.step == 18
     report = write(run.record('all_found', 1.0, 0.3), tmp_path)
+    assert json.loads((tmp_path / 'report.json').read_text()) == report
+    picture = cv2.imread(str(tmp_path / 'report.png')).astype(int)
+    assert picture.shape[0] > 600 and picture.shape[1] > 1000
+    # Something of every kind of mark is there: found (red) and false (violet).
+    for colour in ((0x28, 0x27, 0xD6), (0x94, 0x32, 0x7B)):
+        assert (np.abs(picture - colour).max(axis=2) < 12).sum() > 20
+    text = target_summary(report)
+    for words in ('3 of 3 targets found, 1 false', 'all targets found', '3.0 times real time'):
+        assert words in text
     table = list(csv.DictReader((tmp_path / 'found_targets.csv').open()))
     rows = [('0.51', '0'), ('1.5', '1'), ('1.0', ''), ('1.0', '2')]
     assert [(row['x'], row['target']) for row in table] == rows
@@ -330,42 +341,16 @@ def test_report_without_targets_and_of_a_run_in_which_nothing_happened(run, tmp_
     assert report['rmse'] is None and report['measurements_to_find_all'] is None
 
 
-def test_robots_that_leave_and_come_back_are_events(run):
-    for time, robots in ((0.0, ['mambo', 'second']), (0.05, ['second']), (0.1, ['second'])):
-        run.step(time, robots)
-    run.step(0.15, ['mambo', 'second'])
-    node = {'time': 0.12, 'node': '/filter_node', 'event': 'restarted'}
-    assert run.report('time_limit', 1.0, 1.0, [node])['events'] == [
-        {'time': 0.05, 'agent': 'mambo', 'event': 'lost'},
-        node,
-        {'time': 0.15, 'agent': 'mambo', 'event': 'joined'},
-    ]
-
-
-def test_robots_that_say_they_cannot_go_on_are_events_without_lockstep(run):
+def test_robots_that_cannot_go_on_are_events_among_those_of_nodes(run):
     stale = {'status': 5, 'reason': 'odometry is stale'}
     for time, said in ((0.0, {}), (0.5, stale), (0.6, stale), (0.9, {})):
         run.state(time, 'mambo', [0.5, 0.5, 1.0], **said)
-    assert run.record().events == [
+    node = {'time': 0.7, 'node': '/filter_node', 'event': 'restarted'}
+    assert run.report('time_limit', 1.0, 1.0, [node])['events'] == [
         {'time': 0.5, 'agent': 'mambo', 'event': 'lost', 'reason': 'odometry is stale'},
+        node,
         {'time': 0.9, 'agent': 'mambo', 'event': 'joined'},
     ]
-
-
-def test_written_files_can_be_read_and_the_summary_says_what_matters(run, tmp_path):
-    run.declare(0.5, [0.5, 0.52])
-    run.declare(0.5, [1.9, 1.9])
-    run.update(0.5)
-    report = write(run.record('time_limit', 1.0, 0.5), tmp_path)
-    assert json.loads((tmp_path / 'report.json').read_text()) == report
-    picture = cv2.imread(str(tmp_path / 'report.png')).astype(int)
-    assert picture.shape[0] > 600 and picture.shape[1] > 1000
-    # Something of every kind of mark is there: found (red) and false (violet).
-    for colour in ((0x28, 0x27, 0xD6), (0x94, 0x32, 0x7B)):
-        assert (np.abs(picture - colour).max(axis=2) < 12).sum() > 20
-    text = target_summary(report)
-    for words in ('1 of 3 targets found, 1 false', 'time limit', '2.0 times real time'):
-        assert words in text
 
 
 def labels_of(figure):
@@ -425,12 +410,3 @@ def test_legend_of_many_robots_and_obstacles_is_whole(tmp_path):
     environment = {'bounds': [[0.0, 2.0], [0.0, 2.0]], 'obstacles': obstacles}
     run = Run(scenario_of(tmp_path, TARGETS, robots=robots, environment=environment))
     assert {*robots, 'obstacle'} <= labels_of(plot_report(run.record()))
-
-
-def test_radius_of_the_scenario_wins(tmp_path):
-    run = Run(scenario_of(tmp_path, TARGETS, scoring={'radius': 0.3}))
-    run.declare(0.5, [0.5, 0.75])
-    run.update(0.5)
-    report = run.report()
-    assert report['true_found'] == 1
-    assert report['scoring'] == {'radius': 0.3, 'c': 0.3, 'p': 2.0}

@@ -81,29 +81,18 @@ class Browser:
         self.connection.close()
 
 
-def test_a_late_browser_gets_the_whole_state_first_and_the_end_of_a_run_ends_the_stream(server):
-    for index in range(5000):
-        server.hub.put(state(index))
-    browsers = [Browser(server), Browser(server)]
-    for browser in browsers:
-        browser.until(5000)
-        assert browser.scenes == [SCENE] and browser.events[-1] == state(4999)
-    server.hub.put(state(5000))
-    server.hub.close()
-    for browser in browsers:
-        browser.until()
-        assert browser.events[-1] == state(5000)
-        browser.close()
-
-
-def test_a_browser_that_reads_nothing_holds_up_nobody(server):
-    stuck, reader = Browser(server), Browser(server)
+def test_a_browser_that_reads_nothing_holds_up_nobody_and_a_late_one_gets_everything(server):
+    stuck = Browser(server)
     for index in range(50_000):
         server.hub.put([float(index), 'log', '', 'team', 'rover', 'x' * 300])
-    reader.until(50_000)
-    for browser in (reader, stuck):
+    late = Browser(server)
+    late.until(50_000)
+    assert late.scenes == [SCENE]
+    server.hub.close()
+    late.until()
+    for browser in (late, stuck):
         browser.close()
-    wait_until(lambda: server.hub.put(state(1)) or server.browsers == 0)
+    wait_until(lambda: server.browsers == 0)
 
 
 def test_a_long_run_is_thinned_and_browsers_begin_anew():
@@ -196,9 +185,7 @@ def test_the_page_is_served_and_nothing_else(server):
     assert status == 403 and 'Host' in text
 
 
-@pytest.fixture
-def commanded():
-    """Return a function that commands a server with its token, and what was carried out."""
+def test_commands_are_carried_out_with_the_token_and_wrong_ones_refused():
     calls = []
 
     def commander(*command):
@@ -211,26 +198,8 @@ def commanded():
 
     made = ViewServer(Hub(SCENE), 0, commander=commander)
     assert made.token in made.address
-    yield command, calls
-    made.close()
-
-
-def test_commands_are_carried_out_with_the_token(commanded):
-    command, calls = commanded
-    body = json.dumps({'command': 'pause', 'robot': 'rover'})
     for token in ('', 'wrong'):
-        assert command(body, x_maasi_token=token)[0] == 403
-    assert calls == []
-    status, text = command(body)
-    assert status == 200 and json.loads(text) == {'done': True, 'message': 'paused'}
-    assert calls.pop() == ('pause', 'rover')
-    for word in ('pause', 'resume', 'home', 'stop', 'release'):
-        assert command(json.dumps({'command': word, 'robot': None}))[0] == 200
-        assert calls.pop() == (word, None)
-
-
-def test_wrong_commands_are_refused(commanded):
-    command, calls = commanded
+        assert command('{"command": "pause", "robot": "rover"}', x_maasi_token=token)[0] == 403
     for body in (
         *('{', '[' * 4000, 'null', '{"command": "launch"}', '{"command": ["stop"]}'),
         *('{"command": "stop", "robot": "../../other"}', '{"command": "stop", "robot": 7}'),
@@ -241,6 +210,13 @@ def test_wrong_commands_are_refused(commanded):
     for length, status in (('', 411), ('-1', 411), ('99999999999', 413)):
         assert command('', content_length=length)[0] == status
     assert calls == []
+    names = ('pause', 'resume', 'home', 'stop', 'release')
+    words = [(word, robot) for word in names for robot in ('rover', None)]
+    for word, robot in words:
+        status, text = command(json.dumps({'command': word, 'robot': robot}))
+        assert status == 200 and json.loads(text) == {'done': True, 'message': 'paused'}
+    assert calls == words
+    made.close()
 
 
 def test_a_page_holds_up_nobody_drops_what_is_too_much_and_survives_what_it_cannot_show(
