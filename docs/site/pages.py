@@ -214,7 +214,7 @@ def parameters_page() -> str:
                 code(item.name),
                 item.constraints,
                 '' if item.default is None else code(item.default),
-                item.description,
+                item.info.description,
             )
             for item in parameters_of(node)
         ]

@@ -25,22 +25,18 @@ def _run(target: str) -> Any:
         return resolve_name(target)()
     except ModuleNotFoundError as error:
         missing = error.name or ''
-        if _is_of_ros(missing):
+        package = missing.partition('.')[0]
+        if package.startswith(('ament_', 'rcl')) or package.endswith(
+            ('_interfaces', '_msgs', '_srvs')
+        ):
             needed = 'it needs ROS 2 Jazzy and maasi_msgs, built and sourced'
-        elif missing.partition('.')[0] in _OF_EXTRAS:
+        elif package in _OF_EXTRAS:
             needed = 'it comes with an extra of the package'
         else:
             raise
         name = Path(sys.argv[0]).name
         print(f'error: {name}: no module {missing}: {needed} (docs/install.md)', file=sys.stderr)
         return 2
-
-
-def _is_of_ros(module: str) -> bool:
-    package = module.partition('.')[0]
-    return package.startswith(('ament_', 'rcl')) or package.endswith(
-        ('_interfaces', '_msgs', '_srvs')
-    )
 
 
 filter_node = partial(_run, 'maasi_filter.filter_node:main')

@@ -32,7 +32,6 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.qos import LATCHED, RELIABLE, UPDATES
 from maasi_filter.ros.run_node import run
-from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import unsuitable_lengths
 from maasi_filter.state_file import StateFileError, write_state
 from maasi_msgs.msg import (
@@ -42,52 +41,6 @@ from maasi_msgs.msg import (
     FoundTargetArray,
     MeasurementBatch,
 )
-
-
-class FilterViews:
-    """Particles and markers.
-
-    Publishes
-    ---------
-    `particles` (sensor_msgs/PointCloud2), `markers` (visualization_msgs/MarkerArray)
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        The filter node.
-    """
-
-    def __init__(self, node: LockstepLifecycleNode[FilterNodeSettings]) -> None:
-        self._node = node
-        bounds = node.settings.environment.array()
-        self._size = 0.01 * float((bounds[:, 1] - bounds[:, 0]).max())
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin anew."""
-        self._board = MarkerBoard()
-        self._particles_at = self._markers_at = -math.inf
-
-    def set_up(self) -> None:
-        """Create the publishers."""
-        self._particles = self._node.create_publisher(PointCloud2, 'particles', 2)
-        self._markers = self._node.create_publisher(MarkerArray, 'markers', 10)
-
-    def publish(self, search: SearchFilter, header: Header, now: float) -> None:
-        """Publish what is due at the time `now` [s]."""
-        settings = self._node.settings
-        if _is_due(settings.particles_rate, now, self._particles_at):
-            self._particles_at = now
-            self._particles.publish(particles_to_ros(search.particles, search.weights, header))
-        if _is_due(settings.markers_rate, now, self._markers_at):
-            self._markers_at = now
-            markers = filter_markers(header, search.clusters, search.found_targets, self._size)
-            self._markers.publish(self._board.replace(markers))
-
-
-def _is_due(rate: float, now: float, last: float) -> bool:
-    return rate > 0.0 and abs(now - last) >= 1.0 / rate
-
 
 _TIMEOUT_PERIOD = 0.05
 # Upper bound on predicted steps: a day at 10 steps per second.
@@ -131,7 +84,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             for name, robot in sorted(settings.robots.items())
         }
         self._shared = SharedFoundTargets(self)
-        self._views = FilterViews(self)
+        bounds = settings.environment.array()
+        self._marker_size = 0.01 * float((bounds[:, 1] - bounds[:, 0]).max())
         self._begin_anew()
         # Until when batches wait for the targets that the planner keeps for a restarted filter.
         # Only the first message is used: later ones contain what this filter found itself.
@@ -153,7 +107,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._settled_by: dict[int, int] = {}
         self._found_published = False
         self._shared.reset()
-        self._views.reset()
+        self._board = MarkerBoard()
+        self._particles_at = self._markers_at = -math.inf
         self._latency = 0.0
         self._no_faults = {FOUND: 0, REPEATED: 0}
         self._misfits: dict[str, str] = {}
@@ -161,10 +116,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     def _restore(self, file: Path) -> None:
         """Resume the saved search, or after the last batch of a process that died.
 
-        Raises
-        ------
-        SettingsError
-            If the file is damaged, or of another environment, and does not belong to the run.
+        A file that is damaged, or of another environment, is refused if it is not of the run.
         """
         settings = self.settings
         try:
@@ -206,7 +158,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._update_publisher = self.create_publisher(FilterUpdate, 'filter_update', UPDATES)
         self._clusters_publisher = self.create_publisher(ClusterArray, 'clusters', 10)
         self._found_publisher = self.create_publisher(FoundTargetArray, 'found_targets', LATCHED)
-        self._views.set_up()
+        self._particles_publisher = self.create_publisher(PointCloud2, 'particles', 2)
+        self._markers_publisher = self.create_publisher(MarkerArray, 'markers', 10)
         kept = self.create_subscription(
             FoundTargetArray, 'found_targets/kept', self._on_kept, LATCHED
         )
@@ -383,8 +336,22 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._clusters_publisher.publish(
             ClusterArray(header=header, batch_id=batch.id, clusters=clusters)
         )
-        self._views.publish(self.filter, header, now)
+        self._publish_views(header, now)
         self._latency = time.perf_counter() - begin
+
+    def _publish_views(self, header: Header, now: float) -> None:
+        """Publish the particles and markers that are due at the time `now` [s]."""
+        settings, search = self.settings, self.filter
+        if _is_due(settings.particles_rate, now, self._particles_at):
+            self._particles_at = now
+            self._particles_publisher.publish(
+                particles_to_ros(search.particles, search.weights, header)
+            )
+        if _is_due(settings.markers_rate, now, self._markers_at):
+            self._markers_at = now
+            clusters, found = search.clusters, search.found_targets
+            markers = filter_markers(header, clusters, found, self._marker_size)
+            self._markers_publisher.publish(self._board.replace(markers))
 
     def _publish_found(self, header: Header, batch: int) -> None:
         self._found_published = True
@@ -425,6 +392,10 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             )
             self._publish_found(message.header, int(message.batch_id))
         self._process_complete()
+
+
+def _is_due(rate: float, now: float, last: float) -> bool:
+    return rate > 0.0 and abs(now - last) >= 1.0 / rate
 
 
 def main(arguments: list[str] | None = None) -> int:

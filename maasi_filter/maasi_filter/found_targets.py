@@ -47,7 +47,11 @@ class FoundTargets:
             if old is None:
                 self.targets.append(new)
                 added.append(new)
-            elif not _is_equal(new, old):
+            elif not (
+                (new.origin, new.robot) == (old.origin, old.robot)
+                and np.array_equal(new.position, old.position)
+                and np.array_equal(new.covariance, old.covariance)
+            ):
                 self.targets[f] = new
                 changed.append(new)
         return added + changed
@@ -74,11 +78,3 @@ class FoundTargets:
         apart = [distance(target.position, target.covariance, known) for known in self.targets]
         best = int(np.argmin(apart)) if apart else -1
         return best if apart and apart[best] < SAME_TARGET else -1
-
-
-def _is_equal(one: FoundTarget, other: FoundTarget) -> bool:
-    return (
-        (one.origin, one.robot) == (other.origin, other.robot)
-        and np.array_equal(one.position, other.position)
-        and np.array_equal(one.covariance, other.covariance)
-    )

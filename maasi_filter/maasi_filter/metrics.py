@@ -16,18 +16,13 @@ class Gospa:
     """GOSPA with alpha = 2, and its parts (Rahmathullah, Garcia-Fernandez and Svensson, 2017).
 
     `total` is (localisation + missed + false) to the power 1/p; the parts are powers already.
-
-    Parameters
-    ----------
-    missed, false : float
-        c^p / 2 for each target, or estimate, that is not matched.
     """
 
-    total: float  # The metric, metres
-    localisation: float  # Sum of distances of matched pairs, to the power p
-    missed: float
-    false: float
-    matched: int  # Number of pairs
+    total: float  #: The metric, metres.
+    localisation: float  #: Sum of distances of matched pairs, to the power p.
+    missed: float  #: c^p / 2 for each target that is not matched.
+    false: float  #: The same for each estimate.
+    matched: int  #: Number of pairs.
 
 
 def _points(name: str, value: ArrayLike) -> FloatArray:
@@ -97,19 +92,13 @@ def gospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 
 
 @dataclass(frozen=True)
 class Match:
-    """One-to-one matching of found targets to true ones.
+    """One-to-one matching of found targets to true ones."""
 
-    Parameters
-    ----------
-    true_found, missed, false_found : int
-        Numbers of pairs, of unmatched true targets, and of unmatched found targets.
-    """
-
-    pairs: list[tuple[int, int]]  # Index of the found, and of the true target
-    true_found: int
-    missed: int
-    false_found: int
-    rmse: float  # Root mean square distance of the pairs, metres; nan without pairs
+    pairs: list[tuple[int, int]]  #: Index of the found, and of the true target.
+    true_found: int  #: Number of pairs.
+    missed: int  #: Number of unmatched true targets.
+    false_found: int  #: Number of unmatched found targets.
+    rmse: float  #: Root mean square distance of the pairs, metres; nan without pairs.
 
 
 def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Match:

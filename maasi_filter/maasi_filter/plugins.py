@@ -69,11 +69,6 @@ class PluginGroup:
         """Return a class by one of `names`, or `module:Class`.
 
         Modules beside the scenario file and in the current folder are found too.
-
-        Raises
-        ------
-        PluginError
-            If it is not known, cannot be imported, or is no subclass of `base`.
         """
         if name in self.own:
             return _attribute(self.own[name])

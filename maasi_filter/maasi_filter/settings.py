@@ -106,13 +106,7 @@ class DetectionSettings(Settings):
         return self
 
     def build(self, dimension: int = 3) -> DetectionModel:
-        """Return the model.
-
-        Raises
-        ------
-        ValueError
-            If a model of a user's own is wrong.
-        """
+        """Return the model; ValueError if one of a user's own is wrong."""
         if self.kind not in DETECTIONS.own:
             found = DETECTIONS.load(self.kind)(self.settings, self.probability, dimension)
             assert isinstance(found, DetectionModel)
@@ -187,13 +181,7 @@ class SensorSettings(Settings):
     )
 
     def build(self, name: str, dimension: int) -> Sensor:
-        """Return the sensor of robot `name` for a problem of `dimension` 2 or 3.
-
-        Raises
-        ------
-        ValueError
-            If the dimension is not 2 or 3.
-        """
+        """Return the sensor of robot `name` for a problem of `dimension` 2 or 3."""
         if dimension not in (2, 3):
             raise ValueError(f'dimension: got {dimension}, allowed are 2 and 3')
         return Sensor(
@@ -441,13 +429,7 @@ LARGEST_REMOVAL = 0.5
 
 
 def unsuitable_lengths(settings: FilterSettings, bounds: FloatArray) -> str:
-    """Return a warning if the lengths of a preset are not those of an environment, else ''.
-
-    Parameters
-    ----------
-    bounds : (d, 2) array
-        Of the environment, metres.
-    """
+    """Return a warning if the lengths of a preset are not those of the bounds (d, 2), else ''."""
     distance = settings.resolved().removal_distance
     side = float((bounds[:, 1] - bounds[:, 0]).min())
     if settings.method != 'ic_phd' or distance is None or distance <= LARGEST_REMOVAL * side:

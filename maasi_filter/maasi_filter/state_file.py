@@ -92,13 +92,7 @@ def write_state(path: str | os.PathLike[str], tree: Any, *, durable: bool = True
 
 
 def read_state(path: str | os.PathLike[str]) -> Any:
-    """Return the tree of a file: dictionaries, lists, arrays and plain values.
-
-    Raises
-    ------
-    StateFileError
-        If the file is missing, is of another format or version, or is damaged.
-    """
+    """Return the tree of a file: dictionaries, lists, arrays and plain values."""
     with np.load(io.BytesIO(_payload(path)), allow_pickle=False) as archive:
         parts = dict(archive)
     arrays: dict[str, NDArray[Any]] = {}

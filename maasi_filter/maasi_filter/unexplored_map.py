@@ -63,13 +63,7 @@ def _interpolate_many(
 
 
 def check_bounds(bounds: ArrayLike) -> FloatArray:
-    """Return bounds as a (d, 2) array.
-
-    Raises
-    ------
-    ValueError
-        If they are not finite, or not lower < upper on 2 or 3 axes.
-    """
+    """Return bounds as a (d, 2) array; ValueError if not finite, or not lower < upper."""
     array = np.array(bounds, dtype=float)
     if array.shape not in ((2, 2), (3, 2)):
         raise ValueError(f'bounds: got shape {array.shape}, allowed are (2, 2) and (3, 2)')

@@ -36,7 +36,7 @@ def test_every_field_is_a_parameter_with_a_description():
     flat = flatten(FilterNodeSettings.model_validate(CONTENT))
     fields = {item.name: item for item in parameter_fields(FilterNodeSettings, flat)}
     assert set(flat) <= set(fields)
-    assert all(item.description for item in fields.values())
+    assert all(item.info.description for item in fields.values())
     assert fields['filter.particles'].constraints == 'at least 1 and at most 5000000'
     assert 'paper_003' in fields['filter.preset'].constraints
     assert fields['filter.found_mass'].default is None

@@ -16,17 +16,11 @@ from maasi_msgs.msg import FoundTargetArray
 
 
 class SharedFoundTargets:
-    """Found targets that the filters of other robots publish.
-
-    Subscribes
-    ----------
-    `<robot>/found_targets` (maasi_msgs/FoundTargetArray) of robots with filters of their own
-    """
+    """Found targets that the filters of other robots publish."""
 
     def __init__(self, node: LockstepLifecycleNode[FilterNodeSettings]) -> None:
         self._node = node
         self._subscriptions: list[Subscription] = []
-        self._waiting: dict[str, deque[FoundTargetArray]] = {}
         self.reset()
 
     def __len__(self) -> int:
@@ -35,7 +29,8 @@ class SharedFoundTargets:
 
     def reset(self) -> None:
         """Discard what was received."""
-        self._waiting = {name: deque() for name in sorted(self._node.settings.share_with)}
+        robots = sorted(self._node.settings.share_with)
+        self._waiting: dict[str, deque[FoundTargetArray]] = {name: deque() for name in robots}
 
     def set_up(self) -> None:
         """Subscribe."""

@@ -18,17 +18,10 @@ LEAST_SHARE = 0.5
 
 @dataclass
 class LabelTally:
-    """What is known of the class and identity of one potential target.
+    """What is known of the class and identity of one potential target."""
 
-    Parameters
-    ----------
-    identity : str
-        Empty: not known.
-    classes : dict
-        Sum of the scores of its detections, by class.
-    """
-
-    identity: str = ''
+    identity: str = ''  # Empty: not known
+    #: Sum of the scores of its detections, by class.
     classes: dict[str, float] = field(default_factory=dict)
 
     @classmethod

@@ -43,7 +43,9 @@ class NodeEntities:
 
     def mark(self) -> None:
         """Mark the present entities as kept: `clear` destroys only later ones."""
-        self._kept = self._all()
+        node = self._node
+        made = (node.publishers, node.subscriptions, node.services, node.clients, node.timers)
+        self._kept = [item for items in (*made, node.waitables) for item in items]
 
     def clear(self) -> None:
         """Destroy the entities created since `mark`; nothing without a mark."""
@@ -67,17 +69,6 @@ class NodeEntities:
             for item in list(items):
                 if id(item) not in kept:
                     destroy(item)
-
-    def _all(self) -> list[Any]:
-        node = self._node
-        return [
-            *node.publishers,
-            *node.subscriptions,
-            *node.services,
-            *node.clients,
-            *node.timers,
-            *node.waitables,
-        ]
 
 
 def survive_bad_requests(node: Node, drop: Callable[[str, str], None]) -> None:

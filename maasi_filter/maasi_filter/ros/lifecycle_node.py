@@ -68,8 +68,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
 
     Parameters
     ----------
-    name : str
-        Of the node.
     in_robot : bool
         Whether its namespace is that of a robot: topics of the team are one level up.
     lockstep_member : bool
@@ -282,14 +280,8 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     ) -> None:
         """Be ready only when a message would reach all expected subscribers.
 
-        Parameters
-        ----------
-        publisher : Publisher, or a function that returns the present one
-            Publisher of the message.
-        number : int
-            How many subscribers are expected; mere observers do not count.
-        names : collection of str
-            Nodes that have to be among them, without namespace.
+        `publisher` may be a function that returns the present one; `number` does not count mere
+        observers; nodes of these `names`, without namespace, have to be among the subscribers.
         """
         self.expect(subscribers_connected(self, publisher, number, frozenset(names)))
 
@@ -301,7 +293,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         if not self.active or not all(condition() for condition in self._peers):
             return
         self._end_peers_timer()
-        self.on_ready()
         if self._ready_publisher is not None:
             self._ready_publisher.publish(LockstepDone(node=self.get_fully_qualified_name()))
 
@@ -315,9 +306,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')
         if missing and (fault := loopback_fault()):
             self.get_logger().warning(fault)
-
-    def on_ready(self) -> None:
-        """Handle that all peers are present."""
 
     def _hear_step(self, message: LockstepStep) -> None:
         if not self.active:

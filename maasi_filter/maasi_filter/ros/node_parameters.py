@@ -41,14 +41,8 @@ class NodeParameters(Generic[SettingsT]):
 
     Parameters that were not set have the defaults of the settings: once the node is configured,
     the resolved ones (of a preset, for example), which depend on the parameters that were set.
-
-    Parameters
-    ----------
-    node : Node
-        Owner of the parameters. It has to allow undeclared ones: optional parameters are declared
-        only if they have a value, as a file of `ros2 param dump` cannot represent None.
-    model : type
-        The settings; each becomes a parameter.
+    The node has to allow undeclared parameters: optional ones are declared only if they have a
+    value, as a file of `ros2 param dump` cannot represent None.
     """
 
     def __init__(self, node: Node, model: type[SettingsT]) -> None:
@@ -200,7 +194,9 @@ def check(
 
 def _descriptor(item: ParameterField, ranged: bool) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
-        description=item.description, additional_constraints=item.constraints, dynamic_typing=True
+        description=item.info.description or '',
+        additional_constraints=item.constraints,
+        dynamic_typing=True,
     )
     low, high = item.bound('ge', 'gt'), item.bound('le', 'lt')
     if not ranged or low is high is None or item.number is None:

@@ -48,11 +48,6 @@ class ParameterField:
         return value
 
     @property
-    def description(self) -> str:
-        """Meaning and unit."""
-        return self.info.description or ''
-
-    @property
     def constraints(self) -> str:
         """What is allowed, in words."""
         words = {'ge': 'at least', 'gt': 'above', 'le': 'at most', 'lt': 'below'}
@@ -132,10 +127,7 @@ def flatten(settings: BaseModel, prefix: str = '') -> dict[str, ParameterValue]:
 def unflatten(model: type[BaseModel], flat: Mapping[str, Any]) -> dict[str, Any]:
     """Return flat parameters as nested values for `model.model_validate`.
 
-    Raises
-    ------
-    ValueError
-        If a list of numbers is not one; the message names the parameter.
+    ValueError, if a list of numbers is not one, names the parameter.
     """
     nested: dict[str, Any] = {}
     for item in _walk(model, flat):
@@ -284,7 +276,7 @@ def node_help(node: type, name: str, base: type) -> str:
 
 def _row(item: ParameterField) -> str:
     default: Any = item.default
-    said = [item.description]
+    said = [item.info.description or '']
     if item.constraints:
         said.append(f'allowed: {item.constraints}')
     if default is not None:

@@ -56,13 +56,6 @@ def executor_of(node: Node, context: Context | None = None) -> Executor:
 _SIGNAL_PERIOD = 0.1
 
 
-def _print_help(text: str) -> None:
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:  # `--help | head`; Python writes the rest when it ends
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 def run(
     make_node: Callable[[], LockstepLifecycleNode[Any]],
     arguments: list[str] | None = None,
@@ -74,7 +67,11 @@ def run(
     """
     if {'-h', '--help'} & set(sys.argv[1:] if arguments is None else arguments):
         explained = kind or (make_node if isinstance(make_node, type) else LockstepLifecycleNode)
-        _print_help(node_help(explained, Path(sys.argv[0]).name, LockstepLifecycleNode))
+        try:
+            name = Path(sys.argv[0]).name
+            print(node_help(explained, name, LockstepLifecycleNode), flush=True)
+        except BrokenPipeError:  # `--help | head`; Python writes the rest when it ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     # The handler only sets a flag: an exception raised inside a call into rclpy's C++ surfaces as
     # a different one. A second signal raises at once.

@@ -20,7 +20,7 @@ from maasi_drivers.links.mavlink.link import VehicleLink
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.pose import Pose, compose
+from maasi_filter.models.pose import Pose, compose, inverse
 
 POLL_PERIOD = 0.02
 # Kinds of faults.
@@ -159,7 +159,7 @@ class MavlinkRobotLink(RobotLink):
             }
 
     def _send_target(self, position: FloatArray, yaw: float) -> None:
-        goal = compose(self._map_from_local.inverse(), Pose.from_yaw(self._inside(position), yaw))
+        goal = compose(inverse(self._map_from_local), Pose.from_yaw(self._inside(position), yaw))
         with self._link.lock:
             self._link.vehicle.set_target(goal.position + self._local_origin, goal.yaw)
 
