@@ -167,7 +167,7 @@ def _attribute(reference: str, named: bool = False) -> Any:
     except (Exception, SystemExit) as error:
         raise PluginError(_import_problem(name, error)) from error
     if named:
-        _check_file(name, module)
+        _check_file(name)
     found: Any = module
     for part in attribute.split('.'):
         if not hasattr(found, part):
@@ -200,7 +200,7 @@ def _import_problem(name: str, error: BaseException) -> str:
     return f'module {name} cannot be imported: {type(error).__name__}: {text}{place}'
 
 
-def _check_file(name: str, module: Any) -> None:
+def _check_file(name: str) -> None:
     """Refuse a module that is another one than the file beside the scenario."""
     top = name.partition('.')[0]
     for folder in _folders:

@@ -135,12 +135,8 @@ class SearchFilter(ABC):
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets found before this filter was created; return those that are new.
 
-        They keep their ids, except that an id in use is replaced by the next free one.
-
-        Raises
-        ------
-        ValueError
-            As of `take_over`.
+        They keep their ids, except that an id in use is replaced by the next free one. ValueError
+        as of `take_over`.
         """
         check_taken('kept', targets, self.dimension)
         found = self.register()

@@ -175,15 +175,9 @@ class DetectionModel:
         return self._kind, self._parameters
 
     def probability(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Return pi(x, q), shape (n,), in [0, 1].
+        """Return pi(x, q), shape (n,), in [0, 1], of targets at positions (n, d) [m, map].
 
-        Parameters
-        ----------
-        positions : (n, d) array
-            Target positions, metres, frame `map`, d = 2 or 3. With d = 2 the sensor's height
-            plays no part.
-        pose : Pose
-            Of the sensor.
+        With d = 2 the sensor's height plays no part.
         """
         array = np.asarray(positions, dtype=float)
         if array.ndim != 2 or array.shape[1] not in (2, 3):

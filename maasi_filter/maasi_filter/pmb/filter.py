@@ -132,7 +132,11 @@ class PmbFilter(SearchFilter):
         )
         for member in members:
             self._correct(member, time, result)
-        self._estimate_found()
+        # Estimate the found targets whose densities have changed.
+        for item in self.components:
+            if item.target is not None and item.stale and not item.foreign:
+                item.target = self._estimate(item.target, item)
+            item.stale = False
         found = [item for item in self.components if item.target is not None]
         others = [item for item in self.components if item.target is None]
         self.components = found + merge([i for i in others if i.existence >= LEAST_EXISTENCE])
@@ -255,13 +259,6 @@ class PmbFilter(SearchFilter):
         mean, label = item.density.mean.copy(), item.labels.label
         by = target.robot, target.measurement, target.time
         return FoundTarget(target.id, mean, covariance, *by, label=label)
-
-    def _estimate_found(self) -> None:
-        """Estimate the found targets whose densities have changed in this step."""
-        for item in self.components:
-            if item.target is not None and item.stale and not item.foreign:
-                item.target = self._estimate(item.target, item)
-            item.stale = False
 
     def _predict(self, time: float) -> None:
         """Predict the random walk since the last step."""

@@ -192,9 +192,6 @@ class ClockWatch:
             before, self._pending = self._pending[0], None
             if time_now < before:
                 self._on_restart(1e-9 * (before - time_now))
-        self._look_for_clock(now, time_now)
-
-    def _look_for_clock(self, now: float, time_now: int) -> None:
         simulated = self._node.get_parameter('use_sim_time').value
         if not simulated or time_now or self._node.count_publishers('/clock'):
             self._silent_since, self._patience = None, _PATIENCE

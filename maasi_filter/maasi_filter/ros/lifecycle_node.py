@@ -48,12 +48,6 @@ T = TypeVar('T')
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
-def _has_lists(msg_type: Any) -> bool:
-    """Return whether messages of a type have lists of messages, which are slow to read."""
-    fields = msg_type.get_fields_and_field_types().values()
-    return any(field.startswith('sequence<') and '/' in field for field in fields)
-
-
 class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     """A lifecycle node of the suite.
 
@@ -385,8 +379,9 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         take = callback
         if not options.get('raw'):
             take = partial(self.check_stamp, topic, callback)
-            if _has_lists(msg_type):
-                # Reading 100,000 items of a list alone takes a second.
+            fields = msg_type.get_fields_and_field_types().values()
+            if any(field.startswith('sequence<') and '/' in field for field in fields):
+                # Reading 100,000 items of a list of messages alone takes a second.
                 take, options['raw'] = partial(self._check_size, topic, msg_type, take), True
 
         def call(message: Any) -> None:

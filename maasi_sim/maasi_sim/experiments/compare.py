@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,11 @@ def build_parser() -> argparse.ArgumentParser:
         '--seeds', type=count, default=30, metavar='N', help='how many (default: %(default)s)'
     )
     parser.add_argument(
-        '--first-seed', type=_seed, default=1, metavar='N', help='the first (default: %(default)s)'
+        '--first-seed',
+        type=partial(whole, most=2**32),
+        default=1,
+        metavar='N',
+        help='the first (default: %(default)s)',
     )
     parser.add_argument(
         '--time-limit', type=positive, metavar='S', help="of a search [s], not the scenario's"
@@ -86,10 +91,6 @@ def _names(text: str) -> tuple[str, ...]:
             f"read '{text}', allowed are different names with commas between them"
         )
     return names
-
-
-def _seed(text: str) -> int:
-    return whole(text, 0, 2**32)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -178,11 +178,6 @@ class Experiment:
     note: str = ''
     compared: bool = False
 
-    @property
-    def paper(self) -> str:
-        """The paper's number: the first three digits of the name."""
-        return self.name[:3]
-
     def seed(self, number: int, seed: int = 1) -> int:
         """Return the seed of a map of a campaign; it depends on `maps` and the arguments only."""
         if self.compared:

@@ -146,7 +146,7 @@ def page(sections: dict[str, Section]) -> str:
     papers: dict[str, list[Experiment]] = {}
     for name in known:
         if name in sections:
-            papers.setdefault(known[name].paper, []).append(known[name])
+            papers.setdefault(name[:3], []).append(known[name])
     for paper, items in papers.items():
         parts.append(f'## Paper {paper}\n\n{title_of(paper)}\n')
         # Each open point once, with a letter that the experiments name.

@@ -28,11 +28,6 @@ class Interval:
     number: int
     degrees: float
 
-    @property
-    def error(self) -> float:
-        """Standard error of the mean."""
-        return self.half_width / _student(self.degrees)
-
 
 def _student(degrees: float) -> float:
     """Return the half width of the interval of Student's t with variance 1."""
@@ -130,7 +125,7 @@ def independent_difference(first: Interval, second: Interval) -> Interval:
     If the interval of one is unknown, that of the other is used, which is too narrow.
     """
     parts = [
-        (item.error**2, item.degrees)
+        ((item.half_width / _student(item.degrees)) ** 2, item.degrees)
         for item in (first, second)
         if item.degrees > 0.0 and math.isfinite(item.half_width)
     ]
