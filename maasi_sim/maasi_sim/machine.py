@@ -13,15 +13,13 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-# By key: what a difference is called.
+# By key: what a difference is called, where not by the key.
 _NAMES = {
-    'processor': 'processor',
     'features': 'processor features',
     'python': 'Python',
     'numpy': 'NumPy',
     'scipy': 'SciPy',
     'numba': 'Numba',
-    'llvmlite': 'llvmlite',
     'cv2': 'OpenCV',
 }
 # What a search in one process consists of.
@@ -39,18 +37,17 @@ _LIBRARIES = ('numpy', 'scipy', 'numba', 'llvmlite', 'cv2')
 
 
 @cache
-def _facts() -> tuple[tuple[str, str], ...]:
+def _facts() -> dict[str, str]:
     from numba.core.registry import cpu_target
 
     # What kernels are compiled for, NUMBA_CPU_NAME and NUMBA_CPU_FEATURES included.
     _, processor, features = cpu_target.target_context.codegen().magic_tuple()
-    facts = {
+    return {
         'processor': processor,
         'features': hashlib.sha256(features.encode()).hexdigest()[:12],
         'python': platform.python_version(),
         **{name: import_module(name).__version__ for name in _LIBRARIES},
     }
-    return tuple(facts.items())
 
 
 def this_machine() -> dict[str, str]:

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped
+from pydantic import Field
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
+from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
 from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.emulators.linked_robots import LinkedRobot, linked_robot
-from maasi_sim.scenario.layering import Key
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, ScenarioError
-from maasi_sim.sim_settings import SimNodeSettings
 from maasi_sim.sim_topics import Connections, ExternalRobot, RobotTopics, publish_truth
 from maasi_sim.world.simulation import Simulation
 
@@ -37,6 +37,36 @@ _PATIENCE, _REMINDER = 3.0, 15.0
 _CONNECTION_PATIENCE = 5.0
 # At shutdown: how long linked robots stay reachable for drivers that stop them [s].
 _FAREWELL = 1.0
+
+
+class SimNodeSettings(NodeSettings):
+    """Settings of the simulation node; all else is in the scenario file."""
+
+    live: ClassVar[frozenset[str]] = frozenset({'command_age'})
+
+    step: float = Field(
+        default=0.0, ge=0.0, le=10.0, description="Duration of a step; 0: the scenario's [s]"
+    )
+    scenario: str = Field(
+        min_length=1, description='Scenario file, or the name of one in config/scenarios'
+    )
+    rate: float = Field(
+        default=1.0,
+        ge=0.0,
+        description='Simulated over wall time, at most; 0: as fast as possible, in lockstep only',
+    )
+    follow_clock: bool = Field(
+        default=False,
+        description='Whether its time is a /clock that somebody else publishes; not in lockstep, '
+        'and `rate` does not count',
+    )
+    recorder: bool = Field(default=False, description='Whether it waits for the recorder, too')
+    command_age: float = Field(
+        default=1.0,
+        gt=0.0,
+        description='Simulated time after which a command is too old; in lockstep each is for its '
+        'step [s]',
+    )
 
 
 class SimNode(LockstepLifecycleNode[SimNodeSettings]):
@@ -73,6 +103,9 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
 
     #: Name of the node of each robot that commands it.
     robot_node = 'driver'
+    #: How the scenario is read, and its robots are made.
+    load: ClassVar[Any] = staticmethod(load_scenario)
+    simulate: ClassVar[Any] = Simulation
 
     def __init__(self, **options: Any) -> None:
         super().__init__('sim_node', SimNodeSettings, lockstep_member=False, **options)
@@ -88,10 +121,10 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             raise SettingsError('parameter follow_clock: read true, allowed is false in lockstep')
         overrides = {'parameter step': (('step',), settings.step)} if settings.step > 0.0 else {}
         try:
-            self.scenario = self.load(settings.scenario, overrides)
+            self.scenario: Scenario = self.load(settings.scenario, overrides)
             rate = None if settings.lockstep else settings.rate
             self.scenario.check_pace(settings.lockstep, rate)
-            self.simulation = self.simulate()
+            self.simulation: Simulation = self.simulate(self.scenario, settings.seed)
         except (ScenarioError, ValueError) as error:
             raise SettingsError(str(error)) from error
         self._follows = settings.follow_clock or self.scenario.external_clock
@@ -115,14 +148,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._said, self._said_at = '', 0.0
         self._wall_start = self._wall_step = time.monotonic()
 
-    def load(self, path: str, overrides: Mapping[str, tuple[Key, Any]]) -> Scenario:
-        """Return the scenario of a file."""
-        return load_scenario(path, overrides)
-
-    def simulate(self) -> Simulation:
-        """Return the robots at the start."""
-        return Simulation(self.scenario, self.settings.seed)
-
     def connect(self) -> None:
         """Make publishers and subscriptions beside those of all robots, and of the time."""
 
@@ -145,10 +170,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._robot_of = {node: name for name, node in self._driver_of.items()}
         step_topics = [self.resolve_topic_name('lockstep/step')] if lockstep else []
         self._expected = {
-            self._driver_of[name]: [
-                *step_topics,
-                *filter(None, (topics.odometry_topic, topics.sensor_topic)),
-            ]
+            self._driver_of[name]: [*step_topics, *topics.needed]
             for name, topics in self._robots.items()
         }
         for namespace in self.scenario.namespaces():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 
@@ -78,27 +79,24 @@ class RobotTopics:
         unit = getattr(robot, 'battery_unit', 'fraction')
         self._full = 100.0 if unit == 'percent' else 1.0
         self._battery.header.frame_id = f'{name}/base_link'
-        #: Sensor topic that the driver needs besides odometry.
-        self.sensor_topic = ''
+        #: Full names of the topics that its driver needs.
+        self.needed: list[str] = []
+        if self._odometry_publisher is not None:
+            self.needed.append(self._odometry_publisher.topic_name)
         if equipment.camera is not None:
             self._image_publisher = publisher(Image, 'camera/image_raw')
             self._info_publisher = publisher(CameraInfo, 'camera/camera_info')
             self._image, self._info = camera_messages(equipment.camera, f'{name}/camera_optical')
-            self.sensor_topic = self._image_publisher.topic_name
+            self.needed.append(self._image_publisher.topic_name)
         elif equipment.sensor is not None:
             self._ranges_publisher = publisher(RangeArray, 'ranges')
             self._ranges = RangeArray(header=Header(frame_id=f'{name}/base_link'))
-            self.sensor_topic = self._ranges_publisher.topic_name
+            self.needed.append(self._ranges_publisher.topic_name)
         # The program that moves an external robot also publishes its scan.
         self._scans = equipment.laser is not None and robot.body == 'simulated'
         if equipment.laser is not None and self._scans:
             self._scan_publisher = publisher(LaserScan, 'scan')
             self._scan = scan_message(equipment.laser, f'{name}/base_scan')
-
-    @property
-    def odometry_topic(self) -> str:
-        """Full name of its odometry's topic; empty where it has none."""
-        return '' if self._odometry_publisher is None else self._odometry_publisher.topic_name
 
     def publish(self, stamp: Time) -> bool:
         """Publish what is due; return whether camera or ranging sensor had something."""
@@ -276,31 +274,23 @@ class ExternalRobot:
     Its state is what its driver publishes; simulated sensors measure from there.
     """
 
+    #: The simulation does not wait for it at shutdown.
+    obeys = False
+
     def __init__(self, start: Pose) -> None:
-        self._state = RobotState(start)
-
-    @property
-    def state(self) -> RobotState:
-        """The last published state, in the map."""
-        return self._state
-
-    @property
-    def obeys(self) -> bool:
-        """False: the simulation does not wait for it at shutdown."""
-        return False
+        #: In the map.
+        self.state = RobotState(start)
 
     def take(self, message: AgentState) -> None:
         """Store the newest state."""
         linear, angular = message.twist.linear, message.twist.angular
-        try:
-            self._state = RobotState(
+        # One that is not finite leaves the last valid one.
+        with contextlib.suppress(ValueError):
+            self.state = RobotState(
                 pose_from_ros(message.pose.pose),
                 np.array([linear.x, linear.y, linear.z]),
                 np.array([angular.x, angular.y, angular.z]),
             )
-        except ValueError:
-            # Not finite: keep the last valid pose.
-            return
 
     def cut(self, cut: bool = True) -> None:
         """Do nothing: its link is not simulated."""

@@ -52,7 +52,6 @@ def test_messages_come_back_in_order_with_rising_times(types, tmp_path):
     with BagWriter(tmp_path / 'bag', types, backlog=100) as writer:
         write_steps(writer, range(300))
         writer.wait()
-        assert writer.counts == {'/text': 300}
     writer.close()
     with Bag(tmp_path) as bag:
         assert read_steps(bag) == list(range(300))

@@ -12,7 +12,7 @@ from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_sim.run.node_plan import NodePlan, RunSettings, in_team, with_followed_clock
 from maasi_sim.scenario.loading import config_folder, load_scenario
 from maasi_sim.scenario.schema import ScenarioError
-from maasi_sim.sim_settings import SimNodeSettings
+from maasi_sim.sim_node import SimNodeSettings
 from maasi_sim.targets.mission import plan_nodes
 
 SCENARIOS = sorted(

@@ -8,12 +8,13 @@ import tempfile
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
+
+Reader = TypeVar('Reader', bound='BagReader')
 
 _MAGIC = b'\x89MCAP0\r\n'
 # Opcode and length of a record.
@@ -181,17 +182,10 @@ class BagReader:
             self._reader.close()
         self._stack.close()
 
-    def __enter__(self) -> BagReader:
-        """Return itself."""
+    def __enter__(self: Reader) -> Reader:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close the files."""
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -13,9 +12,9 @@ from maasi_filter.ros.conversions import stamp_of_step, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import SearchLink, SearchLinkArray
+from maasi_sim.buildings.mission import within_range
 from maasi_sim.buildings.scenario import load_cuboid_scenario
 from maasi_sim.buildings.simulation import CuboidSimulation
-from maasi_sim.scenario.layering import Key
 from maasi_sim.sim_node import SimNode
 
 # Share of a step after which the link delivers, even if some robots sent nothing.
@@ -39,16 +38,9 @@ class CuboidSimNode(SimNode):
     """
 
     robot_node = 'cuboid_planner'
+    load = staticmethod(load_cuboid_scenario)
+    simulate = CuboidSimulation
     scenario: Any
-    simulation: Any
-
-    def load(self, path: str, overrides: Mapping[str, tuple[Key, Any]]) -> Any:
-        """See `SimNode.load`."""
-        return load_cuboid_scenario(path, overrides)
-
-    def simulate(self) -> Any:
-        """See `SimNode.simulate`."""
-        return CuboidSimulation(self.scenario, self.settings.seed)
 
     def connect(self) -> None:
         """See `SimNode.connect`."""
@@ -91,8 +83,12 @@ class CuboidSimNode(SimNode):
     def _deliver(self) -> None:
         """Deliver to each robot that has sent the messages in its range."""
         self._link_timer.cancel()
-        senders = sorted(name for name, message in self._sent.items() if not message.silent)
-        heard = self.simulation.heard_by(senders)
+        places = {
+            name: self.simulation.robots[name].state.pose.position
+            for name, message in self._sent.items()
+            if not message.silent
+        }
+        heard = within_range(places, self.scenario.planner.communication_range)
         stamp = stamp_to_ros(stamp_of_step(self.step, self.scenario.step))
         header = Header(frame_id=self.settings.frame, stamp=stamp)
         for name in self.simulation.present:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -40,15 +40,9 @@ class SearchRobotSettings(SearcherSettings):
         default_factory=BatterySettings, description='Its battery as it is shown, simulated'
     )
 
-    @property
-    def external(self) -> bool:
-        """False: the sim moves it."""
-        return False
-
-    @property
-    def takes_off(self) -> bool:
-        """False: it flies from the start."""
-        return False
+    # The simulation moves it, and it flies from the start.
+    external: ClassVar[bool] = False
+    takes_off: ClassVar[bool] = False
 
 
 class CuboidPlanner(CuboidSettings):

@@ -11,7 +11,6 @@ from maasi_planner.buildings.preplanning import CoveragePlan
 from maasi_planner.motion import RobotState
 from maasi_planner.motion.base import check_command
 from maasi_planner.settings import MotionSettings
-from maasi_sim.buildings.mission import within_range
 from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.world.odometry import OdometryModel, OdometryReading
 from maasi_sim.world.robots import Battery, Equipment
@@ -99,8 +98,3 @@ class CuboidSimulation(SimulatedTeam):
     def scan_due(self, name: str) -> bool:
         """Return false: there is no laser scanner."""
         return False
-
-    def heard_by(self, senders: list[str]) -> dict[str, list[str]]:
-        """Return the senders within C_R of each sender (III-B)."""
-        places = {name: self.robots[name].state.pose.position for name in senders}
-        return within_range(places, self.scenario.planner.communication_range)

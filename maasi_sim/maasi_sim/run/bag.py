@@ -27,12 +27,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.rosbag2.storage_mcap import (
-    Channel,
-    McapWriter,
-    write_channel,
-    write_string,
-)
+from rosbags.rosbag2.storage_mcap import Channel, McapWriter, write_channel, write_string
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -100,12 +95,11 @@ class FlushingStorage(McapWriter):
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
         """Add a topic, with the hash of its type as rosbag2 stores it."""
         metadata = BytesIO()
-        for text in (
-            'offered_qos_profiles',
-            offered_qos_profiles,
-            'topic_type_hash',
-            connection.digest,
+        for key, text in (
+            ('offered_qos_profiles', offered_qos_profiles),
+            ('topic_type_hash', connection.digest),
         ):
+            write_string(metadata, key)
             write_string(metadata, text)
         extension = cast('ConnectionExtRosbag2', connection.ext)
         self.channels.append(
@@ -156,14 +150,8 @@ class BagFile(Writer):
         copy.write_text(text.replace(_FOREIGN_DISTRO, _OWN_DISTRO), encoding='utf-8')
         copy.replace(self.metapath)
 
-    def give_up(self) -> None:
-        """Close after a failed write: whole chunks stay readable, without an index."""
-        self.metapath.with_suffix('.yaml.tmp').unlink(missing_ok=True)
-        with contextlib.suppress(Exception):
-            self.abort()
 
-
-class BagWriter:
+class BagWriter(contextlib.AbstractContextManager['BagWriter']):
     """Writes a recording in its own thread; after any error it can be closed, and is readable then.
 
     Messages are in the file after `FLUSH_PERIOD`: a killed process loses no more. They keep their
@@ -207,7 +195,6 @@ class BagWriter:
         self._changed = threading.Condition()
         self._error: BaseException | None = None
         self._closed = False
-        self.counts: dict[str, int] = {}
         self._thread = threading.Thread(target=self._work, name='bag writer', daemon=True)
         self._thread.start()
 
@@ -224,8 +211,7 @@ class BagWriter:
             raise BagError(f'topic {topic}: not announced')
         with self._changed:
             self._pending += len(data)
-            if self._pending > self._limit:
-                self._changed.wait_for(lambda: self._pending <= self._limit or self._error)
+            self._changed.wait_for(lambda: self._pending <= self._limit or self._error)
         self._queue.put((topic, time, data))
 
     def write_message(self, topic: str, time: int, message: Any) -> None:
@@ -267,15 +253,13 @@ class BagWriter:
             except Exception as error:
                 self._error = error
         if self._error is not None:
-            self._writer.give_up()
+            # Whole chunks stay readable, without an index.
+            self._writer.metapath.with_suffix('.yaml.tmp').unlink(missing_ok=True)
+            with contextlib.suppress(Exception):
+                self._writer.abort()
         self._check()
 
-    def __enter__(self) -> BagWriter:
-        """Return itself."""
-        return self
-
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
 
     def _check(self) -> None:
@@ -309,7 +293,6 @@ class BagWriter:
         connection = self._connect(topic, compressed=compressed is not None)
         self._time = max(time, self._time + 1)
         self._writer.write(connection, self._time, data if compressed is None else compressed)
-        self.counts[connection.topic] = self.counts.get(connection.topic, 0) + 1
 
     def _connect(self, topic: str, *, compressed: bool) -> Connection:
         name, (type_name, qos) = topic, self._topics[topic]
@@ -363,7 +346,3 @@ class Bag(BagReader):
             if isinstance(content, dict):
                 return content
         raise BagError(f'{self.path}: holds no scenario: run_scenario did not record it')
-
-    def __enter__(self) -> Bag:
-        """Return itself."""
-        return self

@@ -31,7 +31,7 @@ class DomainError(RuntimeError):
     """No domain is free, or it cannot be used."""
 
 
-class Domain:
+class Domain(contextlib.AbstractContextManager['Domain']):
     """A ROS domain that no other run on this host uses, until `release`.
 
     A domain, and a namespace in it, is locked by the name of an abstract Unix socket: it is valid
@@ -59,7 +59,6 @@ class Domain:
         if fault := loopback_fault():
             raise DomainError(fault)
         self._purpose = purpose
-        self._shared = shared
         self._locks: list[socket.socket] = []
         if number is not None and number not in DOMAINS:
             raise DomainError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
@@ -70,7 +69,9 @@ class Domain:
             problem = self._take(candidate, team, shared)
             if not problem:
                 self.number = candidate
-                self._remove_dead()
+                # Nodes of other runs may be starting in a shared domain.
+                self._own = None if shared else candidate
+                remove_dead(self._own)
                 return
             if number is not None:
                 raise DomainError(f'domain id: {problem} is used by another run')
@@ -106,23 +107,14 @@ class Domain:
 
     def release(self) -> None:
         """Release the domain; what killed nodes left in shared memory goes before."""
-        self._remove_dead()
+        remove_dead(self._own)
         self._unlock()
-
-    def _remove_dead(self) -> None:
-        # Nodes of other runs may be starting in a shared domain.
-        remove_dead(None if self._shared else self.number)
 
     def _unlock(self) -> None:
         while self._locks:
             self._locks.pop().close()
 
-    def __enter__(self) -> Domain:
-        """Return itself."""
-        return self
-
     def __exit__(self, *_: object) -> None:
-        """Release it."""
         self.release()
 
 
