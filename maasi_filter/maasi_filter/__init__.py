@@ -1,36 +1,69 @@
 """State estimation of the team: sensors, exploration, filters and found targets."""
 
-from maasi_filter.ic_phd.filter import IcPhdFilter as IcPhdFilter
-from maasi_filter.make_filter import load_filter as load_filter
-from maasi_filter.make_filter import make_filter as make_filter
-from maasi_filter.make_filter import warm_up as warm_up
-from maasi_filter.metrics import Gospa as Gospa
-from maasi_filter.metrics import Match as Match
-from maasi_filter.metrics import gospa as gospa
-from maasi_filter.metrics import match_targets as match_targets
-from maasi_filter.models.detection import BoxDetection as BoxDetection
-from maasi_filter.models.detection import DetectionModel as DetectionModel
-from maasi_filter.models.detection import ExponentialDetection as ExponentialDetection
-from maasi_filter.models.detection import GaussianDetection as GaussianDetection
-from maasi_filter.models.detection import detection_probability_at as detection_probability_at
-from maasi_filter.models.measurement import MeasurementModel as MeasurementModel
-from maasi_filter.models.measurement import RangeBearing as RangeBearing
-from maasi_filter.models.measurement import RangeBearingElevation as RangeBearingElevation
-from maasi_filter.models.measurement import wrap_angle as wrap_angle
-from maasi_filter.models.pose import Pose as Pose
-from maasi_filter.models.pose import compose as compose
-from maasi_filter.models.pose import inverse as inverse
-from maasi_filter.models.sensor import Sensor as Sensor
-from maasi_filter.pmb.filter import PmbFilter as PmbFilter
-from maasi_filter.records import AgentMeasurement as AgentMeasurement
-from maasi_filter.records import Cluster as Cluster
-from maasi_filter.records import FilterResult as FilterResult
-from maasi_filter.records import FoundTarget as FoundTarget
-from maasi_filter.search_filter import SearchFilter as SearchFilter
-from maasi_filter.settings import DetectionSettings as DetectionSettings
-from maasi_filter.settings import EnvironmentSettings as EnvironmentSettings
-from maasi_filter.settings import FilterSettings as FilterSettings
-from maasi_filter.settings import NoiseSettings as NoiseSettings
-from maasi_filter.settings import SensorSettings as SensorSettings
-from maasi_filter.state_file import StateFileError as StateFileError
-from maasi_filter.unexplored_map import UnexploredMap as UnexploredMap
+from maasi_filter.ic_phd.filter import IcPhdFilter
+from maasi_filter.make_filter import load_filter, make_filter, warm_up
+from maasi_filter.metrics import Gospa, Match, gospa, match_targets
+from maasi_filter.models.detection import (
+    BoxDetection,
+    DetectionModel,
+    ExponentialDetection,
+    GaussianDetection,
+    detection_probability_at,
+)
+from maasi_filter.models.measurement import (
+    MeasurementModel,
+    RangeBearing,
+    RangeBearingElevation,
+    wrap_angle,
+)
+from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.pmb.filter import PmbFilter
+from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
+from maasi_filter.search_filter import SearchFilter
+from maasi_filter.settings import (
+    DetectionSettings,
+    EnvironmentSettings,
+    FilterSettings,
+    NoiseSettings,
+    SensorSettings,
+)
+from maasi_filter.state_file import StateFileError
+from maasi_filter.unexplored_map import UnexploredMap
+
+__all__ = [
+    'AgentMeasurement',
+    'BoxDetection',
+    'Cluster',
+    'DetectionModel',
+    'DetectionSettings',
+    'EnvironmentSettings',
+    'ExponentialDetection',
+    'FilterResult',
+    'FilterSettings',
+    'FoundTarget',
+    'GaussianDetection',
+    'Gospa',
+    'IcPhdFilter',
+    'Match',
+    'MeasurementModel',
+    'NoiseSettings',
+    'PmbFilter',
+    'Pose',
+    'RangeBearing',
+    'RangeBearingElevation',
+    'SearchFilter',
+    'Sensor',
+    'SensorSettings',
+    'StateFileError',
+    'UnexploredMap',
+    'compose',
+    'detection_probability_at',
+    'gospa',
+    'inverse',
+    'load_filter',
+    'make_filter',
+    'match_targets',
+    'warm_up',
+    'wrap_angle',
+]

@@ -69,6 +69,11 @@ class PluginGroup:
         """Return a class by one of `names`, or `module:Class`.
 
         Modules beside the scenario file and in the current folder are found too.
+
+        Raises
+        ------
+        PluginError
+            If it is not known, cannot be imported, or is no subclass of `base`.
         """
         if name in self.own:
             return _attribute(self.own[name])
@@ -167,7 +172,7 @@ def _attribute(reference: str, named: bool = False) -> Any:
     except (Exception, SystemExit) as error:
         raise PluginError(_import_problem(name, error)) from error
     if named:
-        _check_file(name)
+        _check_file(name, module)
     found: Any = module
     for part in attribute.split('.'):
         if not hasattr(found, part):
@@ -200,7 +205,7 @@ def _import_problem(name: str, error: BaseException) -> str:
     return f'module {name} cannot be imported: {type(error).__name__}: {text}{place}'
 
 
-def _check_file(name: str) -> None:
+def _check_file(name: str, module: Any) -> None:
     """Refuse a module that is another one than the file beside the scenario."""
     top = name.partition('.')[0]
     for folder in _folders:

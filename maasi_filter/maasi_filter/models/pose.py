@@ -13,7 +13,13 @@ from maasi_filter.arrays import FloatArray
 
 
 def finite_vector(name: str, value: ArrayLike, length: int) -> FloatArray:
-    """Return `value` as an array of `length` finite numbers; ValueError names `name`."""
+    """Return `value` as a float array of `length` numbers.
+
+    Raises
+    ------
+    ValueError
+        If it has another shape or is not finite; the message names `name`.
+    """
     array = np.array(value, dtype=float)
     if array.shape != (length,):
         raise ValueError(f'{name}: got shape {array.shape}, allowed is ({length},)')
@@ -24,11 +30,22 @@ def finite_vector(name: str, value: ArrayLike, length: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Pose:
-    """Position and orientation of a body; ValueError if not finite, or the quaternion is zero."""
+    """Position and orientation of a body.
 
-    #: (3,): Metres, frame `map`. Two numbers are taken as x, y with z = 0.
+    Parameters
+    ----------
+    position : (3,) array
+        Metres, frame `map`. Two numbers are taken as x, y with z = 0.
+    orientation : (4,) array
+        Unit quaternion w, x, y, z that turns body axes into map axes; normalised here.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, or the quaternion is zero.
+    """
+
     position: FloatArray
-    #: (4,): Unit quaternion w, x, y, z that turns body axes into map axes; normalised here.
     orientation: FloatArray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
 
     def __post_init__(self) -> None:
@@ -92,6 +109,11 @@ class Pose:
             ]
         )
 
+    def inverse(self) -> Pose:
+        """Return the pose of the map's origin seen from this pose."""
+        w, x, y, z = self.orientation
+        return Pose(-(self.rotation().T @ self.position), np.array([w, -x, -y, -z]))
+
 
 def quaternion_product(first: ArrayLike, second: ArrayLike) -> FloatArray:
     """Return the Hamilton product of two quaternions w, x, y, z, each of shape (4,)."""
@@ -116,6 +138,5 @@ def compose(pose_a: Pose, pose_b: Pose) -> Pose:
 
 
 def inverse(pose: Pose) -> Pose:
-    """Return the pose of the map's origin seen from `pose`."""
-    w, x, y, z = pose.orientation
-    return Pose(-(pose.rotation().T @ pose.position), np.array([w, -x, -y, -z]))
+    """Return the inverse of `pose`."""
+    return pose.inverse()

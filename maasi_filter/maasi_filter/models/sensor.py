@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,18 +31,40 @@ def is_covariance(covariance: FloatArray) -> bool:
 
 @dataclass
 class Sensor:
-    """Sensor of a robot; ValueError if its numbers are not usable."""
+    """Sensor of a robot.
 
-    name: str  #: For messages.
-    detection: DetectionModel  #: pi(x, q).
-    measurement: MeasurementModel  #: g(x, q): range, bearing and, in 3D, elevation.
-    covariance: FloatArray  #: (d, d): R, of a measurement; m and rad, squared.
-    #: Intensity of false detections, per unit of measurement space (m rad in 2D, m rad^2 in 3D).
+    Parameters
+    ----------
+    name : str
+        For messages.
+    detection : DetectionModel
+        pi(x, q).
+    measurement : MeasurementModel
+        g(x, q): range and bearing in 2D; range, bearing and elevation in 3D.
+    covariance : (d, d) array
+        R, of a measurement; m and rad, squared.
+    clutter : float
+        Intensity of false detections, per unit of measurement space (m rad in 2D, m rad^2 in 3D).
+    period : float
+        Seconds between possible measurements; 0 means no limit.
+    maximum_range : float
+        Detections from farther away are dropped and counted, metres.
+    resolution : float
+        Detections of one scan that are closer are of one target, in deviations of the noise.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or the covariance is not positive definite.
+    """
+
+    name: str
+    detection: DetectionModel
+    measurement: MeasurementModel
+    covariance: FloatArray
     clutter: float = 0.0
-    period: float = 0.0  #: Seconds between possible measurements; 0 means no limit.
-    #: Detections from farther away are dropped and counted, metres.
-    maximum_range: float = math.inf
-    #: Detections of one scan that are closer are of one target, in deviations of the noise.
+    period: float = 0.0
+    maximum_range: float = field(default=math.inf)
     resolution: float = 1.0
 
     def __post_init__(self) -> None:
