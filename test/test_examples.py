@@ -27,7 +27,7 @@ from maasi_sim.run.bag import Bag
 from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.scenario import load_scenario
 from maasi_sim.search import search
-from maasi_sim.targets.mission import plan_nodes
+from maasi_sim.targets.mission import TargetMission
 
 EXAMPLES = Path(__file__).resolve().parents[1] / 'examples'
 # Far more than anything takes, on a machine that is busy with something else [s].
@@ -169,9 +169,10 @@ OF_THE_FIELD = {
 def test_the_parameters_of_the_field_are_those_of_its_simulation():
     folder = EXAMPLES / 'field_team'
     file = folder / 'search.yaml'
+    run = RunSettings(1, False, None, False, file)
     plans = {
         '_'.join(filter(None, (plan.namespace, plan.name))): plan
-        for plan in plan_nodes(load_scenario(file), RunSettings(1, False, None, False, file))
+        for plan in TargetMission('search', load_scenario(file)).plan_nodes(run)
     }
     for node, (_, model, allowed) in OF_THE_FIELD.items():
         parameters = yaml.safe_load((folder / f'{node}.yaml').read_text())['/**']['ros__parameters']

@@ -20,7 +20,7 @@ from maasi_planner.settings import PLANNERS, PlannerSettings
 from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.scenario import ScenarioError, load_scenario
 from maasi_sim.search import search
-from maasi_sim.targets.mission import plan_nodes
+from maasi_sim.targets.mission import TargetMission
 
 ONE_BY_ONE = '''
 from pydantic import BaseModel, ConfigDict, Field
@@ -366,12 +366,13 @@ def test_driver_of_ones_own_is_tried_before_anything_starts(folder):
     changes = {'driver': (('robots', 'rover', 'driver'), 'mine:Driver')}
     scenario = load_scenario(folder / 'search.yaml', changes)
     run = RunSettings(1, True, None, False, folder / 'search.yaml')
+    mission = TargetMission('search', scenario)
     with pytest.raises(ScenarioError, match=r"robots\.rover\.driver: .*'nowhere_too'"):
-        plan_nodes(scenario, run)
+        mission.plan_nodes(run)
     (folder / 'mine.py').write_text(
         'from maasi_drivers.drivers import RangingDriver\nclass Driver(RangingDriver):\n    pass\n'
     )
-    (plan,) = [plan for plan in plan_nodes(scenario, run) if plan.drives]
+    (plan,) = [plan for plan in mission.plan_nodes(run) if plan.drives]
     assert plan.command(Path('x'), Path('y'))[:3] == ['x', 'mine:Driver', str(folder)]
     with pytest.raises(ScenarioError, match=r"unknown driver 'mambo_drive' .*mean 'mambo_d"):
         load_scenario(folder / 'search.yaml', {'d': (('robots', 'rover', 'driver'), 'mambo_drive')})

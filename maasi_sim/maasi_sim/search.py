@@ -121,11 +121,14 @@ class _Search:
         self._complete = False
 
     def run(self, most_measurements: int | None) -> SearchResult:
-        """Run the search and return its result."""
         reason = None
         for step in range(steps_of(self.scenario.limits.time, self.scenario.step)):
             self.step, self.time = step, step * self.scenario.step
-            self._let_leave()
+            for name in self._departures.get(step, []):
+                self._here.pop(name, None)
+                self.trace.add(EventMaker.leave, self.time, name)
+                (group,) = (group for group in self._groups if name in group.names)
+                group.coordinator.plans[name].leave()
             for robot in self._here.values():
                 robot.observe(round(self.time * 1e9))
             self.trace.robots(self.time, {name: r.state for name, r in self._here.items()})
@@ -150,14 +153,6 @@ class _Search:
         result.found_targets, result.truth, result.scores = self._state()
         result.distance = {name: robot.distance for name, robot in self._robots.items()}
         return result
-
-    def _let_leave(self) -> None:
-        for name in self._departures.get(self.step, []):
-            self._here.pop(name, None)
-            self.trace.add(EventMaker.leave, self.time, name)
-            for group in self._groups:
-                if name in group.names:
-                    group.coordinator.plans[name].leave()
 
     def _plan(self, group: _Group) -> dict[str, PresentRobot]:
         """Plan for the free robots of a group, and send them to their waypoints."""
@@ -307,12 +302,10 @@ class _Robot:
         self.distance += float(np.sqrt((moved * moved).sum()))
 
     def has_ended(self, goal: int) -> bool:
-        """Return whether the goal of this number has ended."""
         now, status = self.follower.goal, self.follower.status
         return now is not None and now.id == goal and status != GoalStatus.MOVING
 
     def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
-        """Return the measurement of the robot at a step."""
         if self.detector is None:
             reading = SensorReading.of_sweep(self.body.sweep(step), self.sensor, self.pose.pose)
         else:

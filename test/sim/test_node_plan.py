@@ -13,7 +13,7 @@ from maasi_sim.run.node_plan import NodePlan, RunSettings, in_team, with_followe
 from maasi_sim.scenario.loading import config_folder, load_scenario
 from maasi_sim.scenario.schema import ScenarioError
 from maasi_sim.sim_node import SimNodeSettings
-from maasi_sim.targets.mission import plan_nodes
+from maasi_sim.targets.mission import TargetMission
 
 SCENARIOS = sorted(
     path.stem
@@ -25,7 +25,7 @@ SCENARIOS = sorted(
 def plans_of(scenario, **changes):
     options = {'seed': 4, 'lockstep': True, 'rate': None, 'recorder': True, 'file': Path('/s.yaml')}
     run = RunSettings(**{**options, **changes})
-    return {plan.full_name: plan for plan in plan_nodes(scenario, run)}
+    return {plan.full_name: plan for plan in TargetMission('', scenario).plan_nodes(run)}
 
 
 def read_back(plan, model):

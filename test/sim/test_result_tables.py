@@ -21,7 +21,7 @@ from maasi_sim.scenario.base import OriginSettings
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
-from maasi_sim.targets.mission import plan_nodes
+from maasi_sim.targets.mission import TargetMission
 from maasi_sim.targets.tables import csv_text, found_rows, geodetic, geojson_text
 
 ORIGIN = OriginSettings(latitude=46.0, longitude=23.5, altitude=350.0)
@@ -81,7 +81,8 @@ def field(folder, **origin):
 
 def test_nodes_are_not_told_the_origin_and_a_wrong_one_is_refused(tmp_path):
     scenario = field(tmp_path, latitude=46.0, longitude=23.5)
-    plans = plan_nodes(scenario, RunSettings(1, True, None, True, Path('/s.yaml')))
+    run = RunSettings(1, True, None, True, Path('/s.yaml'))
+    plans = TargetMission('field', scenario).plan_nodes(run)
     assert not any('environment.origin' in name for plan in plans for name in plan.parameters)
     with pytest.raises(ScenarioError, match=r'field.yaml:.*environment.origin.latitude'):
         field(tmp_path, latitude=146.0, longitude=23.5)

@@ -13,7 +13,7 @@ from maasi_sim.buildings.observer import CuboidRecord
 from maasi_sim.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, colours_of
 from maasi_sim.buildings.report import build_cuboid_report
 from maasi_sim.run.report_files import reason_of_end
-from maasi_sim.run.report_panels import MARGIN, MapView, Plot, draw_report
+from maasi_sim.run.report_panels import MARGIN, MapView, draw_report
 
 
 def plot_cuboid_report(record: CuboidRecord) -> Figure:
@@ -25,8 +25,8 @@ def plot_cuboid_report(record: CuboidRecord) -> Figure:
         _area(record),
         lambda view: _draw_mission(view, record, visited),
         [
-            Plot('', 1.0, lambda axes: _draw_visited(axes, record)),
-            Plot('time [s]', 0.7, lambda axes: _draw_active(axes, record)),
+            ('', 1.0, lambda axes: _draw_visited(axes, record)),
+            ('time [s]', 0.7, lambda axes: _draw_active(axes, record)),
         ],
         'Cuboids visited',
         _rows(record),

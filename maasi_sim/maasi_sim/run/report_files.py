@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from maasi_filter.arrays import FloatArray
 from maasi_sim.machine import this_machine
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.run_folder import ResultsError, remove, write_text, write_whole
@@ -52,6 +51,7 @@ def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> di
     Nothing in it is infinite or not a number.
     """
     wall = record.wall_time
+    moves = {name: np.diff(way[:, 1:], axis=0) for name, way in record.trajectories.items()}
     return {
         'version': REPORT_VERSION,
         'mission': mission,
@@ -60,18 +60,15 @@ def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> di
         'planner': record.scenario.planner.name,
         'agents': record.scenario.names(),
         **content,
-        'distance': {name: finite(_length(way)) for name, way in record.trajectories.items()},
+        'distance': {
+            name: finite(np.linalg.norm(move, axis=1).sum()) for name, move in moves.items()
+        },
         'end_reason': record.end_reason,
         'wall_time': wall,
         'real_time_factor': record.end_time / wall if wall > 0.0 else None,
         'machine': this_machine(),
         'events': record.events,
     }
-
-
-def _length(way: FloatArray) -> float:
-    """Return the length of rows time, x, y, z [m]."""
-    return float(np.linalg.norm(np.diff(way[:, 1:], axis=0), axis=1).sum())
 
 
 def finite(value: float) -> float | None:

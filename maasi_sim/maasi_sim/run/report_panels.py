@@ -55,13 +55,8 @@ def ellipse(
     return Ellipse(place, *widths, angle=angle, fill=False, **style)
 
 
-@dataclass(frozen=True)
-class Plot:
-    """A plot of counts beside the map: label of its axis to the right, relative height."""
-
-    label: str
-    height: float
-    draw: Callable[[Axes], None]
+# A plot of counts beside the map: label of its axis to the right, relative height, what draws it.
+Plot = tuple[str, float, Callable[[Axes], None]]
 
 
 def draw_report(
@@ -90,14 +85,14 @@ def draw_report(
     for marker, label in (('s', 'start'), ('o', 'end')):
         views[0].axes.plot([], [], marker, color=PALE, ms=7, label=label)
     _add_legend(figure, views)
-    heights = [plots[0].height, 0.12 + 0.1 * min(len(colours), 8)]
-    heights += [*(plot.height for plot in plots[1:]), 1.5]
+    first, *further = (height for _, height, _ in plots)
+    heights = [first, 0.12 + 0.1 * min(len(colours), 8), *further, 1.5]
     grid = halves[1].subgridspec(len(heights), 1, height_ratios=heights)
     over, times, *others, text = (figure.add_subplot(grid[row]) for row in range(len(heights)))
-    for axes, plot in zip([over, *others], plots):
-        plot.draw(axes)
+    for axes, (label, _, draw) in zip([over, *others], plots):
+        draw(axes)
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.set_xlabel(plot.label)
+        axes.set_xlabel(label)
         axes.grid(color=GRID, lw=0.8)
         axes.set_axisbelow(True)
         axes.spines[['top', 'right']].set_visible(False)
@@ -204,10 +199,10 @@ def _add_legend(figure: Figure, views: Sequence[MapView]) -> None:
     )
 
 
-def _write_rows(axes: Axes, rows: Sequence[tuple[str, str]], least: int = 10) -> None:
-    """Write names and values below each other, with space for at least `least`."""
+def _write_rows(axes: Axes, rows: Sequence[tuple[str, str]]) -> None:
+    """Write names and values below each other, with space for at least ten."""
     axes.set_axis_off()
     for index, (key, value) in enumerate(rows):
-        height = 1.0 - (index + 0.5) / max(len(rows), least)
+        height = 1.0 - (index + 0.5) / max(len(rows), 10)
         axes.text(0.0, height, key, color='#666666', fontsize=9.5, va='center')
         axes.text(0.3, height, value, fontsize=9.5, va='center')

@@ -26,6 +26,9 @@ from maasi_sim.targets.tally import TargetRecord
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Settings of a robot that its driver has as well.
+_OF_THE_DRIVER = ['start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'battery_unit', 'link']
+
 
 class TargetMission:
     """See `Mission`."""
@@ -41,8 +44,16 @@ class TargetMission:
         self.scenario = with_addresses(self.scenario)
 
     def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
-        """See `Mission.plan_nodes`."""
-        return plan_nodes(self.scenario, run)
+        """Return the simulation, drivers and guards, filters and planners."""
+        scenario = self.scenario
+        scenario.check_pace(run.lockstep, run.rate)
+        common = run.common(scenario)
+        plans = [sim_plan('sim_node', scenario, run)]
+        for name in scenario.names():
+            plans += _robot_plans(name, scenario.robots[name], scenario, common)
+        for namespace, names in scenario.namespaces().items():
+            plans += _team_plans(namespace, names, scenario, common)
+        return plans
 
     def warning(self) -> str:
         """See `Mission.warning`."""
@@ -75,18 +86,6 @@ class TargetMission:
         from maasi_sim.targets.report_figure import plot_report
 
         return plot_report(record)
-
-
-def plan_nodes(scenario: Scenario, run: RunSettings) -> list[NodePlan]:
-    """Return the simulation, drivers and guards, filters and planners."""
-    scenario.check_pace(run.lockstep, run.rate)
-    common = run.common(scenario)
-    plans = [sim_plan('sim_node', scenario, run)]
-    for name in scenario.names():
-        plans += _robot_plans(name, scenario.robots[name], scenario, common)
-    for namespace, names in scenario.namespaces().items():
-        plans += _team_plans(namespace, names, scenario, common)
-    return plans
 
 
 def _team_plans(
@@ -143,14 +142,7 @@ def _robot_plans(
         {
             **common,
             'environment': scenario.environment.of_nodes(),
-            'start': robot.start,
-            'yaw': robot.yaw,
-            'radius': robot.radius,
-            'motion': robot.motion,
-            'sensor': robot.sensor,
-            'camera': robot.camera,
-            'battery_unit': robot.battery_unit,
-            'link': robot.link,
+            **{name: getattr(robot, name) for name in _OF_THE_DRIVER},
             'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,
             'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
         }

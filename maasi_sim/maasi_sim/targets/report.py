@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
 from typing import Any
 
 from maasi_filter.arrays import FloatArray
 from maasi_sim.run.report_files import finite, summary, whole_report
-from maasi_sim.targets.tally import FoundCount, Tally, TargetRecord
+from maasi_sim.targets.tally import TargetRecord
 
 
 def build_report(record: TargetRecord) -> dict[str, Any]:
     """Return the report of a run as plain values."""
     tally = record.tally
-    scores, complete = tally.scores(), _completion(tally)
+    scores, total = tally.scores(), len(tally.truth)
+    # All targets were found, and stayed so, since the last of these.
+    stayed = list(takewhile(lambda item: item.true_found == total, tally.progress[::-1]))
+    complete = stayed[-1] if total and stayed else None
     true = dict(scores.match.pairs)
     found = [
         {
@@ -65,16 +69,6 @@ def to_find_all(report: dict[str, Any]) -> str:
     """Return in words what it took to find all targets."""
     time, measurements = report['time_to_find_all'], report['measurements_to_find_all']
     return '-' if time is None else f'{measurements} measurements and {time:.1f} s'
-
-
-def _completion(tally: Tally) -> FoundCount | None:
-    """Return when all targets were found and stayed so."""
-    complete = None
-    for progress in reversed(tally.progress if len(tally.truth) else []):
-        if progress.true_found < len(tally.truth):
-            break
-        complete = progress
-    return complete
 
 
 def _numbers(values: FloatArray) -> list[float | None]:

@@ -16,16 +16,7 @@ from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import reason_of_end
-from maasi_sim.run.report_panels import (
-    COLOURS,
-    MARGIN,
-    PALE,
-    UNSEEN,
-    MapView,
-    Plot,
-    draw_report,
-    ellipse,
-)
+from maasi_sim.run.report_panels import COLOURS, MARGIN, PALE, UNSEEN, MapView, draw_report, ellipse
 from maasi_sim.targets.report import build_report, to_find_all
 from maasi_sim.targets.tally import TargetRecord
 
@@ -65,15 +56,14 @@ def plot_report(record: TargetRecord) -> Figure:
         view.axes.plot([], [], '+', color=PALE, ms=8, label='waypoint')
         view.axes.plot([], [], ':', color=PALE, lw=1.5, label='field of view at the end')
 
-    label = 'measurements, all robots'
     return draw_report(
         record,
         colours,
         bounds,
         draw_map,
         [
-            Plot('', 1.0, lambda axes: _draw_progress(axes, record, True)),
-            Plot(label, 1.0, lambda axes: _draw_progress(axes, record, False)),
+            ('', 1.0, lambda axes: _draw_progress(axes, record, True)),
+            ('measurements, all robots', 1.0, lambda axes: _draw_progress(axes, record, False)),
         ],
         'Targets found',
         _rows(record),

@@ -132,10 +132,8 @@ class RunPage(LiveView):
     def put_message(self, topic: str, type_name: str, data: bytes) -> None:
         """Take a message of a topic that is shown; never waits."""
         if not (self._known and type_name == MARKERS):
-            self.put(self._decode, topic, type_name, data)
-
-    def _decode(self, _: EventMaker, topic: str, type_name: str, data: bytes) -> None:
-        self._messages.take(topic, type_name, self._types.deserialize_cdr(data, type_name))
+            decode, take = self._types.deserialize_cdr, self._messages.take
+            self.put(lambda _: take(topic, type_name, decode(data, type_name)))
 
     def end(self) -> None:
         """Show the queued messages, and stop serving."""

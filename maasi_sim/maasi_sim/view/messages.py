@@ -167,12 +167,11 @@ class MessageEvents:
         self.maker.seen(self._time(message), message.robot, place, values, covariances)
 
     def _take_update(self, topic: str, message: Any) -> None:
-        clusters = [
-            Cluster(
-                np.array(point(item.position)), _matrix(item.covariance), item.radius, item.mass
-            )
-            for item in message.clusters
-        ]
+        clusters = []
+        for item in message.clusters:
+            covariance = np.asarray(item.covariance, dtype=float).reshape(3, 3)
+            place = np.array(point(item.position))
+            clusters.append(Cluster(place, covariance, item.radius, item.mass))
         members = [(item.robot, int(item.measurement)) for item in message.members]
         space, expected = _space(topic), message.expected_number
         self.maker.filter(self._time(message), space, expected, clusters, members)
@@ -268,10 +267,6 @@ class MessageEvents:
                 word = 'fault' if level > 1 else 'warning' if level else 'team'
                 text = f'{_DIAGNOSTIC_WORDS[level]}: {status.message}'
                 self.maker.message(self.maker.latest, status.name, word, text)
-
-
-def _matrix(values: Any) -> FloatArray:
-    return np.asarray(values, dtype=float).reshape(3, 3)
 
 
 def _space(topic: str) -> str:

@@ -16,22 +16,7 @@ from maasi_sim.view.event_log import LARGEST, EventLog
 FOLDER = Path(__file__).with_name('page')
 REPLAY = 'replay.html'
 # Each uses only what is before it.
-_MODULES = (
-    'run_log',
-    'camera',
-    'colours',
-    'text',
-    'shapes',
-    'buildings',
-    'map',
-    'why',
-    'panels',
-    'curve',
-    'live',
-    'main',
-)
-_IMPORT = re.compile(r'^import .*;\n', re.MULTILINE)
-_EXPORT = re.compile(r'^export ', re.MULTILINE)
+_MODULES = 'run_log camera colours text shapes buildings map why panels curve live main'
 
 
 @cache
@@ -48,10 +33,10 @@ def write_replay(log: EventLog, path: Path, largest: int = LARGEST) -> None:
 @cache
 def _page() -> str:
     """Return the page with style and modules: browsers load no modules beside a local file."""
-    names = ('index.html', 'page.css', *(f'{name}.js' for name in _MODULES))
+    names = ('index.html', 'page.css', *(f'{name}.js' for name in _MODULES.split()))
     text, style, *modules = ((FOLDER / name).read_text(encoding='utf-8') for name in names)
     # In one scope nothing is imported.
-    script = '\n'.join(_EXPORT.sub('', _IMPORT.sub('', module)) for module in modules)
+    script = re.sub(r'^(import .*;\n|export )', '', '\n'.join(modules), flags=re.MULTILINE)
     return _with('SCRIPT', _with('STYLE', text, style), script)
 
 

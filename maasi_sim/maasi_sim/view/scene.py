@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from maasi_drivers.agent.flight_rules import make_fence
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
@@ -18,9 +18,6 @@ from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.targets.scoring import scoring_radius
 from maasi_sim.view.event_log import Scene
-
-# Planners that choose by (17).
-_WEIGHING = ('asi', 'maasi')
 
 
 def empty_scene(name: str = '') -> Scene:
@@ -72,7 +69,8 @@ def rounded(values: ArrayLike) -> list[Any]:
 
 def _objective(settings: PlannerSettings) -> Scene:
     """Return what J is made of, for planners whose J is that of `PlannerSettings`."""
-    if settings.name not in _WEIGHING:
+    # Planners that choose by (17).
+    if settings.name not in ('asi', 'maasi'):
         return {}
     names = ('control', 'alpha', 'beta', 'per_distance')
     weights = {name: getattr(settings.weights(), name) for name in names}
@@ -90,7 +88,14 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
     else:
         view['size'] = list(detection.size)[: scenario.dimension]
     deviations = [float(value) for value in robot.sensor.noise.deviations(scenario.dimension)]
-    fence = _fence(robot, scenario)
+    fence = {}
+    if robot.link != 'topics':
+        # As its driver makes it.
+        flies = robot.link == 'mambo_wifi'
+        limits = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
+        bounds = scenario.environment.array()
+        made = make_fence(bounds, robot.radius, robot.start[2], limits)
+        fence = {} if made is None else {'fence': rounded(made)}
     return {
         'type': robot.type,
         'description': robot.description,
@@ -98,18 +103,8 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
         'clearance': robot.motion.clearance,
         'view': view,
         'deviations': [*deviations, 0.0][:3],
-        **({} if fence is None else {'fence': rounded(fence)}),
+        **fence,
     }
-
-
-def _fence(robot: RobotSettings, scenario: Scenario) -> NDArray[np.float64] | None:
-    """Return the geofence (3, 2) of a robot as its driver makes it [m]; None: it has none."""
-    if robot.link == 'topics':
-        return None
-    flies = robot.link == 'mambo_wifi'
-    settings = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
-    bounds = scenario.environment.array()
-    return make_fence(bounds, robot.radius, robot.start[2], settings)
 
 
 def _buildings(scenario: CuboidScenario) -> Scene:

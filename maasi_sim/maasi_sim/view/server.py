@@ -161,23 +161,17 @@ class ViewServer(ThreadingHTTPServer):
         self._lock = threading.Lock()
         # Connections without a stream or a command, the oldest first.
         self._idle: dict[socket.socket, None] = {}
-        self._listen()
-        threading.Thread(target=self.serve_forever, name='view server', daemon=True).start()
-
-    def _listen(self) -> None:
         last = min(self.wanted_port + _MORE_PORTS, 65535)
-        for port in range(self.wanted_port, last + 1):
+        for wanted in range(self.wanted_port, last + 1):
             try:
-                super().__init__((self.host, port), _Handler)
-                return
+                super().__init__((host, wanted), _Handler)
+                break
             except OSError as error:
-                if error.errno != errno.EADDRINUSE or port == last:
+                if error.errno != errno.EADDRINUSE or wanted == last:
                     raise
-
-    @property
-    def port(self) -> int:
-        """Port that it listens on."""
-        return int(self.server_address[1])
+        # That it listens on.
+        self.port = int(self.server_address[1])
+        threading.Thread(target=self.serve_forever, name='view server', daemon=True).start()
 
     @property
     def address(self) -> str:

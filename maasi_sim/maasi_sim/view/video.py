@@ -118,7 +118,9 @@ def _write_gif(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
 def _pictures(log: EventLog, speed: float) -> Iterator[NDArray[np.uint8]]:
     """Yield pictures of the run, (height, width, 3)."""
     now = Moments(log)
-    bounds = np.array(log.scene.get('bounds') or _extent(log))
+    places = [event[3][:2] for event in log.events if event[1] == 'robot'] or [[0, 0], [1, 1]]
+    extent = [np.min(places, axis=0) - 1.0, np.max(places, axis=0) + 1.0]
+    bounds = np.array(log.scene.get('bounds') or np.transpose(extent))
     figure = Figure(figsize=_SIZE, dpi=_RESOLUTION, layout='constrained')
     canvas = FigureCanvasAgg(figure)
     picture = np.zeros((1, 1, 3), np.uint8)
@@ -131,12 +133,6 @@ def _pictures(log: EventLog, speed: float) -> Iterator[NDArray[np.uint8]]:
         yield picture
     for _ in range(round(_HOLD * RATE)):
         yield picture
-
-
-def _extent(log: EventLog) -> list[list[float]]:
-    places = [event[3][:2] for event in log.events if event[1] == 'robot'] or [[0, 0], [1, 1]]
-    low, high = np.min(places, axis=0) - 1.0, np.max(places, axis=0) + 1.0
-    return np.stack([low, high], axis=1).tolist()
 
 
 def _draw(axes: Any, now: Moments, bounds: NDArray[np.float64]) -> None:
