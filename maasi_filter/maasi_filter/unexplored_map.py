@@ -170,9 +170,7 @@ class UnexploredMap:
             parts = max(1, math.ceil(rate / 0.25))
             for _ in range(parts):
                 flow = rate / parts * np.diff(values, axis=axis)
-                width = [(0, 0)] * self.dimension
-                width[axis] = (1, 1)
-                values += np.diff(np.pad(flow, width), axis=axis)
+                values += np.diff(flow, axis=axis, prepend=0.0, append=0.0)
 
     def at(self, positions: ArrayLike) -> FloatArray:
         """Return e at positions (n, d) by multilinear interpolation, shape (n,).

@@ -18,11 +18,10 @@ LEAST_PER_SCAN = 0.05
 
 def is_covariance(covariance: FloatArray) -> bool:
     """Return whether a finite square matrix is symmetric positive definite despite rounding."""
-    scale = np.sqrt(np.abs(np.diagonal(covariance)))
-    if not (np.isfinite(covariance).all() and (scale > 0.0).all()):
+    variances = np.diagonal(covariance)
+    if not (np.isfinite(covariance).all() and (variances > 0.0).all()):
         return False
-    if (np.diagonal(covariance) <= 0.0).any():
-        return False
+    scale = np.sqrt(variances)
     correlation = covariance / np.outer(scale, scale)
     if np.abs(correlation - correlation.T).max() > 1e-6:
         return False

@@ -36,11 +36,6 @@ class PendingBatch:
         """Names of the members whose measurements have not arrived."""
         return [item.robot for item in self.members if item.robot not in self.measurements]
 
-    @property
-    def complete(self) -> bool:
-        """Whether no measurement is missing."""
-        return all(name in self.failed for name in self.missing)
-
 
 class BatchAssembly:
     """Matches batches and detections; what is refused is dropped and counted by the node."""
@@ -136,7 +131,7 @@ class BatchAssembly:
     def next_complete(self) -> PendingBatch | None:
         """Remove and return the first batch if no measurement of it is missing."""
         first = self.first
-        if first is None or not first.complete:
+        if first is None or not first.failed.issuperset(first.missing):
             return None
         del self.pending[first.id]
         self.last, self.last_stamp = first.id, first.stamp

@@ -290,10 +290,9 @@ def is_known(i: int, components: Sequence[Component], caused: FloatArray) -> boo
 def nearest(target: FoundTarget, components: Sequence[Component]) -> Component | None:
     """Return the nearest component that is not found within the gate of a target, or None."""
     gaps = [
-        distance(item.density.mean, item.density.covariance, target)
+        (distance(item.density.mean, item.density.covariance, target), i)
+        for i, item in enumerate(components)
         if item.target is None
-        else math.inf
-        for item in components
     ]
-    best = int(np.argmin(gaps)) if gaps else 0
-    return components[best] if gaps and gaps[best] < SAME_TARGET else None
+    least, best = min(gaps, default=(math.inf, 0))
+    return components[best] if least < SAME_TARGET else None

@@ -6,9 +6,9 @@ import math
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable
+from collections.abc import Callable, Collection
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -42,8 +42,6 @@ _DIAGNOSTICS_PERIOD = 1.0
 _WARNING_PERIOD = 2.0
 # From activation until a node says what it waits for [s].
 _NOTICE_DELAY = 1.0
-
-T = TypeVar('T')
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -85,6 +83,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._lockstep_member = lockstep_member
         self._parameters_read = NodeParameters(self, settings)
         self._entities_made = NodeEntities(self)
+        self.permanent = self._entities_made.permanent
         #: Why *configure* failed; empty if it succeeded.
         self.problem = ''
         self.dropped: Counter[str] = Counter()
@@ -242,14 +241,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._ready_publisher = self._done_publisher = self.step_subscription = None
         self._peers_timer = None
         self._parameters_read.release()
-
-    def permanent(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return an entity that *cleanup* must not destroy; `NodeEntities` says why.
-
-        That is an action client, an action server, a service or a subscription with event
-        callbacks. It is made at the first call with this key, and lives as long as the node.
-        """
-        return self._entities_made.permanent(key, make)
 
     def offer_service(
         self, name: str, answer: Callable[[Trigger.Request, Trigger.Response], Trigger.Response]

@@ -200,8 +200,7 @@ def draw_visits_over_time(figure: Figure, results: Results) -> None:
         left.plot(100.0 * np.mean(share, axis=0), label=name)
         right.step(range(len(runs[0].columns['active'])), runs[0].columns['active'])
     _label(left, 'step', 'cuboids visited [%]')
-    right.set_xlabel('step')
-    right.set_ylabel('robots that search, first map')
+    right.set(xlabel='step', ylabel='robots that search, first map')
 
 
 def draw_mission_times(figure: Figure, results: Results) -> None:
@@ -244,8 +243,6 @@ def draw_decision_times(figure: Figure, results: Results) -> None:
 
 
 def _label(axes: Any, across: str, up: str = '', title: str = '') -> None:
-    axes.set_xlabel(across)
-    axes.set_ylabel(up)
-    if title:
-        axes.set_title(title, fontsize=10)
+    axes.set(xlabel=across, ylabel=up)
+    axes.set_title(title, fontsize=10)
     axes.legend(fontsize=8, frameon=False)

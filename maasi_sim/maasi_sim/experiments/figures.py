@@ -79,16 +79,9 @@ def draw_curves(
         figure.set_size_inches(10.5, 4.6)
     axes = figure.add_subplot(1, 1 if path is None else 2, 1)
     targets = 0.0
-    longest = max(
-        (
-            float(run.columns[by][-1])
-            for name in styles
-            for run in results.runs.get(name, [])
-            if len(run.columns[by])
-        ),
-        default=1.0,
-    )
-    grid = np.linspace(0.0, end or longest, 400)
+    shown_runs = [run for name in styles for run in results.runs.get(name, [])]
+    ends = [float(run.columns[by][-1]) for run in shown_runs if len(run.columns[by])]
+    grid = np.linspace(0.0, end or max(ends, default=1.0), 400)
     for index, (name, key) in enumerate(styles.items()):
         runs = results.runs.get(name, [])
         if not runs:
@@ -104,10 +97,8 @@ def draw_curves(
             axes.fill_between(grid, mean - half, mean + half, color=colour, alpha=0.15, lw=0)
         targets = max(targets, *(run.value('targets') or 0.0 for run in runs))
     axes.axhline(targets, color=_TRUE, lw=0.8, ls='--')
-    axes.set_xlim(0.0, grid[-1])
-    axes.set_ylim(0.0, 1.06 * max(targets, 1.0))
-    axes.set_xlabel(label)
-    axes.set_ylabel('targets found')
+    axes.set(xlim=(0.0, grid[-1]), ylim=(0.0, 1.06 * max(targets, 1.0)))
+    axes.set(xlabel=label, ylabel='targets found')
     _frame(axes)
     axes.set_axisbelow(True)
     if by == 'measurements':
@@ -172,8 +163,7 @@ def _draw_path(figure: Figure, place: tuple[int, int, int], results: Results, ru
     found = np.array(run.details['found'], float).reshape(-1, dimension)
     axes.plot(*truth.T, 'D', mfc='none', mec=_TRUE, ms=6, label='true target')
     axes.plot(*found.T, 'D', color=_FOUND, ms=3.5, label='found target')
-    axes.set_xlim(*bounds[0])
-    axes.set_ylim(*bounds[1])
+    axes.set(xlim=bounds[0], ylim=bounds[1])
     axes.set_xlabel('x [m]', fontsize=7)
     axes.set_ylabel('y [m]', fontsize=7)
     axes.tick_params(labelsize=6)
@@ -227,19 +217,13 @@ def draw_against(
     figure.set_size_inches(4.6 * len(quantities), 3.8)
     for index, quantity in enumerate(map(results.experiment.quantity, quantities)):
         axes = figure.add_subplot(1, len(quantities), index + 1)
-        found = [
-            (
-                reduce(getitem, setting, results.case(name).settings['scenario']),
-                interval(results, name, quantity),
-            )
-            for name in results.names()
-        ]
-        places = [value for value, _ in found]
-        means = [span.mean for _, span in found]
-        halves = np.nan_to_num([span.half_width for _, span in found])
+        scenarios = [results.case(name).settings['scenario'] for name in results.names()]
+        places = [reduce(getitem, setting, scenario) for scenario in scenarios]
+        spans = [interval(results, name, quantity) for name in results.names()]
+        means = [span.mean for span in spans]
+        halves = np.nan_to_num([span.half_width for span in spans])
         axes.errorbar(places, means, yerr=halves, fmt='o-', color=_OTHERS[index], ms=4, capsize=2)
-        axes.set_xlabel(label)
-        axes.set_ylabel(quantity.title())
+        axes.set(xlabel=label, ylabel=quantity.title())
         _frame(axes)
 
 
@@ -323,10 +307,8 @@ def _draw_survival(axes: Axes, results: Results) -> None:
             lw=1.8,
             label=name,
         )
-    axes.set_xlim(0.0, 1.02 * end or 1.0)
-    axes.set_ylim(0.0, 103.0)
-    axes.set_xlabel('time [s]')
-    axes.set_ylabel('searches that still miss targets [%]')
+    axes.set(xlim=(0.0, 1.02 * end or 1.0), ylim=(0.0, 103.0))
+    axes.set(xlabel='time [s]', ylabel='searches that still miss targets [%]')
     axes.set_title(results.experiment.name, loc='left', fontsize=10, fontweight='bold')
     _frame(axes)
     axes.legend(fontsize=8, frameon=False)

@@ -192,24 +192,18 @@ def run_among_obstacles(settings: dict[str, Any], seed: int) -> Outcome:
 # Random terrain with the statistics of real terrain, as that of the paper is not available.
 
 
-def self_affine_map(
-    generator: np.random.Generator, nodes: int = MAP_NODES, hurst: float = HURST
-) -> FloatArray:
-    """Return heights of a periodic map, (nodes, nodes), with mean 0 and deviation 1.
+def chunk(generator: np.random.Generator, size: float, nodes: int) -> FloatArray:
+    """Return the heights of an area of `size` metres in a map of 12 km, (nodes, nodes) [m].
 
     The power of a wave number k falls with k^-(2 H + 2), so that the mean square difference of
-    two heights grows with their distance to the power 2 H.
+    two heights grows with their distance to the power 2 H. The map is periodic.
     """
-    spectrum = np.fft.rfft2(generator.standard_normal((nodes, nodes)))
-    waves = np.hypot(np.fft.fftfreq(nodes)[:, None], np.fft.rfftfreq(nodes)[None, :])
+    shape = MAP_NODES, MAP_NODES
+    spectrum = np.fft.rfft2(generator.standard_normal(shape))
+    waves = np.hypot(np.fft.fftfreq(MAP_NODES)[:, None], np.fft.rfftfreq(MAP_NODES)[None, :])
     waves[0, 0] = np.inf
-    heights = np.fft.irfft2(spectrum * waves ** -(hurst + 1.0), s=(nodes, nodes))
-    return np.asarray((heights - heights.mean()) / heights.std())
-
-
-def chunk(generator: np.random.Generator, size: float, nodes: int) -> FloatArray:
-    """Return the heights of an area of `size` metres in a map of 12 km, (nodes, nodes) [m]."""
-    heights = DEVIATION * self_affine_map(generator)
+    heights = np.fft.irfft2(spectrum * waves ** -(HURST + 1.0), s=shape)
+    heights = DEVIATION * ((heights - heights.mean()) / heights.std())
     corner = generator.uniform(0.0, MAP_NODES, size=2)
     along = np.linspace(0.0, size * MAP_NODES / MAP_SIZE, nodes)
     places = np.meshgrid(corner[0] + along, corner[1] + along, indexing='ij')
