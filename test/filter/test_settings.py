@@ -20,6 +20,7 @@ from maasi_filter.settings import unsuitable_lengths, unused_settings
         (FilterSettings, {'particels': 5}, 'particels'),
         (FilterSettings, {'particles': 0}, 'particles'),
         (FilterSettings, {'preset': 'paper_005'}, 'preset'),
+        (FilterSettings, {'preset': 'recommended'}, 'write method: pmb in its place'),
         (FilterSettings, {'found_radius': float('nan')}, 'found_radius'),
         (FilterSettings, {'survival_probability': 1.5}, 'survival_probability'),
         (DetectionSettings, {'kind': 'circle'}, 'kind'),
@@ -47,6 +48,7 @@ def test_presets_fill_in_what_is_not_given():
     assert settings.removal == 'closest'
     assert FilterSettings(preset='paper_001', particles=777).resolved().particles == 777
     assert FilterSettings().resolved().particles == 10_000
+    assert SensorSettings().resolution > 0.0
     # The other filter derives its lengths from the sensor.
     assert FilterSettings(method='pmb').resolved().found_radius is None
 
