@@ -56,13 +56,7 @@ def this_machine() -> dict[str, str]:
 
 
 def machine_difference(first: Mapping[str, str], second: Mapping[str, str]) -> str:
-    """Return in words in what two machines differ, '' if in nothing.
-
-    Parameters
-    ----------
-    first, second : mapping
-        As `this_machine` returns it.
-    """
+    """Return in words in what two results of `this_machine` differ, '' if in nothing."""
     keys = dict.fromkeys([*first, *second])
     return ', '.join(
         f'{_NAMES.get(key, key)} {second.get(key, "unknown")} instead of '

@@ -225,20 +225,17 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
 
     def tear_down(self) -> None:
         """Disconnect; the next *configure* begins a new simulation."""
-        self._close_links()
+        for robot in self._linked.values():
+            robot.close()
+        self._linked.clear()
 
     def destroy_node(self) -> None:
         """Shut down, once linked robots have been stopped."""
         until = time.monotonic() + _FAREWELL
         while any(robot.obeys for robot in self._linked.values()) and time.monotonic() < until:
             time.sleep(_LOOK_PERIOD)
-        self._close_links()
+        self.tear_down()
         super().destroy_node()
-
-    def _close_links(self) -> None:
-        for robot in self._linked.values():
-            robot.close()
-        self._linked.clear()
 
     def stamp_of_diagnostics(self) -> Time:
         """Return the simulated time: the clock of the node is wall time."""
@@ -350,7 +347,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self.step = self._first + self.simulation.step
         self._stamp = stamp_of_step(self.step, self._length)
         self._wall_step = time.monotonic()
-        present = self.simulation.present
         if self.settings.lockstep:
             self._due = max(self._due + self._period, self._wall_step)
             for node in self._expected:
@@ -358,7 +354,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
                 if robot is None or robot not in self.simulation.away:
                     self._await(node)
         self.on_new_step()
-        self._publish(present)
+        self._publish(self.simulation.present)
 
     def _publish(self, robots: list[str]) -> None:
         """Publish the data of some robots, the clock, and the step.
@@ -370,12 +366,11 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._robots[name].publish(stamp)
         if self._clock_publisher is not None:
             self._clock_publisher.publish(Clock(clock=stamp))
-        present = self.simulation.present
         self._step_publisher.publish(
             LockstepStep(
                 step=self.step,
                 stamp=stamp,
-                robots=present,
+                robots=self.simulation.present,
                 imaging=[name for name in robots if self.simulation.images_due(name)],
             )
         )

@@ -9,7 +9,7 @@ import maasi_filter
 import maasi_planner
 from maasi_drivers.vision.marker_detector import warm_up as warm_up_drivers
 from maasi_planner.settings import PLANNERS
-from maasi_sim.buildings.scenario import warm_up_buildings
+from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.world.simulation import simulated_robot
 
@@ -30,7 +30,7 @@ _MESSAGES = (
 def warm_up() -> None:
     """Compile, or load from the cache, the kernels of simulations."""
     _play_robots()
-    warm_up_buildings()
+    mission_of(load_cuboid_scenario('buildings_four')).run(1)
 
 
 def _play_robots() -> None:

@@ -42,13 +42,8 @@ class BuildingMission(Mission[CuboidRecord]):
         """See `Mission.observer`."""
         return CuboidObserver(self.name, self.scenario, self.scenario.seed, types)
 
-    def report(self, record: CuboidRecord) -> dict[str, Any]:
-        """See `Mission.report`."""
-        return build_cuboid_report(record)
-
-    def summary(self, report: dict[str, Any]) -> str:
-        """See `Mission.summary`."""
-        return cuboid_summary(report)
+    report = staticmethod(build_cuboid_report)
+    summary = staticmethod(cuboid_summary)
 
     def figure(self, record: CuboidRecord) -> Figure:
         """See `Mission.figure`."""

@@ -111,9 +111,12 @@ class CuboidMission:
         collisions = outside = recharges = 0
         area = self.mission.area
         while True:
-            broadcasts = self._observe()
-            for name, place in self.positions.items():
-                paths[name].append(place.copy())
+            broadcasts = {}
+            for name, agent in self.agents.items():
+                message = agent.observe(self.step, self.positions[name], self.velocities[name])
+                if message is not None:
+                    broadcasts[name] = message
+                paths[name].append(self.positions[name].copy())
             union = np.any([agent.visited for agent in self.agents.values()], axis=0)
             visited.append(int(union.sum()))
             searching = {
@@ -153,14 +156,6 @@ class CuboidMission:
             recharges,
             plans,
         )
-
-    def _observe(self) -> dict[str, Broadcast]:
-        broadcasts = {}
-        for name, agent in self.agents.items():
-            message = agent.observe(self.step, self.positions[name], self.velocities[name])
-            if message is not None:
-                broadcasts[name] = message
-        return broadcasts
 
     def _decide(self, broadcasts: dict[str, Broadcast]) -> list[float]:
         """Let all robots decide, and return how long each took, or all together [s]."""

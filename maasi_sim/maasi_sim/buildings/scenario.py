@@ -131,11 +131,6 @@ def _split(head: Key, text: str) -> tuple[Key, str]:
     return ((*head, *parts), rest) if rest else (head, text)
 
 
-def warm_up_buildings() -> None:
-    """Compile, or load from the cache, the kernels of searches of buildings."""
-    mission_of(load_cuboid_scenario('buildings_four')).run(1)
-
-
 def mission_of(scenario: CuboidScenario) -> CuboidMission:
     """Return a search of buildings in this process, as its nodes carry it out."""
     area = scenario.environment.array()

@@ -144,7 +144,9 @@ class Recorder:
         self._wait_set = rclpy_implementation.WaitSet(2, 0, 0, 0, 0, 0, self.context.handle)
 
     def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> Subscription:
-        return self.node.create_subscription(kind, self._full(topic), _never, qos, raw=True)
+        # Messages are taken without callbacks.
+        full = self._full(topic)
+        return self.node.create_subscription(kind, full, lambda _: None, qos, raw=True)
 
     def _full(self, topic: str) -> str:
         """Return the full name of a topic of the team."""
@@ -164,7 +166,10 @@ class Recorder:
             if topic is None or topic in self._subscriptions or topic in self._refused:
                 continue
             shown = self.listener is not None and is_shown(topic, types[0])
-            if not (self._wants(topic) or shown):
+            # A name with an underscore in front is hidden: the inner topics of actions.
+            useless = topic in _SKIPPED or '/_' in topic or topic.endswith(_KEPT)
+            wanted = not useless and (self.bag is not None or topic in self._wanted)
+            if not (wanted or shown):
                 continue
             infos = self.node.get_publishers_info_by_topic(full)
             if not infos:
@@ -192,12 +197,6 @@ class Recorder:
             if subscription.handle.get_publisher_count()
             < self.node.count_publishers(full := self._full(topic))
         ]
-
-    def _wants(self, topic: str) -> bool:
-        # A name with an underscore in front is hidden: the inner topics of actions.
-        if topic in _SKIPPED or '/_' in topic or topic.endswith(_KEPT):
-            return False
-        return self.bag is not None or topic in self._wanted
 
     def take_ready(self) -> set[str]:
         """Return the names of the nodes that have reported ready."""
@@ -241,15 +240,10 @@ class Recorder:
         self._wait_set.wait(round(timeout * 1e9))
 
     def drain(self, limit: int | None = None) -> None:
-        """
-        Pass all received messages to the observer and the recording.
+        """Pass all received messages to the observer and the recording.
 
-        A run ends at a step: later messages are dropped, so that equal runs give equal recordings.
-
-        Parameters
-        ----------
-        limit : int, optional
-            Simulated time after its start at which the run ends [ns].
+        A run ends at a step, the last one at `limit`, simulated time after the first [ns]: later
+        messages are dropped, so that equal runs give equal recordings.
         """
         # Messages left in the queue would end each wait at once.
         self.take_ready()
@@ -270,9 +264,10 @@ class Recorder:
         taken += updates + steps
         if limit is not None and self.step is not None and not self._finished:
             # Messages of the step at the limit may come before that step.
-            step, following = (self._elapsed_at(self.step + ahead) for ahead in (0, 1))
-            if following >= limit:
-                self._last_step = self.step - (step >= limit)
+            end = limit + (self._begun or 0)
+            if stamp_of_step(self.step + 1, self._step_length) >= end:
+                past = stamp_of_step(self.step, self._step_length) >= end
+                self._last_step = self.step - past
         taken = self._until_last_step(taken)
         now = time.monotonic()
         for topic, data in taken:
@@ -308,14 +303,7 @@ class Recorder:
     @property
     def elapsed(self) -> float:
         """Simulated time since the first step [s]."""
-        return self._elapsed / 1e9
-
-    @property
-    def _elapsed(self) -> int:
-        return 0 if self._begun is None else self.time - self._begun
-
-    def _elapsed_at(self, step: int) -> int:
-        return stamp_of_step(step, self._step_length) - (self._begun or 0)
+        return 0.0 if self._begun is None else (self.time - self._begun) / 1e9
 
     def _is_own(self, topic: str, data: bytes) -> bool:
         """Return whether a message on a topic shared by all teams is the team's own."""
@@ -344,15 +332,9 @@ class Recorder:
                 raise
 
     def gaps(self, joined: bool, patience: float) -> list[str]:
-        """
-        Return what the recording lacks of the topics with a message at each step.
+        """Return what the recording lacks of the topics with a message at each step.
 
-        Parameters
-        ----------
-        joined : bool
-            Whether the clock ran before the run.
-        patience : float
-            Longest time that a recorded topic may begin late [s].
+        They may begin late by `patience` [s]; if `joined`, the clock ran before the run.
         """
         topics = [STEP, *(f'/{name}/state' for name in self.robots)]
         times = [self.first.get(topic, self.time) for topic in topics]
@@ -471,7 +453,3 @@ def _queued(subscription: Subscription) -> list[bytes]:
         if item is None:
             return taken
         taken.append(item[0])
-
-
-def _never(_: bytes) -> None:
-    """Do nothing: messages are taken without callbacks."""

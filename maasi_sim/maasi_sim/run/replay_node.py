@@ -80,11 +80,6 @@ class Recording:
     found: dict[str, list[FoundTarget]] = field(default_factory=dict)
     found_batch: dict[str, int] = field(default_factory=dict)
 
-    @property
-    def namespaces(self) -> list[str]:
-        """Namespaces of the filters."""
-        return list(self.found)
-
 
 def read_recording(path: Path) -> Recording:
     """Return the contents of a recording for a replay."""
@@ -104,14 +99,18 @@ def read_recording(path: Path) -> Recording:
             index = deserialize_message(data, DetectionArray).measurement
             # Duplicate index: a restarted driver; the filter used the first.
             detections.setdefault((topics[topic], index), data)
-        for namespace in recording.namespaces:
+        for namespace in recording.found:
             last = 0
             for _, _, _, data in bag.raw([within(team, within(namespace, UPDATE))]):
                 update = deserialize_message(data, FilterUpdate)
-                used = [
-                    _find(detections, member.robot, member.measurement, path)
-                    for member in update.members
-                ]
+                used = []
+                for member in update.members:
+                    robot, index = member.robot, member.measurement
+                    if (robot, index) not in detections:
+                        raise BagError(
+                            f'{path}: measurement {index} of {robot} is not in the recording'
+                        )
+                    used.append(detections[robot, index])
                 late = update.batch_id <= last
                 last = max(last, update.batch_id)
                 recording.batches.append(Batch(update, used, namespace, late))
@@ -122,14 +121,6 @@ def read_recording(path: Path) -> Recording:
     if len(recording.found) > 1:
         recording.batches.sort(key=lambda batch: (batch.update.step, batch.namespace))
     return recording
-
-
-def _find(
-    detections: dict[tuple[str, int], bytes], robot: str, measurement: int, path: Path
-) -> bytes:
-    if (robot, measurement) not in detections:
-        raise BagError(f'{path}: measurement {measurement} of {robot} is not in the recording')
-    return detections[robot, measurement]
 
 
 class ReplayNode:
@@ -236,10 +227,7 @@ def differences(recorded: list[Any], found: list[Any]) -> list[str]:
 
 
 def replay(
-    path: Path,
-    out: Path | None,
-    domain_id: int | None,
-    interrupted: Callable[[], bool],
+    path: Path, out: Path | None, domain_id: int | None, interrupted: Callable[[], bool]
 ) -> int:
     """Replay a recording, print whether the found targets are equal, and return the exit code.
 
@@ -250,12 +238,12 @@ def replay(
     folder = make_folder(out, '_replay')
     with Domain(domain_id) as domain, contextlib.ExitStack() as ends:
         os.environ.update(domain.environment())
-        processes = [_process(recording.facts, name, folder) for name in recording.namespaces]
+        processes = [_process(recording.facts, name, folder) for name in recording.found]
         ends.callback(stop, processes)
         for process in processes:
             process.start()
         robots = sorted(recording.facts['scenario']['robots'])
-        node = ReplayNode(domain.number, robots, recording.namespaces)
+        node = ReplayNode(domain.number, robots, list(recording.found))
         ends.callback(node.close)
         try:
             return _feed(node, recording, processes, interrupted)

@@ -100,7 +100,10 @@ def build_parser() -> argparse.ArgumentParser:
 def add_view_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a server of the page."""
     parser.add_argument(
-        '--port', type=_port, metavar='N', help='of the page; the next free one (default: 8420)'
+        '--port',
+        type=lambda text: whole(text, most=65535),
+        metavar='N',
+        help='of the page; the next free one (default: 8420)',
     )
     parser.add_argument(
         '--host',
@@ -119,10 +122,6 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
 def view_options(options: argparse.Namespace) -> ViewOptions:
     """Return where the page is served."""
     return ViewOptions(options.port, options.host, options.control)
-
-
-def _port(text: str) -> int:
-    return whole(text, most=65535)
 
 
 def _namespace(text: str) -> str:

@@ -32,6 +32,7 @@ from maasi_sim.run.node_plan import (
     with_saved_state,
 )
 from maasi_sim.run.node_server import wait_for_server
+from maasi_sim.run.processes import stop
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.report_files import StoredReport, store_report
@@ -152,7 +153,7 @@ class ScenarioRun:
             self.recorder = Recorder(domain.number, self.observer, step, self._bag, team)
             ends.callback(self.recorder.close)
             self.recorder.listener = None if page is None else page.put_message
-            ends.callback(self.supervisor.stop_all)
+            ends.callback(stop, list(self.supervisor.processes.values()))
             # Ctrl-C ends the wait at once; the run reports it.
             with self.interruption.at_once():
                 wait_for_server()
@@ -208,8 +209,11 @@ class ScenarioRun:
     def is_followed(self) -> bool:
         """Whether another run follows the clock of this one."""
         follows = self.options.follow_clock or self._scenario.external_clock
-        own = self.supervisor.clock_running and not (follows or self.options.lockstep)
-        return bool(own and not self.interruption and self.recorder.followers())
+        if follows or self.options.lockstep or self.interruption:
+            return False
+        supervisor = self.supervisor
+        running = all(supervisor.processes[name].running for name in supervisor.clocks)
+        return running and bool(self.recorder.followers())
 
     def _keep_clock(self) -> None:
         """Keep the simulation running until no other run follows its clock."""
@@ -336,15 +340,11 @@ class ScenarioRun:
                         f'{self._limits.silence:g} s',
                     )
                 return supervisor.standstill(recorder)
-            self._tell_faults()
+            for name in recorder.faults.keys() - self._told:
+                self.display.say(f'warning: {name}: {recorder.faults[name]}')
+            self._told = set(recorder.faults)
             if self.display.due or self.observer.news:
                 self._show()
-
-    def _tell_faults(self) -> None:
-        """Print an error of a planner when it begins."""
-        for name in self.recorder.faults.keys() - self._told:
-            self.display.say(f'warning: {name}: {self.recorder.faults[name]}')
-        self._told = set(self.recorder.faults)
 
     def _finish_step(self) -> None:
         """Report that the recorder is done with a step, once the disk keeps up."""
@@ -402,8 +402,9 @@ class ScenarioRun:
         if ending.text:
             self.display.say(f'ended: {ending.text}')
         if ending.code == NODE_FAILED:
-            for log, text in self.supervisor.failed_logs():
-                self.display.say(f'--- {short(log)}\n{text}')
+            for name, process in self.supervisor.processes.items():
+                if name in self.supervisor.failed:
+                    self.display.say(f'--- {short(process.log)}\n{process.last_words()}')
         unwritten = self.unwritten + ([stored.problem] if stored.problem else [])
         for problem in unwritten:
             self.display.say(f'error: {problem}')

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -162,7 +162,12 @@ class Supervisor:
         for name, beat in recorder.heartbeats.items():
             self.watch.beat(name, beat)
         recorder.heartbeats.clear()
-        ending = self._check_start() or self._check_heartbeats(recorder)
+        # Before the first step `ScenarioRun` waits for the nodes.
+        late = self.watch.late(self._checked) if self.running else []
+        if late:
+            text = f'{", ".join(late)} not ready {self._limits.start:g} s after the start'
+            return self._failure('not_ready', text, late)
+        ending = self._check_heartbeats(recorder)
         for name, process in self.processes.items():
             if ending is None and not process.running:
                 ending = self._restart(name, process, recorder)
@@ -192,15 +197,6 @@ class Supervisor:
     def _failure(self, reason: str, text: str, names: list[str]) -> Ending:
         self.failed.update(names)
         return Ending(reason, NODE_FAILED, text)
-
-    def _check_start(self) -> Ending | None:
-        """Return an ending if a restarted node takes too long to start."""
-        # Before the first step `ScenarioRun` waits for the nodes.
-        late = self.watch.late(self._checked) if self.running else []
-        if not late:
-            return None
-        text = f'{", ".join(late)} not ready {self._limits.start:g} s after the start'
-        return self._failure('not_ready', text, late)
 
     def _check_heartbeats(self, recorder: Recorder) -> Ending | None:
         """Kill a node that hangs, or return the ending of the run."""
@@ -239,11 +235,6 @@ class Supervisor:
         """Whether a restarted node has not had a heartbeat yet."""
         return any(self.processes[name].restarts for name in self.watch.starting())
 
-    @property
-    def clock_running(self) -> bool:
-        """Whether the simulation runs."""
-        return all(self.processes[name].running for name in self.clocks)
-
     def stop(self, recorder: Recorder, keep_clock: bool, poll: float) -> None:
         """Stop the robots, then the nodes, and record their last messages."""
         kept = self.clocks if keep_clock else set()
@@ -263,16 +254,6 @@ class Supervisor:
         recorder.drain()
         if stubborn:
             self._display.say(f'had to be killed: {", ".join(stubborn)}')
-
-    def stop_all(self) -> None:
-        """Stop every process that still runs."""
-        stop(list(self.processes.values()))
-
-    def failed_logs(self) -> Iterator[tuple[Path, str]]:
-        """Yield the log file and its last lines of each node that failed."""
-        for process in self.processes.values():
-            if process.name in self.failed:
-                yield process.log, process.last_words()
 
     def without_team(self, name: str) -> str:
         """Return the name of a node without the namespace of the team."""

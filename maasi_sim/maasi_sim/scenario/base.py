@@ -118,12 +118,9 @@ class BaseScenario(Settings):
         return sorted(self.robots)
 
     def check_pace(self, lockstep: bool, rate: float | None) -> None:
-        """Check that it can be run in lockstep, or at a rate (simulated over wall time).
+        """Raise a ScenarioError if it cannot be run in lockstep, or at a rate.
 
-        Raises
-        ------
-        ScenarioError
-            If it cannot: links other than topics run in real time.
+        The rate is simulated over wall time; links other than topics run in real time.
         """
 
     def content(self) -> dict[str, Any]:

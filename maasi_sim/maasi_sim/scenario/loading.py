@@ -96,18 +96,6 @@ def read_scenario(path: str | Path) -> Layer:
     return layer
 
 
-def with_overrides(layer: Layer, overrides: Mapping[str, tuple[Key, Any]]) -> Layer:
-    """Return a layer with the values of `load_scenario` that win over it."""
-    result = deepcopy(layer)
-    for origin, (key, value) in overrides.items():
-        if key == ('planner', 'name') and isinstance(result.data.get('planner'), dict):
-            # Of the planner that this one replaces.
-            result.data['planner'].pop('settings', None)
-        override(result, key, value, origin)
-    _name_folders(result)
-    return result
-
-
 def _name_folders(layer: Layer) -> None:
     """Name the folders of modules in `plugin_path`, where a plugin is given as module:Class."""
     folder = layer.folder or Path.cwd()
@@ -165,7 +153,13 @@ def checked(
     if overrides:
         # What wins over the file hides none of its errors.
         validate(model, layer)
-        layer = with_overrides(layer, overrides)
+        layer = deepcopy(layer)
+        for origin, (key, value) in overrides.items():
+            if key == ('planner', 'name') and isinstance(layer.data.get('planner'), dict):
+                # Of the planner that this one replaces.
+                layer.data['planner'].pop('settings', None)
+            override(layer, key, value, origin)
+        _name_folders(layer)
     scenario = validate(model, layer)
     refuse(layer, problems(scenario))
     doubt(layer, doubts_about(scenario))

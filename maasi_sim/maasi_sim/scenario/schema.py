@@ -15,7 +15,7 @@ from maasi_drivers.settings.driver import DRIVERS, BatteryUnit
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import FilterSettings, Finite, SensorSettings, Settings, Vector3
-from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.node_settings import PlannedRobotSettings, PlannerNodeSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.scenario.base import BaseScenario
@@ -139,7 +139,7 @@ class Scenario(BaseScenario):
         return {'': self.names()}
 
     def check_pace(self, lockstep: bool, rate: float | None) -> None:
-        """Check that it can be run in lockstep, or at a rate (simulated over wall time)."""
+        """See `BaseScenario.check_pace`."""
         if not lockstep and rate in (None, 1.0):
             return
         asked = 'lockstep' if lockstep else f'rate {rate:g}'
@@ -181,14 +181,7 @@ def planner_settings(
 ) -> PlannerNodeSettings:
     """Return the settings of the planner of some robots; the others plan for themselves.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        With all layers.
-    names : sequence of str
-        Its robots.
-    common : mapping
-        Settings that all nodes share.
+    `common` are settings that all nodes share.
     """
     return PlannerNodeSettings.model_validate(
         {
@@ -199,11 +192,8 @@ def planner_settings(
             'exploration_spacing': scenario.filter.exploration_spacing,
             'robots': {
                 name: {
-                    'candidates': scenario.robots[name].candidates,
-                    'motion': scenario.robots[name].motion,
-                    'sensor': scenario.robots[name].sensor,
-                    'radius': scenario.robots[name].radius,
-                    'start': scenario.robots[name].start,
+                    key: getattr(scenario.robots[name], key)
+                    for key in PlannedRobotSettings.model_fields
                 }
                 for name in names
             },

@@ -50,15 +50,6 @@ def covering_grid(
 
     Its spacing is at most the side of a square, or cube, as large as what the sensor sees well;
     where that takes too many waypoints, it is a coarser grid, and `never_seen` warns.
-
-    Parameters
-    ----------
-    name : str
-        Of the robot.
-    robot : RobotSettings
-        Its own candidates do not matter.
-    environment : EnvironmentSettings
-        Where it searches.
     """
     bounds = environment.array()
     sides = bounds[:, 1] - bounds[:, 0]
