@@ -18,7 +18,7 @@ from rosgraph_msgs.msg import Clock
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.node_settings import NodeSettings
-from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
+from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, SENSOR, sensor_reader
 from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.emulators.linked_robots import LinkedRobot, linked_robot
@@ -160,7 +160,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         """Compile and connect."""
         lockstep = self.settings.lockstep
         self.simulation.warm_up()
-        qos = sensor_writer(lockstep)
+        qos = RELIABLE if lockstep else SENSOR
         self._robots = {
             name: RobotTopics(self, self.simulation, name, qos) for name in self.simulation.robots
         }

@@ -35,7 +35,6 @@ class SharedFoundTargets:
     def set_up(self) -> None:
         """Subscribe."""
         node = self._node
-        self._subscriptions = []
         for name in self._waiting:
             topic = node.team_topic(f'{name}/found_targets')
             self._subscriptions.append(

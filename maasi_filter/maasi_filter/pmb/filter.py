@@ -231,12 +231,11 @@ class PmbFilter(SearchFilter):
 
     def _find(self, item: Component, member: CheckedMeasurement, time: float) -> FoundTarget:
         """Mark a component as found."""
-        d = self.dimension
-        nowhere = np.zeros(d), np.zeros((d, d))
         self._last_id += 1
-        target = FoundTarget(self._last_id, *nowhere, member.robot, member.index, time)
         if self._offsets.active:
-            self._offsets.find(member.robot, target.id)
+            self._offsets.find(member.robot, self._last_id)
+        mean, covariance, by = item.density.mean, item.density.covariance, member.robot
+        target = FoundTarget(self._last_id, mean, covariance, by, member.index, time)
         item.target = self._estimate(target, item)
         return item.target
 
@@ -257,8 +256,7 @@ class PmbFilter(SearchFilter):
         if self._offsets.active:
             covariance += self._offsets.covariance_of(target.id)
         mean, label = item.density.mean.copy(), item.labels.label
-        by = target.robot, target.measurement, target.time
-        return FoundTarget(target.id, mean, covariance, *by, label=label)
+        return replace(target, position=mean, covariance=covariance, label=label)
 
     def _predict(self, time: float) -> None:
         """Predict the random walk since the last step."""

@@ -96,7 +96,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._peers_timer: Any = None
         # When to say what nobody publishes [s of wall time].
         self._notice_at = math.inf
-        self.step_subscription: Subscription | None = None
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -172,7 +171,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
                 LockstepDone, self.team_topic('lockstep/done'), RELIABLE
             )
             self.expect_subscribers(self._done_publisher)
-            self.step_subscription = self.create_subscription(
+            self.create_subscription(
                 LockstepStep, self.team_topic('lockstep/step'), self._hear_step, RELIABLE
             )
         self.set_up()
@@ -238,7 +237,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.configured = False
         self._peers.clear()
         self._entities_made.clear()
-        self._ready_publisher = self._done_publisher = self.step_subscription = None
+        self._ready_publisher = self._done_publisher = None
         self._peers_timer = None
         self._parameters_read.release()
 

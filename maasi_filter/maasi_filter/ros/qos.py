@@ -69,11 +69,6 @@ def sensor_reader(lockstep: bool) -> QoSProfile:
     return RELIABLE if lockstep else SENSOR_READER
 
 
-def sensor_writer(lockstep: bool) -> QoSProfile:
-    """Return the QoS of publishers of sensor data."""
-    return RELIABLE if lockstep else SENSOR
-
-
 def reader_of(profiles: Sequence[QoSProfile]) -> QoSProfile:
     """Return the quality of service that gets all messages of publishers."""
     reliable = all(item.reliability == ReliabilityPolicy.RELIABLE for item in profiles)

@@ -87,17 +87,10 @@ def make_workers(number: int, wanted: int | None = None, cluster: str | None = N
     if cluster is not None:
         return _of_cluster(cluster)
     processes = min(wanted or os.cpu_count() or 1, number)
-    return _processes(processes) if processes > 1 else Workers()
-
-
-def _begin() -> None:
-    # The main process handles Ctrl-C and shuts down its workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _processes(number: int) -> Workers:
+    if processes <= 1:
+        return Workers()
     # Spawned: a fresh interpreter on every system.
-    pool = ProcessPoolExecutor(number, multiprocessing.get_context('spawn'), _begin)
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context('spawn'), _begin)
     before = dict(os.environ)
     os.environ.update(dict.fromkeys(_ONE_THREAD, '1'))
 
@@ -110,7 +103,12 @@ def _processes(number: int) -> Workers:
         os.environ.clear()
         os.environ.update(before)
 
-    return Workers(pool, number, close=close)
+    return Workers(pool, processes, close=close)
+
+
+def _begin() -> None:
+    # The main process handles Ctrl-C and shuts down its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _of_cluster(address: str) -> Workers:

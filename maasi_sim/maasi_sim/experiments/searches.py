@@ -154,7 +154,7 @@ def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
     scenario = scenario_from_content(settings['scenario'], 'settings')
     bounds = scenario.environment.array()
     exploration = UnexploredMap(bounds, float((bounds[:, 1] - bounds[:, 0]).max()) / 26.0)
-    columns = {name: np.asarray(values, float) for name, values in outcome.columns.items()}
+    columns = outcome.columns
     detections = {
         name: robot.sensor.build(name, scenario.dimension).detection
         for name, robot in scenario.robots.items()
@@ -166,7 +166,7 @@ def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
                 place = [columns[f'{name}_{axis}'][row] for axis in 'xyz']
                 exploration.update(detection, Pose.from_yaw(place, scenario.robots[name].yaw))
         explored.append(exploration.explored_fraction())
-    outcome.columns = {**outcome.columns, 'explored': explored}
+    outcome.columns = {**columns, 'explored': explored}
     outcome.summary['explored'] = explored[-1] if explored else 0.0
     return outcome
 

@@ -39,11 +39,9 @@ def mean_interval(values: ArrayLike) -> Interval:
     array = np.asarray(values, dtype=float)
     array = array[~np.isnan(array)]
     number = len(array)
-    if number == 0:
-        return Interval(math.nan, math.nan, 0, 0.0)
-    mean = float(array.mean())
-    if number == 1:
-        return Interval(mean, math.nan, 1, 0.0)
+    mean = float(array.mean()) if number else math.nan
+    if number < 2:
+        return Interval(mean, math.nan, number, 0.0)
     error = float(array.std(ddof=1)) / math.sqrt(number)
     return Interval(mean, error * _student(number - 1), number, number - 1.0)
 
@@ -92,10 +90,9 @@ def bootstrap_difference(first: ArrayLike, second: ArrayLike) -> Difference:
     if not len(gaps):
         return Difference(math.nan, math.nan, math.nan, math.nan, 0, None)
     mean, median = float(gaps.mean()), float(np.median(gaps))
-    if len(gaps) == 1:
-        return Difference(mean, math.nan, math.nan, median, 1, None)
     if np.ptp(gaps) == 0.0:
-        return Difference(mean, mean, mean, median, len(gaps), None)
+        bound = mean if len(gaps) > 1 else math.nan
+        return Difference(mean, bound, bound, median, len(gaps), None)
     low, high = stats.bootstrap(
         (gaps,), np.mean, confidence_level=LEVEL, random_state=np.random.default_rng(0)
     ).confidence_interval

@@ -372,8 +372,8 @@ def _gap(gap: Difference) -> str:
 
 def compared_page(tables: Sequence[SearchTable], seeds: Sequence[int]) -> str:
     """Return the page of a comparison in Markdown."""
-    text = f"# Comparison of searches\n\nSeeds {seeds[0]} to {seeds[-1]}. Means with Student's "
-    text += (
+    text = (
+        f"# Comparison of searches\n\nSeeds {seeds[0]} to {seeds[-1]}. Means with Student's "
         "95 % interval, the share of complete searches with\nWilson's; differences on the same "
         'seeds with bootstrap intervals. A search that did not\nfind all counts with the time '
         'limit.\n'
