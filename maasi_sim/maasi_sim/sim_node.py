@@ -258,14 +258,12 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         node = message.node
         if node not in self._expected:
             return
-        if self.step >= 0 and self.settings.lockstep and node in self._ready:
-            robot = self._robot_of.get(node)
-            if robot is None or robot not in self.simulation.away:
-                self.get_logger().info(f'{node} was restarted: step {self.step} is republished')
-                self._returned[node] = time.monotonic()
-                self._await(node)
-                if self.active:
-                    self._look_timer.reset()
+        restarted = self.step >= 0 and self.settings.lockstep and node in self._ready
+        if restarted and self._await(node):
+            self.get_logger().info(f'{node} was restarted: step {self.step} is republished')
+            self._returned[node] = time.monotonic()
+            if self.active:
+                self._look_timer.reset()
         self._ready.add(node)
 
     def _missing(self) -> str:
@@ -336,11 +334,15 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
 
     # ---- the steps ---------------------------------------------------------------------------
 
-    def _await(self, node: str) -> None:
-        self._waiting.add(node)
+    def _await(self, node: str) -> bool:
+        """Wait for a node, and for the command of its robot, unless that is away."""
         robot = self._robot_of.get(node)
+        if robot in self.simulation.away:
+            return False
+        self._waiting.add(node)
         if robot is not None:
             self._waiting.add(f'{robot}/cmd_vel')
+        return True
 
     def _begin_step(self) -> None:
         """Publish the current step of the simulation."""
@@ -350,9 +352,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         if self.settings.lockstep:
             self._due = max(self._due + self._period, self._wall_step)
             for node in self._expected:
-                robot = self._robot_of.get(node)
-                if robot is None or robot not in self.simulation.away:
-                    self._await(node)
+                self._await(node)
         self.on_new_step()
         self._publish(self.simulation.present)
 

@@ -94,7 +94,3 @@ class CuboidSimulation(SimulatedTeam):
     def images_due(self, name: str) -> bool:
         """Return false: snapshots are taken by the planners."""
         return False
-
-    def scan_due(self, name: str) -> bool:
-        """Return false: there is no laser scanner."""
-        return False

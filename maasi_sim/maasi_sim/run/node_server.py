@@ -53,25 +53,19 @@ def start_server() -> None:
     os.environ[_STARTED_BY] = str(os.getpid())
     # Ctrl-C in the terminal must not reach the server before it has a session of its own.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    folder = tempfile.gettempdir()
     try:
-        _make_folder()
+        # The server's socket needs a folder whose path is not too long for an address.
+        if len(os.fsencode(folder)) > _LONGEST_FOLDER:
+            tempfile.tempdir = '/tmp'
+        util.get_temp_dir()
         forkserver.ensure_running()
     except OSError as error:
         raise ProcessError(f'the server of the nodes cannot be started: {error}') from error
     finally:
+        tempfile.tempdir = folder
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         del os.environ[_STARTED_BY]
-
-
-def _make_folder() -> None:
-    """Make the folder of the server's socket, in one whose path is not too long for an address."""
-    folder = tempfile.gettempdir()
-    if len(os.fsencode(folder)) > _LONGEST_FOLDER:
-        tempfile.tempdir = '/tmp'
-    try:
-        util.get_temp_dir()
-    finally:
-        tempfile.tempdir = folder
 
 
 def wait_for_server() -> None:

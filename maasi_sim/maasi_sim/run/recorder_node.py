@@ -307,12 +307,10 @@ class Recorder:
 
     def _is_own(self, topic: str, data: bytes) -> bool:
         """Return whether a message on a topic shared by all teams is the team's own."""
-        if not self._team:
-            return True
-        if topic == DIAGNOSTICS:
+        if self._team and topic == DIAGNOSTICS:
             names = [item.name for item in deserialize_message(data, DiagnosticArray).status]
             return any(name.startswith(f'/{self._team}/') for name in names)
-        if topic == ROSOUT:
+        if self._team and topic == ROSOUT:
             logger = f'{self._team.replace("/", ".")}.'
             return bool(deserialize_message(data, Log).name.startswith(logger))
         return True

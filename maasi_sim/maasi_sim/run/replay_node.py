@@ -238,7 +238,12 @@ def replay(
     folder = make_folder(out, '_replay')
     with Domain(domain_id) as domain, contextlib.ExitStack() as ends:
         os.environ.update(domain.environment())
-        processes = [_process(recording.facts, name, folder) for name in recording.found]
+        processes = []
+        for name in recording.found:
+            node_facts = recording.facts['nodes'][within(name, f'/{FILTER}')]
+            parameters = {**node_facts['parameters'], **REPLAYED}
+            kind = node_facts['package'], node_facts['executable']
+            processes.append(NodePlan(*kind, FILTER, name, parameters).process(folder, folder))
         ends.callback(stop, processes)
         for process in processes:
             process.start()
@@ -251,18 +256,6 @@ def replay(
             code, *words = stopped.args
             print(*words, end='', file=sys.stderr)
             return int(code)
-
-
-def _process(facts: dict[str, Any], namespace: str, folder: Path) -> NodeProcess:
-    recorded = facts['nodes'][within(namespace, f'/{FILTER}')]
-    plan = NodePlan(
-        recorded['package'],
-        recorded['executable'],
-        FILTER,
-        namespace,
-        {**recorded['parameters'], **REPLAYED},
-    )
-    return plan.process(folder, folder)
 
 
 def _feed(

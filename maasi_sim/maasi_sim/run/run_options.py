@@ -119,11 +119,6 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def view_options(options: argparse.Namespace) -> ViewOptions:
-    """Return where the page is served."""
-    return ViewOptions(options.port, options.host, options.control)
-
-
 def _namespace(text: str) -> str:
     name = text.strip('/')
     if not _NAMESPACE.fullmatch(name):
@@ -146,12 +141,13 @@ def parse(arguments: list[str] | None) -> Options:
         parser.error('--follow-clock: allowed without --lockstep and --rate')
     if not options.view and (options.port is not None or options.control):
         parser.error('--port and --control need --view')
+    view = ViewOptions(options.port, options.host, options.control)
     names = {item.name for item in fields(Options)}
     given = {name: value for name, value in vars(options).items() if name in names}
     given |= {
         'scenario': options.scenario or '',
         'record': not options.no_record,
         'namespace': options.namespace or '',
-        'view': view_options(options) if options.view else None,
+        'view': view if options.view else None,
     }
     return Options(**given)

@@ -37,7 +37,7 @@ from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.report_files import StoredReport, store_report
 from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
-from maasi_sim.run.run_options import Options, ViewOptions
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
@@ -138,9 +138,7 @@ class ScenarioRun:
     def _execute(self, domain: Domain) -> int:
         with contextlib.ExitStack() as ends:
             ends.callback(self.display.close)
-            page: RunPage | None = None
-            if self.options.view is not None:
-                page = self._page(self.options.view, domain.number)
+            page = self._page(domain.number)
             if page is not None:
                 ends.callback(page.end)
             types = load_types()
@@ -419,8 +417,11 @@ class ScenarioRun:
             code = DONE
         return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
-    def _page(self, options: ViewOptions, domain: int) -> RunPage | None:
-        """Serve the page of the run; an error does not end the run."""
+    def _page(self, domain: int) -> RunPage | None:
+        """Serve the page of the run, if it is asked for; an error does not end the run."""
+        options = self.options.view
+        if options is None:
+            return None
         try:
             scene = scene_of(self.mission.name, self.mission.scenario)
             page = RunPage(scene, options, domain, self.options.namespace)

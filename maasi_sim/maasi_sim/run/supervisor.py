@@ -102,19 +102,7 @@ class NodeWatch:
 
 
 class Supervisor:
-    """Starts the nodes of a run; restarts a node that dies or hangs, or ends the run.
-
-    Attributes
-    ----------
-    processes : dict
-        By the full name of the node.
-    events : list of dict
-        Nodes that died, hung or were restarted.
-    failed : set of str
-        Nodes that caused the end of the run.
-    running : bool
-        Whether the first step has begun; before it nodes may take long to start.
-    """
+    """Starts the nodes of a run; restarts a node that dies or hangs, or ends the run."""
 
     def __init__(
         self,
@@ -125,8 +113,11 @@ class Supervisor:
         display: ProgressDisplay,
     ) -> None:
         self.plans = plans
+        #: Nodes that died, hung or were restarted.
         self.events: list[dict[str, Any]] = []
+        #: Nodes that caused the end of the run.
         self.failed: set[str] = set()
+        #: Whether the first step has begun; before it nodes may take long to start.
         self.running = False
         self._scenario = scenario
         self._limits = scenario.limits

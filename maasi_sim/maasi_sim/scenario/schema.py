@@ -6,14 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.settings.driver import DRIVERS, BatteryUnit
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
-from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import FilterSettings, Finite, SensorSettings, Settings, Vector3
 from maasi_planner.node_settings import PlannedRobotSettings, PlannerNodeSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
@@ -86,10 +83,6 @@ class RobotSettings(Settings):
         default_factory=SimulatedSettings,
         description='True parameters in the simulation, where they differ from those assumed',
     )
-
-    def true_sensor(self, name: str, bounds: NDArray[np.float64]) -> Sensor:
-        """Return its true ranging sensor; bounds (d, 2) [m] of the environment."""
-        return self.simulated.sensor(self.sensor, name, bounds)
 
     @property
     def external(self) -> bool:

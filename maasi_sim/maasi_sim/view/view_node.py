@@ -15,7 +15,7 @@ from rclpy.utilities import remove_ros_args
 
 from maasi_filter.ros.qos import reader_of
 from maasi_sim.missions import load_mission
-from maasi_sim.run.run_options import add_view_options, view_options
+from maasi_sim.run.run_options import ViewOptions, add_view_options
 from maasi_sim.run.topics import message_class
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.view.event_log import Scene
@@ -92,7 +92,8 @@ def main(arguments: list[str] | None = None) -> int:
     rclpy.init(args=given)
     domain = rclpy.get_default_context().get_domain_id()
     try:
-        page = RunPage(scene, view_options(options), domain, options.namespace, waits=False)
+        served = ViewOptions(options.port, options.host, options.control)
+        page = RunPage(scene, served, domain, options.namespace, waits=False)
     except OSError as error:
         print(f'error: {options.host}: {error.strerror or error}', file=sys.stderr)
         rclpy.try_shutdown()

@@ -125,7 +125,9 @@ def simulated_robot(name: str, scenario: Scenario, world: World, seed: int) -> S
             motion=robot.motion,
             radius=robot.radius,
             camera=robot.camera,
-            sensor=robot.true_sensor(name, world.bounds) if robot.camera is None else None,
+            sensor=None
+            if robot.camera
+            else robot.simulated.sensor(robot.sensor, name, world.bounds),
             laser=robot.laser,
             odometry=robot.odometry,
             battery=robot.battery,
