@@ -39,6 +39,7 @@ class CandidateSet:
     def __init__(self, settings: CandidateSettings, bounds: ArrayLike, height: float = 0.0) -> None:
         self.settings = settings
         self.bounds = check_bounds(bounds)
+        self.dimension = len(self.bounds)
         self.height = float(height)
         if not math.isfinite(self.height):
             raise ValueError(f'height: got {height}, allowed are finite numbers')
@@ -48,12 +49,16 @@ class CandidateSet:
         elif settings.points is not None:
             self._fixed = self._complete(np.array(settings.points, dtype=float))
         else:
-            self._ring = self._directions()
-
-    @property
-    def dimension(self) -> int:
-        """2 or 3."""
-        return len(self.bounds)
+            steps = [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)]
+            if settings.ring == 6:
+                if self.dimension == 2:
+                    raise ValueError('ring: got 6, allowed in 2D are 4 and 8')
+                steps += [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
+            elif settings.ring == 8:
+                half = math.sqrt(0.5)
+                steps += [(half, half, 0.0), (-half, half, 0.0), (-half, -half, 0.0)]
+                steps.append((half, -half, 0.0))
+            self._ring = (settings.distance or 0.0) * np.array(steps)
 
     def _grid(self) -> FloatArray:
         settings = self.settings
@@ -88,18 +93,6 @@ class CandidateSet:
         complete = np.full((len(points), 3), self.height)
         complete[:, : points.shape[1]] = points
         return complete
-
-    def _directions(self) -> FloatArray:
-        steps = [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)]
-        if self.settings.ring == 6:
-            if self.dimension == 2:
-                raise ValueError('ring: got 6, allowed in 2D are 4 and 8')
-            steps += [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
-        elif self.settings.ring == 8:
-            half = math.sqrt(0.5)
-            steps += [(x, y, 0.0) for x, y in ((half, half), (-half, half), (-half, -half))]
-            steps.append((half, -half, 0.0))
-        return (self.settings.distance or 0.0) * np.array(steps)
 
     def at(self, position: ArrayLike) -> FloatArray:
         """Return the candidates of a robot at `position` (3,), as a (W, 3) array.
@@ -260,7 +253,10 @@ def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
     headings = np.broadcast_to(yaws[..., None], places.shape[:3]).ravel()
     flat = places.reshape(-1, 3)
     sectors = np.zeros(len(flat), np.int64)
-    if viewer.yaw is None and _turns(viewer.sensor):
+    kind, parameters = viewer.sensor.detection.kernel()
+    # Whether what it sees may depend on the heading.
+    turns = kind == CUSTOM or (kind == BOX and bool(parameters[8] > 0.5))
+    if viewer.yaw is None and turns:
         sectors = np.round(headings / (math.pi / 8.0)).astype(np.int64) % 16
     cells = np.round(flat / (size / 100.0)).astype(np.int64)
     cells -= cells.min(axis=0)
@@ -268,12 +264,6 @@ def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
     keys = ((cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]) * 16 + sectors
     _, first = np.unique(keys, return_index=True)
     return np.ascontiguousarray(flat[first]), np.ascontiguousarray(headings[first])
-
-
-def _turns(sensor: Sensor) -> bool:
-    """Return whether what a sensor sees may depend on the heading."""
-    kind, parameters = sensor.detection.kernel()
-    return kind == CUSTOM or (kind == BOX and bool(parameters[8] > 0.5))
 
 
 def half_view(sensor: Sensor) -> float:

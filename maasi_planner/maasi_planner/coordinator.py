@@ -78,11 +78,6 @@ class RobotPlan:
     measurements: int = 0
     due: bool = False
 
-    @property
-    def destined(self) -> bool:
-        """Whether it has a plan, or has not measured since it had one."""
-        return self.decided_at is None or not self.staying or len(self.positions) > 0
-
     def destination(self, state: RobotState) -> FloatArray:
         """Return the final position of its plan at a state, (3,) [m]."""
         if self.staying or not len(self.positions):
@@ -100,6 +95,9 @@ class RobotPlan:
     def lend(self, step: int) -> None:
         """Note that it follows a goal of another client: it measures without a plan."""
         began = self.decided_at
+        if began is not None and self.staying and not len(self.positions):
+            # It does so already.
+            return
         self.leave()
         if began is None:
             began = self.measured_from = step
@@ -188,7 +186,8 @@ class Coordinator:
         self.planner = make_planner(settings.planner.name, settings.planner)
         self.trigger = MeasurementTrigger(settings.planner)
         self.plans: dict[str, RobotPlan] = {}
-        own = settings.planner.own_explorations
+        planner = settings.planner
+        own = planner.name in ('maas', 'as') and planner.agent_exploration == 'own'
         for name in sorted(settings.robots):
             robot = settings.robots[name]
             motion = make_motion(robot.motion, self.obstacles, robot.radius)
@@ -244,14 +243,8 @@ class Coordinator:
         A robot that nears its waypoint and has nowhere further to go is not in it: it goes on, and
         plans again when it has arrived.
 
-        Parameters
-        ----------
-        step : int
-            k.
-        robots : mapping
-            The robots that take part, by name.
-        taken : sequence of (3,) array and float
-            Final positions of robots of other planners [m], and their radii.
+        robots: those that take part, by name; taken: final positions (3,) of robots of other
+        planners [m], and their radii.
         """
         planning = self.planning(step, robots)
         if not planning:

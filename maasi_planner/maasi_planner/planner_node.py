@@ -50,11 +50,14 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     Subscribes
     ----------
     `<robot>/state` (maasi_msgs/AgentState), `filter_update` (maasi_msgs/FilterUpdate);
-    `<robot>/destination` (geometry_msgs/PointStamped) of robots that plan for themselves
+    `<robot>/destination` (geometry_msgs/PointStamped) of robots that plan for themselves;
+    `found_targets` (maasi_msgs/FoundTargetArray, latched); running freely, `/diagnostics`
+    (diagnostic_msgs/DiagnosticArray): heartbeats of the publishers of `filter_update`
 
     Publishes
     ---------
     `measurement_batch` (maasi_msgs/MeasurementBatch): M_k;
+    `found_targets/kept` (maasi_msgs/FoundTargetArray, latched): from the start, empty at first;
     `decisions` (maasi_msgs/PlanDecision): every candidate with its terms;
     `<robot>/plan` (nav_msgs/Path); `exploration` (latched; 2D: nav_msgs/OccupancyGrid, 3D:
     sensor_msgs/PointCloud2); `markers` (visualization_msgs/MarkerArray);
@@ -82,7 +85,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._jump = round(longest / self.settings.step)
         self.coordinator = Coordinator(self.settings)
         self._orders = Orders(self, self.coordinator, self.modes)
-        self._others = OtherPlanners(self, self.coordinator.names, self._on_destination)
+        self._others = OtherPlanners(self, self.coordinator.names, self._try_step)
         self._guard = FilterGuard(self)
         self._batches = Batches(self, self._guard, self._try_done)
         self._views = PlannerViews(self)
@@ -125,13 +128,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._others.set_up()
         self._guard.set_up()
         self._goals = self._orders.set_up(names, self._try_done)
-        self._action = SearchAction(
-            self,
-            lambda: '' if self.active else 'the planner is not active',
-            lambda: self._command('start', None),
-            self._stand,
-            self.drop,
-        )
+        self._action = SearchAction(self, lambda: self._command('start', None), self._stand)
         offer_services(self, names, self._command)
         self.create_wall_timer(_CHECK_PERIOD, self._check_team)
 
@@ -147,7 +144,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     def _stand(self) -> None:
         self.modes.command('stop')
-        self._orders.end_homing()
+        self._orders.set_homing(self.coordinator.names, False)
         self._orders.stop(self.coordinator.names)
 
     def destroy_node(self) -> None:
@@ -193,9 +190,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self.coordinator.begin_again()
         if word in ('pause', 'stop', 'home'):
             self._orders.stop(follow)
-        self._orders.end_homing(follow)
-        if word == 'home':
-            self._orders.begin_homing(follow)
+        self._orders.set_homing(follow, word == 'home')
         if not self.modes.under_way:
             self._action.stop('stopped by search/stop')
         answer = f'{word}: {", ".join(follow)}'
@@ -241,20 +236,17 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         """
         before = self._expected
         if before is None and message.step == self._taken_step:
-            self._repeat_step()
+            self._batches.publish_again()
+            # If such a robot does answer later, it gets a new goal.
+            for name, _ in sorted(self._goals.waiting):
+                self._orders.refuse(name)
+            self._goals.waiting.clear()
+            self._try_done()
             return
         if before is not None and message.step == before.step:
             message.imaging = sorted({*before.imaging, *message.imaging})
         self._expected = message
         self._try_step()
-
-    def _repeat_step(self) -> None:
-        self._batches.publish_again()
-        # If such a robot does answer later, it gets a new goal.
-        for name, _ in sorted(self._goals.waiting):
-            self._orders.refuse(name)
-        self._goals.waiting.clear()
-        self._try_done()
 
     def _on_state(self, name: str, message: AgentState) -> None:
         if not self.active:
@@ -274,32 +266,20 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             return
         before = self._heard.get(name)
         if before is not None and message.step < before.step:
-            if not self.settings.lockstep and before.step - message.step > 1.0 / self.settings.step:
-                self.get_logger().warning(
-                    f'{name}/state.step went back from {before.step} to {message.step}: '
-                    'starting anew'
-                )
-                self.reset()
-            else:
+            if self.settings.lockstep or before.step - message.step <= 1.0 / self.settings.step:
                 self.drop('old state', f'{name}/state.step: read {message.step}, had {before.step}')
                 return
-        self._heard[name] = HeardState(
-            int(message.step),
-            state,
-            int(message.goal_id),
-            int(message.goal_status),
-            message.reason,
-            Silence(self),
-        )
+            self.get_logger().warning(
+                f'{name}/state.step went back from {before.step} to {message.step}: starting anew'
+            )
+            self.reset()
+        goal = message.goal_id, message.goal_status, message.reason
+        self._heard[name] = HeardState(message.step, state, *goal, Silence(self))
         if self.settings.lockstep:
             self._try_step()
         else:
             self._join_or_leave(name, message.goal_status, message.reason)
             self._try_free_step()
-
-    def _on_destination(self) -> None:
-        if self.settings.lockstep:
-            self._try_step()
 
     # ---- availability of robots and filter ---------------------------------------------------
 
@@ -321,29 +301,37 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         """Remove silent robots from planning; check filter and action."""
         if not self.active:
             return
+        now = time.monotonic()
         if not self.settings.lockstep:
-            now = time.monotonic()
             for name in sorted(self._heard):
                 silent = self._heard[name].silence.length
                 if silent > self.settings.state_timeout:
                     self._leave(name, f'no {name}/state for {silent:.1f} s')
-            self._watch_filter(now)
+            problem = self._guard.problem(now)
+            if problem and not self._held:
+                self.get_logger().error(f'{problem}: all robots are held')
+                self._orders.hold(self.coordinator.names)
+            elif self._held and not problem:
+                self.get_logger().warning('the filter answers again: the search goes on')
+            self._held = problem
+        waits = self.settings.lockstep or bool(self._held)
+        if waits and now - self._batches.published_at > _ANSWER_PATIENCE:
+            self._batches.publish_again()
+        if not self.settings.lockstep:
             self._try_free_step()
-        elif time.monotonic() - self._batches.published_at > _ANSWER_PATIENCE:
-            self._batches.publish_again()
-        self._update_action()
-
-    def _watch_filter(self, now: float) -> None:
-        """Hold the robots while the filter is silent."""
-        problem = self._guard.problem(now)
-        if problem and not self._held:
-            self.get_logger().error(f'{problem}: all robots are held')
-            self._orders.hold(self.coordinator.names)
-        elif self._held and not problem:
-            self.get_logger().warning('the filter answers again: the search goes on')
-        self._held = problem
-        if problem and now - self._batches.published_at > _ANSWER_PATIENCE:
-            self._batches.publish_again()
+        update = self._batches.update
+        self._action.update(
+            max(self._taken_step, 0) * self.settings.step,
+            SearchTargets.Feedback(
+                found=update.found,
+                measurements=self._batches.measurements,
+                decisions=self._decisions,
+                expected_number=update.expected_number,
+                explored=self.coordinator.exploration.explored_fraction(),
+            ),
+            self.coordinator.finished or '',
+            not self._heard or len(self._away) < len(self.coordinator.names),
+        )
 
     # ---- a step ------------------------------------------------------------------------------
 
@@ -370,7 +358,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             set(expected.imaging),
             self._others.taken(step, expected.robots),
         )
-        self._others.planned(expected.robots)
+        self._others.before = set(expected.robots)
         self._try_done()
 
     def _try_free_step(self) -> None:
@@ -399,30 +387,23 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             if free:
                 self._orders.send_home(name, header)
             robots[name] = PresentRobot(heard.state, free and self.modes.of[name] is Mode.SEARCHING)
-        if not self.modes.searching or self._held:
-            self._publish_destinations(header, robots)
-            return
+        searching = Mode.SEARCHING in self.modes.of.values() and not self._held
         begin = time.perf_counter()
-        decision = self.coordinator.plan(step, robots, taken)
+        decision = self.coordinator.plan(step, robots, taken) if searching else None
         if decision is not None:
             self._planning_time = time.perf_counter() - begin
-        self._publish_destinations(header, robots)
+        plans = self.coordinator.plans
+        self._others.publish(
+            header, {name: plans[name].destination(robot.state) for name, robot in robots.items()}
+        )
+        if not searching:
+            return
         if decision is not None:
             self._announce(decision, header)
         members = self.coordinator.measuring(step, robots, imaging)
         if members:
             self._batches.publish(step, members, header)
         self._views.publish(self.coordinator, robots, header, stamp * 1e-9)
-
-    def _publish_destinations(self, header: Header, robots: dict[str, PresentRobot]) -> None:
-        self._others.publish(
-            header,
-            lambda name: (
-                self.coordinator.plans[name].destination(robots[name].state)
-                if name in robots
-                else None
-            ),
-        )
 
     def _announce(self, decision: Any, header: Header) -> None:
         """Publish a decision and send the goals."""
@@ -457,23 +438,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             and not self._batches.waiting
         ):
             self.done(self._taken_step)
-
-    # ---- the action --------------------------------------------------------------------------
-
-    def _update_action(self) -> None:
-        update = self._batches.update
-        self._action.update(
-            max(self._taken_step, 0) * self.settings.step,
-            SearchTargets.Feedback(
-                found=update.found,
-                measurements=self._batches.measurements,
-                decisions=self._decisions,
-                expected_number=update.expected_number,
-                explored=self.coordinator.exploration.explored_fraction(),
-            ),
-            self.coordinator.finished or '',
-            not self._heard or len(self._away) < len(self.coordinator.names),
-        )
 
 
 def main(arguments: list[str] | None = None) -> int:

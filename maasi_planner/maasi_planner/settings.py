@@ -332,11 +332,6 @@ class PlannerSettings(Settings):
             extend=self.extension == 'measuring',
         )
 
-    @property
-    def own_explorations(self) -> bool:
-        """Whether each robot needs an exploration function of its own."""
-        return self.name in ('maas', 'as') and self.agent_exploration == 'own'
-
     @model_validator(mode='after')
     def _lanes_are_shared_out(self) -> PlannerSettings:
         if self.name == 'lawnmower' and self.coordination == 'independent':

@@ -101,18 +101,9 @@ def test_a_cuboid_is_cut_to_the_part_beside_an_obstacle():
 @pytest.mark.parametrize(
     ('changes', 'words'),
     [
-        ({'objects': []}, r'objects: got none'),
-        (
-            {'objects': [{'centre': [290, 130], 'size': [60, 60, 60]}]},
-            r'objects\[0\]: read centre .*inside the area',
-        ),
         (
             {'obstacles': [{'centre': [900, 130], 'size': [60, 60, 60]}]},
             r'obstacles\[0\]: read centre',
-        ),
-        (
-            {'area': [[144, 206], [99, 161], [0, 80]]},
-            r'no cuboid can be reached .*outside the area',
         ),
         ({'probability': 0.0}, r'detection_probability'),
         ({'camera': {'least_distance': 90.0}}, r'least_distance: got 90.0'),

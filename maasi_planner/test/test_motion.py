@@ -160,14 +160,6 @@ def test_drone_keeps_its_height_and_heading_or_faces_its_travel(heading, yaw):
     assert prediction.yaws[0, prediction.lengths[0]] == pytest.approx(yaw, abs=0.05)
 
 
-@pytest.mark.parametrize('name', MODELS)
-def test_length_zero_at_the_waypoint(name):
-    state = RobotState.at_rest([1.0, 1.0, 0.0])
-    prediction = make_motion(MODELS[name]).predict(state, [[1.0, 1.0, 0.0]], 0.05)
-    assert (prediction.lengths[0], prediction.control_cost[0]) == (0, 0.0)
-    assert prediction.reached[0]
-
-
 def test_control_cost_counts_what_it_says():
     """A climb costs force, level flight torques; `torques` leaves the force out."""
     state = RobotState.at_rest([0.0, 0.0, 1.0])

@@ -156,14 +156,11 @@ def test_a_dump_loads_again_and_foreign_keys_are_named(process, dump):
     assert code == 0 and 'is not known' not in said, said
 
 
-def test_a_node_without_parameters_says_in_one_sentence_what_it_needs(process):
+def test_missing_and_wrong_parameters_are_named_with_what_was_read(process):
     code, said = ended(process())
-    assert code == 2
     last = said.splitlines()[-1]
+    assert code == 2
     assert last.startswith('error: parameters environment.bounds, robots: needed, but not set')
-
-
-def test_wrong_parameters_are_named_with_what_was_read(process):
     code, said = ended(process(flatten(SETTINGS) | {'step': -0.5, 'filter.particles': 'many'}))
     assert code == 2
     assert 'parameter step: Input should be greater than 0, read -0.5' in said

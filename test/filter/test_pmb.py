@@ -40,14 +40,6 @@ def look(search, sensor, targets, places, first=0, seed=0):
     return result
 
 
-def moments(mass):
-    """Return mean and covariance of weights (n,) of the cells."""
-    mass = mass / mass.sum()
-    mean = mass @ cells()
-    offset = cells() - mean
-    return mean, (mass[:, None] * offset).T @ offset
-
-
 def test_one_target_without_clutter_is_the_bayesian_posterior():
     generator = np.random.default_rng(3)
     sensor = plane_sensor()
@@ -59,13 +51,12 @@ def test_one_target_without_clutter_is_the_bayesian_posterior():
         probability, likelihood = densities(sensor, place, values)
         exact = exact * probability * likelihood[0]
     best = max(search.components, key=lambda item: item.existence)
-    mean, covariance = moments(exact)
+    exact /= exact.sum()
+    mean, covariance = exact @ cells(), np.cov(cells().T, aweights=exact, ddof=0)
     assert best.existence > 0.99
-    deviation = np.sqrt(np.diagonal(covariance))
-    np.testing.assert_allclose(best.density.mean, mean, atol=0.12 * deviation.max())
-    np.testing.assert_allclose(
-        best.density.covariance, covariance, atol=0.12 * np.diagonal(covariance).max()
-    )
+    largest = np.diagonal(covariance).max()
+    np.testing.assert_allclose(best.density.mean, mean, atol=0.12 * np.sqrt(largest))
+    np.testing.assert_allclose(best.density.covariance, covariance, atol=0.12 * largest)
 
 
 def test_existence_is_that_of_bayes_after_a_detection_and_after_misses():

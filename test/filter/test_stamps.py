@@ -27,9 +27,6 @@ def test_a_stamp_that_is_no_time_is_named(stamp, problem):
     for message, name in ((odometry, 'header.stamp.'), (MeasurementBatch(stamp=stamp), 'stamp.')):
         found = stamp_problem(message)
         assert found is None if problem is None else found.startswith(name + problem)
-
-
-def test_a_message_without_a_stamp_has_no_problem():
     assert stamp_problem(String()) is None
 
 

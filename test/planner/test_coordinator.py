@@ -11,8 +11,6 @@ from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners.intermittent import Intermittent
 from maasi_planner.team import Decision, single_choice, stay
 from maasi_sim.experiments.papers import experiments
-from maasi_sim.scenario.loading import load_scenario
-from maasi_sim.search import search
 
 ROBOT = {
     'candidates': {'grid': [4, 4], 'spacing': 2.0, 'corner': [2.0, 2.0]},
@@ -268,21 +266,6 @@ def test_of_two_waypoints_passed_in_a_row_each_is_measured(monkeypatch):
     coordinator.plans['a'].turning_distance = 1.0
     assert coordinator.plan(3, robots) is not None
     assert [item.robot for item in coordinator.measuring(3, robots)] == ['a']
-
-
-def test_a_search_passes_waypoints_without_slowing_down():
-    scenario = load_scenario('mambo')
-    content = scenario.model_dump(by_alias=True, exclude_unset=True)
-    content['limits']['time'] = 30.0
-    slow = []
-    for radius in (0.0, 0.3):
-        content['robots']['mambo']['motion']['arrival_radius'] = radius
-        result = search(type(scenario).model_validate(content), 1)
-        places = np.array([item.positions['mambo'] for item in result.progress])
-        times = np.array([item.time for item in result.progress])
-        speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times)
-        slow.append(np.mean(speeds < 0.15))
-    assert slow[1] < 0.5 * slow[0]
 
 
 def test_the_experiments_of_the_papers_stop_at_each_waypoint():

@@ -17,11 +17,7 @@ from maasi_planner.buildings.conversions import (
     mission_markers,
 )
 from maasi_planner.buildings.preplanning import plan_mission
-from maasi_planner.buildings.settings import (
-    CuboidMethodSettings,
-    DynamicsSettings,
-    HazardSettings,
-)
+from maasi_planner.buildings.settings import CuboidMethodSettings, HazardSettings
 from maasi_planner.buildings.sharing import Broadcast, assigned, rewards
 from maasi_planner.buildings.way_finder import WayFinder
 
@@ -203,7 +199,9 @@ def test_a_failed_solve_flies_the_plan_before_then_brakes(monkeypatch):
     agent.observe(2, second.positions[1] + np.array([20.0, 0.0, 0.0]), [8.0, 0.0, -2.0])
     third = agent.decide([], random(2))
     assert third.how == 'brake' and third.visits == []
-    assert third.controls[0] == pytest.approx(agent.dynamics.braking([8.0, 0.0, -2.0]))
+    assert third.controls[0] == pytest.approx(
+        agent.dynamics.control_for([8.0, 0.0, -2.0], np.zeros(3))
+    )
     assert agent.failed == 2
 
 
@@ -227,14 +225,12 @@ CAGE = [
     ('make', 'words'),
     [
         (lambda: make_agent(home=[300.0, 0.0, 0.0]), r'purple: start: read .*inside the area'),
-        (lambda: make_agent(home=[175.0, 130.0, 10.0]), r'purple: start: .*inside an object'),
         (lambda: make_agent(obstacles=CAGE), r'no cuboid can be reached: obstacles close it in'),
         (
             lambda: make_agent().observe(0, [np.nan, 0.0, 0.0], np.zeros(3)),
             r'purple: state: got',
         ),
         (lambda: HazardSettings(recharge_steps=[5, 2]), 'recharge_steps: got'),
-        (lambda: DynamicsSettings(force=30.0), r'cannot lift the weight of the robot.*32\.86 N'),
     ],
 )
 def test_bad_input(make, words):

@@ -31,6 +31,7 @@ from maasi_planner.conversions import checked_state, checked_update
 from maasi_planner.node.filter_guard import FilterWatch
 from maasi_planner.node_settings import OtherRobotSettings
 from maasi_planner.planner_node import PlannerNode
+from maasi_planner.settings import PlannerSettings
 
 
 def changed(message, changes):
@@ -301,7 +302,7 @@ def test_wrong_destinations_and_searches_are_dropped():
 def test_silence_is_that_of_heartbeats_and_of_the_oldest_open_batch():
     watch = FilterWatch(4.0)
     assert not watch.problem(1000.0)
-    watch.beat(10.0)
+    watch.beat = 10.0
     assert not watch.problem(13.9)
     assert watch.problem(14.1) == 'no heartbeat of the filter for 4.1 s'
     # A planner that stood still itself blames nobody.
@@ -324,10 +325,12 @@ def test_silence_is_that_of_heartbeats_and_of_the_oldest_open_batch():
     assert not never.problem(1e6)
 
 
-@pytest.mark.parametrize('silent', ['updates', 'heartbeat'])
-def test_robots_are_held_until_the_filter_answers_again(silent):
+@pytest.mark.parametrize(
+    ('silent', 'planner'), [('updates', 'maasi'), ('heartbeat', 'mutual_information')]
+)
+def test_robots_are_held_until_the_filter_answers_again(silent, planner):
     # Long enough for a heartbeat of each second on a busy machine.
-    with running(filter_timeout=4.0) as team:
+    with running(filter_timeout=4.0, planner=PlannerSettings(name=planner)) as team:
         beats = team.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         beat = DiagnosticArray(status=[DiagnosticStatus(name='/team')])
         guard = team.tested._guard

@@ -52,13 +52,6 @@ def cluster(place, radius=0.1, mass=0.9):
     return Cluster(np.array(place), radius**2 * np.eye(2), radius, mass)
 
 
-def test_planners_are_made_by_name():
-    for one, other in (('maasi', 'asi'), ('maas', 'as')):
-        assert type(make_planner(one)) is type(make_planner(other))
-    with pytest.raises(ValueError, match='known are'):
-        make_planner('best')
-
-
 def test_finished_says_why():
     team, view = one_robot(1, kinds=('box',))
     planner = make_planner('maasi')
@@ -330,16 +323,6 @@ def test_robots_without_a_usable_candidate_stay(name, start, candidates, chosen,
     assert robot.waypoint == pytest.approx(chosen or [*start, 0.0])
 
 
-@pytest.mark.parametrize('kind', ['paper', 'information'])
-def test_candidate_at_the_present_place_is_not_chosen(kind):
-    team, view = one_robot()
-    view.candidates = np.vstack([view.state.pose.position, view.candidates])
-    robot = decide('maasi', team, objective=kind, cluster_candidates=False)
-    assert robot.chosen != 0
-    assert robot.lengths[0] == 0
-    assert robot.objective[0] == -np.inf
-
-
 def test_wrong_team_is_refused():
     team, view = one_robot()
     for change in (
@@ -352,9 +335,3 @@ def test_wrong_team_is_refused():
             dataclasses.replace(view, **change)
     with pytest.raises(ValueError, match='step_time'):
         dataclasses.replace(team, step_time=0.0)
-
-
-@pytest.mark.parametrize('name', [*NAMES, 'lawnmower'])
-def test_nobody_plans(name):
-    team = random_team(np.random.default_rng(0), planning=0, waiting=2)
-    assert make_planner(name).decide(team).robots == {}

@@ -234,7 +234,16 @@ class SearchAgent:
         """Take over a plan; without one, the rest of the previous plan, or to brake."""
         if plan is None:
             self.failed += 1
-            plan = self._shifted()
+            # The rest of the previous plan, if that holds, with braking at its end.
+            last, controls, visits = self.plan, [], []
+            if last is not None and (
+                np.abs(last.positions[1] - self.position).max() <= _SAME_STATE
+                and np.abs(last.velocities[1] - self.velocity).max() <= _SAME_STATE
+            ):
+                controls = list(last.controls[1:])
+                visits = [(k - 1, n) for k, n in last.visits if k > 1 and not self.visited[n]]
+            flown = self.dynamics.fly(self.position, self.velocity, controls, self.settings.horizon)
+            plan = Plan(*flown, visits, 'shifted' if controls else 'brake')
         before = [k - 1 for k, _ in self.plan.visits if k > 1] if self.plan else []
         now = [k for k, _ in plan.visits]
         # Count postponements: otherwise a robot can postpone its visit for ever.
@@ -258,15 +267,3 @@ class SearchAgent:
                 self.activity = Activity.SEARCHING
                 self.flight_steps = 0
                 self.plan = None
-
-    def _shifted(self) -> Plan:
-        """Return the rest of the previous plan, if that holds, with braking at its end."""
-        plan, controls, visits = self.plan, [], []
-        if plan is not None and (
-            np.abs(plan.positions[1] - self.position).max() <= _SAME_STATE
-            and np.abs(plan.velocities[1] - self.velocity).max() <= _SAME_STATE
-        ):
-            controls = list(plan.controls[1:])
-            visits = [(k - 1, n) for k, n in plan.visits if k > 1 and not self.visited[n]]
-        flown = self.dynamics.fly(self.position, self.velocity, controls, self.settings.horizon)
-        return Plan(*flown, visits, 'shifted' if controls else 'brake')

@@ -47,7 +47,9 @@ def solve_jointly(solver: PlanSolver, problems: Sequence[Problem]) -> list[Plan]
         cuboid = max(users, key=lambda n: (users[n], -n), default=None)
         if cuboid is None or users[cuboid] == 1:
             return plans
-        visiting = [robot for robot, plan in enumerate(plans) if _visits(plan, cuboid)]
+        visiting = [
+            robot for robot, plan in enumerate(plans) if any(n == cuboid for _, n in plan.visits)
+        ]
         # Branch: either the first of these robots or all others must not visit the cuboid.
         others = [robot for robot in range(len(problems)) if robot != visiting[0]]
         for leaving in (visiting[:1], others):
@@ -67,10 +69,6 @@ def solve_jointly(solver: PlanSolver, problems: Sequence[Problem]) -> list[Plan]
                     seen.add(key)
                     heapq.heappush(queue, (_total(new), len(seen), key, new))
     return None
-
-
-def _visits(plan: Plan, cuboid: int) -> bool:
-    return any(n == cuboid for _, n in plan.visits)
 
 
 def _total(plans: Sequence[Plan]) -> float:

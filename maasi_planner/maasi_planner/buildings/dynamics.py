@@ -51,7 +51,8 @@ class Dynamics:
         """Return positions and velocities (steps + 1, 3), and forces: those given, then braking."""
         positions, velocities, used = [position], [velocity], []
         for k in range(steps):
-            used.append(controls[k] if k < len(controls) else self.braking(velocities[-1]))
+            brakes = k >= len(controls)
+            used.append(self.control_for(velocities[-1], np.zeros(3)) if brakes else controls[k])
             place, speed = self.next(positions[-1], velocities[-1], used[-1])
             positions.append(place)
             velocities.append(speed)
@@ -61,10 +62,6 @@ class Dynamics:
         """Return the force (3,) [N] within its bounds that gets closest to a wanted velocity."""
         change = np.asarray(wanted, dtype=float) - self.retained * np.asarray(velocity, dtype=float)
         return np.clip(self.mass / self.step * change + self.weight, -self.force, self.force)
-
-    def braking(self, velocity: ArrayLike) -> FloatArray:
-        """Return the force (3,) [N] that stops the robot as fast as its bounds allow."""
-        return self.control_for(velocity, np.zeros(3))
 
     def braking_steps(self) -> int:
         """Return the largest number of steps until the robot is at rest on all axes."""

@@ -31,12 +31,6 @@ def detection_probability(distance: float, camera: SearchCameraSettings) -> floa
     return max(0.0, 1.0 - (distance - camera.least_distance) / span)
 
 
-def distance_for(probability: float, camera: SearchCameraSettings) -> float:
-    """Return the largest distance [m] at which p_d is `probability`."""
-    span = camera.largest_distance - camera.least_distance
-    return camera.least_distance + (1.0 - probability) * span
-
-
 def footprint(distance: float, camera: SearchCameraSettings) -> float:
     """Return r, the side of the square footprint of the camera at a distance [m] (III-C)."""
     return 2.0 * distance * math.tan(0.5 * camera.angle)
@@ -83,16 +77,14 @@ class CoveragePlan:
     coverage: float
     boxes: FloatArray = field(init=False)
     centres: FloatArray = field(init=False)
+    # Objects and obstacles.
+    solids: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         boxes = np.array([cell.box for cell in self.cells]).reshape(-1, 3, 2)
         object.__setattr__(self, 'boxes', boxes)
         object.__setattr__(self, 'centres', boxes.mean(axis=2))
-
-    @property
-    def solids(self) -> FloatArray:
-        """Objects and obstacles, (n, 3, 2) [m]."""
-        return np.concatenate([self.objects, self.obstacles])
+        object.__setattr__(self, 'solids', np.concatenate([self.objects, self.obstacles]))
 
     def inside(self, position: ArrayLike) -> BoolArray:
         """Return which cuboids a position (3,) is in, (N,)."""
@@ -109,11 +101,8 @@ class CoveragePlan:
 
     def way_hits(self, begin: ArrayLike, end: ArrayLike) -> bool:
         """Return whether the segment between two positions (3,) cuts an object or obstacle."""
-        return bool(
-            segment_cuts(
-                np.asarray(begin, dtype=float), np.asarray(end, dtype=float), self.solids
-            ).any()
-        )
+        ends = np.asarray(begin, dtype=float), np.asarray(end, dtype=float)
+        return bool(segment_cuts(*ends, self.solids).any())
 
 
 def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolArray:
@@ -139,8 +128,11 @@ def plan_mission(settings: CuboidSettings, area: ArrayLike) -> CoveragePlan:
     objects = _boxes('objects', settings.objects, bounds)
     obstacles = _boxes('obstacles', settings.obstacles, bounds)
     solids = np.concatenate([objects, obstacles])
-    distance = distance_for(settings.detection_probability, settings.camera)
-    side = footprint(distance, settings.camera)
+    # The largest distance at which p_d is as wanted.
+    camera = settings.camera
+    span = camera.largest_distance - camera.least_distance
+    distance = camera.least_distance + (1.0 - settings.detection_probability) * span
+    side = footprint(distance, camera)
     cells: list[Cell] = []
     lost: list[tuple[Cell, str]] = []
     seen = total = 0.0

@@ -209,7 +209,14 @@ class PlanSolver:
         cuboid and lower and upper corner of the intersection. Extreme motion is the sum of the
         lowest and highest velocities before each step, (3, T + 1) [m].
         """
-        fall, climb = self._extremes(problem.velocity)
+        dynamics, sums = self.dynamics, np.zeros((2, 3, self.settings.horizon + 1))
+        for side, sign in enumerate((-1.0, 1.0)):
+            speed = np.array(problem.velocity, dtype=float)
+            push = dynamics.step / dynamics.mass * (sign * dynamics.force - dynamics.weight)
+            for k in range(self.settings.horizon):
+                sums[side, :, k + 1] = sums[side, :, k] + dynamics.step * speed
+                speed = np.clip(dynamics.retained * speed + push, -dynamics.speed, dynamics.speed)
+        fall, climb = sums
         number = np.flatnonzero(wanted)
         area = np.asarray(problem.area, dtype=float)
         reach_low = np.maximum(first[:, None] + fall - fall[:, 1:2], area[:, :1])
@@ -221,17 +228,6 @@ class PlanSolver:
         meets[:2] = False
         steps, which = np.nonzero(meets)
         return steps.copy(), number[which], low[steps, which], high[steps, which], fall, climb
-
-    def _extremes(self, velocity: FloatArray) -> FloatArray:
-        dynamics, horizon = self.dynamics, self.settings.horizon
-        sums = np.zeros((2, 3, horizon + 1))
-        for side, sign in enumerate((-1.0, 1.0)):
-            speed = np.array(velocity, dtype=float)
-            push = dynamics.step / dynamics.mass * (sign * dynamics.force - dynamics.weight)
-            for k in range(horizon):
-                sums[side, :, k + 1] = sums[side, :, k] + dynamics.step * speed
-                speed = np.clip(dynamics.retained * speed + push, -dynamics.speed, dynamics.speed)
-        return sums
 
 
 def _due(problem: Problem, place: FloatArray) -> tuple[list[int], BoolArray]:

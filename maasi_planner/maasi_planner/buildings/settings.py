@@ -16,7 +16,6 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Face = Literal['west', 'east', 'south', 'north', 'bottom', 'top']
 
 FACES: tuple[Face, ...] = ('west', 'east', 'south', 'north', 'bottom', 'top')
-LATERAL: list[Face] = ['west', 'east', 'south', 'north']
 
 
 class BoxSettings(Settings):
@@ -44,7 +43,7 @@ class ObjectSettings(BoxSettings):
     """An object of interest."""
 
     faces: list[Face] = Field(
-        default_factory=lambda: list(LATERAL),
+        default_factory=lambda: list(FACES[:4]),
         min_length=1,
         description='Faces to search; west is that of the smallest x, north of the largest y',
     )
@@ -241,13 +240,7 @@ class CuboidPlannerSettings(NodeSettings, SearcherSettings):
     )
 
     def search(self) -> CuboidSettings:
-        """Return the search with its objects.
-
-        Raises
-        ------
-        ValueError
-            If the faces do not fit the objects.
-        """
+        """Return the search with its objects; `ValueError` if the faces do not fit them."""
         if self.faces and len(self.faces) != len(self.objects):
             raise ValueError(
                 f'faces: got {len(self.faces)}, allowed is one for each of {len(self.objects)} '

@@ -6,7 +6,7 @@ import heapq
 
 import numpy as np
 
-from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings.preplanning import segment_cuts
 
 # Distance of intermediate targets from the corners of obstacles [m].
@@ -33,10 +33,12 @@ class WayFinder:
         """
         if not segment_cuts(place, target, self.solids).any():
             return target
-        corners = self._corners(place, target)
-        points = np.vstack([place, target, corners])
+        points = np.vstack([place, target, self._corners(place, target)])
         number = len(points)
-        times = self._times(points)
+        way = points[None, :, :] - points[:, None, :]
+        times = np.abs(way) / self._speeds
+        times[:, :, 2] = np.where(way[:, :, 2] > 0.0, times[:, :, 2], -way[:, :, 2] / self._down)
+        times = times.max(axis=2) + 1e-3 * np.sqrt((way * way).sum(axis=2))
         for i in range(number):
             blocked = segment_cuts(
                 np.broadcast_to(points[i], points.shape), points, self.solids
@@ -70,23 +72,17 @@ class WayFinder:
         return bool((self.first_corner(place, target) != target).any())
 
     def _corners(self, place: FloatArray, target: FloatArray) -> FloatArray:
-        corners = []
-        for box in self.solids:
-            for height in (place[2], target[2], box[2, 1] + _BERTH):
-                for x in (box[0, 0] - _BERTH, box[0, 1] + _BERTH):
-                    for y in (box[1, 0] - _BERTH, box[1, 1] + _BERTH):
-                        corners.append((x, y, height))
-        points = np.array(corners)
+        points = np.array(
+            [
+                (x, y, height)
+                for box in self.solids
+                for height in (place[2], target[2], box[2, 1] + _BERTH)
+                for x in (box[0, 0] - _BERTH, box[0, 1] + _BERTH)
+                for y in (box[1, 0] - _BERTH, box[1, 1] + _BERTH)
+            ]
+        )
         free = ((points >= self.area[:, 0]) & (points <= self.area[:, 1])).all(axis=1)
         low = points[:, None, :] > self.solids[None, :, :, 0]
         high = points[:, None, :] < self.solids[None, :, :, 1]
-        within: BoolArray = np.all(low & high, axis=2)
-        free &= ~within.any(axis=1)
+        free &= ~np.all(low & high, axis=2).any(axis=1)
         return np.asarray(points[free])
-
-    def _times(self, points: FloatArray) -> FloatArray:
-        way = points[None, :, :] - points[:, None, :]
-        times = np.abs(way) / self._speeds
-        times[:, :, 2] = np.where(way[:, :, 2] > 0.0, times[:, :, 2], -way[:, :, 2] / self._down)
-        length = np.sqrt((way * way).sum(axis=2))
-        return np.asarray(times.max(axis=2) + 1e-3 * length)

@@ -165,12 +165,8 @@ _PARAMETERS: dict[str, FloatArray] = {}
 def mambo_parameters(settings: MotionSettings) -> FloatArray:
     """Return the parameter array of `mambo_step` for settings."""
     key = settings.model_dump_json()
-    if key not in _PARAMETERS:
-        _PARAMETERS[key] = _mambo_parameters(settings)
-    return _PARAMETERS[key].copy()
-
-
-def _mambo_parameters(settings: MotionSettings) -> FloatArray:
+    if key in _PARAMETERS:
+        return _PARAMETERS[key].copy()
     gains = lqr_gains(settings)
     out = np.zeros(13)
     out[K_VX], out[K_PITCH], out[K_Q] = gains['pitch'][1:]
@@ -192,7 +188,8 @@ def _mambo_parameters(settings: MotionSettings) -> FloatArray:
     out[SPEED] = settings.speed / (1.015 * overshoot)
     out[YAW_RATE] = settings.yaw_rate
     out[COUNT_FORCE] = 1.0 if settings.control_inputs == 'all' else 0.0
-    return out
+    _PARAMETERS[key] = out
+    return out.copy()
 
 
 class ObstacleTerm(NamedTuple):

@@ -251,12 +251,7 @@ class CompiledBody(Body):
 class CompiledMotion(MotionModel):
     """Motion model of the suite: its controller and its body are compiled.
 
-    Attributes
-    ----------
-    kind : int
-        Which functions its steps use.
-    steering : Steering
-        How it approaches its waypoint.
+    kind: which functions its steps use; steering: how it approaches its waypoint.
     """
 
     kind: int

@@ -26,14 +26,6 @@ class Batches:
     last: id of the last batch; used: largest id of an update that was used; waiting: whether the
     update of the last batch has not come; published_at: when the last batch was published,
     monotonic clock [s]; update: the last one that was used, and measurements of all of them.
-
-    Publishes
-    ---------
-    `measurement_batch` (maasi_msgs/MeasurementBatch): M_k
-
-    Subscribes
-    ----------
-    `filter_update` (maasi_msgs/FilterUpdate)
     """
 
     def __init__(
@@ -74,10 +66,7 @@ class Batches:
             id=self.last,
             step=step,
             stamp=header.stamp,
-            members=[
-                BatchMember(robot=item.robot, decision=item.decision, measurement=item.measurement)
-                for item in members
-            ],
+            members=[BatchMember(**vars(item)) for item in members],
         )
         self.published_at = time.monotonic()
         self._guard.watch.asked(self.last, self.published_at)

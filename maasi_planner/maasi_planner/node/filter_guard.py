@@ -25,12 +25,9 @@ class FilterWatch:
 
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
-        self._beat: float | None = None
+        #: When the executor of the filter last gave a heartbeat.
+        self.beat: float | None = None
         self._open: dict[int, float] = {}
-
-    def beat(self, now: float) -> None:
-        """Note a heartbeat of the executor of the filter."""
-        self._beat = now
 
     def asked(self, batch: int, now: float) -> None:
         """Note that a batch was published."""
@@ -42,16 +39,16 @@ class FilterWatch:
 
     def stalled(self, seconds: float) -> None:
         """Note that the planner itself was suspended: messages of that time are not read yet."""
-        if self._beat is not None:
-            self._beat += seconds
+        if self.beat is not None:
+            self.beat += seconds
         self._open = {number: since + seconds for number, since in self._open.items()}
 
     def problem(self, now: float) -> str:
         """Return why the filter counts as absent; empty if it does not."""
         if not self.timeout:
             return ''
-        if self._beat is not None and now - self._beat > self.timeout:
-            return f'no heartbeat of the filter for {now - self._beat:.1f} s'
+        if self.beat is not None and now - self.beat > self.timeout:
+            return f'no heartbeat of the filter for {now - self.beat:.1f} s'
         if self._open:
             number = min(self._open)
             waited = now - self._open[number]
@@ -67,13 +64,7 @@ _NAMES_PERIOD = 1.0
 
 
 class FilterGuard:
-    """Tells a planner that runs freely while its filter is silent; robots are held then.
-
-    Subscribes
-    ----------
-    `/diagnostics` (diagnostic_msgs/DiagnosticArray): heartbeats of the publishers of
-    `filter_update`
-    """
+    """Tells a planner that runs freely while its filter is silent; robots are held then."""
 
     def __init__(self, node: LockstepLifecycleNode[PlannerNodeSettings]) -> None:
         self._node = node
@@ -96,7 +87,7 @@ class FilterGuard:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         if any(status.name in self.names for status in message.status):
-            self.watch.beat(time.monotonic())
+            self.watch.beat = time.monotonic()
 
     def problem(self, now: float) -> str:
         """Return why the filter counts as absent at a wall time [s]; empty if it does not."""
@@ -116,14 +107,6 @@ class FoundKeeper:
     """Republishes found targets, latched: a latched message is lost with its publisher.
 
     Targets are kept until a new search, even if the filter no longer has them.
-
-    Subscribes
-    ----------
-    `found_targets` (maasi_msgs/FoundTargetArray, latched)
-
-    Publishes
-    ---------
-    `found_targets/kept` (maasi_msgs/FoundTargetArray, latched): from the start, empty at first
     """
 
     def __init__(self, node: Node) -> None:

@@ -35,7 +35,8 @@ class Orders:
         self._coordinator = coordinator
         #: Robots that follow a goal of another client, with its number.
         self.lent: dict[str, int] = {}
-        # Robots on their way to their start, with the number of that goal; 0: arrived.
+        # Robots on their way to their start, with the number of that goal; 0: arrived, -1: to be
+        # sent there as soon as they are free.
         self._homing: dict[str, int] = {}
         # Simulated time since which each goal was refused, and for how long by now [s].
         self._refused_since: float | None = None
@@ -43,16 +44,8 @@ class Orders:
 
     def set_up(self, names: Sequence[str], answered: Callable[[], None]) -> TeamGoals:
         """Create the clients of the robots; `answered` is called after an answer to a goal."""
-        node = self._node
         self._answered = answered
-        self.goals = TeamGoals(
-            node,
-            {name: node.team_topic(f'{name}/go_to') for name in names},
-            node.settings.lockstep,
-            self._on_answer,
-        )
-        for client in self.goals.clients.values():
-            node.expect(client.server_is_ready)
+        self.goals = TeamGoals(self._node, names, self._on_answer)
         return self.goals
 
     # ---- commands ----------------------------------------------------------------------------
@@ -70,14 +63,12 @@ class Orders:
                 self.goals.cancel(name)
                 self._coordinator.plans[name].staying = True
 
-    def begin_homing(self, names: Iterable[str]) -> None:
-        """Send robots to their starts as soon as they are free."""
-        self._homing.update(dict.fromkeys(names, -1))
-
-    def end_homing(self, names: Iterable[str] | None = None) -> None:
-        """Send robots (None: all) to their starts no more."""
-        for name in list(self._homing) if names is None else names:
+    def set_homing(self, names: Iterable[str], home: bool) -> None:
+        """Send robots to their starts as soon as they are free, or no more."""
+        for name in names:
             self._homing.pop(name, None)
+            if home:
+                self._homing[name] = -1
 
     def leave(self, name: str) -> None:
         """Forget the goals of a robot that takes part no more."""
@@ -159,7 +150,7 @@ class Orders:
         new = self.lent.get(name) != heard.goal
         self.lent[name] = heard.goal
         plan = self._coordinator.plans[name]
-        if self._modes.of[name] is Mode.SEARCHING and plan.destined:
+        if self._modes.of[name] is Mode.SEARCHING:
             plan.lend(step)
         if new:
             self._node.get_logger().warning(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 
 import numpy as np
@@ -19,16 +19,7 @@ from maasi_planner.node_settings import PlannerNodeSettings
 
 
 class OtherPlanners:
-    """Exchanges destinations with the planners of other robots; they plan in the order of names.
-
-    Subscribes
-    ----------
-    `<robot>/destination` (geometry_msgs/PointStamped) of robots that plan for themselves
-
-    Publishes
-    ---------
-    `<robot>/destination` (geometry_msgs/PointStamped) of its own robots, each step
-    """
+    """Exchanges destinations with the planners of other robots; they plan in the order of names."""
 
     def __init__(
         self,
@@ -50,7 +41,8 @@ class OtherPlanners:
             name: {-1: np.array(others[name].start)} for name in sorted(others)
         }
         self._silence: dict[str, Silence] = {}
-        self._before: set[str] = set()
+        #: In lockstep, who took part in the step before.
+        self.before: set[str] = set()
 
     def set_up(self) -> None:
         """Create publishers and subscriptions, where there are others."""
@@ -99,13 +91,9 @@ class OtherPlanners:
             if name < self._own[0]:
                 if max(known) < step:
                     return True
-            elif name in self._before and max(known) < step - 1:
+            elif name in self.before and max(known) < step - 1:
                 return True
         return False
-
-    def planned(self, robots: Iterable[str]) -> None:
-        """Note who took part in a step, in lockstep."""
-        self._before = set(robots)
 
     def taken(self, step: int, robots: Collection[str] | None) -> list[tuple[FloatArray, float]]:
         """Return the known destinations of robots with their own planner, and their radii.
@@ -128,9 +116,8 @@ class OtherPlanners:
                 taken.append((known[last], settings.others[name].radius))
         return taken
 
-    def publish(self, header: Header, destination: Callable[[str], FloatArray | None]) -> None:
-        """Publish where the own robots go; None: the robot takes no part."""
-        for name, publisher in self._publishers.items():
-            point = destination(name)
-            if point is not None:
-                publisher.publish(PointStamped(header=header, point=point_to_ros(point)))
+    def publish(self, header: Header, destinations: Mapping[str, FloatArray]) -> None:
+        """Publish where the own robots that take part go."""
+        for name in sorted(self._publishers.keys() & destinations.keys()):
+            message = PointStamped(header=header, point=point_to_ros(destinations[name]))
+            self._publishers[name].publish(message)

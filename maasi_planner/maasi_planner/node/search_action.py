@@ -24,24 +24,19 @@ class SearchAction:
     A goal starts a search, or takes over a running one. A newer goal preempts an older one, which
     is aborted, while the robots continue, so that a dead client does not block the next one.
 
-    node: owner of the server; problem: returns why no goal is accepted now; empty if one is;
-    on_begin, on_end: called when a search begins, and when the robots must stop; on_refusal: called
-    with the kind of a refusal, and its reason.
+    node: owner of the server; on_begin, on_end: called when a search begins, and when the robots
+    must stop.
     """
 
     def __init__(
         self,
         node: LockstepLifecycleNode[Any],
-        problem: Callable[[], str],
         on_begin: Callable[[], object],
         on_end: Callable[[], None],
-        on_refusal: Callable[[str, str], None],
     ) -> None:
-        self._logger = node.get_logger()
-        self._problem = problem
+        self._node = node
         self._on_begin = on_begin
         self._on_end = on_end
-        self._on_refusal = on_refusal
         self._goal: Any = None
         self._outcome: Future | None = None
         self._feedback = SearchTargets.Feedback()
@@ -59,11 +54,6 @@ class SearchAction:
         server.register_goal_callback(self._judge)
         server.register_handle_accepted_callback(self._accept)
 
-    @property
-    def active(self) -> bool:
-        """Whether a client has a goal."""
-        return self._goal is not None
-
     def update(
         self, time: float, feedback: SearchTargets.Feedback, finished: str, robots: bool
     ) -> None:
@@ -79,17 +69,20 @@ class SearchAction:
             self._began = time
         request, self._feedback = goal.request, feedback
         if goal.is_cancel_requested:
-            self._end(Result.CANCELED, 'cancelled')
+            end = Result.CANCELED, 'cancelled'
         elif request.targets and feedback.found >= request.targets:
-            self._end(Result.TARGETS_FOUND, f'{feedback.found} targets are found')
+            end = Result.TARGETS_FOUND, f'{feedback.found} targets are found'
         elif finished:
-            self._end(Result.DONE, finished)
+            end = Result.DONE, finished
         elif 0.0 < request.time_limit <= time - self._began:
-            self._end(Result.TIME_LIMIT, f'{request.time_limit:g} s are over')
+            end = Result.TIME_LIMIT, f'{request.time_limit:g} s are over'
         elif not robots:
-            self._end(Result.NO_ROBOT, 'no robot can go on')
+            end = Result.NO_ROBOT, 'no robot can go on'
         else:
             goal.publish_feedback(feedback)
+            return
+        self._conclude(*end)
+        self._on_end()
 
     def stop(self, reason: str) -> None:
         """Conclude the goal because the robots are stopped."""
@@ -97,11 +90,11 @@ class SearchAction:
             self._conclude(Result.CANCELED, reason)
 
     def _judge(self, goal: SearchTargets.Goal) -> GoalResponse:
-        problem = self._problem()
+        problem = '' if self._node.active else 'the planner is not active'
         if not (math.isfinite(goal.time_limit) and goal.time_limit >= 0.0):
             problem = f'time_limit: read {goal.time_limit}, allowed are finite numbers from 0 [s]'
         if problem:
-            self._on_refusal('bad goal', f'search: {problem}')
+            self._node.drop('bad goal', f'search: {problem}')
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
@@ -113,13 +106,9 @@ class SearchAction:
         # It is EXECUTING until it is concluded.
         handle.execute(partial(_conclusion, self._outcome))
 
-    def _end(self, reason: int, text: str) -> None:
-        self._conclude(reason, text)
-        self._on_end()
-
     def _conclude(self, reason: int, text: str) -> None:
         self._goal, outcome = None, self._outcome
-        self._logger.info(f'search ended: {text}')
+        self._node.get_logger().info(f'search ended: {text}')
         assert outcome is not None
         outcome.set_result(
             Result(
@@ -158,11 +147,11 @@ def offer_services(
         services.setdefault(node.resolve_service_name(f'search/{word}'), None)
     for service, robots in services.items():
         word = service.rpartition('/')[2]
-        node.offer_service(service, partial(_serve, commander, word, robots))
 
+        def serve(
+            _: Any, response: Trigger.Response, word: str = word, robots: list[str] | None = robots
+        ) -> Trigger.Response:
+            response.success, response.message = commander(word, robots)
+            return response
 
-def _serve(
-    commander: Commander, word: str, names: list[str] | None, _: Any, response: Trigger.Response
-) -> Trigger.Response:
-    response.success, response.message = commander(word, names)
-    return response
+        node.offer_service(service, serve)

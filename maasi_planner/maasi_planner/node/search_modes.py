@@ -38,11 +38,6 @@ class SearchModes:
         self.of = dict.fromkeys(sorted(names), Mode.WAITING)
 
     @property
-    def searching(self) -> bool:
-        """Whether a robot searches."""
-        return Mode.SEARCHING in self.of.values()
-
-    @property
     def under_way(self) -> bool:
         """Whether a search has begun and has not been stopped."""
         return any(mode in (Mode.SEARCHING, Mode.PAUSED, Mode.HOME) for mode in self.of.values())

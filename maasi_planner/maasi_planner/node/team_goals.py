@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
@@ -75,25 +75,26 @@ class TeamGoals:
 
     In lockstep only states are used: they belong to a step, while results arrive at any time.
 
-    node: owner of the clients; topics: name of the action of each robot; lockstep: whether results
-    are ignored; on_answer: called with robot and number of an answered goal, and whether it was
-    accepted.
+    node: owner of the clients; names: robots; on_answer: called with robot and number of an
+    answered goal, and whether it was accepted.
     """
 
     def __init__(
         self,
         node: LockstepLifecycleNode[Any],
-        topics: dict[str, str],
-        lockstep: bool,
+        names: Sequence[str],
         on_answer: Callable[[str, int, bool], None],
     ) -> None:
         self._logger = node.get_logger()
-        self._lockstep = lockstep
+        self._lockstep = node.settings.lockstep
         self._on_answer = on_answer
-        self.clients = {
-            name: node.permanent(topic, partial(ActionClient, node, GoToWaypoint, topic))
-            for name, topic in topics.items()
-        }
+        self.clients = {}
+        for name in names:
+            topic = node.team_topic(f'{name}/go_to')
+            self.clients[name] = node.permanent(
+                topic, partial(ActionClient, node, GoToWaypoint, topic)
+            )
+            node.expect(self.clients[name].server_is_ready)
         self._sent: dict[str, _Sent] = {}
         # Numbers of goals that were cancelled last, with wall time.
         self._cancelled: dict[str, tuple[set[int], float]] = {}

@@ -19,13 +19,7 @@ from maasi_planner.node_settings import PlannerNodeSettings
 
 
 class PlannerViews:
-    """The exploration function, and markers of robots and their ways.
-
-    Publishes
-    ---------
-    `exploration` (latched; 2D: nav_msgs/OccupancyGrid, 3D: sensor_msgs/PointCloud2),
-    `markers` (visualization_msgs/MarkerArray)
-    """
+    """The exploration function, and markers of robots and their ways."""
 
     def __init__(self, node: LockstepLifecycleNode[PlannerNodeSettings]) -> None:
         self._node = node

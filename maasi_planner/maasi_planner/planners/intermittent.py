@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.arrays import FloatArray
 from maasi_planner.objective.team_objective import TeamObjective
-from maasi_planner.planners.base import (
-    Planner,
-    centres_of,
-    explain,
-    usable_options,
-)
+from maasi_planner.planners.base import Planner, centres_of, explain, usable_options
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import (
-    Decision,
-    RobotDecision,
-    TeamView,
-    UsableCandidates,
-    single_choice,
-    stay,
-)
+from maasi_planner.team import Decision, TeamView, single_choice, stay
 
 
 class Intermittent(Planner):
@@ -42,48 +30,35 @@ class Intermittent(Planner):
         decision.objective = value if len(chosen) else 0.0
         decision.exact = exact
         decision.evaluated = work
-        for index, name in enumerate(objective.names):
-            decision.robots[name] = self._robot_decision(
-                team, name, objective, index, chosen, options[name]
-            )
-        return explain(decision)
-
-    def _robot_decision(
-        self,
-        team: TeamView,
-        name: str,
-        objective: TeamObjective,
-        index: int,
-        chosen: IntArray,
-        option: UsableCandidates,
-    ) -> RobotDecision:
-        rows = slice(int(objective.start[index]), int(objective.start[index + 1]))
-        terms = objective.given(index, chosen)
         weights = objective.weights
-        if weights.information:
-            gains = weights.alpha * terms[:, 0] + weights.beta * terms[:, 1]
-            self._prospects[name] = float(gains[option.allowed].max(initial=0.0))
-        if chosen[index] < 0:
-            return stay(team.robots[name], 'stays: another robot is sent to every candidate')
-        best = int(chosen[index] - objective.start[index])
-        refinement, exploration, value = terms[best]
-        reason = (
-            f'J = {value:.4g} with T = {refinement:.4g}, E = {exploration:.4g} over '
-            f'{option.prediction.lengths[best]} steps, the best of {len(option.points)}'
-        )
-        result = single_choice(option.points, option.prediction, best, reason)
-        result.target_refinement, result.exploration, result.objective = terms.T
-        result.measurements = objective.measurements[rows]
-        return result
+        for index, name in enumerate(objective.names):
+            option, terms = options[name], objective.given(index, chosen)
+            if weights.information:
+                gains = weights.alpha * terms[:, 0] + weights.beta * terms[:, 1]
+                self._prospects[name] = float(gains[option.allowed].max(initial=0.0))
+            if chosen[index] < 0:
+                reason = 'stays: another robot is sent to every candidate'
+                decision.robots[name] = stay(team.robots[name], reason)
+                continue
+            first, last = objective.start[index : index + 2].tolist()
+            best = int(chosen[index]) - first
+            refinement, exploration, value = terms[best]
+            reason = (
+                f'J = {value:.4g} with T = {refinement:.4g}, E = {exploration:.4g} over '
+                f'{option.prediction.lengths[best]} steps, the best of {len(option.points)}'
+            )
+            result = single_choice(option.points, option.prediction, best, reason)
+            result.target_refinement, result.exploration, result.objective = terms.T
+            result.measurements = objective.measurements[first:last]
+            decision.robots[name] = result
+        return explain(decision)
 
     def _centres(self, team: TeamView, name: str) -> FloatArray | None:
         """Return the cluster centres as further candidates of a robot, if enabled."""
         wanted = self.settings.cluster_candidates
         if wanted is None:
             wanted = self.settings.objective == 'information'
-        if not wanted:
-            return None
-        heavy = self.heavy(team)
+        heavy = self.heavy(team) if wanted else []
         return centres_of(team, team.robots[name], heavy) if heavy else None
 
     def finished(self, team: TeamView) -> str | None:

@@ -36,8 +36,7 @@ def lanes(
         return [float(low[axis]) + length * i / (number - 1) for i in range(number)]
 
     out = []
-    backwards_x = False
-    backwards_y = False
+    backwards_x = backwards_y = False
     for z in places(2, layer_spacing) if d == 3 else [0.0]:
         rows = places(1, spacing)
         for y in reversed(rows) if backwards_y else rows:
@@ -79,32 +78,24 @@ class Lawnmower(Planner):
             0.5 * spacing if margin is None else margin,
         )
         names = team.names()
-        blocks = max(1, math.ceil(len(names) / 2))
-        blocks = min(blocks, len(all_lanes))
+        blocks = min(max(1, math.ceil(len(names) / 2)), len(all_lanes))
         self._blocks = [
             all_lanes[len(all_lanes) * i // blocks : len(all_lanes) * (i + 1) // blocks]
             for i in range(blocks)
         ]
-        ends = []
-        for block, members in enumerate(self._blocks):
-            ends.append((block, 0, members[0][0]))
-            ends.append((block, 1, members[-1][1]))
+        ends = [
+            (block, side, members[-side][side])
+            for block, members in enumerate(self._blocks)
+            for side in (0, 1)
+        ]
         free = list(ends)
         # In the order of names, each robot starts from the nearest free end.
         for name in names:
             position = team.robots[name].state.pose.position
-            if not free:
-                free = list(ends)
-            best = min(
-                free,
-                key=lambda end: (
-                    float(((end[2] - position)[: team.dimension] ** 2).sum()),
-                    end[0],
-                    end[1],
-                ),
-            )
-            free.remove(best)
-            self._side[name] = (best[0], best[1])
+            free = free or list(ends)
+            gaps = [((end[2] - position)[: team.dimension] ** 2).sum() for end in free]
+            block, side, _ = free.pop(int(np.argmin(gaps)))
+            self._side[name] = (block, side)
             self._pending[name] = []
         self._started = True
 

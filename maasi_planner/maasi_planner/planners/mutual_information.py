@@ -33,18 +33,10 @@ DOUBLINGS = 40
 def mutual_information(missed: FloatArray, weights: FloatArray) -> float:
     """Return the mutual information of targets and the empty measurement set, in nats.
 
-    Parameters
-    ----------
-    missed : (n,) array
-        Probability 1 - pi that a target at each particle is missed; over several measurements
-        the product.
-    weights : (n,) array
-        Expected number of targets at each particle.
-
-    Notes
-    -----
-    The series is summed exactly for its first terms and then in blocks that double, whose error
-    is far below 1e-3 of the result.
+    missed (n,): probability 1 - pi that a target at each particle is missed, over several
+    measurements the product; weights (n,): expected number of targets at each. The series is summed
+    exactly for its first terms and then in blocks that double, whose error is far below 1e-3 of the
+    result.
     """
     number = missed.shape[0]
     power = np.ones(number)
@@ -150,7 +142,10 @@ class MutualInformation(Planner):
         indices = {}
         for name, option in options.items():
             # Candidates that tell nothing are taken in the order of going straight on.
-            order = self._straight_on(team.robots[name], option.points, name)
+            ways = option.points - team.robots[name].state.pose.position
+            lengths = np.sqrt((ways * ways).sum(axis=1))
+            last = self._headings.get(name, np.zeros(3))
+            order = (ways * last).sum(axis=1) / np.maximum(lengths, 1e-12)
             rows = np.flatnonzero(option.allowed)
             indices[name] = rows[np.argsort(-order[rows], kind='stable')].tolist()
         points = {name: option.points for name, option in options.items()}
@@ -188,12 +183,3 @@ class MutualInformation(Planner):
                 pose = Pose.from_yaw(place, heading_to(view, here, place))
                 row[:] = 1.0 - view.sensor.detection.probability(points, pose)
         return out
-
-    def _straight_on(self, view: RobotView, points: FloatArray, name: str) -> FloatArray:
-        """Return how much each waypoint lies straight on, (W,)."""
-        ways = points - view.state.pose.position
-        lengths = np.sqrt((ways * ways).sum(axis=1))
-        last = self._headings.get(name)
-        if last is None:
-            return np.zeros(len(points))
-        return np.asarray((ways * last).sum(axis=1) / np.maximum(lengths, 1e-12))

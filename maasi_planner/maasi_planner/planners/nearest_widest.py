@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.records import Cluster
 from maasi_planner.planners.base import (
     Planner,
     apart,
@@ -50,8 +49,11 @@ class NearestWidest(Planner):
         here = np.array(view.state.pose.position)
         turn = self._turns.get(name, 0)
         for kind in (turn, turn + 1) if clusters else ():
-            index = self._cluster_choice(clusters, centres, here, kind % 2)
-            for position in index:
+            if kind % 2 == 0:
+                keys = [float(((centre - here) ** 2).sum()) for centre in centres]
+            else:
+                keys = [-float(cluster.radius) for cluster in clusters]
+            for position in sorted(range(len(clusters)), key=keys.__getitem__):
                 point = view.motion.keep_out.moved_out(here, centres[position])
                 if point is None or not apart(point, view.radius, taken):
                     continue
@@ -77,14 +79,3 @@ class NearestWidest(Planner):
         result.exploration = explored
         result.objective = np.where(found.allowed, explored, -np.inf)
         return result
-
-    @staticmethod
-    def _cluster_choice(
-        clusters: list[Cluster], centres: FloatArray, here: FloatArray, kind: int
-    ) -> list[int]:
-        """Return the clusters in order of preference."""
-        if kind == 0:
-            keys = [float(((centre - here) ** 2).sum()) for centre in centres]
-        else:
-            keys = [-float(cluster.radius) for cluster in clusters]
-        return sorted(range(len(clusters)), key=lambda i: (keys[i], i))
