@@ -33,10 +33,6 @@ _POSE_TYPES = ('AgentState', 'Odometry', 'PoseStamped')
 _CLEAR = 4.0
 
 
-class CalibrationError(ValueError):
-    """A recording or parameter file cannot be used."""
-
-
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
@@ -93,28 +89,28 @@ def read_parameters(path: Path) -> DriverSettings:
         (node,) = content.values()
         flat = dict(_dotted(node['ros__parameters'], ''))
     except OSError as error:
-        raise CalibrationError(f'{path}: {error.strerror}') from error
+        raise ValueError(f'{path}: {error.strerror}') from error
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(
+        raise ValueError(
             f"{path}: not a parameter file of one node ('/**: {{ros__parameters: ...}}')"
         ) from error
     known = {field.name for field in parameter_fields(DriverSettings, flat)}
     for name in flat:
         if name.startswith(('camera.', 'sensor.', 'environment.')) and name not in known:
-            raise CalibrationError(f'{path}: {name}: there is no such parameter')
+            raise ValueError(f'{path}: {name}: there is no such parameter')
     try:
         settings = DriverSettings.model_validate(unflatten(DriverSettings, flat))
     except ValidationError as error:
         first = error.errors()[0]
         key = '.'.join(map(str, first['loc']))
-        raise CalibrationError(f'{path}: {key}: read {first["input"]!r}; {first["msg"]}') from error
+        raise ValueError(f'{path}: {key}: read {first["input"]!r}; {first["msg"]}') from error
     except ValueError as error:
-        raise CalibrationError(f'{path}: {error}') from error
+        raise ValueError(f'{path}: {error}') from error
     if settings.camera is not None and settings.calibration_file:
         try:
             camera = load_calibration(settings.calibration_file, settings.camera)
         except (OSError, ValueError) as error:
-            raise CalibrationError(f'{path}: calibration_file: {error}') from error
+            raise ValueError(f'{path}: calibration_file: {error}') from error
         settings = settings.model_copy(update={'camera': camera})
     return settings
 
@@ -160,21 +156,21 @@ class RecordedRobot:
                 break
         if len(robots) != 1:
             there = ', '.join(sorted(self._types)) or 'no topics'
-            raise CalibrationError(
+            raise ValueError(
                 f'{bag}: robot: found {", ".join(sorted(robots)) or "none"} with '
                 f'{" or ".join(kinds)}, allowed is one (--robot, --use); recorded are {there}'
             )
         self.robot, self.use = robots.pop(), kind
         own = [self._topic(name) for name in _POSES if self._topic(name) in self._types]
         if poses is None and not own:
-            raise CalibrationError(
+            raise ValueError(
                 f'{bag}: poses: found neither {self._topic("state")} nor {self._topic("odom")}'
             )
         self.poses = poses or own[0]
         if self.poses not in self._types:
-            raise CalibrationError(f'{bag}: poses: {self.poses} is not recorded')
+            raise ValueError(f'{bag}: poses: {self.poses} is not recorded')
         if self._types[self.poses].rpartition('/')[2] not in _POSE_TYPES:
-            raise CalibrationError(
+            raise ValueError(
                 f'{bag}: poses: {self.poses} is {self._types[self.poses]}, allowed are '
                 + ', '.join(_POSE_TYPES)
             )
@@ -196,7 +192,7 @@ class RecordedRobot:
         if self.use == 'detections':
             return list(self._published())
         if self.settings.camera is None:
-            raise CalibrationError(
+            raise ValueError(
                 'parameter camera: got nothing, allowed with images are the settings of a camera'
             )
         return list(self._segmented())
@@ -248,7 +244,7 @@ class RecordedRobot:
 
     def _history(self) -> PoseHistory:
         settings = self.settings
-        placed: list[StampedPose] = []
+        history = PoseHistory(sys.maxsize)
         kind = self._types[self.poses].rpartition('/')[2]
         odometry: MapOdometry | None = None
         start = Pose.from_yaw(settings.start, settings.yaw)
@@ -260,12 +256,9 @@ class RecordedRobot:
                 if odometry is None:
                     first = settings.odometry_origin == 'first'
                     odometry = MapOdometry(start, pose if first else None)
-                placed.append(odometry.apply(_stamp(message), pose))
+                history.add(odometry.apply(_stamp(message), pose))
             else:
-                placed.append(StampedPose(_stamp(message), pose))
-        history = PoseHistory(max(len(placed), 2))
-        for item in placed:
-            history.add(item)
+                history.add(StampedPose(_stamp(message), pose))
         return history
 
 

@@ -209,6 +209,13 @@ def _way(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> f
     return float(course.position[0])
 
 
+# Lowest and highest value by option.
+_ALLOWED = {
+    'tilt': (LEAST_TILT, MOST_TILT),
+    'way': (0.5, 10.0),
+    'legs': (2, 50),
+    'port': (1024, 65535),
+}
 _PERIOD = 0.05
 # Longest wait for it to land [s].
 _LANDING = 15.0
@@ -240,20 +247,6 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _problem(options: argparse.Namespace) -> str:
-    """Return what is wrong with the options, or nothing."""
-    for name, low, high in (
-        ('tilt', LEAST_TILT, MOST_TILT),
-        ('way', 0.5, 10.0),
-        ('legs', 2, 50),
-        ('port', 1024, 65535),
-    ):
-        value = getattr(options, name)
-        if not low <= value <= high:
-            return f'--{name}: read {value:g}, allowed is {low:.4g} to {high:.4g}'
-    return ''
-
-
 def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Event) -> None:
     """Fly, land, and print the result."""
     flight = MeasuringFlight(link, options.way, options.legs, time.monotonic)
@@ -266,7 +259,13 @@ def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Even
             if ended.wait(_PERIOD):
                 raise MeasurementError('interrupted')
     finally:
-        _land(link)
+        end = time.monotonic() + _LANDING
+        while link.connected and link.flying_state != 'landed' and time.monotonic() < end:
+            link.keep_alive()
+            link.land()
+            time.sleep(_PERIOD)
+        if link.airborne:
+            print('error: the drone has not said that it landed', file=sys.stderr)
     found = fit_speed(flight.legs, link.tilt)
     print(
         f'\nmotion.tilt: {link.tilt:g}\n'
@@ -275,22 +274,15 @@ def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Even
     )
 
 
-def _land(link: MamboLink) -> None:
-    end = time.monotonic() + _LANDING
-    while link.connected and link.flying_state != 'landed' and time.monotonic() < end:
-        link.keep_alive()
-        link.land()
-        time.sleep(_PERIOD)
-    if link.airborne:
-        print('error: the drone has not said that it landed', file=sys.stderr)
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the measurement and return its exit code."""
     options = build_parser().parse_args(arguments)
-    if problem := _problem(options):
-        print(f'error: {problem}', file=sys.stderr)
-        return 2
+    for name, (low, high) in _ALLOWED.items():
+        value = getattr(options, name)
+        if not low <= value <= high:
+            allowed = f'{low:.4g} to {high:.4g}'
+            print(f'error: --{name}: read {value:g}, allowed is {allowed}', file=sys.stderr)
+            return 2
     if not options.fly:
         print(
             f'It would take off and fly {options.legs} legs of at most {options.way:g} m forward '

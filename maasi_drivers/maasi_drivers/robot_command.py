@@ -148,12 +148,9 @@ class _User:
             if not self._wait(result.done, _CANCEL_TIME, patient=True):
                 print('cancelled; nothing was heard of its end')
                 return FAILED
-        return self._conclude(result.result())
-
-    @staticmethod
-    def _conclude(answer: Any) -> int:
-        place, reason = answer.result.pose.position, answer.result.reason
-        reached = answer.status == GoalStatus.STATUS_SUCCEEDED
+        end: Any = result.result()
+        place, reason = end.result.pose.position, end.result.reason
+        reached = end.status == GoalStatus.STATUS_SUCCEEDED
         print(
             ('reached' if reached else f'not reached: {reason}')
             + f'; it stands at ({place.x:.3f}, {place.y:.3f}, {place.z:.3f}) m'

@@ -91,7 +91,7 @@ class Play:
             for message in heard:
                 self.vehicle.handle(message, self.now)
             self.vehicle.tick(self.now)
-            self.reports += self.vehicle.reports()
+            self.reports += self.vehicle.log.take()
         for message in self.to_autopilot.take():
             self.autopilot.handle(message)
 

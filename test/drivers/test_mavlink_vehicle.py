@@ -497,7 +497,7 @@ def test_with_a_cut_link_it_stops_and_the_driver_says_so(firmware):
 
 def test_a_position_that_is_frozen_or_not_finite_is_no_news():
     play = Play().fly()
-    play.autopilot.freeze()
+    play.autopilot.frozen = play.autopilot._position()
     play.run(0.2)
     data = play.vehicle.estimate
     last = data.telemetry

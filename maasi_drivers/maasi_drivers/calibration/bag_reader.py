@@ -8,11 +8,10 @@ import tempfile
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.store import Typestore
 
 Reader = TypeVar('Reader', bound='BagReader')
 
@@ -22,11 +21,8 @@ _RECORD_HEADER = 9
 _HEADER, _DATA_END = 0x01, 0x0F
 _LAST_OPCODE = 0x0F
 # An empty data end and footer: opcode, length, content.
-_END = (
-    b'\x0f' + (4).to_bytes(8, 'little') + bytes(4),
-    b'\x02' + (20).to_bytes(8, 'little') + bytes(20),
-    _MAGIC,
-)
+_END = b'\x0f' + (4).to_bytes(8, 'little') + bytes(4)
+_END += b'\x02' + (20).to_bytes(8, 'little') + bytes(20) + _MAGIC
 _METADATA = 'metadata.yaml'
 
 
@@ -42,12 +38,6 @@ class BagMessage:
     time: int
     type: str
     message: Any
-
-
-def write_end(file: BinaryIO) -> None:
-    """End an MCAP file without an index, as the format allows."""
-    for part in _END:
-        file.write(part)
 
 
 def has_end(path: Path) -> bool:
@@ -81,14 +71,14 @@ def whole_length(path: Path) -> int:
 
 
 def _sealed(path: Path, folder: Path) -> Path:
-    """Copy what is whole of an MCAP file into a folder, and end it."""
+    """Copy what is whole of an MCAP file; end it without an index, as the format allows."""
     length = whole_length(path)
     copy = folder / path.name
     with path.open('rb') as source, copy.open('wb') as target:
         shutil.copyfileobj(source, target)
         target.truncate(length)
         target.seek(length)
-        write_end(target)
+        target.write(_END)
     return copy
 
 
@@ -131,11 +121,6 @@ class BagReader:
         return [_sealed(file, folder) if file in cut else file for file in files]
 
     @property
-    def store(self) -> Typestore:
-        """Message types as they were when the recording was made."""
-        return self._reader.typestore
-
-    @property
     def types(self) -> dict[str, str]:
         """Type name by topic."""
         return {item.topic: item.msgtype for item in self._reader.connections}
@@ -167,14 +152,11 @@ class BagReader:
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Yield the messages of `topics` (all if None), in order of time."""
         for topic, type_name, time, data in self.raw(topics):
-            yield BagMessage(topic, time, type_name, self.decode(data, type_name))
-
-    def decode(self, data: bytes, type_name: str) -> Any:
-        """Return the message of serialised bytes."""
-        try:
-            return self._reader.deserialize(data, type_name)
-        except Exception as error:
-            raise BagError(f'{self.path}: holds no {type_name}: {_words(error)}') from error
+            try:
+                message = self._reader.deserialize(data, type_name)
+            except Exception as error:
+                raise BagError(f'{self.path}: holds no {type_name}: {_words(error)}') from error
+            yield BagMessage(topic, time, type_name, message)
 
     def close(self) -> None:
         """Close the files."""

@@ -48,7 +48,8 @@ class Nav2Navigation:
         self._client = node.permanent(
             'navigate_to_pose', lambda: ActionClient(node, NavigateToPose, 'navigate_to_pose')
         )
-        self._goal: Goal | None = None
+        #: The goal that it drives to.
+        self.goal: Goal | None = None
         self._handle: Any = None
         # Handle of the replaced goal, until Nav2 has accepted the present one.
         self._replaced: Any = None
@@ -58,17 +59,14 @@ class Nav2Navigation:
         """Whether its action server is there; DDS notices a killed one only after some 20 s."""
         return bool(self._client.server_is_ready())
 
-    @property
-    def driving(self) -> bool:
-        """Whether it has a goal of ours."""
-        return self._goal is not None
-
     def problem(self) -> str:
         """Return what is wrong with Nav2 while it drives, or nothing."""
         silence = self._silence.length
-        if self.driving and not self.available:
+        if self.goal is None:
+            return ''
+        if not self.available:
             return 'Nav2 is gone'
-        late = self.driving and silence > self._timeout
+        late = silence > self._timeout
         return f'no answer or feedback of Nav2 for {silence:.1f} s' if late else ''
 
     def go(self, goal: Goal, heading: float) -> None:
@@ -77,7 +75,7 @@ class Nav2Navigation:
         Nav2 replaces the goal before, without a stop.
         """
         self._replaced = self._handle or self._replaced
-        self._goal, self._handle = goal, None
+        self.goal, self._handle = goal, None
         self._silence.end()
         pose = PoseStamped()
         pose.header.frame_id = self._frame
@@ -91,13 +89,13 @@ class Nav2Navigation:
     def _answered(self, goal: Goal, handle: Any) -> None:
         self._silence.end()
         if handle is None or not handle.accepted:
-            if goal is self._goal:
+            if goal is self.goal:
                 self._stop_replaced()
             self._ended(goal, False, 'Nav2 refuses the waypoint')
             return
-        if goal is self._goal:
+        if goal is self.goal:
             self._handle, self._replaced = handle, None
-        elif self._goal is None:
+        elif self.goal is None:
             # Given up before Nav2 had answered.
             handle.cancel_goal_async()
             return
@@ -116,15 +114,15 @@ class Nav2Navigation:
         self._ended(goal, reached, '' if reached else reason)
 
     def _ended(self, goal: Goal, reached: bool, reason: str) -> None:
-        if goal is self._goal:
-            self._goal = self._handle = None
+        if goal is self.goal:
+            self.goal = self._handle = None
             self._on_end(goal, reached, reason)
 
     def give_up(self, goal: Goal) -> None:
         """Have Nav2 stop, if it is on the way to this goal."""
-        if goal is not self._goal:
+        if goal is not self.goal:
             return
-        handle, self._goal, self._handle = self._handle, None, None
+        handle, self.goal, self._handle = self._handle, None, None
         self._stop_replaced()
         if handle is not None:
             handle.cancel_goal_async()
@@ -220,7 +218,7 @@ class TurtlebotLink(TopicLink):
             super().send(placed, command)
             return
         self._command.header.stamp = stamp_to_ros(placed.stamp)
-        if not self._nav2.driving:
+        if self._nav2.goal is None:
             self.hold()
 
     def poll(self) -> None:

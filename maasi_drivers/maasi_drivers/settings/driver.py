@@ -28,7 +28,6 @@ CommandType = Annotated[
         'is stamped in lockstep'
     ),
 ]
-LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink']
 # The same in lockstep, where robots wait for their drivers: a busy machine may delay
 # a driver, and zeros in between would change the run [s].
 LOCKSTEP_LEASE = 20.0
@@ -110,7 +109,7 @@ class DriverSettings(NodeSettings):
     )
 
     environment: EnvironmentSettings = Field(description='Where the robot may go')
-    link: LinkName = Field(
+    link: Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink'] = Field(
         default='topics',
         description='How it is reached: ROS topics; pyparrot over WiFi or Bluetooth '
         '(mambo_driver); a program of its own by UDP (mambo_onboard_driver); MAVLink '

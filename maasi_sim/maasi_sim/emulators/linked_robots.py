@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from maasi_drivers.settings.vehicles import MamboSettings
+from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.models.pose import Pose
 from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.emulators.mambo.firmware import FirmwareSettings, MamboFirmware
@@ -48,9 +48,16 @@ def linked_robot(name: str, robot: RobotSettings, seed: int) -> LinkedRobot:
         )
         return FakeMambo(firmware, settings.address)
     # Deferred: pymavlink takes long to import.
-    from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import vehicle_of
+    from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import FakeVehicle
 
-    return vehicle_of(robot, noise_stream(seed, name, purpose='autopilot'))
+    link = robot.mavlink or MavlinkSettings()
+    host, port = link.url.removeprefix('udpin:').split(':')
+    return FakeVehicle(
+        robot.autopilot.model_copy(update={'system': link.system}),
+        f'udpout:{"127.0.0.1" if host == "0.0.0.0" else host}:{port}',
+        Pose.from_yaw([*robot.start[:2], link.ground], robot.yaw),
+        noise_stream(seed, name, purpose='autopilot'),
+    )
 
 
 def with_addresses(scenario: Scenario) -> Scenario:

@@ -258,7 +258,10 @@ class MamboLink:
                 self._do_wanted()
                 self._send_steering()
                 if self.kind == 'ble':
-                    self._probe(drone.drone_connection)
+                    now = time.monotonic()
+                    if now - max(self.heard_at, self._probed_at) >= _PROBE_PERIOD:
+                        self._probed_at = now
+                        ask_for_answer(drone.drone_connection, self.tilt)
                     drone.smart_sleep(_ROUND)
                 else:
                     self._wake.wait(_ROUND)
@@ -267,7 +270,13 @@ class MamboLink:
             self.error = f'the link to the Mambo broke: {error}'
         finally:
             self.connected = False
-            self._leave(drone)
+            connection = drone.drone_connection
+            if self.kind == 'ble':
+                drone.disconnect()
+            else:
+                connection.is_listening = False
+                # Its listener closes the sockets itself.
+                connection.listener_thread.join(2.0)
 
     def _watch_caller(self) -> None:
         """Have the drone hover, and then land, where the caller hangs."""
@@ -321,21 +330,6 @@ class MamboLink:
             steering, self._steering = self._steering, None
         if steering is not None:
             self._drone.fly_direct(*steering)
-
-    def _probe(self, connection: Any) -> None:
-        now = time.monotonic()
-        if now - max(self.heard_at, self._probed_at) >= _PROBE_PERIOD:
-            self._probed_at = now
-            ask_for_answer(connection, self.tilt)
-
-    def _leave(self, drone: Any) -> None:
-        if self.kind == 'ble':
-            drone.disconnect()
-            return
-        connection = drone.drone_connection
-        connection.is_listening = False
-        # Its listener closes the sockets itself.
-        connection.listener_thread.join(2.0)
 
     # ---- what comes in -----------------------------------------------------------------------
 

@@ -16,8 +16,8 @@ from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.robot_topics import OdometryTopic, PoseTopic
 from maasi_drivers.agent.waypoint_follower import Goal
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
-from maasi_drivers.links.mambo.pilot import MamboPilot, Phase, tilt_limit
-from maasi_drivers.settings.vehicles import MamboSettings
+from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
+from maasi_drivers.settings.vehicles import LEAST_TILT, MOST_TILT, MamboSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.lifecycle_node import SettingsError
@@ -66,7 +66,7 @@ class MamboRobotLink(RobotLink):
                 'is that of a flying robot, as mambo'
             )
         kind: Literal['wifi', 'ble'] = 'ble' if settings.link == 'mambo_ble' else 'wifi'
-        tilt = tilt_limit(settings.motion)
+        tilt = min(max(settings.motion.tilt, LEAST_TILT), MOST_TILT)
         self._link = MamboLink(kind, mambo.address, mambo.port, tilt, mambo.climb, mambo.land_after)
         try:
             self._link.check()
@@ -81,7 +81,7 @@ class MamboRobotLink(RobotLink):
         self.activate()
         link.connect()
         driver.create_wall_timer(min(driver.settings.step, POLL_PERIOD), self._update)
-        driver.offer_arm(self._arm, lambda: link.airborne)
+        driver.offer_arm(lambda: self._pilot.permit(time.monotonic()), lambda: link.airborne)
         if self._mambo.pose == 'odometry':
             OdometryTopic(driver)
         elif self._mambo.pose == 'pose':
@@ -98,10 +98,6 @@ class MamboRobotLink(RobotLink):
         self._pilot = MamboPilot(
             self._link, self._motion, self._mambo, self.driver.start_pose, self.fence
         )
-
-    def _arm(self) -> str:
-        """Let the drone take off; return why not, empty where it may."""
-        return self._pilot.permit(time.monotonic())
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
         """Fly a velocity command."""

@@ -10,11 +10,10 @@ import numpy as np
 from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission, outside_fence
 from maasi_drivers.links.mambo.link import MamboLink, PositionEvent
 from maasi_drivers.links.mambo.reckoning import Course, DeadReckoning, TiltModel
-from maasi_drivers.settings.vehicles import LEAST_TILT, MOST_TILT, MamboSettings
+from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import MotionModel, RobotState
-from maasi_planner.settings import MotionSettings
 
 # Acceleration per speed error [1/s].
 _SPEED_GAIN = 2.5
@@ -34,11 +33,6 @@ ALTITUDE_TOLERANCE = 0.1
 _LEAST_SPEED = 0.05
 _STILL = np.zeros(4)
 NOT_ALLOWED = 'on the ground: it may not take off (parameter mambo.arm)'
-
-
-def tilt_limit(motion: MotionSettings) -> float:
-    """Return the tilt to set in the drone for a robot's settings [rad]."""
-    return min(max(motion.tilt, LEAST_TILT), MOST_TILT)
 
 
 class Phase(Enum):
@@ -153,23 +147,19 @@ class MamboPilot:
         model, course = self.reckoning.model, self.reckoning.ahead()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         turned = np.array([[cosine, sine], [-sine, cosine]])
-        ramped = self._ramp(turned.T @ command[:2], course.velocity[:2])
+        # Ramped in the map, from the velocity before.
+        passed = self._now - self._desired[0]
+        before = self._desired[1] if passed <= _DESIRED_AGE else course.velocity[:2]
+        change = turned.T @ command[:2] - before
+        size, most = float(np.hypot(*change)), _RAMP * min(passed, _DESIRED_AGE)
+        ramped = before + change * (min(size, most) / size if size > 0.0 else 0.0)
         self._desired = self._now, self._stoppable(course, ramped)
         desired = turned @ self._desired[1]
         speed = turned @ course.velocity[:2]
         against = turned @ self.reckoning.push
-        tilts = model.shares(model.drag * desired + _SPEED_GAIN * (desired - speed) - against)
+        wanted = model.drag * desired + _SPEED_GAIN * (desired - speed) - against
         rest = [command[2] / model.climb, command[3] / model.turn]
-        self._send(command, np.clip([*tilts, *rest], -1.0, 1.0))
-
-    def _ramp(self, desired: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the desired velocity in the map (2,), ramped towards a new one."""
-        passed = self._now - self._desired[0]
-        before = self._desired[1] if passed <= _DESIRED_AGE else velocity
-        change = desired - before
-        size = float(np.hypot(*change))
-        most = _RAMP * min(passed, _DESIRED_AGE)
-        return before + change * (min(size, most) / size if size > 0.0 else 0.0)
+        self._send(command, np.clip([*wanted / model.thrust, *rest], -1.0, 1.0))
 
     def _stoppable(self, course: Course, desired: FloatArray) -> FloatArray:
         """Return a velocity in the map (2,) that can be stopped before the geofence."""

@@ -55,13 +55,6 @@ _TYPES = range(1, 5)
 _TIMEOUT = 0.3
 
 
-def address_towards(host: str) -> str:
-    """Return the address of this host from which it reaches another one."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect((host, 9))
-        return str(probe.getsockname()[0])
-
-
 def has_whole_frames(data: bytes) -> bool:
     """Return whether a datagram is made of frames that pyparrot can take apart."""
     while data:
@@ -82,7 +75,10 @@ class DroneSocket:
         self._drone = drone
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            self._socket.bind((address_towards(drone), port))
+            # To the address of this host from which it reaches the drone.
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.connect((drone, 9))
+                self._socket.bind((probe.getsockname()[0], port))
         except OSError:
             self._socket.close()
             raise

@@ -85,10 +85,6 @@ class TiltModel:
             course.yaw + h * self.turn * turn,
         )
 
-    def shares(self, acceleration: FloatArray) -> FloatArray:
-        """Return the shares forward and left (2,) that make an acceleration [m/s^2, heading]."""
-        return np.clip(acceleration / self.thrust, -1.0, 1.0)
-
 
 # Share of the difference to an event by which position and velocity are corrected.
 _POSITION_GAIN, _VELOCITY_GAIN = 0.8, 0.25
@@ -135,20 +131,18 @@ class DeadReckoning:
 
     def covariance(self) -> FloatArray:
         """Return that of the pose, (6, 6): x, y, z [m^2], rotations about the map's axes."""
-        settings = self.settings
+        settings, acting = self.settings, self._acting()[:2]
         position = settings.position_noise**2 + (settings.position_growth * self.age) ** 2
         attitude = settings.attitude_noise**2
-        tilt = attitude + self._tilt_doubt() ** 2
-        return np.diag([position] * 3 + [tilt, tilt, attitude])
-
-    def _tilt_doubt(self) -> float:
-        """Return the uncertainty of the tilt from the uncertain delay of commands [rad]."""
-        delay, acting = self.settings.delay, self._acting()[:2]
+        # The delay of commands is uncertain: deviation of a uniform distribution.
         near = [
-            shares[:2] - acting for acts, shares in self._sent if abs(self._now - acts) <= delay
+            shares[:2] - acting
+            for acts, shares in self._sent
+            if abs(self._now - acts) <= settings.delay
         ]
-        # Standard deviation of a uniform distribution of that half-width.
-        return self.model.tilt * float(np.abs(near).max(initial=0.0)) / math.sqrt(3.0)
+        doubt = self.model.tilt * float(np.abs(near).max(initial=0.0)) / math.sqrt(3.0)
+        tilt = attitude + doubt**2
+        return np.diag([position] * 3 + [tilt, tilt, attitude])
 
     def _acting(self) -> FloatArray:
         """Return the shares that the drone flies now."""

@@ -7,7 +7,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from maasi_drivers.links.mavlink.estimate import Estimate, FlightOrigin, swap_enu_ned, swap_yaw
 from maasi_drivers.links.mavlink.firmware import FailsafeCheck, Firmware, identify
@@ -33,15 +33,6 @@ _MESSAGES = {
 _ANSWER_PATIENCE, _TRIES = 0.5, 5
 # Position only, and yaw: no velocity, acceleration, yaw rate; and no yaw either.
 _POSITION_AND_YAW, _NO_YAW = 0x9F8, 0x400
-
-
-class ModeChange(NamedTuple):
-    """What a heartbeat says, and what the one before said: armed or not, and custom mode."""
-
-    was_armed: bool
-    armed: bool
-    before: int
-    mode: int
 
 
 @dataclass
@@ -80,20 +71,14 @@ class Autopilot:
         self._received_at = self._heartbeat_at = self._requested_at = self._setpoint_at = -math.inf
 
     @property
-    def mode_name(self) -> str:
-        """Of the present mode."""
-        assert self.firmware is not None
-        return self.firmware.mode_name(self.mode)
-
-    @property
     def in_external_mode(self) -> bool:
         """Whether it is in the mode in which it takes set-points."""
         return self.firmware is not None and self.mode == self.firmware.external
 
     # ---- what comes in -----------------------------------------------------------------------
 
-    def handle(self, message: Any, now: float) -> ModeChange | None:
-        """Take a message; return what a heartbeat says.
+    def handle(self, message: Any, now: float) -> tuple[bool, int] | None:
+        """Take a message; after a heartbeat return whether it was armed before, and the mode then.
 
         Of other systems only messages with the driver's own id count.
         """
@@ -106,13 +91,22 @@ class Autopilot:
             return None
         self._received_at = now
         if kind == 'HEARTBEAT':
-            return self._take_heartbeat(message)
+            if self.refusal or (self.firmware is None and not self._recognise(message)):
+                return None
+            before = self.armed, self.mode
+            self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            self.mode = int(message.custom_mode)
+            return before
         if kind == 'STATUSTEXT':
             self._log.add_text(int(message.severity), message.text.rstrip('\0').strip(), now)
         elif kind == 'PARAM_VALUE':
             self._take_parameter(message)
         elif kind == 'COMMAND_ACK':
-            self._take_answer(message, now)
+            if self.commands and self.commands[0].number == message.command:
+                if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
+                    self.commands[0].sent = now
+                else:
+                    self._conclude(int(message.result))
         elif self.firmware is not None:
             self.estimate.take(message, now, self.armed)
         return None
@@ -131,14 +125,6 @@ class Autopilot:
             and message.target_system == own
             and message.target_component not in (0, self._sender.srcComponent)
         )
-
-    def _take_heartbeat(self, message: Any) -> ModeChange | None:
-        if self.refusal or (self.firmware is None and not self._recognise(message)):
-            return None
-        was_armed, before = self.armed, self.mode
-        self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        self.mode = int(message.custom_mode)
-        return ModeChange(was_armed, self.armed, before, self.mode)
 
     def _recognise(self, message: Any) -> bool:
         try:
@@ -218,14 +204,6 @@ class Autopilot:
     def command(self, number: int, parameters: tuple[float, ...]) -> None:
         """Send a command until it is answered, after those before it; report a refusal."""
         self.commands.append(_Command(number, parameters))
-
-    def _take_answer(self, message: Any, now: float) -> None:
-        if not self.commands or self.commands[0].number != message.command:
-            return
-        if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
-            self.commands[0].sent = now
-        else:
-            self._conclude(int(message.result))
 
     def _conclude(self, result: int | None) -> None:
         """Take the result of the oldest command; None: it was not answered."""

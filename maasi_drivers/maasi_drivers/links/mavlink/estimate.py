@@ -160,10 +160,9 @@ class Estimate:
         self._on_restart = on_restart
         self.dropped: Counter[str] = Counter()
         self.charge_reports = 0
-        self.clear()
+        self._clear()
 
-    def clear(self) -> None:
-        """Discard all data."""
+    def _clear(self) -> None:
         self.telemetry: Telemetry | None = None
         self.heard_at = -math.inf
         self.origin = np.zeros(3)
@@ -179,16 +178,6 @@ class Estimate:
         self._boot_time: int | None = None
         self._position: tuple[int, tuple[float, ...]] | None = None
         self._attitude = (np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
-
-    @property
-    def ready(self) -> bool:
-        """Whether there is a position, and nothing against it."""
-        return self.telemetry is not None and not self.problem(False)
-
-    @property
-    def on_ground(self) -> bool:
-        """Whether it says that it stands on the ground."""
-        return bool(self.landed == mavlink.MAV_LANDED_STATE_ON_GROUND)
 
     @property
     def has_fix(self) -> bool:
@@ -233,7 +222,14 @@ class Estimate:
         if kind == 'LOCAL_POSITION_NED':
             self._take_position(message, now, armed)
         elif kind == 'ATTITUDE_QUATERNION':
-            self._take_attitude(message, now)
+            quaternion = np.array([message.q1, message.q2, message.q3, message.q4])
+            rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
+            norm = float(np.linalg.norm(quaternion))
+            if not (np.isfinite(rates).all() and 0.9 < norm < 1.1):
+                self.dropped['ATTITUDE_QUATERNION that is none'] += 1
+                return
+            self._note_time(message.time_boot_ms, now)
+            self._attitude = (swap_orientation(quaternion / norm), swap_flu_frd(rates))
         elif kind == 'BATTERY_STATUS':
             self._from_batteries = True
             left = message.battery_remaining
@@ -256,7 +252,7 @@ class Estimate:
     def _note_time(self, milliseconds: int, now: float) -> None:
         """Detect a restart by the time since boot, which never decreases otherwise."""
         if self._boot_time is not None and milliseconds < self._boot_time - _RESTART:
-            self.clear()
+            self._clear()
             self._on_restart()
         else:
             self.heard_at = now
@@ -285,13 +281,3 @@ class Estimate:
             self.origin = origin
         place, velocity = swap_enu_ned(values[:3]), swap_enu_ned(values[3:])
         self.telemetry = Telemetry(now, place, velocity, *self._attitude)
-
-    def _take_attitude(self, message: Any, now: float) -> None:
-        quaternion = np.array([message.q1, message.q2, message.q3, message.q4])
-        rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
-        norm = float(np.linalg.norm(quaternion))
-        if not (np.isfinite(rates).all() and 0.9 < norm < 1.1):
-            self.dropped['ATTITUDE_QUATERNION that is none'] += 1
-            return
-        self._note_time(message.time_boot_ms, now)
-        self._attitude = (swap_orientation(quaternion / norm), swap_flu_frd(rates))

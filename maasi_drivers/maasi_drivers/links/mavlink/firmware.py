@@ -123,16 +123,16 @@ PX4_COPTER = Firmware(
     },
 )
 
-FIRMWARES = (ARDUCOPTER, ARDUSUB, PX4_COPTER)
+FIRMWARES = {'arducopter': ARDUCOPTER, 'ardusub': ARDUSUB, 'px4': PX4_COPTER}
 
 
 def identify(autopilot: int, vehicle_type: int) -> Firmware:
     """Return the firmware of a heartbeat."""
     kind = 'submarine' if vehicle_type == SUBMARINE else 'copter' if vehicle_type in COPTERS else ''
-    for firmware in FIRMWARES:
+    for firmware in FIRMWARES.values():
         if firmware.autopilot == autopilot and firmware.kind == kind:
             return firmware
-    known = ', '.join(item.name for item in FIRMWARES)
+    known = ', '.join(item.name for item in FIRMWARES.values())
     raise ValueError(
         f'HEARTBEAT: read autopilot {autopilot}, type {vehicle_type}, allowed are copters and '
         f'submarines under {known}'
@@ -203,7 +203,14 @@ class FailsafeCheck:
             )
         if len(self.values) == len(self._names):
             self.complete = True
-            self._report_all()
+            for name, failsafe in self._firmware.failsafes.items():
+                value = self.values[name]
+                off = value is None or value in failsafe.off
+                rest = ', which does not help' if value is not None and off else ''
+                text = f'failsafe for when {failsafe.meaning}: {name} {_state(value)}{rest}'
+                self._log.add(WARNING if off else INFO, text)
+            if problem := self._station_problem():
+                self._log.add(WARNING, problem)
 
     def problem(self, now: float) -> str:
         """Return why the vehicle must not be armed; empty where nothing speaks against it."""
@@ -243,16 +250,6 @@ class FailsafeCheck:
                 'keeps the failsafe from acting; set it to 0'
             )
         return ''
-
-    def _report_all(self) -> None:
-        for name, failsafe in self._firmware.failsafes.items():
-            value = self.values[name]
-            off = value is None or value in failsafe.off
-            rest = ', which does not help' if value is not None and off else ''
-            text = f'failsafe for when {failsafe.meaning}: {name} {_state(value)}{rest}'
-            self._log.add(WARNING if off else INFO, text)
-        if problem := self._station_problem():
-            self._log.add(WARNING, problem)
 
 
 def _state(value: float | None) -> str:

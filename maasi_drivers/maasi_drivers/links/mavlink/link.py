@@ -122,16 +122,12 @@ class VehicleLink:
                 self._open()
                 continue
             try:
-                self._turn()
+                self._connection.select(_PERIOD)
+                with self.lock:
+                    while (message := self._connection.recv_msg()) is not None:
+                        self.vehicle.handle(message, time.monotonic())
+                    self.vehicle.tick(time.monotonic())
             except OSError as error:
                 # A device that was pulled out may come back.
                 self.failure = f'mavlink.url: {self.settings.url}: {error}'
                 self._shut()
-
-    def _turn(self) -> None:
-        connection = self._connection
-        connection.select(_PERIOD)
-        with self.lock:
-            while (message := connection.recv_msg()) is not None:
-                self.vehicle.handle(message, time.monotonic())
-            self.vehicle.tick(time.monotonic())

@@ -49,7 +49,7 @@ class MavlinkRobotLink(RobotLink):
         self._mavlink = settings.mavlink or MavlinkSettings()
         if self._localised:
             self._mavlink = self._mavlink.model_copy(update={'origin': 'local'})
-        if not self._localised:
+        else:
             driver.pose_name = 'LOCAL_POSITION_NED'
         self._local_poses = PoseHistory()
         self._charge_reports = 0
@@ -177,7 +177,13 @@ class MavlinkRobotLink(RobotLink):
         self._arrivals.observe(time.monotonic(), driver.get_clock().now().nanoseconds)
         if not driver.active:
             return
-        self._judge(fault)
+        before = driver.health.get(_VEHICLE)
+        driver.judge(_VEHICLE, fault, 'the vehicle accepts set-points')
+        if fault:
+            self._heading = None
+            # The first text is logged with the fault.
+            if before and fault != before:
+                driver.get_logger().info(fault)
         if reports != self._charge_reports:
             self._charge_reports = reports
             driver.take_charge(charge)
@@ -192,7 +198,7 @@ class MavlinkRobotLink(RobotLink):
     def _log_reports(self) -> None:
         """Log the reports of the vehicle."""
         with self._link.lock:
-            reports = self._link.vehicle.reports()
+            reports = self._link.vehicle.log.take()
         logger = self.driver.get_logger()
         # The logger tells severities by the line that it is called from.
         for severity, text in reports:
@@ -204,15 +210,6 @@ class MavlinkRobotLink(RobotLink):
                 logger.info(text)
             else:
                 logger.debug(text)
-
-    def _judge(self, fault: str) -> None:
-        """Report the fault of the vehicle, and log each new text of it."""
-        before = self.driver.health.get(_VEHICLE)
-        self.driver.judge(_VEHICLE, fault, 'the vehicle accepts set-points')
-        if fault:
-            self._heading = None
-            if before and fault != before:
-                self.driver.get_logger().info(fault)
 
     def _take_telemetry(self, telemetry: Telemetry) -> None:
         driver = self.driver
@@ -240,7 +237,14 @@ class MavlinkRobotLink(RobotLink):
         """Align the autopilot's frame with a localiser's pose, and check the geofence."""
         if self._localised:
             self._align(placed)
-        self._check_fence(placed.pose.position)
+        position, health = placed.pose.position, self.driver.health
+        outside = float(np.abs(position - self._inside(position)).max())
+        if outside > MARGIN and _VEHICLE not in health:
+            there = np.round(position, 2).tolist()
+            text = f'{outside:.1f} m outside the geofence, at {there} m: it returns'
+            health.begin(_GEOFENCE, text)
+        elif not outside and health.end(_GEOFENCE, 'inside the geofence again'):
+            self.driver.follower.stay()
 
     def _align(self, placed: StampedPose) -> None:
         """Compute where the autopilot's frame is in the map, from its pose at the same time."""
@@ -250,15 +254,6 @@ class MavlinkRobotLink(RobotLink):
         turn = Pose.from_yaw(np.zeros(3), placed.pose.yaw - local.pose.yaw)
         position = placed.pose.position - turn.rotation() @ local.pose.position
         self._map_from_local = Pose(position, turn.orientation)
-
-    def _check_fence(self, position: FloatArray) -> None:
-        health, outside = self.driver.health, float(np.abs(position - self._inside(position)).max())
-        if outside > MARGIN and _VEHICLE not in health:
-            there = np.round(position, 2).tolist()
-            text = f'{outside:.1f} m outside the geofence, at {there} m: it returns'
-            health.begin(_GEOFENCE, text)
-        elif not outside and health.end(_GEOFENCE, 'inside the geofence again'):
-            self.driver.follower.stay()
 
     def _inside(self, position: FloatArray) -> FloatArray:
         return np.clip(position, self.fence[:, 0], self.fence[:, 1])

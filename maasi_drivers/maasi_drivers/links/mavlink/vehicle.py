@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission
-from maasi_drivers.links.mavlink.autopilot import Autopilot, ModeChange
+from maasi_drivers.links.mavlink.autopilot import Autopilot
 from maasi_drivers.links.mavlink.estimate import FlightOrigin
 from maasi_drivers.links.mavlink.firmware import Firmware
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, ReportLog, mavlink
@@ -68,9 +68,9 @@ class Vehicle:
         self.height = start[2] - settings.ground
         self.phase = Phase.CONNECTING
         self.active = False
-        self._log = ReportLog()
-        self._place = FlightOrigin(settings, start, memory, self._log)
-        self._autopilot = Autopilot(settings, sender, self._log, self._place, self._on_restart)
+        self.log = ReportLog()
+        self._place = FlightOrigin(settings, start, memory, self.log)
+        self._autopilot = Autopilot(settings, sender, self.log, self._place, self._on_restart)
         self.estimate = self._autopilot.estimate
         self._permission = ArmPermission(settings.arm_timeout)
         # Where it is to be, and its yaw there; none: it keeps its own.
@@ -97,7 +97,8 @@ class Vehicle:
     @property
     def in_air(self) -> bool:
         """Whether it is armed, and not on the ground."""
-        return self._autopilot.armed and not self.estimate.on_ground
+        landed = self.estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND
+        return self._autopilot.armed and not landed
 
     @property
     def parameters(self) -> Mapping[str, float | None]:
@@ -142,10 +143,6 @@ class Vehicle:
         telemetry = self.estimate.telemetry
         return np.zeros(3) if telemetry is None else telemetry.position.copy()
 
-    def reports(self) -> list[tuple[int, str]]:
-        """Return what happened since the last call: severity as in MAVLink, and text."""
-        return self._log.take()
-
     # ---- what the driver wants ---------------------------------------------------------------
 
     def set_target(self, position: ArrayLike, yaw: float) -> None:
@@ -188,7 +185,7 @@ class Vehicle:
         if autopilot.lost or self._place.problem or self.phase in _UNABLE:
             return self.fault
         if autopilot.armed and autopilot.firmware is not None and not autopilot.in_external_mode:
-            return f'it is flown in {autopilot.mode_name}'
+            return f'it is flown in {autopilot.firmware.mode_name(autopilot.mode)}'
         if not (self.settings.arm or autopilot.armed):
             return 'mavlink.arm is false'
         if self.phase is Phase.WAITING and autopilot.failsafes is not None:
@@ -215,21 +212,27 @@ class Vehicle:
 
     def handle(self, message: Any, now: float) -> None:
         """Take a message."""
-        change = self._autopilot.handle(message, now)
-        if change is not None:
-            self._judge_mode(change, now)
+        before = self._autopilot.handle(message, now)
+        if before is not None:
+            self._judge_mode(*before, now)
         elif self._autopilot.refusal and self.phase is not Phase.REFUSED:
             self._enter(Phase.REFUSED, self._autopilot.refusal)
 
-    def _judge_mode(self, change: ModeChange, now: float) -> None:
+    def _judge_mode(self, was_armed: bool, before: int, now: float) -> None:
         """Give the vehicle up where the pilot, a failsafe or a disarming has taken it."""
-        firmware, mode = self._firmware, change.mode
+        firmware, mode, armed = self._firmware, self._autopilot.mode, self._autopilot.armed
         if self.phase is Phase.CONNECTING:
             self._enter(Phase.PREPARING)
-        elif change.was_armed and not change.armed:
+        elif was_armed and not armed:
             self._on_disarmed(now)
-        elif mode not in self._own_modes(change.before):
-            self._let_go(mode)
+        elif mode not in self._own_modes(before):
+            name = firmware.mode_name(mode)
+            text = f'the pilot or a failsafe has taken over: mode {name}; the driver lets go'
+            self.log.add(WARNING, text)
+            self._autopilot.commands.clear()
+            self._permission.end()
+            self._target = None
+            self._enter(Phase.RELEASED, f'mode {name}')
         elif self.phase is Phase.ENDING:
             self._autopilot.accepted.discard(_MODE)
             if mode == self._ending_mode:
@@ -237,13 +240,13 @@ class Vehicle:
                 self._autopilot.commands.clear()
         elif self.phase is Phase.RELEASED:
             name = firmware.mode_name(mode)
-            if mode == firmware.external and change.armed and not firmware.px4:
-                self._log.add(WARNING, f'the pilot gives {name} back')
+            if mode == firmware.external and armed and not firmware.px4:
+                self.log.add(WARNING, f'the pilot gives {name} back')
                 self._begin_flying()
-            elif mode == firmware.external and not change.armed:
-                self._log.add(INFO, f'{name} is back: {UNTIL_ARM}')
+            elif mode == firmware.external and not armed:
+                self.log.add(INFO, f'{name} is back: {UNTIL_ARM}')
                 self._enter(Phase.PREPARING)
-            elif mode != change.before:
+            elif mode != before:
                 self._detail = f'mode {name}'
 
     def _own_modes(self, before: int) -> set[int]:
@@ -263,25 +266,15 @@ class Vehicle:
         if self.phase is Phase.ENDING:
             self._enter(Phase.STOPPED, f'it has landed{self._reason}, {UNTIL_ARM}')
         elif self.phase not in (Phase.PREPARING, Phase.WAITING):
-            text = self._log.recent_text(now, 2)
+            text = self.log.recent_text(now, 2)
             why = f'by the autopilot or the pilot{f" ({text})" if text else ""}'
-            self._log.add(WARNING, f'it has been disarmed {why}')
+            self.log.add(WARNING, f'it has been disarmed {why}')
             self._enter(Phase.STOPPED, f'{why}, {UNTIL_ARM}')
-
-    def _let_go(self, mode: int) -> None:
-        name = self._firmware.mode_name(mode)
-        self._log.add(
-            WARNING, f'the pilot or a failsafe has taken over: mode {name}; the driver lets go'
-        )
-        self._autopilot.commands.clear()
-        self._permission.end()
-        self._target = None
-        self._enter(Phase.RELEASED, f'mode {name}')
 
     def _on_restart(self) -> None:
         """Begin anew with an autopilot that was restarted: its local frame is another one."""
         text = 'the autopilot has restarted'
-        self._log.add(WARNING, text)
+        self.log.add(WARNING, text)
         self._autopilot.forget_requests()
         self._permission.end()
         if self.phase in (Phase.CONNECTING, Phase.PREPARING, Phase.WAITING):
@@ -323,7 +316,12 @@ class Vehicle:
         if self._phase_at == -math.inf:
             self._phase_at = now
         if self._permission.expired(now):
-            self._on_expired(now)
+            # Whoever requested it may not expect it any more.
+            text = self.log.recent_text(now)
+            why = f' ({text})' if text else ''
+            limit = f'{self.settings.arm_timeout:g} s'
+            self.log.add(WARNING, f'not armed within {limit}{why}, {UNTIL_ARM}')
+            self.forbid()
         work = {
             Phase.PREPARING: self._prepare,
             Phase.WAITING: self._wait,
@@ -342,33 +340,25 @@ class Vehicle:
         self._tried_at = now
         return True
 
-    def _on_expired(self, now: float) -> None:
-        """Give the take-off up: whoever requested it may not expect it any more."""
-        text = self._log.recent_text(now)
-        self._log.add(
-            WARNING,
-            f'not armed within {self.settings.arm_timeout:g} s{f" ({text})" if text else ""}, '
-            + UNTIL_ARM,
-        )
-        self.forbid()
-
     def _prepare(self, now: float) -> None:
-        self._detail = self._log.recent_text(now)
+        self._detail = self.log.recent_text(now)
         assert self._autopilot.failsafes is not None
-        if self._autopilot.failsafes.complete and self.estimate.ready:
+        estimate = self.estimate
+        ready = estimate.telemetry is not None and not estimate.problem(fix_needed=False)
+        if self._autopilot.failsafes.complete and ready:
             self._enter(Phase.WAITING)
             self._wait(now)
 
     def _wait(self, now: float) -> None:
         autopilot = self._autopilot
         assert autopilot.failsafes is not None
-        name = autopilot.mode_name
+        name = self._firmware.mode_name(autopilot.mode)
         permitted = self.active and self._permission.holds(now)
         if autopilot.armed and not autopilot.in_external_mode:
             self._permission.end()
             self._detail = f'it is flown in {name}'
         elif autopilot.armed and permitted:
-            self._log.add(INFO, f'it is armed, in {name}: taken over')
+            self.log.add(INFO, f'it is armed, in {name}: taken over')
             self._permission.end()
             if self.in_air:
                 self._begin_flying()
@@ -403,7 +393,7 @@ class Vehicle:
             self._permission.end()
             self._begin_rising(now)
         elif self._is_due(now, _ARMING_PERIOD):
-            self._detail = self._log.recent_text(now)
+            self._detail = self.log.recent_text(now)
             self._autopilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 
     def _begin_rising(self, now: float) -> None:
@@ -432,7 +422,7 @@ class Vehicle:
         elif now - self._nearer_at > timeout:
             way = f'at {height:.1f} m of {top:.1f} m'
             reason = f'it came no nearer to its height in {timeout:g} s: {way}'
-            self._log.add(ERROR, f'{reason}: it lands')
+            self.log.add(ERROR, f'{reason}: it lands')
             self.finish('land', reason)
         elif not by_command:
             self._target[2] = top

@@ -276,11 +276,6 @@ class FakeMambo:
         if state[1] != before[1]:
             self._acked_event((0, 5, 1), struct.pack('<B', state[1]))
 
-    def _tell_all(self) -> None:
-        self._said = None
-        self._tell_state()
-        self._event((0, 5, 0), b'')
-
     def _send_sensors(self, elapsed: float) -> None:
         firmware, body = self.firmware, self.firmware.body
         estimate = firmware.estimate()
@@ -354,7 +349,9 @@ class FakeMambo:
         number = _ID.unpack_from(frame.payload)
         self.heard[number] += 1
         if number == ALL_STATES:
-            self._tell_all()
+            self._said = None
+            self._tell_state()
+            self._event((0, 5, 0), b'')
         else:
             obey(self.firmware, number, frame.payload[_ID.size :])
 
@@ -375,17 +372,11 @@ def build_parser() -> argparse.ArgumentParser:
     add('type', 'robot type (default: %(default)s)', default='mambo', metavar='NAME')
     add('seed', 'of the noise', type=whole, default=1, metavar='N')
     add('charge', 'of the battery at the start, 0 to 1', type=float, default=1.0, metavar='X')
-    for name, unit, what, default in (
-        ('drag', '1/s', 'of its body', settings.drag),
-        ('delay', 's', 'from a command to its tilt set-point', settings.delay),
-    ):
-        add(name, f'{what} [{unit}] (%(default)s)', type=float, default=default, metavar='X')
-    add(
-        'lost-link',
-        'behaviour when its controller is silent (%(default)s)',
-        choices=('hover', 'land'),
-        default=settings.lost_link,
-    )
+    drag, delay = 'of its body [1/s]', 'from a command to its tilt set-point [s]'
+    add('drag', f'{drag} (%(default)s)', type=float, default=settings.drag, metavar='X')
+    add('delay', f'{delay} (%(default)s)', type=float, default=settings.delay, metavar='X')
+    silent = 'behaviour when its controller is silent (%(default)s)'
+    add('lost-link', silent, choices=('hover', 'land'), default=settings.lost_link)
     return parser
 
 

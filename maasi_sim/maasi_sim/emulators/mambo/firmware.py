@@ -147,12 +147,7 @@ class FlyingState(IntEnum):
     EMERGENCY = 5
 
 
-AIRBORNE = (
-    FlyingState.TAKING_OFF,
-    FlyingState.HOVERING,
-    FlyingState.FLYING,
-    FlyingState.LANDING,
-)
+AIRBORNE = frozenset(FlyingState) - {FlyingState.LANDED, FlyingState.EMERGENCY}
 
 
 class Piloting(NamedTuple):
@@ -246,13 +241,12 @@ class MamboFirmware:
     def advance(self, dt: float) -> None:
         """Advance by `dt` seconds."""
         pieces = max(1, math.ceil(dt / _PIECE - 1e-9))
+        h = dt / pieces
         for _ in range(pieces):
-            self._piece(dt / pieces)
-
-    def _piece(self, h: float) -> None:
-        self.time += h
-        self._look_after()
-        if self.flying_state in AIRBORNE:
+            self.time += h
+            self._look_after()
+            if self.flying_state not in AIRBORNE:
+                continue
             self.body.step(self._command(), self.limits['tilt'], h)
             self.charge.drain(float(np.linalg.norm(self.body.velocity)), h)
             if self.height <= 0.0 and self.body.velocity[2] <= 0.0:

@@ -8,8 +8,6 @@ from pydantic import Field, model_validator
 
 from maasi_filter.settings import Finite, Settings
 
-FirmwareName = Literal['arducopter', 'ardusub', 'px4']
-
 
 class AutopilotSettings(Settings):
     """Settings of a fake autopilot; `external`: another program is the autopilot."""
@@ -19,7 +17,9 @@ class AutopilotSettings(Settings):
         description='Whether the autopilot is not simulated here, but a simulator of ArduPilot or '
         'PX4, or a real vehicle; in a scenario, autopilot: external',
     )
-    firmware: FirmwareName = Field(default='arducopter', description='Whose behaviour it has')
+    firmware: Literal['arducopter', 'ardusub', 'px4'] = Field(
+        default='arducopter', description='Whose behaviour it has'
+    )
     system: int = Field(default=1, ge=1, le=255, description='Its system id')
     depth: float = Field(
         default=0.0, ge=0.0, description='Of a submarine when it is switched on [m]'

@@ -26,7 +26,7 @@ from maasi_drivers.links.mavlink.estimate import (
     swap_orientation,
     swap_yaw,
 )
-from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, Firmware
+from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, FIRMWARES, PX4_COPTER
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
@@ -37,11 +37,6 @@ from maasi_sim.emulators.mavlink.autopilot_settings import (
 )
 from maasi_sim.emulators.mavlink.flight_model import FlightModel
 
-FIRMWARES: dict[str, Firmware] = {
-    'arducopter': ARDUCOPTER,
-    'ardusub': ARDUSUB,
-    'px4': PX4_COPTER,
-}
 # ArduCopter disarms on the ground after so long [s].
 _DISARM_DELAY = 10.0
 # PX4 wants setpoints for so long, and not so long ago, before OFFBOARD [s].
@@ -248,10 +243,6 @@ class FakeAutopilot:
     def say(self, severity: int, text: str) -> None:
         """Send a text."""
         self._sender.statustext_send(severity, text.encode()[:50])
-
-    def freeze(self) -> None:
-        """Send the same position from now on, with new stamps."""
-        self.frozen = self._position()
 
     @property
     def _milliseconds(self) -> int:

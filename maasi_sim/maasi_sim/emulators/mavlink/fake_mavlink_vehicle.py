@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from maasi_drivers.links.mavlink.firmware import FIRMWARES
 from maasi_drivers.links.mavlink.link import LinkError, open_connection
 from maasi_drivers.links.mavlink.protocol import mavlink
-from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
-from maasi_sim.emulators.mavlink.fake_autopilot import FIRMWARES, FakeAutopilot
-from maasi_sim.scenario.schema import RobotSettings
+from maasi_sim.emulators.mavlink.fake_autopilot import FakeAutopilot
 
 _PERIOD = 0.02
 # Longest time simulated at once after a delay [s].
@@ -90,18 +89,6 @@ class FakeVehicle:
                     self.autopilot.advance(late / steps)
 
 
-def vehicle_of(robot: RobotSettings, generator: np.random.Generator) -> FakeVehicle:
-    """Return the vehicle of a robot of a scenario, at its start."""
-    link = robot.mavlink or MavlinkSettings()
-    host, port = link.url.removeprefix('udpin:').split(':')
-    return FakeVehicle(
-        robot.autopilot.model_copy(update={'system': link.system}),
-        f'udpout:{"127.0.0.1" if host == "0.0.0.0" else host}:{port}',
-        Pose.from_yaw([*robot.start[:2], link.ground], robot.yaw),
-        generator,
-    )
-
-
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
@@ -125,28 +112,23 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def read_parameters(items: list[str]) -> dict[str, float]:
-    """Return parameters given as NAME=VALUE."""
-    parameters = {}
-    for item in items:
-        name, _, value = item.partition('=')
-        try:
-            parameters[name] = float(value)
-        except ValueError:
-            raise ValueError(f'--parameter: read {item!r}, allowed is NAME=NUMBER') from None
-    return parameters
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Simulate a vehicle until a signal; a crash of the autopilot is exit code 3."""
     options = build_parser().parse_args(arguments)
+    parameters = {}
     try:
+        for item in options.parameter:
+            name, _, value = item.partition('=')
+            try:
+                parameters[name] = float(value)
+            except ValueError:
+                raise ValueError(f'--parameter: read {item!r}, allowed is NAME=NUMBER') from None
         settings = AutopilotSettings(
             firmware=options.firmware,
             system=options.system,
             estimator_time=options.estimator_time,
             charge=options.charge,
-            parameters=read_parameters(options.parameter),
+            parameters=parameters,
         )
         vehicle = FakeVehicle(
             settings, options.url, Pose.from_yaw(np.zeros(3), 0.0), np.random.default_rng(1)
