@@ -139,24 +139,19 @@ FIELD = np.array([[-0.3, 2.4], [-0.3, 2.4]])
 WAYPOINTS = [[2.2, 2.2], [-0.1, 2.2], [2.2, -0.1], [-0.1, -0.1], [1.05, 1.05], [1.43, 1.05]]
 
 
-def measure(drag, delay, way=1.0, legs=6):
-    """Return what a measuring flight says, and how far it went from its place [m]."""
-    flight = Flight(drag=drag, firmware_delay=delay, arm=False)
-    measuring = MeasuringFlight(flight, way, legs, lambda: flight.time)
-    far = 0.0
-    for _ in measuring.steps():
-        flight.step()
-        far = max(far, float(np.hypot(*(flight.where - HOME.position)[:2])))
-    return fit_speed(measuring.legs, TILT), far
-
-
 def measure_and_fly(drag, delay):
     """Return how a Mambo flies over the field with what its measuring flight says.
 
-    Farthest beyond a waypoint and outside the field, way flown and from waypoint to waypoint [m].
+    Farthest from its place in legs of 1 m, beyond a waypoint and outside the field, way flown and
+    from waypoint to waypoint [m].
     """
-    flown = SimpleNamespace(overshoot=0.0, outside=-math.inf, way=0.0, straight=0.0)
-    flown.measured = measure(drag, delay)[0]
+    flown = SimpleNamespace(far=0.0, overshoot=0.0, outside=-math.inf, way=0.0, straight=0.0)
+    flight = Flight(drag=drag, firmware_delay=delay, arm=False)
+    measuring = MeasuringFlight(flight, 1.0, 6, lambda: flight.time)
+    for _ in measuring.steps():
+        flight.step()
+        flown.far = max(flown.far, float(np.hypot(*(flight.where - HOME.position)[:2])))
+    flown.measured = fit_speed(measuring.legs, TILT)
     speed, late = flown.measured.full_speed, flown.measured.delay
     flight = Flight(drag=drag, firmware_delay=delay, full_speed=speed, delay=late).up()
     began = flight.time
