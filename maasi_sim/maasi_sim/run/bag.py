@@ -161,12 +161,7 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
     that image_transport would use. JPEG has quality 95 without chroma subsampling; PNG costs ten
     times the time. `write` blocks while more than `backlog` bytes wait.
 
-    Raises
-    ------
-    BagError
-        If the folder exists. `write`, `wait` and `close` raise it after an error of the thread.
-    BagWriteError
-        If the folder cannot be made, or the thread could not write (disk full).
+    An error of the thread is raised by `write`, `wait` and `close`, after it.
     """
 
     def __init__(

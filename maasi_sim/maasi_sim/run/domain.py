@@ -40,12 +40,6 @@ class Domain(contextlib.AbstractContextManager['Domain']):
     Without a number it is the first free one from 1 (0 is the ROS default). Locks of different
     purposes are independent. If `shared`, other runs may use it as well, in other namespaces than
     `team`.
-
-    Raises
-    ------
-    DomainError
-        If the requested one is used by another run or not from 0 to 101, if none is free, or if
-        the loopback interface, through which nodes discover each other, is down.
     """
 
     def __init__(
@@ -56,6 +50,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         team: str = '',
         shared: bool = False,
     ) -> None:
+        # Nodes discover each other through it.
         if fault := loopback_fault():
             raise DomainError(fault)
         self._purpose = purpose

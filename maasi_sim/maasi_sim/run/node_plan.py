@@ -47,41 +47,26 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class NodePlan:
-    """A node to start.
+    """A node to start; its parameters are flat, with dots."""
 
-    Attributes
-    ----------
-    package, executable : str
-        As for `ros2 run`.
-    name, namespace : str
-        Of the node; the namespace without slashes, empty for none.
-    parameters : dict
-        Flat, with dots.
-    says_ready : bool
-        Whether it reports on `lockstep/ready`, and is awaited.
-    says_done : bool
-        Whether it takes part in lockstep.
-    is_clock : bool
-        Whether it publishes the time.
-    drives : bool
-        Whether it commands a robot, which is stopped when the node dies.
-    given : dict
-        Parameters passed on the command line, as the file must not start a search on real robots.
-    arguments : tuple of str
-        Before those of ROS.
-    """
-
+    #: As for `ros2 run`.
     package: str
     executable: str
+    #: Of the node; the namespace without slashes, empty for none.
     name: str
     namespace: str = ''
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    #: Whether it reports on `lockstep/ready`, and is awaited; whether it takes part in lockstep.
     says_ready: bool = True
     says_done: bool = True
+    #: Whether it publishes the time.
     is_clock: bool = False
+    #: Whether it commands a robot, which is stopped when the node dies.
     drives: bool = False
     remaps: Mapping[str, str] = field(default_factory=dict)
+    #: Parameters on the command line, as the file must not start a search on real robots.
     given: Mapping[str, Any] = field(default_factory=dict)
+    #: Before those of ROS.
     arguments: tuple[str, ...] = ()
 
     @property

@@ -68,15 +68,13 @@ class Batch:
 
 @dataclass
 class Recording:
-    """Contents of a recording for a replay.
+    """Contents of a recording for a replay."""
 
-    `facts` are scenario, seed and parameters of each node; batches of several filters are in the
-    order of steps and names. By namespace of the filter: found targets at the end, and the batch
-    after which they were published.
-    """
-
+    #: Scenario, seed and parameters of each node.
     facts: dict[str, Any]
+    #: Of several filters in the order of steps and names.
     batches: list[Batch] = field(default_factory=list)
+    #: By namespace of the filter: found targets at the end, and the batch that they are of.
     found: dict[str, list[FoundTarget]] = field(default_factory=dict)
     found_batch: dict[str, int] = field(default_factory=dict)
 

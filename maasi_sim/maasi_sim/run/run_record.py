@@ -50,38 +50,25 @@ class RunRecord:
 
 
 class Observer(ABC):
-    """Gathers the data of a report from serialised messages, and detects the end of the run.
+    """Gathers the data of a report from serialised messages, and detects the end of the run."""
 
-    Attributes
-    ----------
-    topics, update_topics : sequence of str
-        That it needs; of these, filter updates: added after the messages they refer to.
-    total, found, measurements : int
-        Targets or cuboids there are, and found so far; measurements so far, of all robots.
-    explored : float
-        Share of the environment explored.
-    news : bool
-        Whether something was found since the caller last reset it.
-    completed : object or None
-        Time and step at which all was found, where the scenario stops then.
-    settled : str or None
-        The reason, once all planners report that nothing is left to gain.
-    end_step : int or None
-        Step at which the search ended by itself; None before.
-    begin : float or None
-        Time of the first step [s]: a clock that the run follows may start at any time.
-    robots : list of str or None
-        That take part, as the simulation says.
-    """
-
+    #: Of the needed `topics`, filter updates: added after the messages they refer to.
     update_topics: Sequence[str] = ()
+    #: Targets or cuboids there are, and found so far; measurements so far, of all robots.
     total = found = measurements = 0
+    #: Share of the environment explored.
     explored = 0.0
+    #: Whether something was found since the caller last reset it.
     news = False
+    #: Time and step at which all was found, where the scenario stops then.
     completed: Any = None
+    #: The reason, once all planners report that nothing is left to gain.
     settled: str | None = None
+    #: Step at which the search ended by itself.
     end_step: int | None = None
+    #: Time of the first step [s]: a clock that the run follows may start at any time.
     begin: float | None = None
+    #: That take part, as the simulation says.
     robots: list[str] | None = None
 
     def __init__(
