@@ -77,7 +77,7 @@ def test_a_node_without_state_takes_found_targets_from_the_latched_topic(kept):
         # The batch waits for the message: a new target would get the id of a kept one.
         team.measure(20, THREE)
         pending = team.filter._batches.pending
-        team.until(lambda: 20 in pending and pending[20].complete)
+        team.until(lambda: 20 in pending and not pending[20].missing)
         assert not team.updates
         publisher.publish(kept)
         team.until(lambda: team.updates and team.found)
