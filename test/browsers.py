@@ -37,7 +37,6 @@ class Page:
         self.page.wait_for_selector('body[data-ready]')
 
     def number(self):
-        """Return the number that the page gives as found."""
         return int(self.page.inner_text('#found_count').split()[0])
 
     def seek(self, seconds):

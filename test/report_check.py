@@ -34,6 +34,5 @@ def _validators() -> dict[str, jsonschema.Draft202012Validator]:
 
 
 def check_report(report: dict[str, Any]) -> dict[str, Any]:
-    """Return the report if it is as the schema says."""
     _validators()[report['mission']].validate(report)
     return report

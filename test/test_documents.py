@@ -33,7 +33,6 @@ def anchors(text):
 
 
 def dead_links(text, folder):
-    """Return the relative links whose file or heading does not exist."""
     dead = []
     for link in re.findall(r'\]\((?!\w+:)([^)\s]+)\)', text):
         name, _, anchor = link.partition('#')
@@ -46,7 +45,6 @@ def dead_links(text, folder):
 
 
 def dead_paths(text):
-    """Return the paths in backticks that do not exist."""
     dead = []
     for quoted in re.findall(r'`([^`\n]+)`', text):
         path = quoted.removeprefix('./').split(' ')[0].rstrip('/')

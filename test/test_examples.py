@@ -35,7 +35,6 @@ PATIENCE = 400.0
 
 
 def run_python(*arguments):
-    """Run Python to its end and return what it did."""
     command = [sys.executable, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
 

@@ -37,7 +37,6 @@ ROS_PACKAGES = ('*_msgs', '*_interfaces', 'rcl*', 'rosidl*', 'std_srvs', 'tf2_*'
 
 @cache
 def modules():
-    """Return the file of each of our modules by its name."""
     found = {}
     for package in PACKAGES[1:]:
         for path in sorted(ROOT.glob(f'maasi_*/maasi_{package}/**/*.py')):

@@ -94,7 +94,6 @@ def folder(tmp_path, monkeypatch):
 
 
 def change(folder: Path, before: str, after: str) -> Path:
-    """Return the scenario with a text replaced."""
     path = folder / 'search.yaml'
     assert before in path.read_text()
     path.write_text(path.read_text().replace(before, after))
@@ -102,7 +101,6 @@ def change(folder: Path, before: str, after: str) -> Path:
 
 
 def chosen(result) -> list[int]:
-    """Return what was chosen in a search, in order."""
     return [decision.robots['rover'].chosen for decision in result.decisions]
 
 

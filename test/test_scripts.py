@@ -12,7 +12,6 @@ SHELL = SCRIPTS / 'shell'
 
 
 def call(*command, folder=ROOT, **variables):
-    """Run a command to its end."""
     return subprocess.run(
         [str(part) for part in command],
         cwd=folder,

@@ -157,14 +157,12 @@ class _Search:
     def _plan(self, group: _Group) -> dict[str, PresentRobot]:
         """Plan for the free robots of a group, and send them to their waypoints."""
         coordinator, plans, here = group.coordinator, group.coordinator.plans, self._here
-        present = {
-            name: PresentRobot(
-                here[name].state,
-                plans[name].staying or here[name].has_ended(plans[name].decision + 1),
-            )
-            for name in group.names
-            if name in here
-        }
+        present = {}
+        for name in [name for name in group.names if name in here]:
+            follower, plan = here[name].follower, plans[name]
+            ended = follower.goal is not None and follower.goal.id == plan.decision + 1
+            ended = ended and follower.status != GoalStatus.MOVING
+            present[name] = PresentRobot(here[name].state, plan.staying or ended)
         taken = [
             (self._destinations[name], self.scenario.robots[name].radius)
             for other in self._groups
@@ -300,10 +298,6 @@ class _Robot:
         self.body.step(step, dt)
         moved = self.body.state.pose.position - before
         self.distance += float(np.sqrt((moved * moved).sum()))
-
-    def has_ended(self, goal: int) -> bool:
-        now, status = self.follower.goal, self.follower.status
-        return now is not None and now.id == goal and status != GoalStatus.MOVING
 
     def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
         if self.detector is None:

@@ -20,28 +20,13 @@ from maasi_sim.view.page_file import write_replay
 
 @dataclass(frozen=True)
 class SearchState(FoundCount):
-    """State of a search after a measurement batch.
+    """State of a search after a measurement batch."""
 
-    Attributes
-    ----------
-    time : float
-        [s].
-    step : int
-        k.
-    measurements : int
-        Number so far, of all robots.
-    found, true_found : int
-        Targets found so far, and the number of true ones among them.
-    rmse : float
-        Of the true ones [m]; nan without any.
-    members : tuple of str
-        Robots that measured.
-    positions : dict
-        Of all robots, (3,) [m].
-    """
-
+    #: Of the true targets among those found [m]; nan without any.
     rmse: float
+    #: Robots that measured.
     members: tuple[str, ...]
+    #: Of all robots, (3,) [m].
     positions: dict[str, FloatArray]
 
 

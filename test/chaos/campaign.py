@@ -7,11 +7,11 @@ import tempfile
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from chaos_cases import Case, all_cases
+from chaos_cases import all_cases
 from chaos_execution import execute
 from chaos_verdict import judge
 
@@ -21,19 +21,7 @@ PASSED, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 GOLDEN = 0.6180339887498949
 
 
-@dataclass(frozen=True)
-class Result:
-    """Result of a case; `problems` is empty if it passed."""
-
-    case: Case
-    code: int | None
-    seconds: float
-    ended_after: float
-    problems: list[str]
-
-
 def build_parser():
-    """Return the parser of the command line."""
     parser = Parser(
         prog='chaos',
         description='Run scenarios in which nodes are killed or hang, and check the results: '
@@ -70,29 +58,17 @@ def summary(results, seed, left_out):
     """Return the results as plain values."""
     counts = {}
     for item in results:
-        case = item.case
-        mode = 'lockstep' if case.lockstep else 'free'
-        reaction = 'respawn' if case.respawn else 'end'
-        number = 'two' if len(case.nodes) > 1 else 'one'
-        kind = f'{case.kind} {mode} {reaction} {case.fault} {case.when} {number}'
-        counts.setdefault(kind, Counter())['failed' if item.problems else 'passed'] += 1
+        *kind, nodes = item['name'].split('-')
+        kind = ' '.join([*kind, 'two' if '+' in nodes else 'one'])
+        counts.setdefault(kind, Counter())['failed' if item['problems'] else 'passed'] += 1
+    failed = sum(bool(item['problems']) for item in results)
     return {
         'seed': seed,
-        'passed': sum(not item.problems for item in results),
-        'failed': sum(bool(item.problems) for item in results),
+        'passed': len(results) - failed,
+        'failed': failed,
         'left_out': left_out,
         'counts': counts,
-        'cases': [
-            {
-                'name': item.case.name,
-                **asdict(item.case),
-                'exit_code': item.code,
-                'seconds': round(item.seconds, 1),
-                'ended_after': round(item.ended_after, 1),
-                'problems': item.problems,
-            }
-            for item in results
-        ],
+        'cases': results,
     }
 
 
@@ -112,7 +88,16 @@ def run_all(cases, folder, options):
         outcome = execute(case, folder / case.name, options.seed)
         seconds = time.monotonic() - begin
         problems = judge(case, outcome)
-        results.append(Result(case, outcome.code, seconds, outcome.ended_after, problems))
+        results.append(
+            {
+                'name': case.name,
+                **asdict(case),
+                'exit_code': outcome.code,
+                'seconds': round(seconds, 1),
+                'ended_after': round(outcome.ended_after, 1),
+                'problems': problems,
+            }
+        )
         word = 'FAILED' if problems else 'passed'
         text = f'{word} {case.name}: exit code {outcome.code}, {seconds:.0f} s'
         print('\n  '.join([text, *problems]), flush=True)
@@ -129,7 +114,6 @@ def run_all(cases, folder, options):
 
 
 def main(arguments=None):
-    """Run the command line and return its exit code."""
     options = build_parser().parse_args(arguments)
     try:
         cases = chosen_cases(options.case)
@@ -148,7 +132,7 @@ def main(arguments=None):
         except KeyboardInterrupt:
             print('error: interrupted', file=sys.stderr)
             return INTERRUPTED
-    passed = sum(not item.problems for item in results)
+    passed = sum(not item['problems'] for item in results)
     left_out = len(cases) - len(results)
     print(
         f'{passed} of {len(results)} cases passed'

@@ -100,7 +100,6 @@ class Case:
 
     @property
     def name(self):
-        """Unique name, for the command line."""
         mode = 'lockstep' if self.lockstep else 'free'
         reaction = 'respawn' if self.respawn else 'end'
         nodes = '+'.join(node.strip('/').replace('/', '_') for node in self.nodes)
@@ -123,7 +122,6 @@ class Case:
         return self.fault == 'hang' and (self.lockstep or self.when == 'start')
 
     def scenario(self):
-        """Return the content of its scenario file."""
         limits = {'silence': 8.0, 'start': 120.0, 'time': 12.0}
         if self.fault == 'hang' and self.when == 'start':
             limits['start'] = 30.0
@@ -146,7 +144,6 @@ class Case:
         }
 
     def options(self):
-        """Return the options of its run."""
         if self.lockstep:
             return ['--lockstep']
         return ['--rate', '3'] if self.kind == 'buildings' else []

@@ -34,7 +34,6 @@ class Outcome:
 
 
 def execute(case, folder, seed):
-    """Run a case in a new folder; return its outcome."""
     folder.mkdir(parents=True)
     file, run, output = folder / 'scenario.yaml', folder / 'run', folder / 'output.txt'
     file.write_text(to_yaml(case.scenario()), encoding='utf-8')

@@ -123,7 +123,6 @@ def speeds_of(bag, robot):
 
 
 def judge_last_commands(bag, robots):
-    """Check that the last command of each robot is zero."""
     topics = {f'/{robot}/cmd_vel': robot for robot in robots}
     last = {topics[item.topic]: item.message for item in bag.messages(topics)}
     problems = []

@@ -7,7 +7,7 @@ import sys
 import campaign
 import pytest
 from builtin_interfaces.msg import Time
-from campaign import PASSED, WRONG_INPUT, Result, main, summary
+from campaign import PASSED, WRONG_INPUT, main, summary
 from chaos_cases import Case, all_cases
 from chaos_execution import Outcome
 from chaos_verdict import judge
@@ -145,7 +145,7 @@ def test_a_recording_or_report_that_cannot_be_read_is_found(tmp_path):
 
 
 def test_the_summary_counts_by_kind():
-    results = [Result(KILLED, 3, 1.0, 1.0, []), Result(KILLED, 0, 1.0, 1.0, ['exit code'])]
+    results = [{'name': KILLED.name, 'problems': found} for found in ([], ['exit code'])]
     content = summary(results, 1, 5)
     assert content['counts'] == {'search free end kill middle one': {'passed': 1, 'failed': 1}}
     assert (content['passed'], content['failed'], content['left_out']) == (1, 1, 5)

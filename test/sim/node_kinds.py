@@ -76,7 +76,6 @@ class Kind:
 
     @property
     def name(self):
-        """Of the node."""
         if self.executable.endswith('_driver'):
             return 'driver'
         known = {'guard_node': 'guard', 'cuboid_planner_node': 'cuboid_planner'}

@@ -73,7 +73,6 @@ def test_scenario_is_found_again(types, tmp_path):
 
 
 def stored(types, folder, kind, message):
-    """Return the message of a bag to which one image was written."""
     with BagWriter(folder / 'bag', types, images=kind) as writer:
         writer.add_topic('/image', 'sensor_msgs/msg/Image')
         writer.write_message('/image', 5, message)
@@ -134,7 +133,6 @@ def test_what_is_no_recording_is_refused(tmp_path, name):
 
 @pytest.fixture(scope='module')
 def whole(types, tmp_path_factory):
-    """Return a recording of several chunks."""
     folder = tmp_path_factory.mktemp('whole') / 'bag'
     with BagWriter(folder, types) as writer:
         write_steps(writer, range(60), 30000)

@@ -115,7 +115,6 @@ def start(tmp_path):
 
 
 def interrupted(process):
-    """Return what a node says when it is interrupted."""
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, said

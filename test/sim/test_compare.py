@@ -18,7 +18,6 @@ PLANNERS = ['nearest_widest', 'lawnmower']
 
 @pytest.fixture
 def scenario(tmp_path):
-    """Return the file of a scenario whose search takes a fraction of a second."""
     path = tmp_path / 'field.yaml'
     path.write_text(yaml.safe_dump(SMALL_FIELD))
     return path
@@ -26,7 +25,6 @@ def scenario(tmp_path):
 
 @pytest.fixture
 def executed(monkeypatch):
-    """Return the searches made, in their order."""
     made: list[tuple[str, int]] = []
     original = campaign.execute
 
@@ -39,7 +37,6 @@ def executed(monkeypatch):
 
 
 def command(scenario, out, *more, seeds=2):
-    """Return the exit code of a comparison in this process."""
     arguments = [str(scenario), '--planners', ','.join(PLANNERS), '--seeds', str(seeds)]
     if out is not None:
         arguments += ['--out', str(out)]

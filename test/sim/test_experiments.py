@@ -71,7 +71,6 @@ def toy(monkeypatch):
 
 
 def command(out, *more):
-    """Return the exit code of the command for the toy, with one worker."""
     return reproduce.main(['000-toy', '--out', str(out), '--workers', '1', *map(str, more)])
 
 
@@ -83,9 +82,6 @@ def run_files(out: Path) -> dict[str, str]:
         assert run.timing.pop('processor_time') >= 0.0
         found[file.name] = runs.to_text(run)
     return found
-
-
-# Runs and their files
 
 
 def test_damaged_run_is_made_again_and_no_other(toy, tmp_path, capsys):
@@ -107,9 +103,6 @@ def test_columns_of_a_run_are_of_one_length(toy):
     case = toy.cases(False)[0]
     with pytest.raises(ValueError, match='columns'):
         runs.run_of(toy.name, case, 0, 1, Outcome({}, {'a': [1.0], 'b': [1.0, 2.0]}))
-
-
-# Campaigns
 
 
 @pytest.mark.parametrize('ending', [signal.SIGINT, signal.SIGTERM])
@@ -187,9 +180,6 @@ def test_run_that_fails_leaves_the_others(toy, tmp_path, monkeypatch, capsys):
     assert (tmp_path / '000-toy' / 'table.md').exists()
 
 
-# What is written
-
-
 def test_outputs_hold_what_was_run_beside_the_paper_and_in_pairs(toy, tmp_path):
     assert command(tmp_path) == 0
     folder = tmp_path / '000-toy'
@@ -263,9 +253,6 @@ def test_page_says_what_was_run_and_keeps_what_was_not_run_again(toy, tmp_path):
     assert '**not run**' in new.read_text()
 
 
-# Command line
-
-
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
@@ -298,9 +285,6 @@ def test_names_are_unique_and_listed(capsys):
             assert item.case in names and item.quantity in known
         for pair in experiment.comparisons:
             assert {pair.first, pair.second} <= set(names) and pair.quantity in known
-
-
-# Workers and machines
 
 
 def test_cluster_that_does_not_answer_is_said(monkeypatch, capsys, tmp_path, toy):

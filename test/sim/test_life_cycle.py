@@ -21,16 +21,6 @@ def made_by(node):
     }
 
 
-def endpoints(node):
-    """Return how many endpoints a node has under each name, as it counts them itself."""
-    own = Counter()
-    for kind in ('publisher', 'subscription'):
-        own.update((kind, item.topic_name) for item in getattr(node, f'{kind}s'))
-    for kind in ('service', 'client'):
-        own.update((kind, item.service_name) for item in getattr(node, f'{kind}s'))
-    return own
-
-
 def in_graph(node):
     """Return how many endpoints a node has under each topic and service, as others see them."""
     counts = Counter()
@@ -47,10 +37,14 @@ def in_graph(node):
 
 def unknown(node):
     """Return the endpoints of which the graph holds another number than the node has itself."""
-    counts = in_graph(node)
+    counts, own = in_graph(node), Counter()
+    for kind in ('publisher', 'subscription'):
+        own.update((kind, item.topic_name) for item in getattr(node, f'{kind}s'))
+    for kind in ('service', 'client'):
+        own.update((kind, item.service_name) for item in getattr(node, f'{kind}s'))
     return {
         key: (number, counts[key])
-        for key, number in endpoints(node).items()
+        for key, number in own.items()
         if counts[key] != number and '/_' not in key[1]
     }
 

@@ -39,8 +39,6 @@ SCENARIO = {
 
 
 class Session:
-    """A recorder, and a node that publishes the time and odometry."""
-
     def __init__(self, folder, number, context):
         file = folder / 'scenario.yaml'
         file.write_text(yaml.safe_dump(SCENARIO))
@@ -67,7 +65,6 @@ class Session:
         self.until(lambda: not self.recorder.unmatched())
 
     def move(self, *times):
-        """Publish odometry with stamps, and wait until it is taken."""
         before = self.recorder.last_seen.get('/rover/odom')
         for nanoseconds in times:
             message = Odometry()

@@ -29,7 +29,6 @@ COVARIANCE = np.array([[0.04, 0.01, 0.02], [0.01, 0.09, 0.03], [0.02, 0.03, 0.16
 
 
 def rows_of(dimension, origin=None):
-    """Return the rows of a true and a false target."""
     found = [
         FoundTarget(number, place[:dimension], COVARIANCE[:dimension, :dimension], 'drone', 3, 7.5)
         for number, place in enumerate(np.array([[1.0, 2.0, 3.0], [9.0, 9.0, 9.0]]), 1)
@@ -72,7 +71,6 @@ def test_geojson_has_longitude_first():
 
 
 def field(folder, **origin):
-    """Return a small scenario with an origin."""
     environment = {**SMALL_FIELD['environment'], 'origin': origin}
     path = folder / 'field.yaml'
     path.write_text(yaml.safe_dump({**SMALL_FIELD, 'environment': environment}))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from maasi_drivers.vision.camera_model import Camera, box_view_margin
-from maasi_sim.scenario.loading import config_folder, scenario_from_values
+from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.search import search
 
 TURTLEBOTS = {
@@ -30,11 +30,6 @@ def scenario(kind, height=0.0):
         'limits': {'time': 400.0},
     }
     return scenario_from_values(values, 'test')
-
-
-def test_the_turtlebots_are_there():
-    known = {path.stem for path in (config_folder() / 'robots').glob('turtlebot*.yaml')}
-    assert known == set(TURTLEBOTS)
 
 
 @pytest.mark.parametrize('kind', [*TURTLEBOTS, 'mambo'])

@@ -1,6 +1,7 @@
 """Timeouts of filter and planner are in simulated time."""
 
 import time
+from contextlib import closing
 
 import pytest
 from node_kinds import KINDS
@@ -19,8 +20,6 @@ TIMEOUT = 0.3
 
 
 class World:
-    """A clock, a node that uses it, and one that talks to it."""
-
     def __init__(self, context, kind, **changes):
         self.node = Node('world', context=context)
         self.tested = KINDS[kind].make(context, **changes)
@@ -62,20 +61,13 @@ class World:
 
 
 @pytest.fixture
-def begin(context):
-    worlds = []
-
-    def make(kind, **changes):
-        worlds.append(World(context, kind, **changes))
-        return worlds[-1]
-
-    yield make
-    for world in worlds:
-        world.close()
+def world(context, request):
+    with closing(World(context, **request.param)) as made:
+        yield made
 
 
-def test_a_batch_is_given_up_in_simulated_time(begin):
-    world = begin('filter', batch_timeout=TIMEOUT)
+@pytest.mark.parametrize('world', [{'kind': 'filter', 'batch_timeout': TIMEOUT}], indirect=True)
+def test_a_batch_is_given_up_in_simulated_time(world):
     updates = []
     world.node.create_subscription(FilterUpdate, '/filter_update', updates.append, UPDATES)
     world.until(lambda: world.node.count_publishers('/filter_update'))
@@ -91,8 +83,8 @@ def test_a_batch_is_given_up_in_simulated_time(begin):
     assert list(updates[0].missing) == ['rover']
 
 
-def test_a_silent_robot_is_left_out_in_simulated_time(begin):
-    world = begin('planner', state_timeout=TIMEOUT)
+@pytest.mark.parametrize('world', [{'kind': 'planner', 'state_timeout': TIMEOUT}], indirect=True)
+def test_a_silent_robot_is_left_out_in_simulated_time(world):
     node = world.tested
     state = AgentState(robot='rover', step=1)
     state.header.frame_id = 'map'

@@ -17,7 +17,6 @@ FIRST, SECOND, OTHER = (GENERATOR.normal(5.0, 2.0, number) for number in (12, 12
 
 
 def welch(first, second):
-    """Return the difference to a published mean."""
     paper = mean_interval(second)
     published = statistics.from_published(paper.mean, paper.half_width, len(second))
     return statistics.independent_difference(mean_interval(first), published)

@@ -16,7 +16,6 @@ from maasi_sim.view.view_node import main
 
 
 def serve(context, name, services, called):
-    """Return a node with services that note that they were called."""
     node = rclpy.create_node(name, context=context)
 
     def answer(service, _, response):

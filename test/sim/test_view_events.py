@@ -37,8 +37,6 @@ def state(seconds, **fields):
 
 
 class Taken:
-    """Events made of messages."""
-
     def __init__(self, scene=None, on_restart=None):
         self.events = []
         self.maker = EventMaker(scene or empty_scene(), self.events.append)
@@ -179,7 +177,6 @@ def test_topics_are_known_by_type_and_name():
 
 
 def unpacked(text):
-    """Return scene and events of a packed log."""
     scene, *events = gzip.decompress(base64.b64decode(text)).decode().split('\n')
     return json.loads(scene), [json.loads(item) for item in events]
 

@@ -36,7 +36,6 @@ def frames(log, path, speed=1e3):
 
 
 def bluish(picture):
-    """Return which pixels have the robot's colour."""
     return np.abs(picture.astype(int) - (178, 114, 0)).max(axis=2) < 40
 
 

@@ -39,7 +39,6 @@ def server():
 
 
 def ask(server, method, path, body=None, headers=None):
-    """Return status and body of an answer."""
     connection = http.client.HTTPConnection('127.0.0.1', server.port, timeout=PATIENCE)
     try:
         connection.request(method, path, body, headers or {})
@@ -50,8 +49,6 @@ def ask(server, method, path, body=None, headers=None):
 
 
 class Browser:
-    """Reads a stream of events."""
-
     def __init__(self, server):
         self.connection = socket.create_connection(('127.0.0.1', server.port), timeout=PATIENCE)
         self.connection.sendall(b'GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n')
@@ -60,7 +57,6 @@ class Browser:
         self.scenes, self.events, self.ended = [], [], False
 
     def until(self, number=0):
-        """Read until there are so many events, or the end."""
         kind, deadline = None, time.monotonic() + PATIENCE
         while not self.ended and not 0 < number <= len(self.events):
             line = self.file.readline().decode()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -42,16 +43,15 @@ class Run:
             self.process.kill()
             self.finish()
 
-    def wait_for(self, text):
-        """Read the output up to a line with a text."""
+    def wait_for(self, pattern):
+        """Read the output up to a line with a pattern; return that line."""
         for line in self.process.stdout:
             self.output += line
-            if text in line:
-                return
-        raise AssertionError(f'never said {text}: {self.output}')
+            if re.search(pattern, line):
+                return line
+        raise AssertionError(f'never said {pattern}: {self.output}')
 
     def finish(self):
-        """Wait for its end; return itself."""
         self.output += self.process.communicate(timeout=PATIENCE)[0]
         self.code = self.process.returncode
         return self
@@ -76,7 +76,6 @@ def command(scenario, folder, *options):
 
 
 def started(words, folder, environment=None, **options):
-    """Return the run of a command line."""
     process = subprocess.Popen(
         words,
         env={**os.environ, **(environment or {})},
@@ -99,7 +98,6 @@ def run_scenario(scenario, folder, *options, environment=None):
 
 
 def write_scenario(path, targets, start=(1.9, 1.9, 1.0), **changes):
-    """Write the scenario of a small search by a drone; return its path."""
     candidates = {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]}
     content = {
         'version': 1,
@@ -117,11 +115,6 @@ def wait_for(condition, what):
     wait_until(condition, lambda: time.sleep(0.05), f'{what} within {PATIENCE:g} s', PATIENCE)
 
 
-def processes_with(text):
-    """Return the ids of the processes whose command line has a text in it."""
-    return list(processes_of(text))
-
-
 def plain(message):
     """Return a message of a bag as plain values that can be compared."""
     if hasattr(message, '__dataclass_fields__'):
@@ -133,22 +126,13 @@ def plain(message):
 
 
 def of_topic(run, topic):
-    """Return the messages of a topic in the bag of a run, as plain data."""
     with Bag(run.bag) as bag:
         return [plain(item.message) for item in bag.messages([topic])]
 
 
-def replay(run, folder):
-    """Replay the bag of a run; return the finished process."""
-    return subprocess.run(
-        [*command('', '')[:3], '--replay', str(run.bag)],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+def check_replay(run, folder):
+    done = started([*command('', '')[:3], '--replay', str(run.bag)], folder, cwd=folder).finish()
+    assert done.code == 0 and 'equal to the bit' in done.output, done.output
 
 
 class Operator:

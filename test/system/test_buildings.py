@@ -2,15 +2,13 @@
 
 import os
 import signal
-import subprocess
 
 import numpy as np
 import pytest
 import yaml
-from scenario_runs import PATIENCE, command, of_topic, plain, processes_with, run_scenario
+from scenario_runs import of_topic, run_scenario, start
 
 from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
-from maasi_sim.run.bag import Bag
 
 pytestmark = pytest.mark.system
 
@@ -99,34 +97,16 @@ def test_the_link_has_a_range_and_batteries_fail(tmp_path):
 
 def test_a_killed_planner_stops_nobody_and_takes_up_its_work(tmp_path):
     file = small(tmp_path, on_exit='respawn')
-    folder = tmp_path / 'run'
-    process = subprocess.Popen(
-        command(file, folder, '--rate', 4),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    try:
-        for line in process.stdout:
-            if 'visited of' in line and ' 0 visited' not in line:
-                break
-        (victim,) = processes_with(f'{folder}/parameters/green_cuboid_planner.yaml')
-        os.kill(victim, signal.SIGKILL)
-        output, _ = process.communicate(timeout=PATIENCE)
-    finally:
-        process.kill()
-    assert process.returncode == 0, output
-    assert 'is restarted' in output
-    with Bag(folder / 'bag') as bag:
-        decisions = {
-            name: [plain(item.message) for item in bag.messages([f'/{name}/decision'])]
-            for name in ('blue', 'green')
-        }
-    steps = [item['step'] for item in decisions['green']]
+    with start(file, tmp_path / 'run', '--rate', 4) as run:
+        run.wait_for(r' [1-9]\d* visited of')
+        os.kill(*run.processes('/green/cuboid_planner'), signal.SIGKILL)
+        run.finish()
+    assert run.code == 0, run.output
+    assert 'is restarted' in run.output
+    steps = [item['step'] for item in of_topic(run, '/green/decision')]
     gaps = np.diff(steps)
     lost, away = steps[int(np.argmax(gaps))], gaps.max()
     # It was away for a while, the other one went on, and it came back.
     assert away > 1 and steps[-1] > lost
-    between = [item for item in decisions['blue'] if lost < item['step'] < lost + away]
-    assert len(between) >= away // 2
+    others = [item['step'] for item in of_topic(run, '/blue/decision')]
+    assert sum(lost < step < lost + away for step in others) >= away // 2

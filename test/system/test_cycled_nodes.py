@@ -34,8 +34,6 @@ OTHERS = {
 
 
 class Cycler(Operator):
-    """A client of the life cycles of a run's nodes."""
-
     run = None
 
     def until(self, condition, what):

@@ -62,7 +62,6 @@ sys.exit(run_scenario.main(sys.argv[1:]))
 
 @pytest.fixture
 def scripted(tmp_path):
-    """Return the function that writes a scenario with the scripted planner."""
     (tmp_path / 'scripted.py').write_text(SCRIPTED)
 
     def write(fault, **changes):
@@ -227,13 +226,6 @@ def test_wrong_options_are_named(options, words, capsys):
 def test_what_does_not_fit_the_scenario_is_named_with_the_option(options, words):
     with pytest.raises(ScenarioError, match=re.escape(words)):
         ScenarioRun(Options('mambo', **options), interruption=False)
-
-
-def test_options_win_over_the_scenario():
-    options = Options('mambo', planner='lawnmower', seed=9, time_limit=3.0)
-    scenario = ScenarioRun(options, interruption=False).mission.scenario
-    values = (scenario.planner.name, scenario.limits.time, scenario.seed)
-    assert values == ('lawnmower', 3.0, 9)
 
 
 def test_a_run_gets_a_folder_of_its_own(tmp_path, monkeypatch):

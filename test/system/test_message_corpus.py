@@ -206,7 +206,6 @@ class World:
         return self.names[kind].rpartition('/')[0]
 
     def known(self, kind, what):
-        """Return the topics or services of a node, with their types."""
         look = getattr(self.node, f'get_{what}_names_and_types_by_node')
         found = look(self.names[kind].rpartition('/')[2], self.space(kind))
         return {name: kinds[0] for name, kinds in sorted(found) if name.startswith(f'/{kind}/')}
@@ -233,7 +232,6 @@ class World:
         self.node.create_subscription(kind, topic, self.heard[topic].append, quality)
 
     def call(self, requests):
-        """Send requests, service to type and request, and wait for all answers."""
         waiting = {}
         for service, (kind, request) in requests.items():
             if service not in self.clients:
@@ -264,7 +262,6 @@ def world(context, tmp_path):
 
 
 def send_corpus(world, topics):
-    """Send messages to every topic, requests to every service and action."""
     corpus = Corpus(12)
     for round_ in range(ROUNDS):
         # Now and then all stamps are before zero.

@@ -3,7 +3,8 @@
 import json
 
 import pytest
-from scenario_runs import of_topic, replay, run_scenario
+import yaml
+from scenario_runs import check_replay, of_topic, run_scenario
 
 from maasi_sim.run.bag import Bag
 from maasi_sim.scenario.loading import load_scenario
@@ -46,7 +47,6 @@ def test_a_run_beside_another_does_not_hear_it(repeated):
 
 
 def transforms(run):
-    """Return what a run says on /tf, by stamp and frame."""
     return {
         (repr(item['header']['stamp']), item['child_frame_id']): item
         for message in of_topic(run, '/tf')
@@ -105,15 +105,40 @@ def test_the_bag_holds_the_run(repeated):
 
 
 def test_a_replay_finds_the_same(repeated, tmp_path):
-    run, _ = repeated
-    done = replay(run, tmp_path)
-    assert done.returncode == 0, done.stdout
-    assert 'equal to the bit' in done.stdout
+    check_replay(repeated[0], tmp_path)
 
 
-def test_free_running_finds_targets_too(tmp_path):
-    options = ('--seed', 1, '--time-limit', 12, '--rate', 1)
-    run = run_scenario('mambo_turtlebot', tmp_path / 'run', *options)
-    assert run.code in (0, 1), run.output
-    assert run.report['false_found'] == 0
-    assert sum(run.report['measurements'].values()) >= 20
+def test_independent_robots_share_what_they_find_and_nothing_else(tmp_path):
+    """002, section 4."""
+    scenario = load_scenario('ranging_pair_3d').content()
+    scenario['planner'] = {'name': 'maas', 'coordination': 'independent', 'alpha': 1.0}
+    # The first target is for both to see.
+    for robot, start in (('drone1', [100.0, 60.0, 60.0]), ('drone2', [100.0, 130.0, 60.0])):
+        scenario['robots'][robot]['start'] = start
+        scenario['robots'][robot]['candidates'] = {'ring': 6, 'distance': 12.0}
+    scenario['targets'] = {'positions': [[100.0, 95.0, 70.0], [60.0, 70.0, 60.0], [250.0] * 3]}
+    scenario['limits']['time'] = 30.0
+    file = tmp_path / 'independent.yaml'
+    file.write_text(yaml.safe_dump(scenario))
+    run = run_scenario(file, tmp_path / 'run', '--seed', 1, '--lockstep')
+    assert run.code == 1, run.output
+    result = search(load_scenario(file), 1)
+    assert len(result.found_targets) == 2
+    for name in ('drone1', 'drone2'):
+        ours = [item for item in result.decisions if name in item.robots]
+        theirs = of_topic(run, f'/{name}/decisions')
+        assert len(ours) >= 5
+        assert [item.step for item in ours] == [item['step'] for item in theirs]
+        for one, other in zip(ours, theirs):
+            waypoint = other['robots'][0]['waypoint']
+            assert one.robots[name].waypoint.tolist() == [waypoint[axis] for axis in 'xyz']
+        # Both find the second target at the same time; it is the first one's then.
+        last = of_topic(run, f'/{name}/found_targets')[-1]['targets']
+        assert [item['robot'] for item in last] == ['drone1', 'drone1']
+    report = run.report
+    assert report['end_reason'] == result.end_reason
+    assert [item['position'] for item in report['found']] == [
+        target.position.tolist() for target in result.found_targets
+    ]
+    assert report['measurements'] == result.measurements
+    check_replay(run, tmp_path)

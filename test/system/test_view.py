@@ -1,13 +1,11 @@
 """The page of a run in a browser: what it shows is what the bag and the report hold."""
 
-import subprocess
-
 import numpy as np
 import pytest
 import rclpy
 from browsers import CHROMIUM, chromium, needs_chromium
 from rclpy.executors import SingleThreadedExecutor
-from scenario_runs import PATIENCE, Run, command, of_topic
+from scenario_runs import PATIENCE, of_topic, start
 from waiting import wait_until
 
 from maasi_filter.ros.qos import RELIABLE
@@ -25,46 +23,32 @@ from maasi_sim.view.view_run import main
 pytestmark = pytest.mark.system
 
 
-class Watched(Run):
-    """A run, and what a browser saw of it while it went on."""
-
-    def __init__(self, folder):
-        options = ('--seed', 1, '--lockstep', '--time-limit', 30, '--view', '--control')
-        process = subprocess.Popen(
-            [*command('mambo_turtlebot', folder, *options), '--port', '0'],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        lines = []
-        while not (lines and lines[-1].startswith('view: ')):
-            lines.append(process.stdout.readline())
-            assert lines[-1], lines
-        if CHROMIUM is not None:
-            self._watch(lines[-1].split()[1])
-        rest, _ = process.communicate(timeout=PATIENCE)
-        super().__init__(folder, process.returncode, ''.join([*lines, rest]))
-
-    def _watch(self, address):
-        with chromium() as shown:
-            shown.open(address)
-            shown.until('maasi.log.duration > 1')
-            shown.page.click('#robots tr[data-robot=turtlebot]')
-            shown.page.click('button[data-command=pause]')
-            shown.until("/[^.]$/.test(document.querySelector('#controls [role=status]').innerText)")
-            self.answer = shown.page.inner_text('#controls [role=status]')
-            shown.until('document.body.dataset.connection === "ended"', PATIENCE)
-            shown.page.keyboard.press('End')
-            shown.settle()
-            self.found = shown.number()
-            self.decisions = shown.page.evaluate('maasi.log.decisions.times.length')
-            self.controls = shown.page.is_visible('#controls')
+def watch(run, address):
+    """Note what a browser sees of a run while it goes on."""
+    with chromium() as shown:
+        shown.open(address)
+        shown.until('maasi.log.duration > 1')
+        shown.page.click('#robots tr[data-robot=turtlebot]')
+        shown.page.click('button[data-command=pause]')
+        shown.until("/[^.]$/.test(document.querySelector('#controls [role=status]').innerText)")
+        run.answer = shown.page.inner_text('#controls [role=status]')
+        shown.until('document.body.dataset.connection === "ended"', PATIENCE)
+        shown.page.keyboard.press('End')
+        shown.settle()
+        run.found = shown.number()
+        run.decisions = shown.page.evaluate('maasi.log.decisions.times.length')
+        run.controls = shown.page.is_visible('#controls')
 
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
-    return Watched(tmp_path_factory.mktemp('viewed') / 'run')
+    options = ('--seed', 1, '--lockstep', '--time-limit', 30, '--view', '--control', '--port', 0)
+    folder = tmp_path_factory.mktemp('viewed') / 'run'
+    with start('mambo_turtlebot', folder, *options) as run:
+        address = run.wait_for('^view: ').split()[1]
+        if CHROMIUM is not None:
+            watch(run, address)
+        return run.finish()
 
 
 @pytest.fixture(scope='module')

@@ -68,10 +68,8 @@ def geodetic(position: FloatArray, origin: OriginSettings) -> Row:
     import pymap3d
 
     east, north, up = [*map(float, position), 0.0][:3]
-    latitude, longitude, altitude = pymap3d.enu2geodetic(
-        east, north, up, origin.latitude, origin.longitude, origin.altitude
-    )
-    places = map(float, (latitude, longitude, altitude))
+    reference = origin.latitude, origin.longitude, origin.altitude
+    places = map(float, pymap3d.enu2geodetic(east, north, up, *reference))
     return dict(zip(('latitude', 'longitude', 'altitude'), places))
 
 

@@ -23,7 +23,9 @@ from maasi_sim.world.world import World
 class FoundCount:
     """Measurements and found targets of all robots so far, after a filter update."""
 
+    #: [s].
     time: float
+    #: k.
     step: int
     measurements: int
     found: int
@@ -127,18 +129,10 @@ class Tally:
 
 @dataclass
 class TargetRecord(RunRecord):
-    """The record of a search for targets.
+    """The record of a search for targets."""
 
-    Attributes
-    ----------
-    tally : Tally
-        At the end.
-    waypoints : dict
-        By robot: chosen ones in order, (n, 3) [m].
-    measured_from : dict
-        By robot: poses at which it measured, in order.
-    """
-
+    #: At the end.
     tally: Tally
+    #: By robot, in order: chosen ones, (n, 3) [m], and poses at which it measured.
     waypoints: dict[str, FloatArray] = field(default_factory=dict)
     measured_from: dict[str, list[Pose]] = field(default_factory=dict)

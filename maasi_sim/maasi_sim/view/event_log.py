@@ -46,8 +46,6 @@ LARGEST = 4_500_000
 # Shortest time between states of a robot, and between other events that may be thinned [s].
 STATE_PERIOD = 0.1
 _THINNED = ('robot', 'seen', 'filter', 'map', 'way', 'score', 'cuboid')
-# Thinning is given up at this period [s].
-_LONGEST_PERIOD = 1e5
 
 
 def line(event: Event | Scene) -> str:
@@ -78,7 +76,8 @@ class EventLog:
         while True:
             text = '\n'.join([line(log.scene), *map(line, log.events)])
             packed = base64.b64encode(gzip.compress(text.encode(), 7, mtime=0)).decode()
-            if len(packed) <= largest or period > _LONGEST_PERIOD:
+            # At such a period nothing more is thinned.
+            if len(packed) <= largest or period > 1e5:
                 return packed
             period = max(2.0 * period, 2.0 * STATE_PERIOD)
             log = EventLog({**self.scene, 'thinned': period}, thin(self.events, period))

@@ -19,7 +19,6 @@ REPLAY = 'replay.html'
 _MODULES = 'run_log camera colours text shapes buildings map why panels curve live main'
 
 
-@cache
 def empty_page() -> str:
     """Return the page without a run: it asks the server that it came from."""
     return _with('RUN', _page(), '')

@@ -236,7 +236,9 @@ def _draw_robot(
         axes.plot([x, x], [y, y], [bounds[2, 0], z], ':', color=colour, lw=0.8)
     elif 'view' in robot and not away:
         axes.add_patch(_view(robot['view'], place, yaw, colour))
-    marker: Any = 'D' if size == 3 else _arrow(yaw)
+    # From above it points ahead.
+    arrow = [[1.4, 0.0], [-0.9, 0.8], [-0.5, 0.0], [-0.9, -0.8], [1.4, 0.0]]
+    marker: Any = 'D' if size == 3 else Outline(arrow @ _turn(yaw))
     style = {'ms': 8 if size == 3 else 16, 'alpha': 0.35 if away else 1.0}
     _plot(axes, place, size, '', marker=marker, color=colour, **style)
     axes.text(*place[:size], f'   {name}', fontsize=9, weight='bold')
@@ -247,12 +249,6 @@ def _draw_robot(
         else:
             line: Any = {'fill': False, 'ec': colour, 'ls': '-.', 'lw': 0.9, 'alpha': 0.7}
             axes.add_patch(Rectangle((left, low), right - left, high - low, **line))
-
-
-def _arrow(yaw: float) -> Outline:
-    """Return a marker that points along a yaw [rad]."""
-    ahead, left = np.array([1.4, -0.9, -0.5, -0.9, 1.4]), np.array([0.0, 0.8, 0.0, -0.8, 0.0])
-    return Outline(np.column_stack([ahead, left]) @ _turn(yaw))
 
 
 def _turn(yaw: float) -> NDArray[np.float64]:
