@@ -1,7 +1,5 @@
 """Checks a report against the schema that is shipped, strictly: no field that it does not know."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from importlib.resources import files

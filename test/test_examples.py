@@ -1,21 +1,18 @@
 """The examples: each is run, as a user would."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
-from waiting import wait_until
+from scenario_runs import PATIENCE, beside, run_scenario
 
 from maasi_drivers.settings.driver import DriverSettings, GuardSettings
 from maasi_filter import plugins
@@ -30,8 +27,6 @@ from maasi_sim.search import search
 from maasi_sim.targets.mission import TargetMission
 
 EXAMPLES = Path(__file__).resolve().parents[1] / 'examples'
-# Far more than anything takes, on a machine that is busy with something else [s].
-PATIENCE = 400.0
 
 
 def run_python(*arguments):
@@ -80,7 +75,7 @@ def test_a_robot_with_a_sensor_of_its_own_finds_targets(kind, method):
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
-    """Return the folder of a run with a planner and a sensor of one's own, and its scenario."""
+    """Return a run with a planner and a sensor of one's own."""
     folder = tmp_path_factory.mktemp('examples')
     content = yaml.safe_load((EXAMPLES / 'own_sensor' / 'search.yaml').read_text())
     content['plugin_path'] = [str(EXAMPLES / name) for name in ('own_planner', 'own_sensor')]
@@ -88,41 +83,35 @@ def run(tmp_path_factory):
     content['limits'] = {'time': 20.0}
     (folder / 'robots').symlink_to(EXAMPLES / 'robots')
     (folder / 'search.yaml').write_text(yaml.safe_dump(content))
-    command = ['-m', 'maasi_sim.run.run_scenario', folder / 'search.yaml', '--lockstep']
-    done = run_python(*command, '--out', folder / 'out')
-    assert done.returncode in (0, 1), done.stdout + done.stderr
-    return folder
+    done = run_scenario(folder / 'search.yaml', folder / 'out', '--lockstep')
+    assert done.code in (0, 1), done.output
+    return done
 
 
-@pytest.fixture(scope='module')
-def report(run):
-    return json.loads((run / 'out' / 'report.json').read_text())
-
-
-def test_nodes_run_planner_and_sensor_as_one_process_does(run, report):
-    result = search(load_scenario(run / 'search.yaml'), seed=1)
-    assert result.total_measurements > 20 and report['measurements'] == result.measurements
-    found = [item['position'] for item in report['found']]
+def test_nodes_run_planner_and_sensor_as_one_process_does(run):
+    result = search(load_scenario(run.folder.parent / 'search.yaml'), seed=1)
+    assert result.total_measurements > 20 and run.report['measurements'] == result.measurements
+    found = [item['position'] for item in run.report['found']]
     assert np.allclose(found, [item.position for item in result.found_targets], atol=1e-6)
 
 
-def test_a_recording_is_read_as_the_document_says(run, report, capsys):
+def test_a_recording_is_read_as_the_document_says(run, capsys):
     text = (EXAMPLES.parent / 'docs' / 'how_to' / 'bags.md').read_text()
     (block,) = re.findall(r'```python\n(.*?)```', text, re.DOTALL)
-    exec(block.replace('runs/20260101_120000/bag', str(run / 'out' / 'bag')), {})
-    assert len(report['found']) > 0
-    assert capsys.readouterr().out.splitlines()[-1].count('(') == len(report['found'])
+    exec(block.replace('runs/20260101_120000/bag', str(run.bag)), {})
+    targets = len(run.report['found'])
+    assert capsys.readouterr().out.splitlines()[-1].count('(') == targets > 0
 
 
-def test_a_recording_is_read_without_our_packages(run, report):
+def test_a_recording_is_read_without_our_packages(run):
     # Isolated: neither PYTHONPATH nor the current folder.
-    done = run_python('-I', EXAMPLES / 'read_bag' / 'read_bag.py', run / 'out' / 'bag')
+    done = run_python('-I', EXAMPLES / 'read_bag' / 'read_bag.py', run.bag)
     assert done.returncode == 0, done.stderr
-    with Bag(run / 'out') as bag:
+    with Bag(run.folder) as bag:
         stamps = [item.message.header.stamp for item in bag.messages(['/scout/state'])]
     first = stamps[0].sec + 1e-9 * stamps[0].nanosec
     assert f'/scout/state: {len(stamps)} poses, from {first:.1f} to' in done.stdout
-    assert done.stdout.count('target ') == len(report['found'])
+    assert done.stdout.count('target ') == len(run.report['found'])
 
 
 def test_detections_of_ones_own_are_found_without_a_warning(domain):
@@ -190,38 +179,27 @@ def test_the_parameters_of_the_field_are_those_of_its_simulation():
             assert int(autopilot['MAV_GCS_SYSID']) == parameters['mavlink.own_system']
 
 
-def test_the_nodes_of_the_field_become_active_with_their_file(context, tmp_path):
+def test_the_nodes_of_the_field_become_active_with_their_file(tmp_path):
     heard, processes, names = {}, [], set()
-    node = rclpy.create_node('listener', context=context)
-    node.create_subscription(
-        DiagnosticArray,
-        '/diagnostics',
-        lambda message: heard.update({item.name: item.message for item in message.status}),
-        50,
-    )
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    try:
+
+    def hear(message):
+        heard.update({item.name: item.message for item in message.status})
+
+    def active():
+        assert all(process.poll() is None for process in processes)
+        return all(heard.get(name, '').startswith('active') for name in names)
+
+    with beside() as operator, ExitStack() as started:
+        operator.node.create_subscription(DiagnosticArray, '/diagnostics', hear, 50)
         for file, (executable, *_) in OF_THE_FIELD.items():
             robot = file.partition('_')[0] if file.endswith(('_driver', '_guard')) else ''
             names.add('/' + file.replace(f'{robot}_', f'{robot}/') if robot else f'/{file}')
             words = ['--ros-args', '-r', f'__ns:=/{robot}', '--params-file', f'{file}.yaml']
-            with (tmp_path / file).open('w') as log:
-                processes.append(
-                    subprocess.Popen(
-                        [executable, *words], cwd=EXAMPLES / 'field_team', stdout=log, stderr=log
-                    )
-                )
-
-        def active():
-            assert all(process.poll() is None for process in processes)
-            return all(heard.get(name, '').startswith('active') for name in names)
-
-        wait_until(active, lambda: executor.spin_once(0.1), lambda: heard)
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.wait(PATIENCE)
-        executor.shutdown()
-        node.destroy_node()
+            log = started.enter_context((tmp_path / file).open('w'))
+            process = subprocess.Popen(
+                [executable, *words], cwd=EXAMPLES / 'field_team', stdout=log, stderr=log
+            )
+            processes.append(process)
+            started.callback(process.wait, PATIENCE)
+            started.callback(process.terminate)
+        operator.until(active, lambda: heard)

@@ -1,7 +1,5 @@
 """What the packages declare is what they import, and what rosdep and pip can install."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from importlib.metadata import version

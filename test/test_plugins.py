@@ -1,7 +1,5 @@
 """Classes of a user's own: by entry point, by module:Class, with settings of their own."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

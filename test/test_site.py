@@ -3,8 +3,6 @@
 The API reference is left out here, as it takes minutes: ./scripts/docs builds it too.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

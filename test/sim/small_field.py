@@ -1,7 +1,5 @@
 """The content of a scenario whose search takes a fraction of a second."""
 
-from __future__ import annotations
-
 from typing import Any
 
 SMALL_FIELD: dict[str, Any] = {

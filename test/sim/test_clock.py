@@ -12,9 +12,8 @@ from nav_msgs.msg import Odometry
 from node_kinds import KINDS
 from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
+from scenario_runs import PATIENCE, Operator, beside
 from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
@@ -22,29 +21,25 @@ from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
 
-# Far more than eleven nodes need to start, for a machine that is busy with something else.
-PATIENCE = 400.0
 SECOND = 1_000_000_000
 JUMPS = tuple(item * SECOND for item in (60, 5, 61, 0, 2))
 
 
-class World(Node):
+class World(Operator):
     """Publishes `/clock`, and odometry of a rover; hears what nodes say."""
 
-    def __init__(self, context):
-        super().__init__('world', context=context)
-        self.executor_used = SingleThreadedExecutor(context=context)
-        self.executor_used.add_node(self)
-        self.clock = self.create_publisher(Clock, '/clock', RELIABLE)
+    def __init__(self, domain):
+        super().__init__(domain)
+        node = self.node
+        self.clock = node.create_publisher(Clock, '/clock', RELIABLE)
         self.stamps = {}
         self.names, self.commands, self.states, self.logs = [], [], [], []
-        self.create_subscription(DiagnosticArray, '/diagnostics', self.take, 10)
-        self.create_subscription(
-            Log, '/rosout', lambda item: self.logs.append(item.msg), LATCHED_ALL
-        )
-        self.create_subscription(TwistStamped, '/rover/cmd_vel', self.commands.append, RELIABLE)
-        self.create_subscription(AgentState, '/rover/state', self.states.append, RELIABLE)
-        self.odometry = self.create_publisher(Odometry, '/rover/odom', RELIABLE)
+        hear = node.create_subscription
+        hear(DiagnosticArray, '/diagnostics', self.take, 10)
+        hear(Log, '/rosout', lambda item: self.logs.append(item.msg), LATCHED_ALL)
+        hear(TwistStamped, '/rover/cmd_vel', self.commands.append, RELIABLE)
+        hear(AgentState, '/rover/state', self.states.append, RELIABLE)
+        self.odometry = node.create_publisher(Odometry, '/rover/odom', RELIABLE)
 
     def take(self, message):
         for status in message.status:
@@ -58,7 +53,7 @@ class World(Node):
         """Take all that comes for a moment: what is said more often is heard late."""
         end = time.monotonic() + 0.02
         while (left := end - time.monotonic()) > 0.0:
-            self.executor_used.spin_once(timeout_sec=left)
+            self.executor.spin_once(timeout_sec=left)
 
     def tell(self, nanoseconds):
         self.clock.publish(Clock(clock=stamp_to_ros(nanoseconds)))
@@ -90,11 +85,9 @@ def moves(command):
 
 
 @pytest.fixture
-def world(context):
-    made = World(context)
-    yield made
-    made.executor_used.shutdown()
-    made.destroy_node()
+def world():
+    with beside(World) as made:
+        yield made
 
 
 @pytest.fixture
@@ -122,11 +115,11 @@ def interrupted(process):
 
 
 def is_active(world, name):
-    client = world.create_client(GetState, f'{name}/get_state')
+    client = world.node.create_client(GetState, f'{name}/get_state')
     world.until(client.service_is_ready, f'{name} has no services')
     future = client.call_async(GetState.Request())
     world.until(future.done, f'{name} does not answer')
-    world.destroy_client(client)
+    world.node.destroy_client(client)
     return future.result().current_state.label == 'active'
 
 
@@ -156,8 +149,8 @@ class Rover:
         self.now = self.step = 100 * SECOND
         self.position = 0.0
         world.until(world.odometry.get_subscription_count)
-        world.until(lambda: world.count_publishers('/rover/cmd_vel'))
-        self.client = ActionClient(world, GoToWaypoint, '/rover/go_to')
+        world.until(lambda: world.node.count_publishers('/rover/cmd_vel'))
+        self.client = ActionClient(world.node, GoToWaypoint, '/rover/go_to')
         world.until(self.client.server_is_ready)
         world.until(self.move)
 
@@ -248,7 +241,7 @@ def test_a_slow_simulated_clock_ends_no_goal_and_leaves_no_robot_moving(world, s
 @pytest.mark.parametrize('clock', [True, False])
 def test_only_a_missing_clock_is_warned_of(world, start, clock):
     if not clock:
-        world.destroy_publisher(world.clock)
+        world.node.destroy_publisher(world.clock)
     process = start('guard')
     # Nothing is published on /clock yet, as before the start of a run.
     world.until(lambda: world.names.count('/rover/guard') >= 6)
@@ -258,7 +251,7 @@ def test_only_a_missing_clock_is_warned_of(world, start, clock):
 def test_a_second_clock_that_says_zero_does_not_start_the_search_again(world, start):
     process = start('planner')
     nodes = {'/planner_node': process}
-    other = world.create_publisher(Clock, '/clock', RELIABLE)
+    other = world.node.create_publisher(Clock, '/clock', RELIABLE)
     world.until(lambda: other.get_subscription_count() and world.clock.get_subscription_count())
 
     def heard():
@@ -266,7 +259,7 @@ def test_a_second_clock_that_says_zero_does_not_start_the_search_again(world, st
         other.publish(Clock())
         world.listen()
         world.tell(SECOND)
-        return any('it has 2 publishers (world), allowed is one' in line for line in world.logs)
+        return any('it has 2 publishers (operator), allowed is one' in line for line in world.logs)
 
     world.seen_at(SECOND, nodes)
     world.until(heard)

@@ -1,7 +1,5 @@
 """Tests of ./scripts/compare: searches that are kept, what is written, and its statistics."""
 
-from __future__ import annotations
-
 import csv
 import json
 import pickle

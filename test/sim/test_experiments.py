@@ -1,7 +1,5 @@
 """Tests of campaigns: kept runs, resumption, workers, tables, the page, bad input."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import math

@@ -1,7 +1,5 @@
 """Tests of the papers' experiments: each in a small version, with all that it writes."""
 
-from __future__ import annotations
-
 import csv
 
 import numpy as np

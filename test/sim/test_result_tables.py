@@ -1,7 +1,5 @@
 """Results that leave the suite: tables of found targets, data frames, the page of the report."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -9,18 +9,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 from maasi_filter.ros.conversions import MarkerBoard
 from maasi_sim.missions import load_mission
 from maasi_sim.run.rviz_view import view_text
-from maasi_sim.scenario.loading import config_folder
 
 
 def topics_of(text):
     displays = yaml.safe_load(text)['Visualization Manager']['Displays']
     return {item['Topic']['Value']: item['Topic'] for item in displays if 'Topic' in item}
-
-
-@pytest.mark.parametrize('name', ['search', 'search_3d'])
-def test_the_files_name_no_robot(name):
-    text = (config_folder() / 'rviz' / f'{name}.rviz').read_text()
-    assert all(topic.count('/') == 1 or 'truth' in topic for topic in topics_of(text))
 
 
 @pytest.mark.parametrize(

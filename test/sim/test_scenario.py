@@ -8,11 +8,7 @@ import yaml
 
 from maasi_sim.missions import load_mission
 from maasi_sim.scenario.layering import ScenarioWarning
-from maasi_sim.scenario.loading import (
-    config_folder,
-    find_scenario,
-    load_scenario,
-)
+from maasi_sim.scenario.loading import config_folder, find_scenario, load_scenario
 from maasi_sim.scenario.schema import ScenarioError
 from maasi_sim.scenario.visibility import never_seen, robot_candidates
 
@@ -93,6 +89,8 @@ def test_types_beside_the_scenario_win_and_are_named_with_their_line(tmp_path, l
         load(changed(('robots.mambo.type', 'slow')))
 
 
+LEAVES = {'at': 5.0, 'robot': 'mambo', 'do': 'leave'}
+GRID, DISCS = 'robots.mambo.candidates', 'environment.obstacles'
 WRONG = [
     # What is changed, the key in the message, and words that it must hold.
     ([('plannr', {'name': 'asi'})], 'plannr', ["did you mean 'planner'", 'known are']),
@@ -119,31 +117,15 @@ WRONG = [
     ([('robots.mambo.start.1', 'x')], 'robots.mambo.start[1]', ["read 'x'", 'a valid number']),
     ([('robots.mambo.start', [0.5, 2.5, 1.0])], 'robots.mambo.start', ['environment.bounds']),
     ([('seed', 2**63)], 'seed', [f'read {2**63}', f'or equal to {2**63 - 1}']),
-    ([('robots.mambo.candidates.grid', [0, 6])], 'robots.mambo.candidates.grid[0]', ['equal to 1']),
-    ([('robots.mambo.candidates.grid', [6, 2.5])], 'robots.mambo.candidates.grid[1]', ['integer']),
-    ([('robots.mambo.candidates.grid', [60, 6])], 'robots.mambo.candidates', ['waypoints inside']),
-    ([('robots.mambo.candidates.spacing', None)], 'robots.mambo.candidates', ['a grid needs it']),
-    (
-        [('robots.mambo.candidates', {'grid': [2, 2, 2], 'spacing': 0.1})],
-        'robots.mambo.candidates.grid',
-        ['allowed in 2D'],
-    ),
-    (
-        [('robots.mambo.candidates', {'ring': 6, 'distance': 0.2})],
-        'robots.mambo.candidates.ring',
-        ['allowed in 2D'],
-    ),
+    ([(f'{GRID}.grid', [0, 6])], f'{GRID}.grid[0]', ['equal to 1']),
+    ([(f'{GRID}.grid', [6, 2.5])], f'{GRID}.grid[1]', ['integer']),
+    ([(f'{GRID}.grid', [60, 6])], GRID, ['waypoints inside']),
+    ([(f'{GRID}.spacing', None)], GRID, ['a grid needs it']),
+    ([(GRID, {'grid': [2, 2, 2], 'spacing': 0.1})], f'{GRID}.grid', ['allowed in 2D']),
+    ([(GRID, {'ring': 6, 'distance': 0.2})], f'{GRID}.ring', ['allowed in 2D']),
     ([('environment.bounds.0', [2.0, 0.0])], 'environment', ['lower < upper']),
-    (
-        [('environment.obstacles', [{'centre': [0.5, 0.6], 'radius': 0.1}])],
-        'robots.mambo.start',
-        ['environment.obstacles[0]'],
-    ),
-    (
-        [('environment.obstacles', [{'centre': [1.5, 1.6, 0.0], 'radius': 0.1}])],
-        'environment.obstacles[0].centre',
-        ['2 coordinates'],
-    ),
+    ([(DISCS, [{'centre': [0.5, 0.6], 'radius': 0.1}])], 'robots.mambo.start', [f'{DISCS}[0]']),
+    ([(DISCS, [{'centre': [1, 1, 0], 'radius': 0.1}])], f'{DISCS}[0].centre', ['2 coordinates']),
     ([('targets.margin', 1.5)], 'targets.margin', ['at most half']),
     ([('targets.count', 500)], 'targets.separation', ['not 500']),
     ([('targets', {'positions': [[0.5, 3.0]]})], 'targets.positions[0]', ['within the bounds']),
@@ -155,14 +137,10 @@ WRONG = [
     ([('robots.mambo.sensor.detection', {'lower': [0.0, 0.0, 0.0], 'upper': [1.0, 1.0]})],
      'robots.mambo.sensor.detection', ['2 or 3 numbers each']),
     ([('robots.mambo.driver', 'ranging_driver')], 'robots.mambo.camera', ['has none']),
-    ([('events', [{'at': 5.0, 'robot': 'mamba', 'do': 'leave'}])], 'events[0].robot', ["'mambo'"]),
-    ([('events', [{'at': 5.0, 'robot': 'mambo', 'do': 'back'}])], 'events[0].do', ['is there']),
-    ([('events', [{'at': 5.0, 'robot': 'mambo', 'do': 'go'}])], 'events[0].do', ['leave, back']),
-    (
-        [('events', [{'at': at, 'robot': 'mambo', 'do': 'leave'} for at in (5.0, 6.0)])],
-        'events[1].do',
-        ['mambo has left'],
-    ),
+    ([('events', [LEAVES | {'robot': 'mamba'}])], 'events[0].robot', ["'mambo'"]),
+    ([('events', [LEAVES | {'do': 'back'}])], 'events[0].do', ['is there']),
+    ([('events', [LEAVES | {'do': 'go'}])], 'events[0].do', ['leave, back']),
+    ([('events', 2 * [LEAVES])], 'events[1].do', ['mambo has left']),
     ([('on_exit', 'restart')], 'on_exit', ['end, respawn']),
     *(
         ([(f'robots.{name}', PLAIN['robots']['mambo'])], f'robots.{name}', [f"'{name}' as a name"])
@@ -387,14 +365,8 @@ def test_waypoints_on_one_side_get_a_warning_that_names_the_unseen_part(load):
 @pytest.mark.parametrize(
     ('changes', 'words'),
     [
-        (
-            [('events', [{'at': 20.0, 'robot': 'mambo', 'do': 'leave'}])],
-            r'events\[0\]\.at: read 20, but the run ends at 5 s',
-        ),
-        (
-            [('robots.mambo.yaw', 180)],
-            r'robots\.mambo\.yaw: read 180, .* degrees are 3\.142',
-        ),
+        ([('events', [LEAVES | {'at': 20.0}])], r'events\[0\]\.at: read 20, .* run ends at 5 s'),
+        ([('robots.mambo.yaw', 180)], r'robots\.mambo\.yaw: read 180, .* degrees are 3\.142'),
         (
             [('robots.other', PLAIN['robots']['mambo'] | {'start': [0.55, 0.5, 1.0]})],
             r'robots\.other\.start: .* 0\.05 m from the start of mambo',

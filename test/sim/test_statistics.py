@@ -1,7 +1,5 @@
 """Tests of means and their confidence intervals, against SciPy and printed tables."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

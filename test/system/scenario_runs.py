@@ -29,10 +29,12 @@ PATIENCE = 400.0
 class Run:
     """A run: its process while it goes on, then its exit code and output, and what it left."""
 
-    def __init__(self, folder, code=None, output='', process=None):
+    code = None
+    output = ''
+
+    def __init__(self, folder, process):
         self.folder = Path(folder)
-        self.code = code
-        self.output = output
+        self.bag = self.folder / 'bag'
         self.process = process
 
     def __enter__(self):
@@ -65,10 +67,6 @@ class Run:
     def report(self):
         return check_report(json.loads((self.folder / 'report.json').read_text()))
 
-    @property
-    def bag(self):
-        return self.folder / 'bag'
-
 
 def command(scenario, folder, *options):
     words = ['-m', 'maasi_sim.run.run_scenario', scenario, '--out', folder, *options]
@@ -85,7 +83,7 @@ def started(words, folder, environment=None, **options):
         text=True,
         **options,
     )
-    return Run(folder, process=process)
+    return Run(folder, process)
 
 
 def start(scenario, folder, *options, environment=None):

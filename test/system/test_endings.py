@@ -60,15 +60,10 @@ sys.exit(run_scenario.main(sys.argv[1:]))
 """
 
 
-@pytest.fixture
-def scripted(tmp_path):
-    (tmp_path / 'scripted.py').write_text(SCRIPTED)
-
-    def write(fault, **changes):
-        planner = {'name': 'scripted:Scripted', 'settings': {'fault': fault}}
-        return write_scenario(tmp_path / 'search.yaml', FAR, planner=planner, **changes)
-
-    return write
+def scripted(folder, fault, **changes):
+    (folder / 'scripted.py').write_text(SCRIPTED)
+    planner = {'name': 'scripted:Scripted', 'settings': {'fault': fault}}
+    return write_scenario(folder / 'search.yaml', FAR, planner=planner, **changes)
 
 
 def test_a_run_without_a_home_folder_in_a_poor_environment(tmp_path, monkeypatch):
@@ -87,9 +82,9 @@ def test_a_run_without_a_home_folder_in_a_poor_environment(tmp_path, monkeypatch
     assert run.processes() == []
 
 
-def test_a_node_that_dies_again_and_again_is_given_up(tmp_path, scripted):
+def test_a_node_that_dies_again_and_again_is_given_up(tmp_path):
     limits = {'time': 60.0, 'restarts': 1}
-    path = scripted('raises', on_exit='respawn', limits=limits)
+    path = scripted(tmp_path, 'raises', on_exit='respawn', limits=limits)
     run = run_scenario(path, tmp_path / 'run', '--lockstep')
     assert run.code == 3, run.output
     assert '/planner_node exited with 1, after 1 restarts' in run.output
@@ -102,15 +97,15 @@ def test_a_node_that_dies_again_and_again_is_given_up(tmp_path, scripted):
     ]
 
 
-def test_a_node_that_never_gets_ready_is_named(tmp_path, scripted):
-    run = run_scenario(scripted('waits', limits={'start': 10.0}), tmp_path / 'run')
+def test_a_node_that_never_gets_ready_is_named(tmp_path):
+    run = run_scenario(scripted(tmp_path, 'waits', limits={'start': 10.0}), tmp_path / 'run')
     assert run.code == 3, run.output
     assert '/planner_node is not ready' in run.output
     assert run.report['end_reason'] == 'not_ready'
 
 
-def test_the_planner_may_end_a_run_before_all_is_found(tmp_path, scripted):
-    run = run_scenario(scripted('ends'), tmp_path / 'run', '--lockstep', '--no-record')
+def test_the_planner_may_end_a_run_before_all_is_found(tmp_path):
+    run = run_scenario(scripted(tmp_path, 'ends'), tmp_path / 'run', '--lockstep', '--no-record')
     assert run.code == 1, run.output
     assert 'ended: a scripted end' in run.output
     assert run.report['end_reason'] == 'planner_done'

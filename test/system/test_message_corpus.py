@@ -6,6 +6,7 @@ import math
 import os
 import signal
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,9 +16,8 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from node_kinds import KINDS
 from rclpy.action import ActionClient
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from scenario_runs import Operator, beside
 from std_srvs.srv import Trigger
 from waiting import PATIENCE, wait_until
 
@@ -157,13 +157,11 @@ def stamped(message, seconds, frame='map'):
     return message
 
 
-class World:
+class World(Operator):
     """All nodes, each in a namespace and process of its own, and who sends them messages."""
 
-    def __init__(self, context, folder):
-        self.node = Node('corpus', context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
+    def __init__(self, folder, domain):
+        super().__init__(domain)
         self.names, self.status, self.heard = {}, {}, {}
         self.publishers, self.clients, self.processes = {}, {}, {}
         for kind in NODES:
@@ -183,6 +181,10 @@ class World:
 
     def until(self, condition, what):
         wait_until(condition, self.turn, what)
+
+    def close(self):
+        stop(list(self.processes.values()), [(signal.SIGKILL, PATIENCE)])
+        super().close()
 
     def turn(self):
         for kind, process in self.processes.items():
@@ -253,12 +255,9 @@ class World:
 
 
 @pytest.fixture
-def world(context, tmp_path):
-    made = World(context, tmp_path)
-    yield made
-    stop(list(made.processes.values()), [(signal.SIGKILL, PATIENCE)])
-    made.executor.shutdown()
-    made.node.destroy_node()
+def world(tmp_path):
+    with beside(partial(World, tmp_path)) as made:
+        yield made
 
 
 def send_corpus(world, topics):

@@ -51,11 +51,6 @@ def run(tmp_path_factory):
         return run.finish()
 
 
-@pytest.fixture(scope='module')
-def address(run):
-    return (run.folder / REPLAY).as_uri()
-
-
 def count(events, kind):
     return sum(event[1] == kind for event in events)
 
@@ -79,7 +74,7 @@ def test_a_browser_saw_the_run_while_it_went_on(run):
 
 
 @needs_chromium
-def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run, address):
+def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run):
     log = read_events(run.folder)
     before = [event for event in log.events if event[0] <= 10.0]
     explored = [event for event in before if event[1] in ('map', 'plan')][-1]
@@ -89,7 +84,7 @@ def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run, address):
     assert expected > 1.0
     with chromium() as shown:
         page = shown.page
-        shown.open(address)
+        shown.open((run.folder / REPLAY).as_uri())
         page.keyboard.press('End')
         shown.settle()
         assert shown.number() == len(run.report['found'])
@@ -136,12 +131,12 @@ def test_a_search_in_space_from_above_is_shaded_by_its_columns(tmp_path):
 
 
 @needs_chromium
-def test_a_click_on_a_decision_shows_its_candidates(run, address):
+def test_a_click_on_a_decision_shows_its_candidates(run):
     decisions = of_topic(run, '/decisions')
     first = decisions[0]['robots'][0]
     with chromium() as shown:
         page = shown.page
-        shown.open(address)
+        shown.open((run.folder / REPLAY).as_uri())
         page.click(f'#log li.decision:has-text("{first["robot"]}: decision 0")')
         shown.settle()
         rows = page.locator('#why tbody tr')
@@ -165,10 +160,10 @@ def test_a_click_on_a_decision_shows_its_candidates(run, address):
 
 
 @needs_chromium
-def test_it_plays_by_the_space_bar_also_on_a_phone_in_space_and_in_the_dark(run, address):
+def test_it_plays_by_the_space_bar_also_on_a_phone_in_space_and_in_the_dark(run):
     with chromium(390, 844, color_scheme='dark', has_touch=True) as shown:
         page = shown.page
-        shown.open(address)
+        shown.open((run.folder / REPLAY).as_uri())
         assert page.get_attribute('html', 'data-theme') == 'dark'
         page.select_option('#speed', '20')
         page.locator('#map').focus()
