@@ -125,10 +125,9 @@ class UnexploredMap:
         self.step = size / cells
         shape = [int(number) + 1 for number in cells]
         self._values = np.ones(shape + [1] * (3 - self.dimension))
-        self._lower = np.zeros(3)
-        self._lower[: self.dimension] = self.bounds[:, 0]
-        self._step = np.zeros(3)
-        self._step[: self.dimension] = self.step
+        height = [0.0] * (3 - self.dimension)
+        self._lower = np.array([*self.bounds[:, 0], *height])
+        self._step = np.array([*self.step, *height])
         grids = np.meshgrid(*self.axes(), indexing='ij')
         # One row for each axis, as kernels read them.
         self._nodes = np.array([grid.ravel() for grid in grids]).T

@@ -101,10 +101,9 @@ class BatchAssembly:
         """Take detections; return a batch of their own if they are late or were not asked for."""
         node = self._node
         number = int(message.batch_id)
-        problem = self._problem(name, message)
         pending = self.pending.get(number)
         expected = pending if pending is not None and name in pending.missing else None
-        problem = problem or self._stamp_problem(name, message, expected)
+        problem = self._problem(name, message, expected)
         if problem is not None:
             node.drop('bad detections', f'{name}/detections.{problem}')
             if expected is not None:
@@ -156,7 +155,9 @@ class BatchAssembly:
         first.failed.update(missing)
         return True
 
-    def _problem(self, name: str, message: DetectionArray) -> str | None:
+    def _problem(
+        self, name: str, message: DetectionArray, expected: PendingBatch | None
+    ) -> str | None:
         """Return why a whole message is refused, or None."""
         if message.robot != name:
             return f'robot: read {message.robot!r}, allowed on this topic is {name!r}'
@@ -167,12 +168,6 @@ class BatchAssembly:
             )
         if message.measurement > batch_id_limit(0):
             return f'measurement: read {message.measurement}, allowed is up to {batch_id_limit(0)}'
-        return None
-
-    def _stamp_problem(
-        self, name: str, message: DetectionArray, expected: PendingBatch | None
-    ) -> str | None:
-        """Return why the stamp of detections is refused, or None."""
         stamp = stamp_from_ros(message.header.stamp)
         last = self.heard[name][2] if name in self.heard else 0
         if expected is not None:

@@ -161,10 +161,6 @@ class Component:
             view.likelihood[k] = float(drawn.mean())
             view.drawn[k] = drawn
 
-    def odds(self, view: View) -> FloatArray:
-        """Return r L_j / (1 - r p_D) of the gated detections."""
-        return self.existence * view.likelihood / (1.0 - self.existence * view.detected)
-
     def update(
         self,
         view: View,

@@ -179,7 +179,8 @@ class PmbFilter(SearchFilter):
         # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
         odds = np.zeros((len(seen), len(scan.terms)))
         for i, (item, view) in enumerate(zip(self.components, seen)):
-            odds[i, view.gated] = item.odds(view)
+            r = item.existence
+            odds[i, view.gated] = r * view.likelihood / (1.0 - r * view.detected)
         other = kappa + scan.intensity
         tallies = [item.labels for item in self.components]
         named = associate_by_identity(member.labels, tallies, odds, other)

@@ -83,10 +83,6 @@ class StampGate:
         self._last = stamp
         return True
 
-    def clear(self) -> None:
-        """Reset: the next stamp is accepted."""
-        self._last = self._suspect = None
-
 
 class Silence:
     """Time since the last message of a source: simulated if the node uses simulated time.

@@ -204,12 +204,9 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
     if problem is not None:
         return problem
     size = len(detection.covariance)
-    if not size:
-        return None
-    if size != dimension * dimension:
+    if size not in (0, dimension * dimension):
         return f'covariance: read {size} numbers, allowed are {dimension * dimension}, or none'
-    matrix = np.array(detection.covariance).reshape(dimension, dimension)
-    if not is_covariance(matrix):
+    if size and not is_covariance(np.reshape(detection.covariance, (dimension, dimension))):
         return (
             f'covariance: read {list(detection.covariance)}, allowed is a symmetric positive '
             'definite matrix of finite numbers'

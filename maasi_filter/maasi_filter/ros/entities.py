@@ -93,6 +93,7 @@ def survive_bad_requests(node: Node, drop: Callable[[str, str], None]) -> None:
 
 # Longest time from the discovery of a subscription to its connection [s].
 _CONNECTION_PATIENCE = 5.0
+_OBSERVERS = ('recorder', 'guard', 'rosbag2_recorder')
 _EVERYWHERE = ('/parameter_events', '/clock', '/diagnostics')
 
 
@@ -119,7 +120,8 @@ def subscribers_connected(
             for info in node.get_subscriptions_info_by_topic(present.topic_name)
             if info.topic_type == f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'
         ]
-        if not set(names) <= set(known) or sum(map(_takes_part, known)) < number:
+        peers = [name for name in known if name not in _OBSERVERS and not name.startswith('_')]
+        if not set(names) <= set(known) or len(peers) < number:
             return False
         known_since.append(time.monotonic())
         # An observer with an incompatible quality of service never connects.
@@ -128,11 +130,6 @@ def subscribers_connected(
         return late or present.get_subscription_count() >= len(known)
 
     return connected
-
-
-def _takes_part(name: str) -> bool:
-    """Return whether a subscribing node is a peer, not a mere observer."""
-    return name not in ('recorder', 'guard', 'rosbag2_recorder') and not name.startswith('_')
 
 
 class Unconnected:

@@ -23,6 +23,7 @@ from maasi_filter.plugins import add_folders
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.parameters import (
     ParameterField,
+    choices,
     flatten,
     parameter_fields,
     parameter_name,
@@ -199,10 +200,11 @@ def _descriptor(item: ParameterField, ranged: bool) -> ParameterDescriptor:
         dynamic_typing=True,
     )
     low, high = item.bound('ge', 'gt'), item.bound('le', 'lt')
-    if not ranged or low is high is None or item.number is None:
+    kinds = [kind for kind in choices(item.info.annotation) if kind is not type(None)]
+    if not ranged or low is high is None or kinds not in ([int], [float]):
         return descriptor
     most = sys.float_info.max
-    if item.number is float:
+    if kinds == [float]:
         ends = -most if low is None else float(low), most if high is None else float(high)
         span = FloatingPointRange(from_value=ends[0], to_value=ends[1])
         descriptor.floating_point_range = [span]

@@ -61,12 +61,6 @@ class ParameterField:
                 parts.append(f'one of {", ".join(item.names())}, or module:Class')
         return ' and '.join(parts)
 
-    @property
-    def number(self) -> type | None:
-        """Type of a single number: float or int."""
-        kinds = [item for item in choices(self.info.annotation) if item is not type(None)]
-        return kinds[0] if len(kinds) == 1 and kinds[0] in (int, float) else None
-
     def bound(self, *kinds: str) -> Any:
         """Return the first bound of these kinds, such as 'ge', or None."""
         found = (getattr(item, kind, None) for item in self.info.metadata for kind in kinds)

@@ -12,7 +12,7 @@ from maasi_planner.buildings.preplanning import plan_mission
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
 from maasi_sim.buildings.mission import CuboidMission
 from maasi_sim.buildings.picture import draw_mission, legend
-from maasi_sim.experiments.experiment import Outcome, Quantity, Results, Run
+from maasi_sim.experiments.experiment import Outcome, Quantity, Results
 from maasi_sim.experiments.statistics import mean_interval
 
 if TYPE_CHECKING:
@@ -137,25 +137,21 @@ def draw_missions(
         panels = [(name, step), (name, None)]
     grid = figure.add_gridspec(1, len(panels))
     for index, (name, until) in enumerate(panels):
-        _draw_run(figure, grid[index], results.runs[name][0], results, until)
-
-
-def _draw_run(figure: Figure, place: Any, run: Run, results: Results, step: int | None) -> None:
-    axes = figure.add_subplot(place, projection='3d')
-    settings = results.case(run.case).settings
-    mission = plan_mission(mission_settings(settings), settings['area'])
-    end = None if step is None else step + 1
-    paths = {
-        name[:-2]: np.stack([run.columns[f'{name[:-2]}_{axis}'] for axis in 'xyz'], axis=1)[:end]
-        for name in run.columns
-        if name.endswith('_x')
-    }
-    shots = {s['cuboid'] for s in run.details['snapshots'] if step is None or s['step'] <= step}
-    plans = None if step is None else run.details['plans'].get(str(step))
-    draw_mission(axes, mission, paths, shots, plans)
-    when = run.columns['step'][-1] if step is None else step
-    axes.set_title(f'{run.case}, step {when:.0f}', fontsize=9)
-    legend(axes)
+        axes = figure.add_subplot(grid[index], projection='3d')
+        run, settings = results.runs[name][0], results.case(name).settings
+        mission = plan_mission(mission_settings(settings), settings['area'])
+        last = run.columns['step'][-1] if until is None else until
+        robots = [column[:-2] for column in run.columns if column.endswith('_x')]
+        end = None if until is None else until + 1
+        paths = {
+            robot: np.stack([run.columns[f'{robot}_{axis}'] for axis in 'xyz'], axis=1)[:end]
+            for robot in robots
+        }
+        shots = {shot['cuboid'] for shot in run.details['snapshots'] if shot['step'] <= last}
+        plans = None if until is None else run.details['plans'].get(str(until))
+        draw_mission(axes, mission, paths, shots, plans)
+        axes.set_title(f'{name}, step {last:.0f}', fontsize=9)
+        legend(axes)
 
 
 def draw_batteries_and_ranges(figure: Figure, results: Results) -> None:
