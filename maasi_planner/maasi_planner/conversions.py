@@ -118,8 +118,7 @@ def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyG
     grid.info.map_load_time = header.stamp
     grid.info.resolution = step[0]
     grid.info.width, grid.info.height = values.shape[:2]
-    corner = exploration.bounds[:, 0] - 0.5 * np.array(step)
-    grid.info.origin.position = point_to_ros(corner)
+    grid.info.origin.position = point_to_ros(exploration.bounds[:, 0] - 0.5 * np.array(step))
     grid.info.origin.orientation.w = 1.0
     cells = np.rint(100.0 * values.reshape(values.shape[:2]).T).astype(np.int8)
     grid.data = array.array('b', cells.tobytes())

@@ -176,9 +176,7 @@ class Coordinator:
         environment = settings.environment
         self.dimension = environment.dimension
         bounds = environment.array()
-        spacing = settings.exploration_spacing
-        if spacing is None:
-            spacing = default_spacing(bounds)
+        spacing = settings.exploration_spacing or default_spacing(bounds)
         self.exploration = UnexploredMap(bounds, spacing)
         self.obstacles = Obstacles.from_settings(environment.obstacles)
         self.clusters: list[Cluster] = []
@@ -212,7 +210,7 @@ class Coordinator:
         self.exploration.values[...] = 1.0
         self.finished = None
         self.planner = make_planner(self.settings.planner.name, self.settings.planner)
-        self.trigger.reset()
+        self.trigger = MeasurementTrigger(self.settings.planner)
         for plan in self.plans.values():
             plan.leave()
 

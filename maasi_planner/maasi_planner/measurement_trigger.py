@@ -40,10 +40,6 @@ class MeasurementTrigger:
         self.settings = settings
         self._means: dict[str, float] = {}
 
-    def reset(self) -> None:
-        """Discard all trajectories."""
-        self._means.clear()
-
     def begin(
         self,
         robot: str,
@@ -57,14 +53,9 @@ class MeasurementTrigger:
         """Store a new trajectory; call at each decision of the robot."""
         if self.settings.measurement == 'periodic' or self.settings.trigger == 'absolute':
             return
-        places = np.asarray(positions, dtype=float)[::period_steps]
-        headings = np.asarray(yaws, dtype=float)[::period_steps]
-        uses = [
-            expected_use(
-                sensor, Pose.from_yaw(place, yaw), clusters, exploration, self.settings.gamma
-            )
-            for place, yaw in zip(places, headings)
-        ]
+        ways = (np.asarray(values, dtype=float)[::period_steps] for values in (positions, yaws))
+        poses, gamma = map(Pose.from_yaw, *ways), self.settings.gamma
+        uses = [expected_use(sensor, pose, clusters, exploration, gamma) for pose in poses]
         self._means[robot] = sum(uses) / len(uses)
 
     def measures(

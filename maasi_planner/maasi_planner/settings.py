@@ -310,8 +310,7 @@ class PlannerSettings(Settings):
 
     def renamed(self, name: str) -> PlannerSettings:
         """Return the settings of another planner, with the same numbers."""
-        values = {key: getattr(self, key) for key in type(self).model_fields}
-        return PlannerSettings.model_validate({**values, 'name': name, 'settings': None})
+        return PlannerSettings.model_validate({**dict(self), 'name': name, 'settings': None})
 
     def weights(self) -> Weights:
         """Return the weights of the objective."""

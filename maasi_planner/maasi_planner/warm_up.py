@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
@@ -16,8 +14,6 @@ from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import make_planner
 from maasi_planner.settings import MotionSettings, PlannerSettings
 from maasi_planner.team import RobotView, TeamView
-
-Model = Literal['constant_speed', 'mambo', 'unicycle', 'quadrotor']
 
 
 def _decide(team: TeamView) -> None:
@@ -44,11 +40,7 @@ def _decide(team: TeamView) -> None:
 def warm_up() -> None:
     """Run small decisions of every kind, so that the first real one does not compile."""
     obstacles = Obstacles(np.array([[1.0, 1.0, 0.0]]), np.array([0.1]), np.array([False]))
-    pairs: tuple[tuple[int, tuple[Model, Model]], ...] = (
-        (2, ('mambo', 'unicycle')),
-        (3, ('constant_speed', 'quadrotor')),
-    )
-    for dimension, models in pairs:
+    for dimension, models in ((2, ('mambo', 'unicycle')), (3, ('constant_speed', 'quadrotor'))):
         exploration = UnexploredMap(np.array([[0.0, 2.0]] * dimension), 0.25)
         clusters = [Cluster(np.full(dimension, 0.6), 0.01 * np.eye(dimension), 0.1, 0.5)]
         noise = np.diag([0.02, 0.05, 0.05][:dimension]) ** 2

@@ -36,7 +36,6 @@ MODELS = {
 
 
 def test_lqr_is_that_of_the_whole_model():
-    """The gains by chain are those of the 12-state discrete LQR."""
     settings = MotionSettings(
         model='mambo',
         state_weights=[2, 3, 4, 1, 5, 1, 1, 2, 1, 1, 1, 3],
@@ -75,7 +74,6 @@ def test_command_is_the_leading_set_point():
 
 @pytest.mark.parametrize('name', MODELS)
 def test_simulated_is_predicted(name):
-    """Stepping the body under the controller's commands follows the prediction."""
     motion = make_motion(MODELS[name])
     rng = np.random.default_rng(3)
     state = RobotState.at_rest([1.0, 0.5, 1.0], 0.4)
@@ -100,7 +98,6 @@ def test_simulated_is_predicted(name):
 
 @pytest.mark.parametrize('name', MODELS)
 def test_every_waypoint_is_reached(name):
-    """From any place and heading, everywhere in the environment."""
     settings = MODELS[name]
     motion = make_motion(settings)
     axis = np.linspace(-0.3, 2.4, 8)
@@ -128,7 +125,6 @@ FAST = {
 
 @pytest.mark.parametrize('settings', [*MODELS.values(), *FAST.values()], ids=[*MODELS, *FAST])
 def test_limits_hold_under_any_command(settings):
-    """Speed, acceleration, tilt and turn rate stay within the settings whatever is asked for."""
     body = make_motion(settings).body(RobotState.at_rest([0.0, 0.0, 1.0]))
     rng = np.random.default_rng(11)
     fast = settings.speed > 1.0

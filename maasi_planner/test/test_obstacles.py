@@ -44,7 +44,6 @@ def random_spheres(rng):
 
 
 def least_room(motion, prediction):
-    """Return the least distance of a trajectory from an obstacle."""
     obstacles = motion.keep_out.obstacles
     offsets = prediction.positions.reshape(-1, 1, 3) - obstacles.centres
     offsets[:, ~obstacles.spheres, 2] = 0.0
@@ -52,7 +51,6 @@ def least_room(motion, prediction):
 
 
 def check_way(motion, state, goals, step, room):
-    """Assert that all goals are reached with room beside all obstacles."""
     prediction = motion.predict(state, goals, step)
     assert prediction.reached.all()
     assert least_room(motion, prediction) >= room
@@ -77,17 +75,12 @@ def check_random(settings, obstacles, seed, number, bounds, height, radius):
         check_way(motion, state, goals, 0.05 if flat else 0.1, radius)
 
 
-@pytest.mark.parametrize('settings', ROBOTS, ids=lambda settings: settings['model'])
+@pytest.mark.parametrize('settings', [*ROBOTS, WINDOW])
 def test_no_robot_enters_an_obstacle(settings):
-    """1,000 random scenarios in all, 250 of each kind of robot."""
     height = 0.0 if settings['model'] == 'unicycle' else 1.0
-    for seed in range(250):
-        check_random(settings, random_discs, seed, 3, (-0.2, 2.3), height, 0.1)
-
-
-def test_dynamic_window_enters_no_obstacle():
-    for seed in range(40):
-        check_random(WINDOW, random_discs, seed, 1, (-0.2, 2.3), 0.0, 0.1)
+    seeds, goals = (40, 1) if settings is WINDOW else (250, 3)
+    for seed in range(seeds):
+        check_random(settings, random_discs, seed, goals, (-0.2, 2.3), height, 0.1)
 
 
 @pytest.mark.parametrize('model', ['constant_speed', 'mambo'])

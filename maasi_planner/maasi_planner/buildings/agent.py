@@ -15,7 +15,7 @@ from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.preplanning import CoveragePlan, detection_probability
 from maasi_planner.buildings.problem import Plan, PlanSolver, Problem
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
-from maasi_planner.buildings.sharing import Broadcast, assigned, nearest, rewards
+from maasi_planner.buildings.sharing import Broadcast, assigned, rewards
 from maasi_planner.buildings.way_finder import WayFinder
 
 # Tolerances of arrival at the station [m, m/s].
@@ -207,21 +207,17 @@ class SearchAgent:
 
     def _aim(self, heard: Sequence[Broadcast]) -> FloatArray:
         """Return x*: the cuboid nearest to its predicted position, or the assigned one (10)."""
-        unvisited = np.flatnonzero(~self.visited)
-        if heard:
-            predicted = self.settings.assignment == 'predicted'
-            places = {m.robot: m.predicted if predicted else m.position for m in heard}
-            places[self.name] = self._predicted() if predicted else self.position
-            order = sorted(places)
-            chosen = assigned(
-                np.stack([places[name] for name in order]),
-                order.index(self.name),
-                self.mission.centres,
-                unvisited,
-            )
-        else:
-            chosen = nearest(self._predicted(), self.mission.centres, unvisited)
-        return self.position if chosen is None else self.mission.centres[chosen]
+        centres, unvisited = self.mission.centres, np.flatnonzero(~self.visited)
+        if not heard and len(unvisited):
+            offset = centres[unvisited] - self._predicted()
+            return centres[unvisited[np.argmin((offset * offset).sum(axis=1))]]
+        predicted = self.settings.assignment == 'predicted'
+        places = {m.robot: m.predicted if predicted else m.position for m in heard}
+        places[self.name] = self._predicted() if predicted else self.position
+        order = sorted(places)
+        stacked = np.stack([places[name] for name in order])
+        chosen = assigned(stacked, order.index(self.name), centres, unvisited)
+        return self.position if chosen is None else centres[chosen]
 
     def _predicted(self) -> FloatArray:
         """Return x at t + tau* + 1 of the previous plan; the present position without a plan."""

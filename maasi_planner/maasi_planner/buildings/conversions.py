@@ -30,7 +30,7 @@ _LARGEST_HAZARD = 1e9
 
 def vector_to_ros(values: FloatArray) -> Vector3:
     """Return a vector (3,)."""
-    x, y, z = (float(value) for value in values)
+    x, y, z = map(float, values)
     return Vector3(x=x, y=y, z=z)
 
 

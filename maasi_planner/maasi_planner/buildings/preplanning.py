@@ -216,9 +216,7 @@ def _usable(
             return box, 'a cuboid is above the ceiling'
         return box, 'a cuboid is outside the area'
     for solid in solids:
-        wall = np.stack(
-            [solid[:, 0] - settings.clearance, solid[:, 1] + settings.clearance], axis=1
-        )
+        wall = solid + np.array([-settings.clearance, settings.clearance])
         if ((box[:, 0] >= wall[:, 1]) | (box[:, 1] <= wall[:, 0])).any():
             continue
         # Keep the largest part beside the solid.

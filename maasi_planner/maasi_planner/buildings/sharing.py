@@ -35,14 +35,6 @@ class Broadcast:
     predicted: FloatArray
 
 
-def nearest(place: FloatArray, centres: FloatArray, unvisited: IntArray) -> int | None:
-    """Return the unvisited cuboid nearest to a position (3,), None if none is left."""
-    if not len(unvisited):
-        return None
-    offset = centres[unvisited] - place
-    return int(unvisited[np.argmin((offset * offset).sum(axis=1))])
-
-
 def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntArray) -> int | None:
     """Return the cuboid assigned to robot `own` among robots at positions (m, 3): (10).
 
