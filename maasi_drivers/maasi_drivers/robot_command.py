@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import signal
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -61,18 +62,6 @@ def _metres(text: str) -> float:
     return value
 
 
-def describe(state: AgentState) -> str:
-    """Return a state in words."""
-    position = state.pose.pose.position
-    battery = f'{state.battery:.0%}' if state.battery >= 0.0 else 'unknown'
-    reason = f': {state.reason}' if state.reason else ''
-    return (
-        f'{state.robot}: {_STATUS.get(state.goal_status, "unknown")}{reason}; at '
-        f'({position.x:.3f}, {position.y:.3f}, {position.z:.3f}) m in {state.header.frame_id}, '
-        f'battery {battery}'
-    )
-
-
 class _User:
     """A node that waits for one robot."""
 
@@ -82,11 +71,8 @@ class _User:
         self._top = '/' + options.robot.strip('/')
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._interrupted = False
-        signal.signal(signal.SIGINT, self._interrupt)
-
-    def _interrupt(self, *_: object) -> None:
-        self._interrupted = True
+        self._interrupted = threading.Event()
+        signal.signal(signal.SIGINT, lambda *_: self._interrupted.set())
 
     def _wait(
         self, condition: Callable[[], object], timeout: float = math.inf, *, patient: bool = False
@@ -94,7 +80,7 @@ class _User:
         """Return whether a condition came true before the timeout, and, if not patient, Ctrl-C."""
         end = time.monotonic() + timeout
         while not condition():
-            if time.monotonic() > end or (self._interrupted and not patient):
+            if time.monotonic() > end or (self._interrupted.is_set() and not patient):
                 return False
             self._executor.spin_once(timeout_sec=0.05)
         return True
@@ -103,13 +89,22 @@ class _User:
         """Wait for something; end the command where it does not come."""
         if self._wait(condition, self._options.timeout):
             return
-        if not self._interrupted:
-            print(f'{what} for {self._options.timeout:g} s: is its driver there?')
-        raise SystemExit(INTERRUPTED if self._interrupted else ABSENT)
+        if self._interrupted.is_set():
+            raise SystemExit(INTERRUPTED)
+        print(f'{what} for {self._options.timeout:g} s: is its driver there?')
+        raise SystemExit(ABSENT)
 
     def show(self) -> int:
         """Print the next state."""
-        print(describe(self._next_state()))
+        state = self._next_state()
+        position = state.pose.pose.position
+        battery = f'{state.battery:.0%}' if state.battery >= 0.0 else 'unknown'
+        reason = f': {state.reason}' if state.reason else ''
+        print(
+            f'{state.robot}: {_STATUS.get(state.goal_status, "unknown")}{reason}; at '
+            f'({position.x:.3f}, {position.y:.3f}, {position.z:.3f}) m in '
+            f'{state.header.frame_id}, battery {battery}'
+        )
         return DONE
 
     def _next_state(self) -> AgentState:

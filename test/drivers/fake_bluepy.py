@@ -13,7 +13,6 @@ import threading
 import time
 from functools import partial
 from types import ModuleType, SimpleNamespace
-from typing import ClassVar
 
 from maasi_sim.emulators.mambo.fake_mambo import ALL_STATES, obey
 
@@ -32,29 +31,53 @@ def part(name, **methods):
     return SimpleNamespace(uuid=f'9a66{name}-0800-9191-11e4-012d1540cb8e', **methods)
 
 
-class Peripheral:
-    """The radio, and a drone in real time at its other end: `firmware`, set by `BluetoothMambo`.
+class BluetoothMambo:
+    """A fake Mambo in real time, with the radio that pyparrot reaches it by.
 
     While `lost` nothing gets through; a write without response then still succeeds. `heard` has
     channel and command of what came through.
     """
 
-    firmware = None
-    lost = False
-    heard: ClassVar[list] = []
+    address = 'e0:14:d0:63:3d:d0'
 
-    def __init__(self):
+    def __init__(self, monkeypatch, firmware):
+        # Without it, as it will be for the next test.
+        from pyparrot import Minidrone
+
+        self.firmware = firmware
+        self.lost, self.heard = False, []
         self._waiting = queue.Queue()
         self._lock = threading.Lock()
         self._sequence = 0
         self._said = None
         self._ended = threading.Event()
+        btle = ModuleType('bluepy.btle')
+        btle.Peripheral, btle.UUID, btle.DefaultDelegate = None, str, object
+        btle.BTLEException = type('BTLEException', (Exception,), {})
+        monkeypatch.setitem(sys.modules, 'bluepy', ModuleType('bluepy'))
+        monkeypatch.setitem(sys.modules, 'bluepy.btle', btle)
+        from pyparrot.networking import bleConnection
+
+        monkeypatch.setattr(bleConnection, 'Peripheral', lambda: self)
+        monkeypatch.setattr(Minidrone, 'BLEAvailable', True)
+        monkeypatch.setattr(Minidrone, 'BLEConnection', bleConnection.BLEConnection, raising=False)
+
+    @property
+    def state(self):
+        return self.firmware.state
+
+    def cut(self, cut=True):
+        self.lost = cut
+
+    # ---- what pyparrot calls -----------------------------------------------------------------
 
     def connect(self, address, kind):
         threading.Thread(target=self._live, daemon=True).start()
 
     def disconnect(self):
         self._ended.set()
+
+    close = disconnect
 
     def getServices(self):
         return [
@@ -64,7 +87,7 @@ class Peripheral:
 
     def _characteristic(self, name):
         handle = _HANDLES[name]
-        return part(name, handle=handle, getHandle=lambda: handle, write=partial(self.hear, name))
+        return part(name, handle=handle, getHandle=lambda: handle, write=partial(self._hear, name))
 
     def writeCharacteristic(self, handle, data):
         pass
@@ -103,7 +126,7 @@ class Peripheral:
             self._sequence = (self._sequence + 1) % 256
             self._waiting.put((name, struct.pack('<BB', 4, self._sequence) + content))
 
-    def hear(self, name, data):
+    def _hear(self, name, data):
         if self.lost:
             return
         with self._lock:
@@ -118,40 +141,3 @@ class Peripheral:
                 obey(self.firmware, number, data[6:])
             if name == 'fa0b':
                 self._notify('fb1b', data[1:2])
-
-
-class BluetoothMambo:
-    """A fake Mambo that pyparrot reaches by Bluetooth."""
-
-    address = 'e0:14:d0:63:3d:d0'
-
-    def __init__(self, monkeypatch, firmware):
-        # Without it, as it will be for the next test.
-        from pyparrot import Minidrone
-
-        self.firmware = firmware
-        btle = ModuleType('bluepy.btle')
-        btle.Peripheral, btle.UUID, btle.DefaultDelegate = Peripheral, str, object
-        btle.BTLEException = type('BTLEException', (Exception,), {})
-        monkeypatch.setitem(sys.modules, 'bluepy', ModuleType('bluepy'))
-        monkeypatch.setitem(sys.modules, 'bluepy.btle', btle)
-        for name, value in (('firmware', firmware), ('lost', False), ('heard', [])):
-            monkeypatch.setattr(Peripheral, name, value)
-        from pyparrot.networking import bleConnection
-
-        monkeypatch.setattr(Minidrone, 'BLEAvailable', True)
-        monkeypatch.setattr(Minidrone, 'BLEConnection', bleConnection.BLEConnection, raising=False)
-
-    @property
-    def state(self):
-        return self.firmware.state
-
-    @property
-    def heard(self):
-        return Peripheral.heard
-
-    def cut(self, cut=True):
-        Peripheral.lost = cut
-
-    def close(self):
-        pass

@@ -107,6 +107,7 @@ def test_a_velocity_that_cannot_be_stopped_before_the_geofence_is_not_flown(end,
 @pytest.mark.parametrize('drag', [0.3, 3.0])
 def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
     flight = Flight(drag=drag, delay=0.2, pose=pose)
+    flight.sent = 'true' if pose == 'events' else 'none'
 
     def step():
         if flight.where[2] > 0.05:
@@ -122,6 +123,10 @@ def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
         step()
     assert flight.pilot.phase is Phase.FLYING
     assert max(step() for _ in range(100)) < 0.03
+    # Without a pose it hovers.
+    flight.sent, began = 'none', flight.time
+    flight.until(lambda: flight.pilot.problem.startswith('no position'))
+    assert flight.time - began <= AT_MOST
 
 
 # ---- safety ----------------------------------------------------------------------------------
@@ -269,22 +274,6 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     assert flight.pilot.permit(flight.time) == ''
     flight.up()
     assert flight.firmware.take_offs == 2
-
-
-def test_it_flies_by_the_pose_of_another_system():
-    flight = Flight(pose='pose')
-    flight.sent = 'none'
-
-    def tell():
-        flight.pilot.take_pose(flight.time, flight.firmware.state)
-        return flight.pilot.phase is Phase.FLYING
-
-    flight.until(tell)
-    flight.goal = np.array([2.0, 0.5, 1.0])
-    flight.until(lambda: tell() and flight.left < 0.05)
-    began = flight.time
-    flight.until(lambda: flight.pilot.problem.startswith('no position'))
-    assert flight.time - began <= AT_MOST
 
 
 @pytest.mark.parametrize('phase', [Phase.TAKING_OFF, Phase.CLIMBING])

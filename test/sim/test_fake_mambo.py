@@ -181,7 +181,7 @@ def test_position_events_that_are_no_numbers_are_left_out(pair):
         link.steer(math.nan, 0.0, 0.0, 0.0)
 
 
-def test_that_of_a_scenario_stands_below_its_start_and_flies_as_its_link_says():
+def test_that_of_a_scenario_stands_below_its_start_and_flies_to_its_height():
     scenario = load_scenario('mambo_turtlebot_wifi')
     robot = scenario.robots['mambo']
     asked = robot.mambo.model_copy(update={'address': '127.0.0.9'})
@@ -190,21 +190,16 @@ def test_that_of_a_scenario_stands_below_its_start_and_flies_as_its_link_says():
     # An address that was asked for stays.
     assert robots['other'].mambo == asked
     drone = linked_robot('mambo', robots['mambo'], 1)
-    link = MamboLink('wifi', robots['mambo'].mambo.address, robots['mambo'].mambo.port)
-    link.connect()
     try:
-        wait_until(lambda: link.connected)
         assert_allclose(drone.state.pose.position, [1.9, 1.9, 0.0])
         assert not drone.obeys
-        link.take_off()
-        wait_until(lambda: link.flying_state == 'hovering')
+        drone.firmware.take_off()
+        wait_until(lambda: drone.firmware.flying_state == FlyingState.HOVERING)
         assert drone.obeys
         assert_allclose(drone.state.pose.position, [1.9, 1.9, 0.8], atol=0.15)
-        link.land()
-        wait_until(lambda: link.flying_state == 'landed')
+        drone.firmware.land()
         assert not drone.obeys
     finally:
-        link.close()
         drone.close()
 
 

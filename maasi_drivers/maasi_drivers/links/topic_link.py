@@ -72,11 +72,6 @@ class CommandPublisher:
         if self.publisher is not None:
             self.publisher.publish(command if self._kind is TwistStamped else command.twist)
 
-    def wait(self, seconds: float) -> None:
-        """Wait until all commands have arrived, for at most so many seconds."""
-        if self.publisher is not None:
-            self.publisher.wait_for_all_acked(Duration(nanoseconds=round(seconds * 1e9)))
-
     def destroy(self) -> None:
         """Destroy the publisher."""
         if self.publisher is not None:
@@ -86,7 +81,7 @@ class CommandPublisher:
 
 _ZERO = (0.0, 0.0, 0.0, 0.0)
 # At the end: commands, and longest wait until the last one has arrived [s].
-_STOP_COMMANDS, _STOP_TIME = 3, 0.3
+_STOP_COMMANDS, _STOP_TIME = 3, Duration(seconds=0.3)
 # Polls from one look for the guard to the next.
 _GUARD_POLLS = 5
 
@@ -150,7 +145,8 @@ class TopicLink(RobotLink):
             return
         for _ in range(_STOP_COMMANDS):
             self._publish(_ZERO)
-        self._publisher.wait(_STOP_TIME)
+        if self._publisher.publisher is not None:
+            self._publisher.publisher.wait_for_all_acked(_STOP_TIME)
 
     def poll(self) -> None:
         """Follow the type that the robot subscribes to; warn where nothing does."""

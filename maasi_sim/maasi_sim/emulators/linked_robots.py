@@ -15,7 +15,6 @@ from maasi_sim.world.world import noise_stream
 
 # Hover height of a Mambo after take-off relative to the height at which the search starts [1].
 _TAKE_OFF_SHARE = 0.8
-_LOOPBACK = '127.'
 
 
 class LinkedRobot(Leader, Protocol):
@@ -65,7 +64,7 @@ def with_addresses(scenario: Scenario) -> Scenario:
     robots = dict(scenario.robots)
     for name, robot in scenario.robots.items():
         mambo = robot.mambo
-        if robot.link == 'mambo_wifi' and mambo and not mambo.address.startswith(_LOOPBACK):
+        if robot.link == 'mambo_wifi' and mambo and not mambo.address.startswith('127.'):
             mambo = mambo.model_copy(update={'address': free_address(), 'port': free_port()})
             robots[name] = robot.model_copy(update={'mambo': mambo})
     return scenario.model_copy(update={'robots': robots})

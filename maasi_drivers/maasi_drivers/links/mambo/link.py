@@ -37,7 +37,6 @@ CALLER_TIMEOUT = 0.5
 _REPEAT = 0.7
 # Age of what was heard last after which a reported landing does not count [s].
 _OUTDATED = 1.0
-_RETRIES = 3
 # Over Bluetooth: silence after which a command is sent that the drone has to acknowledge [s].
 _PROBE_PERIOD = 0.3
 # From one try to connect to the next [s].
@@ -299,7 +298,7 @@ class MamboLink:
     def _try_to_connect(self, drone: Any) -> str:
         """Return why there is no connection, or nothing."""
         try:
-            return '' if drone.connect(num_retries=_RETRIES) else 'it refused the connection'
+            return '' if drone.connect(num_retries=3) else 'it refused the connection'
         except Exception as error:
             # pyparrot raises whatever comes up below it.
             return str(error) or type(error).__name__

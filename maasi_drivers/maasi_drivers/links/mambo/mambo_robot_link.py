@@ -29,8 +29,6 @@ POLL_PERIOD = 0.05
 _LANDING_TIME, _LANDING_PERIOD = 1.0, 0.02
 # Share of a new difference of positions in the velocity.
 _SMOOTHING = 0.5
-# Kind of fault.
-_FLIGHT = 'flight'
 _RISING = (Phase.TAKING_OFF, Phase.CLIMBING)
 
 
@@ -179,7 +177,7 @@ class MamboRobotLink(RobotLink):
             self.driver.get_logger().info(phase.value + why)
         # While it takes off, a goal that it has already is kept.
         if not (problem and phase in _RISING and self.driver.follower.current is not None):
-            self.driver.judge(_FLIGHT, problem, 'flying: goals are accepted')
+            self.driver.judge('flight', problem, 'flying: goals are accepted')
 
     def observe(self, placed: StampedPose) -> None:
         """Hand a pose of another system to the pilot."""

@@ -32,10 +32,8 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.lifecycle_node import SettingsError
 
-MAGIC = b'MSWO'
-VERSION = 1
+# Magic and version, kind, nothing, sequence, position and yaw.
 _ORDER = struct.Struct('<4sBBHI4f')
-_CHECKSUM = struct.Struct('<I')
 
 
 class OrderKind(IntEnum):
@@ -46,24 +44,22 @@ class OrderKind(IntEnum):
     GO = 2
 
 
-def encode(sequence: int, kind: OrderKind, position: FloatArray, yaw: float = 0.0) -> bytes:
+def encode(sequence: int, kind: OrderKind, position: FloatArray) -> bytes:
     """Return an order as a datagram.
 
-    Position (3,) [m] and yaw [rad] count from where it took off, in the axes of its heading then:
-    forward, left, up, anticlockwise.
+    The position (3,) [m] is from where it took off, in the axes of its heading then: forward, left,
+    up; the heading stays.
     """
-    if not np.isfinite([*position, yaw]).all():
-        raise ValueError(f'order: got {position}, {yaw}, allowed are finite numbers [m, rad]')
-    data = _ORDER.pack(MAGIC, VERSION, kind, 0, sequence % 2**32, *position, yaw)
-    return data + _CHECKSUM.pack(zlib.crc32(data))
+    if not np.isfinite(position).all():
+        raise ValueError(f'order: got {position}, allowed are finite numbers [m]')
+    data = _ORDER.pack(b'MSWO', 1, kind, 0, sequence % 2**32, *position, 0.0)
+    return data + struct.pack('<I', zlib.crc32(data))
 
 
 # Between two orders [s]; without them the program on board hovers, then lands.
 _PERIOD = 0.1
 # At the end: orders to land, and the time between them [s].
 _LAST_ORDERS, _LAST_PERIOD = 5, 0.05
-# Kind of fault.
-_FLIGHT = 'flight'
 
 
 class OnboardLink(RobotLink):
@@ -202,7 +198,7 @@ class OnboardLink(RobotLink):
         place = compose(
             self._origin, Pose.from_rpy(pose.position, (pose.roll, pose.pitch, pose.yaw))
         )
-        driver.judge(_FLIGHT, self._next_order(pose, place), 'flying: goals are accepted')
+        driver.judge('flight', self._next_order(pose, place), 'flying: goals are accepted')
         placed = self._speed.place(stamp, place)
         driver.take_pose(replace(placed, covariance=self._mambo.pose_covariance()))
 

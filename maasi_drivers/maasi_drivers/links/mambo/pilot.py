@@ -257,7 +257,12 @@ class MamboPilot:
         if link.error:
             self._ended = link.error
             return self._ended
-        lost = self._check_pose(now)
+        recent = now - self._placed_at <= self.settings.link_timeout
+        self._stuck |= recent and now - self._moved_at > self.settings.link_timeout
+        if not self._missing(now):
+            self._lost_since = None
+        elif self._lost_since is None:
+            self._lost_since = now
         if self.phase is Phase.GROUND:
             return self._stand(now)
         if self.phase is Phase.LANDING:
@@ -268,7 +273,7 @@ class MamboPilot:
             return f'{self._ended or "landed: its goal was cancelled"}, {UNTIL_ARM}'
         if link.flying_state == 'emergency':
             return self._emergency()
-        return self._stay_up(now, lost)
+        return self._stay_up(now)
 
     def _emergency(self) -> str:
         self._ended = 'the Mambo is in emergency: restart it'
@@ -305,14 +310,15 @@ class MamboPilot:
         self.phase, self._since = phase, now
         return phase.value
 
-    def _stay_up(self, now: float, lost: float | None) -> str:
+    def _stay_up(self, now: float) -> str:
         """Continue a flight, or land it."""
         if low := self._low_battery():
             return self.end(low)
-        if lost is not None:
+        if self._lost_since is not None:
             self.hover()
             text = self._missing(now)
-            return self.end(text) if lost >= self.settings.land_after else text
+            too_long = now - self._lost_since >= self.settings.land_after
+            return self.end(text) if too_long else text
         flying_state, timeout = self.link.flying_state, self.settings.take_off_timeout
         late = now - self._since > timeout
         if self.phase is Phase.TAKING_OFF:
@@ -361,17 +367,6 @@ class MamboPilot:
             if age > self.settings.link_timeout:
                 return f'{text} for {f"{age:.1f} s" if math.isfinite(age) else "all the time"}'
         return ''
-
-    def _check_pose(self, now: float) -> float | None:
-        """Return for how long one of them has been missing, beyond the timeout [s]."""
-        timeout = self.settings.link_timeout
-        self._stuck |= now - self._moved_at > timeout and now - self._placed_at <= timeout
-        if not self._missing(now):
-            self._lost_since = None
-            return None
-        if self._lost_since is None:
-            self._lost_since = now
-        return now - self._lost_since
 
     def _is_silent(self, now: float) -> bool:
         return now - self.link.heard_at > self.settings.link_timeout

@@ -68,7 +68,9 @@ class Autopilot:
         self._settings = settings
         self._sender = sender
         self._log = log
-        self._received_at = self._heartbeat_at = self._requested_at = self._setpoint_at = -math.inf
+        self._received_at = self._heartbeat_at = self._setpoint_at = -math.inf
+        #: Time of the last request for messages.
+        self.requested_at = -math.inf
 
     @property
     def in_external_mode(self) -> bool:
@@ -175,20 +177,15 @@ class Autopilot:
         assert self.firmware is not None
         self.failsafes = FailsafeCheck(self.firmware, self._settings, self._sender, self._log)
 
-    def forget_requests(self) -> None:
-        """Discard open commands, and request messages anew: a restart resets their rates."""
-        self.commands.clear()
-        self._requested_at = -math.inf
-
     def request_data(self, now: float) -> None:
         """Request parameters and messages that are missing."""
         if self.failsafes is not None:
             self.failsafes.read(now)
-        silence = now - max(self.estimate.silent_since, self._requested_at)
-        known = self._requested_at > -math.inf
+        silence = now - max(self.estimate.silent_since, self.requested_at)
+        known = self.requested_at > -math.inf
         if self.commands or self.lost or (known and silence < _STREAM_PATIENCE):
             return
-        self._requested_at = now
+        self.requested_at = now
         for name, rate in _MESSAGES.items():
             number = getattr(mavlink, f'MAVLINK_MSG_ID_{name}')
             interval = 1e6 / (rate or self._settings.position_rate)

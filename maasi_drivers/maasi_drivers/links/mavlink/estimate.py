@@ -52,7 +52,6 @@ def swap_orientation(quaternion: ArrayLike) -> FloatArray:
 
 # Autopilots that were switched on within this time of each other are the same one [s].
 _SAME_BOOT = 5.0
-_HOST_BOOT = Path('/proc/sys/kernel/random/boot_id')
 
 
 class FlightOrigin:
@@ -124,7 +123,7 @@ class FlightOrigin:
 
 def _host_boot() -> str:
     """Return what tells one start of this computer from another: the steady clock begins there."""
-    return _HOST_BOOT.read_text().strip()
+    return Path('/proc/sys/kernel/random/boot_id').read_text().strip()
 
 
 # A time since boot that is smaller by more than this means a restart [ms].

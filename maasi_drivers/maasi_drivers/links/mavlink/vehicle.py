@@ -275,7 +275,9 @@ class Vehicle:
         """Begin anew with an autopilot that was restarted: its local frame is another one."""
         text = 'the autopilot has restarted'
         self.log.add(WARNING, text)
-        self._autopilot.forget_requests()
+        self._autopilot.commands.clear()
+        # It has reset the rates of its messages.
+        self._autopilot.requested_at = -math.inf
         self._permission.end()
         if self.phase in (Phase.CONNECTING, Phase.PREPARING, Phase.WAITING):
             self._autopilot.read_failsafes()

@@ -177,11 +177,18 @@ class FakeAutopilot:
             if not body.grounded:
                 body.drift(dt)
             return
-        if body.grounded and self._rising_to is None and not self._lifts_off():
+        setpoint = self._setpoint
+        # A setpoint over the ground takes it off, as PX4 does.
+        lifts_off = (
+            self.firmware.rise == 'setpoint'
+            and setpoint is not None
+            and self.mode == self.firmware.external
+            and setpoint[0][2] > 0.1
+        )
+        if body.grounded and self._rising_to is None and not lifts_off:
             if self.now - self._armed_at > _DISARM_DELAY:
                 self.disarm('Disarming motors')
             return
-        setpoint = self._setpoint
         if self.mode == self.firmware.land:
             body.fly(np.array([0.0, 0.0, _SURFACING if body.submarine else -_LANDING]), dt)
             if body.grounded:
@@ -195,15 +202,6 @@ class FakeAutopilot:
             body.fly(np.zeros(3), dt)
         else:
             body.fly_to(*setpoint, dt)
-
-    def _lifts_off(self) -> bool:
-        """Return whether a setpoint over the ground takes it off, as PX4 does."""
-        return (
-            self.firmware.rise == 'setpoint'
-            and self._setpoint is not None
-            and self.mode == self.firmware.external
-            and bool(self._setpoint[0][2] > 0.1)
-        )
 
     def disarm(self, text: str) -> None:
         """Turn the motors off, and say why."""
