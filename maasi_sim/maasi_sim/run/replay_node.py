@@ -24,7 +24,6 @@ from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
 from maasi_msgs.msg import (
     DetectionArray,
     FilterUpdate,
-    FoundTarget,
     FoundTargetArray,
     LockstepDone,
     MeasurementBatch,
@@ -74,9 +73,8 @@ class Recording:
     facts: dict[str, Any]
     #: Of several filters in the order of steps and names.
     batches: list[Batch] = field(default_factory=list)
-    #: By namespace of the filter: found targets at the end, and the batch that they are of.
-    found: dict[str, list[FoundTarget]] = field(default_factory=dict)
-    found_batch: dict[str, int] = field(default_factory=dict)
+    #: By namespace of the filter: found targets at the end.
+    found: dict[str, FoundTargetArray] = field(default_factory=dict)
 
 
 def read_recording(path: Path) -> Recording:
@@ -87,7 +85,7 @@ def read_recording(path: Path) -> Recording:
         for name in recording.facts.get('nodes', {}):
             namespace, _, node = name.strip('/').rpartition('/')
             if node == FILTER:
-                recording.found[namespace] = []
+                recording.found[namespace] = FoundTargetArray()
         if not recording.found:
             raise BagError(f'{path}: holds no parameters of {FILTER}')
         robots = recording.facts['scenario']['robots']
@@ -97,7 +95,7 @@ def read_recording(path: Path) -> Recording:
             index = deserialize_message(data, DetectionArray).measurement
             # Duplicate index: a restarted driver; the filter used the first.
             detections.setdefault((topics[topic], index), data)
-        for namespace in recording.found:
+        for namespace in list(recording.found):
             last = 0
             for _, _, _, data in bag.raw([within(team, within(namespace, UPDATE))]):
                 update = deserialize_message(data, FilterUpdate)
@@ -113,9 +111,7 @@ def read_recording(path: Path) -> Recording:
                 last = max(last, update.batch_id)
                 recording.batches.append(Batch(update, used, namespace, late))
             for _, _, _, data in bag.raw([within(team, within(namespace, FOUND))]):
-                array = deserialize_message(data, FoundTargetArray)
-                recording.found[namespace] = list(array.targets)
-                recording.found_batch[namespace] = array.batch_id
+                recording.found[namespace] = deserialize_message(data, FoundTargetArray)
     if len(recording.found) > 1:
         recording.batches.sort(key=lambda batch: (batch.update.step, batch.namespace))
     return recording
@@ -146,8 +142,7 @@ class ReplayNode:
         )
         self.node = Node('replay', context=self.context, use_global_arguments=False)
         self.updates: list[FilterUpdate] = []
-        self.found: dict[str, list[FoundTarget]] = {name: [] for name in namespaces}
-        self.found_batch = dict.fromkeys(namespaces, 0)
+        self.found = {name: FoundTargetArray() for name in namespaces}
         self._awaited = {within(name, f'/{FILTER}') for name in namespaces}
         self._batches = {
             name: self.node.create_publisher(MeasurementBatch, within(name, BATCH), RELIABLE)
@@ -161,9 +156,8 @@ class ReplayNode:
             self.node.create_subscription(
                 FilterUpdate, within(name, UPDATE), self.updates.append, RELIABLE
             )
-            self.node.create_subscription(
-                FoundTargetArray, within(name, FOUND), partial(self._on_found, name), LATCHED_ALL
-            )
+            keep = partial(self.found.__setitem__, name)
+            self.node.create_subscription(FoundTargetArray, within(name, FOUND), keep, LATCHED_ALL)
         self.node.create_subscription(LockstepDone, '/lockstep/ready', self._on_ready, LATCHED_ALL)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
@@ -192,10 +186,6 @@ class ReplayNode:
             )
         for member, data in zip(update.members, batch.detections):
             self._detections[member.robot].publish(deserialize_message(data, DetectionArray))
-
-    def _on_found(self, namespace: str, message: FoundTargetArray) -> None:
-        self.found[namespace] = list(message.targets)
-        self.found_batch[namespace] = message.batch_id
 
     def _on_ready(self, message: LockstepDone) -> None:
         self._awaited.discard(message.node)
@@ -291,19 +281,20 @@ def _feed(
         batch.update.missing = node.updates[-1].missing
         if first_difference is None and node.updates[-1] != batch.update:
             first_difference = batch.update.batch_id
+    found = recording.found
     wait_for(
-        lambda: all(node.found_batch[key] >= last for key, last in recording.found_batch.items()),
+        lambda: all(node.found[key].batch_id >= item.batch_id for key, item in found.items()),
         'the filter published no found targets',
     )
     lines = []
-    for namespace, found in recording.found.items():
-        now = node.found[namespace]
-        lines += [within(namespace, f' {line}').strip() for line in differences(found, now)]
+    for namespace, before in found.items():
+        texts = differences(before.targets, node.found[namespace].targets)
+        lines += [within(namespace, f' {text}').strip() for text in texts]
     for line in lines:
         print(line)
     if first_difference is not None:
         print(f'the first update that differs is that of batch {first_difference}')
-    number = sum(len(found) for found in recording.found.values())
+    number = sum(len(item.targets) for item in found.values())
     if lines:
         print(f'{len(recording.batches)} batches replayed: the found targets are NOT equal')
         return DIFFERENT

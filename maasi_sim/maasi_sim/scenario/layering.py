@@ -203,11 +203,22 @@ def override(layer: Layer, key: Key, value: Any, origin: str) -> None:
 
 
 def validate(model: type[Model], layer: Layer) -> Model:
-    """Return the settings of a tree, strictly by type."""
+    """Return the settings of a tree, strictly by type; an error has one line for each wrong key."""
     try:
         return model.model_validate(layer.data, strict=True)
     except ValidationError as error:
-        raise ScenarioError(describe(error, model, layer)) from None
+        errors = error.errors(include_url=False)
+    problems: dict[Key, list[Any]] = {}
+    for item in errors:
+        problems.setdefault(_resolve(item['loc'], layer.data, item['type']), []).append(item)
+    lines = []
+    for key, items in problems.items():
+        texts = list(dict.fromkeys(_explain(item, key, model, layer.data) for item in items))
+        read = f'read {_show(items[0]["input"])}, '
+        texts[1:] = [text.removeprefix(read) for text in texts[1:]]
+        origin = layer.origin(key)
+        lines.append(f'{origin}: {dotted(key) or "the whole"}: ' + '; or '.join(texts))
+    raise ScenarioError('\n'.join(lines))
 
 
 def refuse(layer: Layer, problems: Iterable[tuple[Key, str]]) -> None:
@@ -221,21 +232,6 @@ def doubt(layer: Layer, problems: Iterable[tuple[Key, str]]) -> None:
     """Issue a ScenarioWarning for each problem."""
     for key, text in problems:
         warnings.warn(f'{layer.origin(key)}: {dotted(key)}: {text}', ScenarioWarning, stacklevel=3)
-
-
-def describe(error: ValidationError, model: type[BaseModel], layer: Layer) -> str:
-    """Return a validation error in words, one line for each wrong key."""
-    problems: dict[Key, list[Any]] = {}
-    for item in error.errors(include_url=False):
-        problems.setdefault(_resolve(item['loc'], layer.data, item['type']), []).append(item)
-    lines = []
-    for key, items in problems.items():
-        texts = list(dict.fromkeys(_explain(item, key, model, layer.data) for item in items))
-        read = f'read {_show(items[0]["input"])}, '
-        texts[1:] = [text.removeprefix(read) for text in texts[1:]]
-        origin = layer.origin(key)
-        lines.append(f'{origin}: {dotted(key) or "the whole"}: ' + '; or '.join(texts))
-    return '\n'.join(lines)
 
 
 def _resolve(loc: Sequence[str | int], data: Any, kind: str) -> Key:
