@@ -19,22 +19,6 @@ from maasi_sim.emulators.mambo.firmware import FlyingState
 AT_MOST = 1.5
 
 
-def test_it_takes_off_flies_to_waypoints_and_lands():
-    flight = Flight().up()
-    assert flight.pilot.problem == ''
-    assert_allclose(flight.where, HOME.position, atol=0.12)
-    # At another height, and it stays there.
-    flight.goal = np.array([0.1, 0.2, 1.2])
-    flight.until(lambda: flight.left < 0.03)
-    flight.step(60)
-    assert flight.left < 0.04
-    flight.pilot.end('the search is over')
-    flight.until_it_is(FlyingState.LANDED)
-    flight.step(100)
-    assert flight.pilot.problem == f'landed: the search is over, {UNTIL_ARM}'
-    assert flight.firmware.take_offs == 1
-
-
 @pytest.mark.parametrize('share', [0.6, 1.0, 1.6])
 def test_events_correct_a_speed_that_was_measured_wrong(share):
     flight = Flight(full_speed=share * full_speed(0.5)).up()
@@ -224,6 +208,7 @@ def drift(flight):
 @pytest.mark.parametrize(
     ('fault', 'text'),
     [
+        (lambda flight: flight.pilot.end('the end'), f'landed: the end, {UNTIL_ARM}'),
         (drain, f'battery at 0.08, below 0.10, {UNTIL_ARM}'),
         (drift, f'outside the geofence, -0.4 to 2.5 m, {UNTIL_ARM}'),
         (lambda flight: flight.firmware.land(), f'by itself, {UNTIL_ARM}'),

@@ -1,4 +1,4 @@
-"""The fake Mambo's firmware, and its wire under pyparrot as it is on PyPI."""
+"""The fake Mambo's wire under pyparrot as it is on PyPI, and its command."""
 
 import math
 import signal
@@ -17,41 +17,11 @@ from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
 from maasi_filter.models.pose import Pose
 from maasi_sim.emulators.linked_robots import linked_robot, with_addresses
 from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port, main
-from maasi_sim.emulators.mambo.firmware import (
-    FirmwareSettings,
-    FlyingState,
-    MamboFirmware,
-    Piloting,
-)
+from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState, MamboFirmware
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.world.robots import BatterySettings
 
 START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
-
-
-@pytest.mark.parametrize(
-    ('what', 'state'), [('hover', FlyingState.HOVERING), ('land', FlyingState.LANDED)]
-)
-def test_what_it_does_without_its_controller_is_a_setting(what, state):
-    settings = FirmwareSettings(lost_link=what)
-    made = MamboFirmware(START, settings)
-    made.take_off()
-    while made.time < 6.0:
-        made.hear()
-        # On its way up it does not obey.
-        made.pilot(Piloting(pitch=60))
-        made.advance(0.05)
-    assert made.flying_state == FlyingState.FLYING
-    # No piloting command is flown for ever.
-    made.advance(settings.command_timeout + settings.delay + 0.06)
-    assert made.flying_state == FlyingState.HOVERING
-    made.advance(settings.landing_timeout - settings.command_timeout - 0.3)
-    assert made.flying_state == FlyingState.HOVERING
-    made.advance(10.0)
-    assert made.flying_state == state
-
-
-# ---- the wire, under pyparrot ----------------------------------------------------------------
 
 
 @pytest.fixture
