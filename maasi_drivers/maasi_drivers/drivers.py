@@ -5,7 +5,6 @@ A link to vehicles is imported by the driver that uses it: MAVLink needs an extr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pkgutil import resolve_name
 from typing import Any
@@ -20,39 +19,35 @@ from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.run_node import run
 
 
-def _link(name: str) -> Callable[[RobotNode], RobotLink]:
-    """Return what makes the link of a class, `module:Class` in the folder of the links."""
-
-    def make(driver: RobotNode) -> RobotLink:
-        try:
-            link: RobotLink = resolve_name(f'maasi_drivers.links.{name}')(driver)
-        except ModuleNotFoundError as error:
-            raise SettingsError(
-                f'parameter link: read {driver.settings.link!r}, which needs {error.name}, of an '
-                'extra of the package (docs/install.md)'
-            ) from error
-        return link
-
-    return make
+def _link(name: str, driver: RobotNode) -> RobotLink:
+    """Return the link of a class, `module:Class` in the folder of the links."""
+    try:
+        link: RobotLink = resolve_name(f'maasi_drivers.links.{name}')(driver)
+    except ModuleNotFoundError as error:
+        raise SettingsError(
+            f'parameter link: read {driver.settings.link!r}, which needs {error.name}, of an '
+            'extra of the package (docs/install.md)'
+        ) from error
+    return link
 
 
-_MAMBO = _link('mambo.mambo_robot_link:MamboRobotLink')
-_MAVLINK = _link('mavlink.mavlink_robot_link:MavlinkRobotLink')
+_MAMBO = partial(_link, 'mambo.mambo_robot_link:MamboRobotLink')
+_MAVLINK = partial(_link, 'mavlink.mavlink_robot_link:MavlinkRobotLink')
 
 
 class MamboDriver(AgentDriver):
     """A quadrotor with a camera that looks down; see `MamboRobotLink` and `CameraInput`."""
 
     def __init__(self, **options: Any) -> None:
-        links = {'topics': TopicLink, 'mambo_wifi': _MAMBO, 'mambo_ble': _MAMBO}
-        super().__init__(links, CameraInput, **options)
+        links = {'mambo_wifi': _MAMBO, 'mambo_ble': _MAMBO}
+        super().__init__({'topics': TopicLink, **links}, CameraInput, **options)
 
 
 class MamboOnboardDriver(AgentDriver):
     """A drone with a program of its own; see `OnboardLink` and docs/measurement_feed.md."""
 
     def __init__(self, **options: Any) -> None:
-        links = {'mambo_feed': _link('mambo.onboard_link:OnboardLink')}
+        links = {'mambo_feed': partial(_link, 'mambo.onboard_link:OnboardLink')}
         super().__init__(links, CameraInput, **options)
 
 
@@ -81,7 +76,7 @@ class TurtlebotDriver(AgentDriver):
     """A ground robot with a camera; see `TurtlebotLink` and `CameraInput`."""
 
     def __init__(self, **options: Any) -> None:
-        link = _link('turtlebot_link:TurtlebotLink')
+        link = partial(_link, 'turtlebot_link:TurtlebotLink')
         super().__init__({'topics': link}, CameraInput, **options)
 
 

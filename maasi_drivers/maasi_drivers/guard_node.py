@@ -82,7 +82,10 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
 
     def halt(self) -> None:
         """Stop publishing."""
-        self._end_stop()
+        if self._stop_timer is not None:
+            self._stop_timer.cancel()
+            self.destroy_timer(self._stop_timer)
+            self._stop_timer = None
 
     def status(self) -> dict[str, Any]:
         """Return whether the driver was lost, and whether the robot is being stopped."""
@@ -99,7 +102,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         if not self._lost:
             if self._stop_timer is not None:
                 self.get_logger().info('the driver is back')
-            self._end_stop()
+            self.halt()
         elif self.active and self._stop_timer is None:
             self._begin_stop()
 
@@ -115,12 +118,6 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         if self._stop_timer is not None and self._nav2.service_is_ready():
             # Without an id: all its goals.
             self._nav2.call_async(CancelGoal.Request())
-
-    def _end_stop(self) -> None:
-        if self._stop_timer is not None:
-            self._stop_timer.cancel()
-            self.destroy_timer(self._stop_timer)
-            self._stop_timer = None
 
     def _command_zeros(self) -> None:
         if self._stop_timer is None:

@@ -70,6 +70,7 @@ class AgentDriver(RobotNode):
 
     link: RobotLink
     sensor_input: SensorInput
+    goals: GoalServer
 
     def __init__(
         self, links: Mapping[str, MakeLink], make_sensor: MakeSensor, **options: Any
@@ -79,7 +80,6 @@ class AgentDriver(RobotNode):
         self._make_sensor = make_sensor
         # What has to be closed.
         self._opened: list[RobotLink | SensorInput] = []
-        self._goals: GoalServer | None = None
         # Outlives *cleanup* and *configure*, but not the process.
         self._stop_latched = False
 
@@ -107,12 +107,6 @@ class AgentDriver(RobotNode):
         self._answered: int | None = None
         self._unusable: int | None = None
 
-    @property
-    def goals(self) -> GoalServer:
-        """The action `go_to`."""
-        assert self._goals is not None, 'not configured'
-        return self._goals
-
     def set_up(self) -> None:
         """Compile, make the parts and connect."""
         settings = self.settings
@@ -124,7 +118,7 @@ class AgentDriver(RobotNode):
         self._watchdog = Watchdog(self, self.link, self.sensor_input, self._state)
         self._responder = MeasurementResponder(self, self.sensor_input, self._watchdog)
         self._frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
-        self._goals = GoalServer(self, self.link, self._frames)
+        self.goals = GoalServer(self, self.link, self._frames)
         if self._stop_latched:
             self.health.begin(STOP, STOPPED)
         self._opened.append(self.link)
@@ -151,20 +145,17 @@ class AgentDriver(RobotNode):
 
     def tear_down(self) -> None:
         """Disconnect."""
-        self._close()
+        for part in self._opened:
+            part.close()
+        self._opened = []
 
     def destroy_node(self) -> None:
         """Send the last results, and leave the graph."""
         self.active = False
-        if self._goals is not None:
-            self._goals.settle()
+        if hasattr(self, 'goals'):
+            self.goals.settle()
         super().destroy_node()
-        self._close()
-
-    def _close(self) -> None:
-        for part in self._opened:
-            part.close()
-        self._opened = []
+        self.tear_down()
 
     def reset(self) -> None:
         """Discard what belongs to the time before a jump back."""
@@ -185,9 +176,9 @@ class AgentDriver(RobotNode):
 
     def status(self) -> dict[str, Any]:
         """Return goal, fault and counts."""
-        left_out = self._responder.left_out
+        left_out, goal = self._responder.left_out, self.follower.goal
         return {
-            'goal': f'{self._state.goal_id}: {self.follower.status.name}',
+            'goal': f'{0 if goal is None else goal.id}: {self.follower.status.name}',
             'fault': self.health.text,
             'battery': f'{self._state.charge:.2f}',
             'open batches': len(self._responder.queue),
@@ -202,7 +193,8 @@ class AgentDriver(RobotNode):
         self.link.observe(placed)
         self.silence.end()
         if self.health.end(ODOMETRY, f'{self.pose_name}: received again'):
-            self._watchdog.pose_is_back()
+            # It may have been silent with the odometry.
+            self._watchdog.sensed_at = None
         if self.settings.lockstep:
             self.history.add(placed)
             self._answer_step()
@@ -231,7 +223,9 @@ class AgentDriver(RobotNode):
 
     def end_goal(self, status: GoalStatus, reason: str) -> None:
         """End the present goal, if there is one."""
-        self.goals.end(status, reason)
+        goal = self.follower.end(status, reason)
+        if goal is not None:
+            self.goals.finish(goal)
 
     def publish_fault(self) -> None:
         """Publish `state` with the fault of a robot that has no pose yet."""

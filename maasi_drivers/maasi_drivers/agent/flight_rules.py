@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -68,17 +67,6 @@ def make_fence(
     if start > ground:
         fence[2, 0] = max(fence[2, 0], ground)
     return fence
-
-
-def fence_problem(fence: FloatArray, point: Sequence[float]) -> str | None:
-    """Return why a waypoint (x, y, z) is not allowed, or nothing."""
-    for axis, value, (low, high) in zip('xyz', point, fence.tolist(), strict=True):
-        if not low <= value <= high:
-            return (
-                f'waypoint.pose.position.{axis}: read {value}, allowed is {low:g} to '
-                f'{high:g} [m], the geofence'
-            )
-    return None
 
 
 def outside_fence(fence: FloatArray, position: FloatArray) -> str:

@@ -15,7 +15,6 @@ from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
 from maasi_filter.ros.conversions import pose_to_ros
 from maasi_msgs.action import GoToWaypoint
 
-_FEEDBACK_PERIOD = 500_000_000
 # At the end: longest wait for the last results, and executor tasks that send them [s].
 _SETTLE_TIME, _LAST_TASKS = 0.3, 5
 
@@ -47,12 +46,6 @@ class GoalServer:
         server.register_cancel_callback(self._cancel)
         server.register_execute_callback(self._conclude)
 
-    def end(self, status: GoalStatus, reason: str) -> None:
-        """End the present goal, if there is one."""
-        goal = self._driver.follower.end(status, reason)
-        if goal is not None:
-            self.finish(goal)
-
     def finish(self, goal: Goal) -> None:
         """Have the result of a goal sent: the executor calls `_conclude` for it."""
         self._link.goal_ended(goal)
@@ -76,11 +69,11 @@ class GoalServer:
         follower = self._driver.follower
         if (
             follower.status == GoalStatus.MOVING
-            and placed.stamp - self._feedback_at >= _FEEDBACK_PERIOD
+            and placed.stamp - self._feedback_at >= 500_000_000
             and follower.goal is not None
         ):
             self._feedback_at = placed.stamp
-            distance = follower.distance(placed.pose.position)
+            distance = follower.distance(placed.pose.position, follower.goal)
             follower.goal.handle.publish_feedback(GoToWaypoint.Feedback(distance=distance))
 
     def problem(self, request: GoToWaypoint.Goal) -> str | None:
@@ -144,7 +137,7 @@ class GoalServer:
         if goal is None or goal.handle is not handle:
             # It has ended or was replaced.
             return CancelResponse.REJECT
-        self.end(GoalStatus.CANCELED, 'cancelled')
+        self._driver.end_goal(GoalStatus.CANCELED, 'cancelled')
         if not self._driver.settings.lockstep:
             self._link.hold()
         self._link.goal_cancelled()

@@ -27,10 +27,7 @@ from maasi_msgs.msg import DetectionArray, MeasurementBatch
 
 @dataclass(frozen=True)
 class MeasurementRequest:
-    """A measurement that a robot is to take: batch, its index, and the stamp [ns].
-
-    The first image stamped at or after it is used.
-    """
+    """A measurement that a robot is to take, by the first image at or after the stamp [ns]."""
 
     batch: int
     stamp: int

@@ -167,12 +167,6 @@ class PoseHistory:
         return interpolate(poses[max(index - 1, 0)], poses[index], stamp)
 
 
-# Longest time over which a difference is a velocity [ns].
-_LONGEST = 1_000_000_000
-# Faster than this is a jump of the pose, not a movement [m/s, rad/s].
-_FASTEST = 50.0
-
-
 class PoseSpeed:
     """Differences of poses over time."""
 
@@ -186,7 +180,7 @@ class PoseSpeed:
         """
         velocity, turning = np.zeros(3), np.zeros(3)
         before, self._before = self._before, (stamp, pose)
-        if before is not None and 0 < stamp - before[0] < _LONGEST:
+        if before is not None and 0 < stamp - before[0] < 1_000_000_000:
             period = 1e-9 * (stamp - before[0])
             velocity = (pose.position - before[1].position) / period
             change = compose(inverse(before[1]), pose).orientation
@@ -194,6 +188,7 @@ class PoseSpeed:
             half = float(np.linalg.norm(change[1:]))
             angle = 2.0 * math.atan2(half, float(change[0]))
             turning = change[1:] * (angle / half if half > 0.0 else 2.0) / period
-            if max(np.linalg.norm(velocity), np.linalg.norm(turning)) > _FASTEST:
+            # Faster than this is a jump of the pose [m/s, rad/s].
+            if max(np.linalg.norm(velocity), np.linalg.norm(turning)) > 50.0:
                 velocity, turning = np.zeros(3), np.zeros(3)
         return StampedPose(stamp, pose, velocity=velocity, angular_velocity=turning)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -30,16 +30,10 @@ from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, TRANSFORMS
 
 # From a camera (x forward) to its optical frame (x right, y down, z forward).
 _OPTICAL = (-0.5 * math.pi, 0.0, -0.5 * math.pi)
-_NOWHERE = (0.0, 0.0, 0.0)
 
 
-class FixedFrame(NamedTuple):
-    """A frame that is fixed on a robot: its place in its parent [m], turned by `rpy` [rad]."""
-
-    parent: str
-    name: str
-    position: Sequence[float]
-    rpy: Sequence[float]
+# A frame that is fixed on a robot: parent, name, place in the parent [m], turned by `rpy` [rad].
+FixedFrame = tuple[str, str, Sequence[float], Sequence[float]]
 
 
 def base_frame(robot: str, settings: DriverSettings) -> str:
@@ -53,14 +47,14 @@ def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
     frames: list[FixedFrame] = []
     if settings.camera is not None:
         mount, camera = settings.camera.mount, f'{robot}/camera'
-        frames.append(FixedFrame(base, camera, mount.position, mount.rpy))
-        frames.append(FixedFrame(camera, f'{robot}/camera_optical', _NOWHERE, _OPTICAL))
+        frames.append((base, camera, mount.position, mount.rpy))
+        frames.append((camera, f'{robot}/camera_optical', (0.0, 0.0, 0.0), _OPTICAL))
     if settings.scan is not None:
         place, turn = (*settings.scan.position, 0.0), (0.0, 0.0, settings.scan.yaw)
-        frames.append(FixedFrame(base, f'{robot}/base_scan', place, turn))
+        frames.append((base, f'{robot}/base_scan', place, turn))
     ranging = settings.ranging
     if ranging.frame == 'body':
-        frames.append(FixedFrame(base, f'{robot}/ranging', ranging.position, ranging.rpy))
+        frames.append((base, f'{robot}/ranging', ranging.position, ranging.rpy))
     return frames
 
 
@@ -75,21 +69,15 @@ def robot_description(robot: str, settings: DriverSettings) -> str:
         geometry = ElementTree.SubElement(ElementTree.SubElement(link, part), 'geometry')
         size = repr(settings.radius)
         ElementTree.SubElement(geometry, 'cylinder', radius=size, length=size)
-    for frame in sensor_frames(robot, settings):
-        ElementTree.SubElement(root, 'link', name=frame.name)
-        joint = ElementTree.SubElement(root, 'joint', name=f'{frame.name}_joint', type='fixed')
-        ElementTree.SubElement(joint, 'parent', link=frame.parent)
-        ElementTree.SubElement(joint, 'child', link=frame.name)
-        xyz, rpy = (' '.join(map(str, map(float, item))) for item in (frame.position, frame.rpy))
+    for parent, name, *place in sensor_frames(robot, settings):
+        ElementTree.SubElement(root, 'link', name=name)
+        joint = ElementTree.SubElement(root, 'joint', name=f'{name}_joint', type='fixed')
+        ElementTree.SubElement(joint, 'parent', link=parent)
+        ElementTree.SubElement(joint, 'child', link=name)
+        xyz, rpy = (' '.join(map(str, map(float, item))) for item in place)
         ElementTree.SubElement(joint, 'origin', xyz=xyz, rpy=rpy)
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding='unicode') + '\n'
-
-
-_NO_TYPE = (
-    'the package tf2_msgs is not installed (sudo apt install ros-$ROS_DISTRO-tf2-msgs): nothing is '
-    'published on tf and tf_static, and goals have to be in the frame '
-)
 
 
 class RobotFrames:
@@ -124,26 +112,28 @@ class RobotFrames:
         self._taken: int | None = None
         self._publisher: Publisher | None = None
         self._static_publisher: Publisher | None = None
-        self._type = self._message_type()
         self._connect()
 
-    def _message_type(self) -> Any:
-        """Return tf2_msgs/TFMessage, or None where it is not installed."""
+    def _connect(self) -> None:
+        """Connect, and publish what does not change."""
+        node, settings = self._node, self._settings
+        self._type: Any = None
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
-            if self._settings.poses == 'tf':
+            if settings.poses == 'tf':
                 raise SettingsError(
                     "parameter pose_source: read 'tf', but the package tf2_msgs is not installed "
                     "(sudo apt install ros-$ROS_DISTRO-tf2-msgs); allowed without it is 'odometry'"
                 ) from error
-            self._node.get_logger().warning(_NO_TYPE + repr(self._settings.frame))
-            return None
-        return TFMessage
-
-    def _connect(self) -> None:
-        """Connect, and publish what does not change."""
-        node, settings, kind = self._node, self._settings, self._type
+            node.get_logger().warning(
+                'the package tf2_msgs is not installed (sudo apt install ros-$ROS_DISTRO-tf2-msgs):'
+                f' nothing is published on tf and tf_static, and goals have to be in the frame '
+                f'{settings.frame!r}'
+            )
+        else:
+            self._type = TFMessage
+        kind = self._type
         if settings.tf_rate:
             description = node.create_publisher(String, 'robot_description', LATCHED)
             description.publish(String(data=robot_description(self._robot, settings)))
@@ -154,8 +144,8 @@ class RobotFrames:
             self._static_publisher = node.create_publisher(kind, static, LATCHED)
             if settings.poses != 'tf':
                 self._publisher = node.create_publisher(kind, node.team_topic('tf'), TRANSFORMS)
-        for frame in sensor_frames(self._robot, settings):
-            self._add_static(frame.parent, frame.name, Pose.from_rpy(frame.position, frame.rpy))
+        for parent, name, position, rpy in sensor_frames(self._robot, settings):
+            self._add_static(parent, name, Pose.from_rpy(position, rpy))
         self._publish_static()
         if not settings.lockstep:
             for topic, quality in (('tf', TRANSFORMS), ('tf_static', LATCHED_ALL)):

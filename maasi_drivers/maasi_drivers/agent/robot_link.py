@@ -12,16 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import fence_problem
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.obstacles import Obstacles
-
-# Commands below these are not expected to change the pose [m/s, rad/s].
-_LEAST_SPEED, _LEAST_TURN = 0.02, 0.05
 
 
 class RobotLink(ABC):
@@ -101,7 +97,13 @@ class RobotLink(ABC):
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Return why a waypoint (x, y, z) [m, map] is refused, or None."""
-        return fence_problem(self.fence, position)
+        for axis, value, (low, high) in zip('xyz', position, self.fence.tolist(), strict=True):
+            if not low <= value <= high:
+                return (
+                    f'waypoint.pose.position.{axis}: read {value}, allowed is {low:g} to '
+                    f'{high:g} [m], the geofence'
+                )
+        return None
 
     def goal_taken(self, goal: Goal) -> None:
         """Take note of a new goal."""
@@ -126,7 +128,7 @@ class RobotLink(ABC):
 
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
         """Return whether this command must change pose and images."""
-        return bool(math.hypot(*command[:3]) > _LEAST_SPEED or abs(command[3]) > _LEAST_TURN)
+        return bool(math.hypot(*command[:3]) > 0.02 or abs(command[3]) > 0.05)
 
     # ---- lockstep ----------------------------------------------------------------------------
 

@@ -18,11 +18,6 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.ros.clocks import JUMP, Silence, StampGate
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 
-# Length of the window of observations [s].
-_WINDOW = 2.0
-# A lead that falls by more at once is a jump back of the node's time [ns].
-_JUMP = 1_000_000_000
-
 
 class ArrivalClock:
     """The node's time at any instant of the steady clock.
@@ -32,7 +27,7 @@ class ArrivalClock:
     """
 
     def __init__(self) -> None:
-        # Recent instants [s] and leads of the node's time [ns], with falling leads.
+        # Instants of the last 2 s [s] and leads of the node's time [ns], with falling leads.
         self._leads: deque[tuple[float, int]] = deque()
 
     def observe(self, now: float, time: int) -> None:
@@ -42,12 +37,12 @@ class ArrivalClock:
             leads.clear()
             return
         lead = time - round(now * 1e9)
-        if leads and lead < leads[-1][1] - _JUMP:
+        if leads and lead < leads[-1][1] - JUMP:
             leads.clear()
         while leads and leads[-1][1] <= lead:
             leads.pop()
         leads.append((now, lead))
-        while leads[0][0] < now - _WINDOW:
+        while leads[0][0] < now - 2.0:
             leads.popleft()
 
     def stamp(self, instant: float) -> int | None:
@@ -98,9 +93,6 @@ class Health:
         if was and recovered:
             self._logger.info(recovered)
         return was
-
-
-_POSE_NAMES = {'odometry': 'odometry', 'tf': 'pose on tf', 'pose': 'pose'}
 
 
 @dataclass(frozen=True)
@@ -162,7 +154,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         self.silence = Silence(self)
         self.arrivals = ArrivalClock()
         self.map_odometry: MapOdometry | None = None
-        self.pose_name = _POSE_NAMES[settings.poses]
+        self.pose_name = 'pose on tf' if settings.poses == 'tf' else settings.poses
         self.feed_peer: FeedPeer | None = None
         # Slow odometry is not a jump.
         self._gate = StampGate(max(JUMP, round(2e9 * settings.odometry_timeout)))
@@ -172,14 +164,9 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         return round(stamp * 1e-9 / self.settings.step)
 
     def is_new_pose(self, what: str, stamp: int) -> bool:
-        """Return whether a pose of this stamp is to be used; one far back restarts the driver.
+        """Return whether a pose of a stamp [ns] is to be used; one far back restarts the driver.
 
-        Parameters
-        ----------
-        what : str
-            Topic and field, for messages.
-        stamp : int
-            [ns].
+        `what` is its topic and field, for messages.
         """
         if not (self.settings.lockstep or self._gate.accepts(stamp)):
             self.drop(
@@ -264,25 +251,16 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
             # The position that it held is outdated.
             self.follower.stay()
 
-    def arm_problem(self) -> str:
-        """Return why a robot that flies must not take off; empty where nothing is known."""
-        if not self.active:
-            return 'the driver is not active'
-        return self.health.get(STOP) or self.health.get(BATTERY)
-
     def offer_arm(self, arm: Callable[[], str], in_air: Callable[[], bool] = lambda: False) -> None:
         """Offer the service `arm` (std_srvs/Trigger) of a robot that takes off.
 
-        Parameters
-        ----------
-        arm : callable
-            Gives the permission, or returns the reason of a refusal; empty where it is given.
-        in_air : callable
-            Whether it flies already, and is taken over.
+        `arm` gives the permission, or returns why it is refused; `in_air` tells whether the robot
+        flies already, and is taken over.
         """
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            problem = self.arm_problem() or arm()
+            problem = '' if self.active else 'the driver is not active'
+            problem = problem or self.health.get(STOP) or self.health.get(BATTERY) or arm()
             response.success = not problem
             if problem:
                 response.message = problem

@@ -226,7 +226,7 @@ class ScanInput:
         if goal is None or goal.status != GoalStatus.MOVING:
             self._nearest = None
             return False
-        left = follower.distance(placed.pose.position)
+        left = follower.distance(placed.pose.position, goal)
         if (
             self._nearest is None
             or self._nearest[0] is not goal

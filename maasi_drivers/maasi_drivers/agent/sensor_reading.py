@@ -15,15 +15,7 @@ from maasi_filter.records import Label
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a ranging sensor returns at one instant.
-
-    Attributes
-    ----------
-    values : ndarray, shape (m, d)
-        Range [m], bearing and, in 3D, elevation [rad].
-    labels : tuple of Label
-        Class and identity of each; empty: none is known.
-    """
+    """What a ranging sensor returns at one instant: values and labels as in `SensorReading`."""
 
     values: FloatArray
     labels: tuple[Label, ...] = ()

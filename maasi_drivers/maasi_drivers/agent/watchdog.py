@@ -32,11 +32,6 @@ class StatePublisher:
         driver.create_wall_timer(LIVELINESS_PERIOD, self._publisher.assert_liveliness)
         driver.expect_subscribers(self._publisher, names={'planner_node'})
 
-    @property
-    def goal_id(self) -> int:
-        """Of the goal that was published last; 0: none."""
-        return int(self._state.goal_id)
-
     def publish(self, placed: StampedPose, step: int) -> None:
         """Publish a pose at a step, with goal and faults."""
         state = self._state
@@ -70,13 +65,8 @@ class StatePublisher:
 
 
 PERIOD = 0.1
-# Checks per published state of a robot without odometry.
-_CHECKS_PER_STATE = 2
 # Time without a first pose, or without a charge, after which a warning is logged [s].
 _PATIENCE, _CHARGE_PATIENCE = 3.0, 10.0
-# Wall time beyond its timeout after which a robot with silent odometry is stopped without a
-# fault: a simulated clock may be slow [s].
-_CLOCK_PATIENCE = 0.5
 
 
 class Watchdog:
@@ -92,14 +82,14 @@ class Watchdog:
         self.moving = False
         # Stamps of the last change of the pose, and of the pose at the last image [ns].
         self._changed_at = 0
-        self._sensed_at: int | None = None
+        self.sensed_at: int | None = None
         self._checked_at = self._charged_at = time.monotonic()
         self._stalled = False
         self._checks = 0
 
     def reset(self) -> None:
         """Discard what belongs to another time."""
-        self._sensed_at = None
+        self.sensed_at = None
         self.moving = False
 
     def check(self) -> None:
@@ -131,16 +121,11 @@ class Watchdog:
             if health.begin(ODOMETRY, f'no {driver.pose_name} for {age:.1f} s'):
                 self._checks = 0
             self._link.hold()
-            if self._checks % _CHECKS_PER_STATE == 0:
+            if self._checks % 2 == 0:
                 self._state.publish_status()
-        elif silence.wall > timeout + _CLOCK_PATIENCE:
-            # The simulated clock is slow or stands, which real robots do not.
+        elif silence.wall > timeout + 0.5:
+            # Without a fault: the simulated clock is slow or stands, which real robots do not.
             self._link.hold()
-
-    def note_pose(self, placed: StampedPose) -> None:
-        """Check a new pose, before it is added to the history; not in lockstep."""
-        self._check_frozen(placed)
-        self._check_sensor(placed)
 
     def take_charge(self, charge: float) -> None:
         """Take a charge, 0 to 1; anything else is unknown and leaves a fault as it is."""
@@ -154,10 +139,6 @@ class Watchdog:
         else:
             health.end(BATTERY)
 
-    def pose_is_back(self) -> None:
-        """Begin the sensor's timeout anew: it may have been silent with the odometry."""
-        self._sensed_at = None
-
     def note_frame(self, topic: str, repeated: bool) -> None:
         """Note an image or sweep; see `RobotNode.take_frame`."""
         latest, health = self._driver.history.latest, self._driver.health
@@ -165,28 +146,24 @@ class Watchdog:
             return
         # A robot at rest may see the same twice; a sensor that hung has to deliver something new.
         if not repeated or not (self.moving or SENSOR in health):
-            self._sensed_at = latest.stamp
+            self.sensed_at = latest.stamp
             health.end(SENSOR, f'{topic}: received again')
 
-    def _check_frozen(self, placed: StampedPose) -> None:
-        """Stop a robot whose pose stays the same to the bit under a command to move."""
-        driver = self._driver
-        timeout, before = driver.settings.frozen_pose_timeout, driver.history.latest
+    def note_pose(self, placed: StampedPose) -> None:
+        """Check a new pose, before it is added to the history; not in lockstep."""
+        health, settings = self._driver.health, self._driver.settings
+        # A pose that stays the same to the bit under a command to move.
+        before = self._driver.history.latest
         same = before is not None and placed.pose == before.pose
         if not same:
-            driver.health.end(FROZEN_POSE, 'the pose changes again')
-        if not timeout or not same or not self.moving:
+            health.end(FROZEN_POSE, 'the pose changes again')
+        if not settings.frozen_pose_timeout or not same or not self.moving:
             self._changed_at = placed.stamp
-            return
         age = 1e-9 * (placed.stamp - self._changed_at)
-        if age > timeout:
-            driver.health.begin(FROZEN_POSE, f'the pose has not changed for {age:.1f} s')
-
-    def _check_sensor(self, placed: StampedPose) -> None:
-        """Stop a robot whose sensor is silent."""
-        timeout = self._driver.settings.sensor_patience
-        if self._sensed_at is None:
-            self._sensed_at = placed.stamp
-        age = 1e-9 * (placed.stamp - self._sensed_at)
-        if timeout and age > timeout:
-            self._driver.health.begin(SENSOR, f'no new {self._sensor.name} for {age:.1f} s')
+        if age > settings.frozen_pose_timeout:
+            health.begin(FROZEN_POSE, f'the pose has not changed for {age:.1f} s')
+        if self.sensed_at is None:
+            self.sensed_at = placed.stamp
+        age = 1e-9 * (placed.stamp - self.sensed_at)
+        if settings.sensor_patience and age > settings.sensor_patience:
+            health.begin(SENSOR, f'no new {self._sensor.name} for {age:.1f} s')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -26,24 +26,11 @@ class GoalStatus(IntEnum):
 
 @dataclass(eq=False)
 class Goal:
-    """A waypoint of a robot.
+    """A waypoint (3,) of a robot [m, map].
 
-    Attributes
-    ----------
-    id : int
-        Decision index plus one.
-    step : int
-        At which it was decided; it takes effect from the next one on.
-    waypoint : ndarray, shape (3,)
-        [m, map].
-    tolerance : float
-        Distance at which it counts as reached; 0: the robot's own [m].
-    handle : object
-        The handle of its client.
-    status : GoalStatus
-        Its state.
-    reason : str
-        Why it ended without success.
+    `id` is the index of its decision plus one; it takes effect from the step after `step` on.
+    Within `tolerance` it counts as reached; 0: the robot's own [m]. `handle` is that of its client;
+    `reason` says why it ended without success.
     """
 
     id: int
@@ -51,7 +38,7 @@ class Goal:
     waypoint: FloatArray
     tolerance: float = 0.0
     handle: Any = None
-    status: GoalStatus = field(default=GoalStatus.MOVING)
+    status: GoalStatus = GoalStatus.MOVING
     reason: str = ''
 
 
@@ -98,12 +85,9 @@ class WaypointFollower:
         self._hold = None
         return goal
 
-    def distance(self, position: FloatArray) -> float:
-        """Return the straight distance to the goal [m]; 0 without one."""
-        return 0.0 if self.goal is None else self._distance(position, self.goal.waypoint)
-
-    def _distance(self, position: FloatArray, waypoint: FloatArray) -> float:
-        offset = (waypoint - position).tolist()
+    def distance(self, position: FloatArray, goal: Goal) -> float:
+        """Return the straight distance to a goal [m]."""
+        offset = (goal.waypoint - position).tolist()
         return math.hypot(*offset[:2]) if self.on_ground else math.hypot(*offset)
 
     def update(self, state: RobotState, step: int | None = None) -> tuple[FloatArray, Goal | None]:
@@ -117,7 +101,11 @@ class WaypointFollower:
             self.goal, self._next = self._next, None
         goal, reached = self.goal, None
         if goal is not None and goal.status == GoalStatus.MOVING:
-            if not self._arrived(position, goal):
+            if goal.tolerance in (0.0, self.motion.settings.tolerance):
+                arrived = self.motion.arrived(position, goal.waypoint)
+            else:
+                arrived = self.distance(position, goal) <= goal.tolerance
+            if not arrived:
                 return self.motion.command(state, goal.waypoint), None
             goal.status = GoalStatus.REACHED
             self._hold = goal.waypoint
@@ -127,11 +115,6 @@ class WaypointFollower:
         if self._hold is None:
             self._hold = np.array(position)
         return self.motion.command(state, self._hold), reached
-
-    def _arrived(self, position: FloatArray, goal: Goal) -> bool:
-        if goal.tolerance in (0.0, self.motion.settings.tolerance):
-            return self.motion.arrived(position, goal.waypoint)
-        return self._distance(position, goal.waypoint) <= goal.tolerance
 
     @property
     def target(self) -> FloatArray | None:

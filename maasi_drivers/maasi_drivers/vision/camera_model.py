@@ -33,14 +33,6 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> FloatArray:
     )
 
 
-def _largest_radius(k: FloatArray) -> float:
-    """Normalised radius up to which the radial model grows, so that it can be inverted."""
-    k1, k2, _, _, k3 = k
-    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0]) if np.any(k[[0, 1, 4]]) else np.empty(0)
-    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-    return float(np.sqrt(real.min())) if real.size else np.inf
-
-
 @dataclass(frozen=True)
 class Camera:
     """A calibrated camera mounted on a robot.
@@ -68,6 +60,10 @@ class Camera:
         fx, fy = settings.focal_length
         distortion = np.zeros(5)
         distortion[: len(settings.distortion)] = settings.distortion
+        k1, k2, _, _, k3 = distortion
+        # Squares of the radii at which the radial model stops growing, so that it has no inverse.
+        ends = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+        ends = ends.real[(np.abs(ends.imag) < 1e-9) & (ends.real > 0)]
         return cls(
             width=settings.width,
             height=settings.height,
@@ -75,7 +71,7 @@ class Camera:
             distortion=distortion,
             position=np.array(settings.mount.position, dtype=np.float64),
             rotation=rotation_from_rpy(*settings.mount.rpy) @ _OPTICAL_TO_BODY,
-            largest_radius=_largest_radius(distortion),
+            largest_radius=float(np.sqrt(ends.min(initial=np.inf))),
         )
 
     def centre(self, pose: Pose) -> FloatArray:
@@ -178,13 +174,6 @@ class Camera:
             np.minimum(pixels[:, 1] + 0.5, self.height - 0.5 - pixels[:, 1]),
         )
         return np.where(np.isnan(margins), -np.inf, margins)
-
-    def pixels_per_metre(self, pose: Pose) -> float:
-        """Return the image's scale on the floor at its centre [px/m]; NaN above the horizon."""
-        _, by_pixel, _ = self.back_project(
-            [[(self.width - 1) / 2.0, (self.height - 1) / 2.0]], pose, 0.0
-        )
-        return float(1.0 / np.sqrt(np.abs(np.linalg.det(by_pixel[0]))))
 
 
 def box_view_margin(

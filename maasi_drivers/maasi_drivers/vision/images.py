@@ -33,7 +33,6 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     'bayer_gbrg8': (1, cv2.COLOR_BayerGR2RGB),
     'bayer_grbg8': (1, cv2.COLOR_BayerGB2RGB),
 }
-_SUBSAMPLED = ('nv12', 'nv21')
 COLOUR_ENCODINGS = tuple(_ENCODINGS)
 _MAXIMUM_SIDE = 16384
 
@@ -58,7 +57,7 @@ def image_to_array(
             '(the markers are told by their colour)'
         )
     size, conversion = _ENCODINGS[encoding]
-    halved = encoding in _SUBSAMPLED
+    halved = encoding in ('nv12', 'nv21')
     odd = (size == 2 or halved) and width % 2, halved and height % 2
     if any(odd):
         raise ValueError(
@@ -96,7 +95,6 @@ def decode_image(data: bytes | bytearray | array | ImageArray, kind: str) -> Ima
 # From one try to open a source to the next [s].
 _REOPEN = 1.0
 _OPEN_TIMEOUT, _READ_TIMEOUT = 5000, 2000
-_DEFAULT_RATE = 30.0
 
 
 class ImageSourceError(ValueError):
@@ -186,7 +184,7 @@ class VideoSource:
             self._closing.wait(_REOPEN)
 
     def _play(self, capture: cv2.VideoCapture) -> None:
-        rate = capture.get(cv2.CAP_PROP_FPS) or _DEFAULT_RATE
+        rate = capture.get(cv2.CAP_PROP_FPS) or 30.0
         due = time.monotonic()
         while not self._closing.is_set():
             there, image = capture.read()

@@ -16,11 +16,6 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Label
 
-# Part of a marker's area that must be seen where the image's border cuts it.
-_LEAST_CUT = 0.4
-# Deviation of the height of the floor; keeps covariances regular in 3D [m].
-_FLOOR_DEVIATION = 0.005
-
 
 class MarkerDetector:
     """The camera as a sensor of range and bearing to markers on the floor (001, section 6.1).
@@ -90,7 +85,7 @@ class MarkerDetector:
                 settings.segmentation.maximum_diameter,
             )
             # Of a marker that the border cuts enough must be left to tell it from other things.
-            sized = (parts <= most**2) & (parts >= np.where(blobs.border_cut, _LEAST_CUT, least**2))
+            sized = (parts <= most**2) & (parts >= np.where(blobs.border_cut, 0.4, least**2))
             sized &= ~blobs.border_cut | (reach <= most)
         whole = ~blobs.border_cut if settings.cut_blobs == 'drop' else np.ones(len(blobs), bool)
         dropped = {
@@ -103,7 +98,9 @@ class MarkerDetector:
         pixel_covariances = blobs.covariances + settings.pixel_noise**2 * np.eye(2)
         if blobs.border_cut.any():
             # A cut marker's centroid is off by up to its radius: a uniform error, in any direction.
-            radius = 0.5 * settings.marker_diameter * camera.pixels_per_metre(pose)
+            middle = (camera.width - 1) / 2.0, (camera.height - 1) / 2.0
+            area = np.abs(np.linalg.det(camera.back_project([middle], pose)[1][0]))
+            radius = 0.5 * settings.marker_diameter * float(1.0 / np.sqrt(area))
             pixel_covariances[blobs.border_cut] += radius**2 / 3.0 * np.eye(2)
         covariances = by_pixel[keep] @ pixel_covariances @ by_pixel[keep].transpose(0, 2, 1)
         if pose_covariance is not None:
@@ -111,7 +108,8 @@ class MarkerDetector:
             covariances = covariances + by_pose @ pose_covariance @ by_pose.transpose(0, 2, 1)
         places, spread = np.zeros((len(positions), 3)), np.zeros((len(positions), 3, 3))
         places[:, :2] = positions
-        spread[:, :2, :2], spread[:, 2, 2] = covariances, _FLOOR_DEVIATION**2
+        # The floor's height is off by 5 mm: covariances stay regular in 3D.
+        spread[:, :2, :2], spread[:, 2, 2] = covariances, 0.005**2
         used = slice(self._model.dimension)
         return SensorReading(
             *measured(self._model, places[:, used], spread[:, used, used], pose),

@@ -38,7 +38,6 @@ _FARTHEST, _MOST_TILT = 1000.0, 1.5
 _FAR_BEHIND = 1000
 # So does any, after a silence of this length [s].
 _SILENCE = 2.0
-_MOST_AT_ONCE = 64
 
 
 class FeedError(ValueError):
@@ -230,7 +229,7 @@ class FeedReceiver:
         With each packet when its image was taken, by the monotonic clock of this host [s].
         """
         packets = []
-        for _ in range(_MOST_AT_ONCE):
+        for _ in range(64):
             try:
                 data, (host, _) = self._socket.recvfrom(65536)
             except BlockingIOError:
@@ -245,20 +244,16 @@ class FeedReceiver:
             except FeedError as error:
                 self._on_drop('bad packet', str(error), 1)
                 continue
-            if self._is_new(packet.sequence, now):
-                packets.append((packet, now - packet.age))
+            last = self._last
+            if last is not None and now - self._heard_at < _SILENCE:
+                # As a signed difference, so that it may wrap.
+                ahead = (packet.sequence - last + 2**31) % 2**32 - 2**31
+                text = f'sequence: read {packet.sequence}, allowed is what follows {last}'
+                if -_FAR_BEHIND < ahead <= 0:
+                    self._on_drop('old packet', text, 1)
+                    continue
+                if 1 < ahead < _FAR_BEHIND:
+                    self._on_drop('lost packet', text, ahead - 1)
+            self._last, self._heard_at = packet.sequence, now
+            packets.append((packet, now - packet.age))
         return packets
-
-    def _is_new(self, sequence: int, now: float) -> bool:
-        last, silent = self._last, now - self._heard_at
-        if last is not None and silent < _SILENCE:
-            # As a signed difference, so that it may wrap.
-            ahead = (sequence - last + 2**31) % 2**32 - 2**31
-            text = f'sequence: read {sequence}, allowed is what follows {last}'
-            if -_FAR_BEHIND < ahead <= 0:
-                self._on_drop('old packet', text, 1)
-                return False
-            if 1 < ahead < _FAR_BEHIND:
-                self._on_drop('lost packet', text, ahead - 1)
-        self._last, self._heard_at = sequence, now
-        return True

@@ -1,6 +1,6 @@
 """Markers in an image: the papers' rule, one that adapts to the light, and fiducial markers.
 
-All rules take an RGB image and return `Blobs`; `segment` chooses by name.
+All rules take an RGB image (h, w, 3) and return `Blobs`; `segment` chooses by name.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from maasi_drivers.settings.camera import SegmentationSettings
 from maasi_drivers.vision.detector import Blobs
 from maasi_filter.arrays import FloatArray, ImageArray, IntArray
 
-# About how many pixels the colour of the floor is taken from.
-_FLOOR_SAMPLES = 4096
 # Added to the mean of the channels before dividing by it: noise in the dark is not blue.
 _DARK = 6.0
 
@@ -57,11 +55,7 @@ def _components(mask: ImageArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
 
 
 def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
-    """
-    Find blobs of a fixed blue excess, with the plain centroid of their pixels (001, section 6.1).
-
-    Shapes and units: image (h, w, 3).
-    """
+    """Find blobs of a fixed blue excess, with the centroid of their pixels (001, section 6.1)."""
     mask = paper_mask(image, settings.threshold)
     blobs = _components(mask)[2]
     return blobs.select(blobs.areas >= settings.minimum_area * mask.size)
@@ -83,15 +77,10 @@ def _blueness(balanced: FloatArray) -> FloatArray:
     return ratio
 
 
-def _excess(balanced: FloatArray) -> FloatArray:
-    """Return the blue excess O_p of pixels (..., 3): linear in how much of each is marker."""
-    red, green, blue = np.moveaxis(balanced, -1, 0)
-    return np.asarray(blue - 0.5 * (red + green))
-
-
 def _floor_statistics(image: ImageArray) -> tuple[FloatArray, float, float]:
     """Return white-balance gains (3,) from the floor; median and deviation of its blueness."""
-    stride = max(1, int(np.sqrt(image.shape[0] * image.shape[1] / _FLOOR_SAMPLES)))
+    # About 4096 pixels.
+    stride = max(1, int(np.sqrt(image.shape[0] * image.shape[1] / 4096)))
     sample = image[stride // 2 :: stride, stride // 2 :: stride].reshape(-1, 3)
     medians = np.array([max(_median(np.bincount(channel)), 1.0) for channel in sample.T])
     # Bounded, as an image of mostly marker or coloured sheet is no reference.
@@ -163,7 +152,10 @@ def _weigh(
     # The component's box and three pixels around it.
     first_row, first_column = max(top - 3, 0), max(left - 3, 0)
     window = np.s_[first_row : top + height + 3, first_column : left + width + 3]
-    labels, excess = labels[window], _excess(gains * image[window])
+    red, green, blue = np.moveaxis(gains * image[window], -1, 0)
+    # O_p of 001, which is linear in how much of a pixel is marker.
+    excess = blue - 0.5 * (red + green)
+    labels = labels[window]
     own, floor = labels == blob + 1, labels == 0
     # The excess of a pixel inside a marker: the mean of the upper half of the component.
     values = np.sort(excess[own])
@@ -199,8 +191,6 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     gates on the blueness at the peak, on aspect and solidity; centroids weighted by how much of
     each pixel is marker. Sizes are gated where the geometry is known, in
     `maasi_drivers.vision.marker_detector`.
-
-    Shapes and units: image (h, w, 3).
     """
     # One memory layout: kernels are compiled for the layouts that they meet.
     image = np.ascontiguousarray(image)
@@ -236,8 +226,6 @@ def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blob
 
     The detector finds whole markers only, so none is cut by the border. The centre is where the
     diagonals intersect, which perspective does not shift.
-
-    Shapes and units: image (h, w, 3).
     """
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     found, ids, _ = _detector(settings.dictionary).detectMarkers(grey)
@@ -246,25 +234,19 @@ def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blob
     names = [] if ids is None else [f'{settings.dictionary}:{number}' for number in ids.ravel()]
     following = np.roll(corners, -1, axis=1)
     products = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
+    one, two = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    gap = corners[:, 1] - corners[:, 0]
+    share = (gap[:, 0] * two[:, 1] - gap[:, 1] * two[:, 0]) / (
+        one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
+    )
     return Blobs(
-        _intersections(corners),
+        corners[:, 0] + share[:, None] * one,
         0.5 * np.abs(products.sum(axis=1)),
         np.ptp(corners, axis=1) if count else np.zeros((0, 2)),
         np.zeros(count, np.bool_),
         np.zeros((count, 2, 2)),
         tuple(names),
     )
-
-
-def _intersections(corners: FloatArray) -> FloatArray:
-    """Return where the diagonals of quadrilaterals (n, 4, 2) intersect, (n, 2)."""
-    one, two = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
-    gap = corners[:, 1] - corners[:, 0]
-    share = (gap[:, 0] * two[:, 1] - gap[:, 1] * two[:, 0]) / (
-        one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
-    )
-    centres: FloatArray = corners[:, 0] + share[:, None] * one
-    return centres
 
 
 @cache

@@ -24,8 +24,6 @@ from maasi_sim.world.floor import RenderSettings, Shape
 from maasi_sim.world.world import noise_stream
 
 DISC, RECTANGLE = 0, 1
-_MAXIMUM_SUBSAMPLES = 33
-_TEXTURE_CELL = 0.01
 
 
 class Shot(NamedTuple):
@@ -213,19 +211,12 @@ def paint(albedo, floor_x, floor_y, shapes, boxes, drift, blur):  # type: ignore
                     cover = 1.0 if distance < 0.0 else 0.0
                 else:
                     footprint = np.sqrt(abs(xc * yr - xr * yc))
-                    count = min(int(np.ceil(2.0 * move / footprint)) + 1, _MAXIMUM_SUBSAMPLES)
+                    count = min(int(np.ceil(2.0 * move / footprint)) + 1, 33)
                     cover = 0.0
                     for sample in range(count):
                         t = (sample + 0.5) / count - 0.5
-                        distance, nx, ny = _signed_distance(
-                            kind,
-                            a,
-                            b,
-                            cosine,
-                            sine,
-                            x - cx - t * drift[index, 0],
-                            y - cy - t * drift[index, 1],
-                        )
+                        dx, dy = x - cx - t * drift[index, 0], y - cy - t * drift[index, 1]
+                        distance, nx, ny = _signed_distance(kind, a, b, cosine, sine, dx, dy)
                         slope = np.sqrt((nx * xc + ny * yc) ** 2 + (nx * xr + ny * yr) ** 2)
                         cover += min(max(0.5 - distance / (slope * soft), 0.0), 1.0)
                     cover /= count
@@ -244,7 +235,8 @@ def floor_albedo(floor_x, floor_y, colour, texture, albedo):  # type: ignore[no-
         albedo[channel] = colour[channel]
     if texture == 0.0:
         return
-    per_cell = 1.0 / _TEXTURE_CELL
+    # Cells of a centimetre.
+    per_cell = 100.0
     for row in range(height):
         for column in range(width):
             x, y = floor_x[row, column], floor_y[row, column]
@@ -298,9 +290,6 @@ def expose(albedo, floor_x, floor_y, exposure, noise, offsets, image):  # type: 
                 image[row, column, channel] = levels[channel, column]
 
 
-_NOISE_TABLE_SIZE = 1 << 16
-
-
 class CameraRenderer:
     """Renders what one robot's camera sees."""
 
@@ -341,7 +330,7 @@ class CameraRenderer:
         self._drift_rates = 2.0 * np.pi / settings.drift_period * drift.uniform(0.7, 1.4, size=4)
         # Normal numbers, the same for all cameras, read at offsets drawn for each row.
         table = np.random.Generator(np.random.PCG64(20240601))
-        self._noise = table.standard_normal(_NOISE_TABLE_SIZE, dtype=np.float32)
+        self._noise = table.standard_normal(1 << 16, dtype=np.float32)
         self._floor_x = np.empty((camera.height, camera.width))
         self._floor_y = np.empty_like(self._floor_x)
         self._albedo = np.empty((3, camera.height, camera.width), dtype=np.float32)
@@ -411,15 +400,9 @@ class CameraRenderer:
             float(settings.shot_noise),
         )
         expose(self._albedo, *floor, exposure, self._noise, offsets, image)
-        return (
-            image if settings.jpeg_quality is None else through_jpeg(image, settings.jpeg_quality)
-        )
-
-
-def through_jpeg(image: ImageArray, quality: int) -> ImageArray:
-    """Return an RGB image after JPEG compression at a quality of 1 to 100."""
-    _, encoded = cv2.imencode(
-        '.jpg', cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
-    )
-    decoded = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR))
-    return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        if settings.jpeg_quality is None:
+            return image
+        quality = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]
+        _, encoded = cv2.imencode('.jpg', cv2.cvtColor(image, cv2.COLOR_RGB2BGR), quality)
+        decoded = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR))
+        return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), dtype=np.uint8)

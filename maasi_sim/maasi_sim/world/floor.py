@@ -100,24 +100,9 @@ class RenderSettings(Settings):
     @classmethod
     def ideal(cls, **changes: object) -> RenderSettings:
         """Return settings without noise, blur, drift or uneven light, but for the changes given."""
-        values: dict[str, object] = dict.fromkeys(
-            (
-                'floor_texture',
-                'light_variation',
-                'vignetting',
-                'exposure_drift',
-                'white_balance_drift',
-                'shot_noise',
-                'read_noise',
-                'exposure_time',
-                'blur',
-            ),
-            0.0,
-        )
-        return cls.model_validate(values | changes)
-
-
-Colour = Sequence[float]
+        drifts = ('exposure_drift', 'white_balance_drift', 'light_variation', 'vignetting')
+        noises = ('floor_texture', 'shot_noise', 'read_noise', 'exposure_time', 'blur')
+        return cls.model_validate(dict.fromkeys((*drifts, *noises), 0.0) | changes)
 
 
 @dataclass(frozen=True)
@@ -130,12 +115,12 @@ class Shape:
 
     centre: tuple[float, float]
     half_size: tuple[float, float]
-    colour: Colour
+    colour: Sequence[float]
     rectangle: bool = False
     angle: float = 0.0
 
 
-def disc(centre: ArrayLike, radius: float, colour: Colour) -> Shape:
+def disc(centre: ArrayLike, radius: float, colour: Sequence[float]) -> Shape:
     """Return a disc on the floor: centre [m, map], radius [m], reflectance."""
     x, y = (float(value) for value in np.asarray(centre, dtype=float)[:2])
     return Shape((x, y), (radius, radius), tuple(colour))
@@ -144,11 +129,7 @@ def disc(centre: ArrayLike, radius: float, colour: Colour) -> Shape:
 def draw_distractors(
     settings: RenderSettings, world: World, generator: np.random.Generator
 ) -> list[Shape]:
-    """
-    Draw the distractors of a world.
-
-    Only sheets may touch a marker: one that is partly covered could not be detected.
-    """
+    """Draw distractors. Only sheets may touch a marker: one partly covered is not detected."""
     counts = settings.distractors
     low, high = world.bounds[:2, 0], world.bounds[:2, 1]
     radius = 0.5 * settings.marker_diameter
@@ -170,11 +151,11 @@ def draw_distractors(
     for _ in range(counts.sheets):
         centre = draw(-1.0)
         sides = generator.uniform(0.05, 0.125, size=2)
-        colour = np.array([0.60, 0.68, 0.80]) * generator.uniform(0.85, 1.15)
+        pale = np.array([0.60, 0.68, 0.80]) * generator.uniform(0.85, 1.15)
         if centre is not None:
             angle = float(generator.uniform(0, np.pi))
             sizes = (float(sides[0]), float(sides[1]))
-            shapes.append(Shape(centre, sizes, colour.tolist(), True, angle))
+            shapes.append(Shape(centre, sizes, pale.tolist(), True, angle))
     for _ in range(counts.lines):
         half = float(generator.uniform(0.1, 0.4))
         width = float(generator.uniform(0.0015, 0.004))
@@ -182,15 +163,15 @@ def draw_distractors(
         line = draw(2.5 * radius, half * np.array([np.cos(angle), np.sin(angle)]))
         if line is not None:
             shapes.append(Shape(line, (half, width), settings.marker_colour, True, angle))
-    for count, size, colours in (
-        (counts.purple, 1.0, [[0.42, 0.12, 0.50]]),
-        (counts.cyan, 1.0, [[0.35, 0.55, 0.62]]),
-        (counts.large, 3.0, [settings.marker_colour]),
+    for count, size, colour in (
+        (counts.purple, 1.0, [0.42, 0.12, 0.50]),
+        (counts.cyan, 1.0, [0.35, 0.55, 0.62]),
+        (counts.large, 3.0, settings.marker_colour),
     ):
         for _ in range(count):
             centre = draw((size + 2.0) * radius)
             if centre is not None:
-                shapes.append(disc(centre, size * radius, colours[0]))
+                shapes.append(disc(centre, size * radius, colour))
     return shapes
 
 

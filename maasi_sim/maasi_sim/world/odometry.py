@@ -92,7 +92,11 @@ class OdometryModel:
         self._offset = (0.0, 0.0)
         self._turn = 0.0
         axes = 3 if start.position[2] > 0.0 else 2
-        self._constant = self._drawn_offset(axes)
+        # The constant error of the position [m].
+        self._constant = np.zeros(3)
+        if settings.position_offset > 0.0:
+            drawn = noise_stream(seed, robot, 0, 'offset').standard_normal(axes)
+            self._constant[:axes] = drawn * (settings.position_offset / math.hypot(*drawn))
         offset = np.zeros(3)
         offset[:axes] = self.reported.position_offset**2 / axes
         self._noise_covariance = np.diag(
@@ -146,14 +150,6 @@ class OdometryModel:
             np.array([v + linear * n for v, n in zip(velocity, twist_noise[:3])]),
             np.array([v + angular * n for v, n in zip(turning, twist_noise[3:])]),
         )
-
-    def _drawn_offset(self, axes: int) -> FloatArray:
-        """Return the constant error of the position, (3,) [m]."""
-        offset = np.zeros(3)
-        if self.settings.position_offset > 0.0:
-            drawn = noise_stream(self.seed, self.robot, 0, 'offset').standard_normal(axes)
-            offset[:axes] = drawn * (self.settings.position_offset / math.hypot(*drawn))
-        return offset
 
     def _from_start(self, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Return a position of the map in the frame of the start."""

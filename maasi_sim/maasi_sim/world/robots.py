@@ -62,11 +62,8 @@ class SimulatedSettings(Settings):
         """Return the true ranging sensor; its clutter is within the diagonal of the bounds."""
         dimension = len(bounds)
         noise = self.noise or believed.noise
-        detection = believed.detection.model_copy(
-            update={
-                'probability': min(believed.detection.probability * self.probability_factor, 1.0)
-            }
-        )
+        probability = min(believed.detection.probability * self.probability_factor, 1.0)
+        detection = believed.detection.model_copy(update={'probability': probability})
         true = believed.model_copy(update={'noise': noise, 'detection': detection})
         sensor = true.build(name, dimension)
         sensor.covariance = sensor.covariance * self.noise_factor**2
@@ -76,10 +73,6 @@ class SimulatedSettings(Settings):
             space = reach * 2.0 * math.pi * (math.pi if dimension == 3 else 1.0)
             sensor.clutter = self.clutter_per_scan / space
         return sensor
-
-
-# Sink rate of a flying robot with an empty battery [m/s].
-_SINKING = 0.3
 
 
 class BatterySettings(Settings):
@@ -219,7 +212,7 @@ class SimulatedRobot:
             return
         command = self._command
         if self.battery.empty:
-            command = np.array([0.0, 0.0, -_SINKING if self._flies else 0.0, 0.0])
+            command = np.array([0.0, 0.0, -0.3 if self._flies else 0.0, 0.0])
         before = self.state
         if not self._resting:
             self._body.step(command, dt)

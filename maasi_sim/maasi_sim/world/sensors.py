@@ -57,7 +57,11 @@ class RangingSensor:
             errors += noise[:, column, None] * self._spread[:, column]
         returns, causes = (values + errors)[seen], np.flatnonzero(seen)
         if self.sensor.clutter > 0.0 and self.reach > 0.0:
-            clutter = self._clutter(generator, dimension)
+            # Uniform in range and angles.
+            low = np.array([0.0, -math.pi, -0.5 * math.pi][:dimension])
+            high = np.array([self.reach, math.pi, 0.5 * math.pi][:dimension])
+            number = generator.poisson(self.sensor.clutter * float(np.prod(high - low)))
+            clutter = generator.uniform(low, high, size=(number, dimension))
             returns = np.concatenate([returns, clutter])
             causes = np.concatenate([causes, np.full(len(clutter), -1)])
         order = generator.permutation(len(returns))
@@ -67,13 +71,6 @@ class RangingSensor:
         if dimension == 3:
             returns[:, 2] = np.clip(returns[:, 2], -0.5 * math.pi, 0.5 * math.pi)
         return returns, causes
-
-    def _clutter(self, generator: np.random.Generator, dimension: int) -> FloatArray:
-        """Draw false returns, uniform in range and angles."""
-        low = np.array([0.0, -math.pi, -0.5 * math.pi][:dimension])
-        high = np.array([self.reach, math.pi, 0.5 * math.pi][:dimension])
-        count = generator.poisson(self.sensor.clutter * float(np.prod(high - low)))
-        return generator.uniform(low, high, size=(count, dimension))
 
 
 class LaserSettings(Settings):

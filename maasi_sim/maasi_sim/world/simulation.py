@@ -10,12 +10,9 @@ from numpy.typing import NDArray
 
 from maasi_filter.models.pose import Pose
 from maasi_sim.scenario.base import BaseScenario
-from maasi_sim.scenario.schema import RobotSettings, Scenario, steps_of
+from maasi_sim.scenario.schema import Scenario, steps_of
 from maasi_sim.world.robots import Equipment, SimulatedRobot
 from maasi_sim.world.world import World
-
-# A time this close to a step, in steps, is the step's.
-_TOLERANCE = 1e-6
 
 
 class SimulatedTeam:
@@ -71,9 +68,11 @@ class Simulation(SimulatedTeam):
         robots = {
             name: simulated_robot(name, scenario, self.world, seed) for name in scenario.names()
         }
-        self._image_steps = {
-            name: _steps_between_images(scenario.robots[name], scenario.step) for name in robots
-        }
+        self._image_steps = {}
+        for name in robots:
+            robot = scenario.robots[name]
+            period = robot.sensor.period if robot.camera is None else 1.0 / robot.camera.rate
+            self._image_steps[name] = steps_of(period, scenario.step)
         super().__init__(scenario, robots)
 
     def warm_up(self) -> None:
@@ -113,7 +112,8 @@ class Simulation(SimulatedTeam):
 
 def step_of_event(time: float, step: float) -> int:
     """Return the first step at or after a time [s]."""
-    return math.ceil(time / step - _TOLERANCE)
+    # A time as close as this to a step is the step's.
+    return math.ceil(time / step - 1e-6)
 
 
 def simulated_robot(name: str, scenario: Scenario, world: World, seed: int) -> SimulatedRobot:
@@ -138,8 +138,3 @@ def simulated_robot(name: str, scenario: Scenario, world: World, seed: int) -> S
         scenario.floor,
         seed,
     )
-
-
-def _steps_between_images(robot: RobotSettings, step: float) -> int:
-    period = robot.sensor.period if robot.camera is None else 1.0 / robot.camera.rate
-    return steps_of(period, step)

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from maasi_filter.arrays import FloatArray
@@ -28,10 +27,8 @@ def noise_stream(
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
 
 
-# Draws for one target before the space counts as full.
-_ATTEMPTS = 1000
-# Draws of a whole set of targets before the space counts as full.
-_RESTARTS = 10
+# Draws for one target, and of a whole set of targets, before the space counts as full.
+_ATTEMPTS, _RESTARTS = 1000, 10
 
 
 class TargetSettings(Settings):
@@ -80,22 +77,10 @@ class TargetSettings(Settings):
 
 @dataclass(frozen=True)
 class World:
-    """The true world.
+    """The true world: bounds (d, 2), targets (n, d) [m, map], obstacles in their own size.
 
-    Attributes
-    ----------
-    bounds : ndarray, shape (d, 2)
-        Lower and upper bound on each axis of the map [m].
-    targets : ndarray, shape (n, d)
-        True positions [m].
-    obstacles : Obstacles
-        In their own size.
-    walk : float
-        Deviation of the targets' random walk on each axis in one step [m].
-    seed : int
-        Of the walk.
-    labels : tuple of Label
-        Label that sensors report for each target; empty: none.
+    `walk` is the deviation of the targets' random walk on each axis in one step [m], `seed` that of
+    the walk. `labels` are what sensors report for each target; empty: none.
     """
 
     bounds: FloatArray
@@ -137,50 +122,39 @@ class World:
         bounds = environment.array()
         obstacles = Obstacles.from_settings(environment.obstacles)
         if targets.positions is not None:
-            positions = check_positions(targets.positions, bounds)
+            positions = np.empty((len(targets.positions), len(bounds)))
+            for index, row in enumerate(targets.positions):
+                if len(row) != len(bounds):
+                    raise ValueError(
+                        f'targets.positions[{index}]: got {len(row)} coordinates, allowed '
+                        f'{len(bounds)}'
+                    )
+                if not np.all((row >= bounds[:, 0]) & (row <= bounds[:, 1])):
+                    raise ValueError(
+                        f'targets.positions[{index}]: got {row}, allowed within the bounds '
+                        f'{bounds.tolist()}'
+                    )
+                positions[index] = row
         else:
             positions = draw_targets(
                 targets, bounds, noise_stream(seed, purpose='targets'), obstacles
             )
-        walk = targets.walk * step**0.5
-        return cls(bounds, positions, obstacles, walk, seed, labels_of(targets, len(positions)))
-
-
-def labels_of(targets: TargetSettings, count: int) -> tuple[Label, ...]:
-    """Return the labels that sensors report for `count` targets; empty: none."""
-    if not (targets.identified or targets.classes):
-        return ()
-    return tuple(
-        Label(
-            targets.classes[i % len(targets.classes)] if targets.classes else '',
-            1.0 if targets.classes else 0.0,
-            f'target_{i + 1}' if targets.identified else '',
+        labels = tuple(
+            Label(
+                targets.classes[i % len(targets.classes)] if targets.classes else '',
+                1.0 if targets.classes else 0.0,
+                f'target_{i + 1}' if targets.identified else '',
+            )
+            for i in range(len(positions) if targets.identified or targets.classes else 0)
         )
-        for i in range(count)
-    )
-
-
-def check_positions(positions: ArrayLike, bounds: FloatArray) -> FloatArray:
-    """Return given target positions as an (n, d) array."""
-    rows = [np.asarray(row, dtype=float) for row in np.asarray(positions, dtype=object)]
-    for index, row in enumerate(rows):
-        if row.shape != (len(bounds),):
-            raise ValueError(
-                f'targets.positions[{index}]: got {row.size} coordinates, allowed {len(bounds)}'
-            )
-        if not np.all((row >= bounds[:, 0]) & (row <= bounds[:, 1])):
-            raise ValueError(
-                f'targets.positions[{index}]: got {row.tolist()}, '
-                f'allowed within the bounds {bounds.tolist()}'
-            )
-    return np.array(rows, dtype=float).reshape(len(rows), len(bounds))
+        return cls(bounds, positions, obstacles, targets.walk * step**0.5, seed, labels)
 
 
 def draw_targets(
     settings: TargetSettings,
     bounds: FloatArray,
     generator: np.random.Generator,
-    obstacles: Obstacles | None = None,
+    obstacles: Obstacles,
 ) -> FloatArray:
     """Draw target positions (count, d) [m], each at least ``margin`` outside of all obstacles."""
     count = settings.count or 0
@@ -191,7 +165,7 @@ def draw_targets(
             f'{0.5 * float((bounds[:, 1] - bounds[:, 0]).min()):g}'
         )
     for _ in range(_RESTARTS):
-        drawn = _draw(settings, count, low, high, generator, obstacles or Obstacles.none())
+        drawn = _draw(settings, count, low, high, generator, obstacles)
         if drawn is not None:
             return drawn
     raise ValueError(
