@@ -1,7 +1,6 @@
 """The simulated laser scanner."""
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from maasi_filter.models.pose import Pose
@@ -15,17 +14,7 @@ def scanner(settings=EXACT, centres=(), radii=(), seed=1, robot='ground'):
     return LaserScanner(settings, BOUNDS, centres, radii, seed, robot)
 
 
-@pytest.mark.parametrize(('yaw', 'turned'), [(0.0, 0), (np.pi / 2, 1)])
-def test_walls_are_where_they_are_anticlockwise_from_straight_ahead(yaw, turned):
-    ranges = scanner().scan(Pose.from_yaw([1.0, 0.5, 0.0], yaw), 0)
-    assert ranges.shape == (360,)
-    assert ranges.dtype == np.float32
-    assert_allclose(ranges[[0, 90, 180, 270]], np.roll([2.0, 1.5, 1.0, 0.5], -turned), rtol=1e-6)
-    settings = LaserSettings(noise=0.0, wall_margin=0.25)
-    assert_allclose(scanner(settings).scan(Pose.from_yaw([1, 0.5, 0], 0.0), 0)[0], 2.25)
-
-
-def test_circles_agree_with_a_fine_march_along_each_beam():
+def test_walls_and_circles_agree_with_a_fine_march_along_each_beam():
     centres, radii = np.array([[1.5, 1.0], [2.2, 0.4], [0.5, 1.6]]), np.array([0.2, 0.1, 0.3])
     pose = Pose.from_yaw([0.9, 0.8, 0.0], 0.4)
     ranges = scanner(centres=centres, radii=radii).scan(pose, 0)
@@ -39,10 +28,10 @@ def test_circles_agree_with_a_fine_march_along_each_beam():
 
 
 def test_far_is_infinite_and_near_is_minus_infinite():
-    settings = LaserSettings(noise=0.0, wall_margin=0.0, minimum_range=0.6, maximum_range=1.9)
+    settings = LaserSettings(noise=0.0, wall_margin=0.1, minimum_range=0.65, maximum_range=1.9)
     ranges = scanner(settings).scan(Pose.from_yaw([1.0, 0.5, 0.0], 0.0), 0)
     assert_array_equal(ranges[[0, 270]], [np.inf, -np.inf])
-    assert_allclose(ranges[90], 1.5)
+    assert_allclose(ranges[90], 1.6)
 
 
 def test_outside_its_walls_it_sees_nothing_behind_and_inside_a_circle_zero():
@@ -62,5 +51,4 @@ def test_noise_is_keyed_and_as_large_as_set():
     exact = scanner(LaserSettings(noise=0.0, wall_margin=0.0, beams=4000, maximum_range=9.0))
     difference = noisy.scan(pose, 3) - exact.scan(pose, 3)
     assert_allclose([difference.mean(), difference.std()], [0.0, 0.05], atol=0.003)
-    assert_array_equal(noisy.scan(pose, 3), noisy.scan(pose, 3))
     assert (noisy.scan(pose, 4) != noisy.scan(pose, 3)).all()

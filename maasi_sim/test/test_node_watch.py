@@ -11,14 +11,11 @@ FILTER, PLANNER = '/filter_node', '/planner_node'
 
 
 @pytest.fixture
-def queued():
-    """Return the time that processes have waited for a processor, by their numbers."""
-    return {}
-
-
-@pytest.fixture
-def watch(queued):
+def watch():
+    # Time that processes have waited for a processor, by their numbers.
+    queued = {}
     made = NodeWatch(4.5, 180.0, lambda pid: queued.get(pid, 0.0))
+    made.queued = queued
     made.begin(FILTER, 1, 0.0)
     made.begin(PLANNER, 2, 0.0)
     return made
@@ -58,10 +55,10 @@ def test_a_node_that_starts_has_as_long_as_the_limit_says(watch):
     assert set(watch.starting()) == {FILTER, PLANNER}
 
 
-def test_time_in_the_queue_for_a_processor_does_not_count(watch, queued):
-    queued[1] = 2.0
+def test_time_in_the_queue_for_a_processor_does_not_count(watch):
+    watch.queued[1] = 2.0
     watch.beat(FILTER, 1.0)
-    queued[1] = 5.0
+    watch.queued[1] = 5.0
     assert look(watch, 1.1, 8.4) is None
     assert look(watch, 8.4, 9.0) is not None
 

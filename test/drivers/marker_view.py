@@ -60,14 +60,10 @@ def hard_floor(seed: int) -> RenderSettings:
 
 def one_image(settings: CameraSettings, targets, pose: Pose, floor=None) -> np.ndarray:
     """Return what a camera sees of markers on the floor, without disturbances by default."""
-    floor = floor or RenderSettings.ideal()
-    world = World.from_settings(
-        EnvironmentSettings(bounds=[[-1, 3], [-1, 3]]), TargetSettings(positions=targets), 1
-    )
-    shapes = scene_of(world, floor, 1)
-    return CameraRenderer(Camera.from_settings(settings), floor, shapes, 1, 'drone').render(
-        pose, 0, 0
-    )
+    floor, space = floor or RenderSettings.ideal(), EnvironmentSettings(bounds=[[-1, 3], [-1, 3]])
+    shapes = scene_of(World.from_settings(space, TargetSettings(positions=targets), 1), floor, 1)
+    renderer = CameraRenderer(Camera.from_settings(settings), floor, shapes, 1, 'drone')
+    return renderer.render(pose, 0, 0)
 
 
 def sequence(

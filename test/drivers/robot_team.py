@@ -154,14 +154,8 @@ class Team(Node):
                 self.until_done(len(self.states) + 1)
             else:
                 self.say()
-                self.until(
-                    lambda known=known: (
-                        len(self.commands) > known
-                        and self.states[-1:]
-                        and self.state.step == self.step
-                    ),
-                    'no command',
-                )
+                self.until(lambda known=known: len(self.commands) > known, 'no command')
+                self.until(lambda: self.states and self.state.step == self.step, 'no state')
             self.body.step(self.command, STEP)
 
     def begin_step(self, k, robots=('rover',), first='odom'):
@@ -228,12 +222,9 @@ class Team(Node):
 
     def takes(self, *arguments, live=None):
         """Return whether the robot sets out for a goal; it moves on meanwhile."""
-        live = live or ((lambda: None) if self.deaf else self.move)
+        live, moving = live or ((lambda: None) if self.deaf else self.move), AgentState.MOVING
         _, result = self.send_accepted(*arguments)
-        self.until(
-            lambda: live() or result.done() or self.state.goal_status == AgentState.MOVING,
-            'the goal is not answered',
-        )
+        self.until(lambda: live() or result.done() or self.state.goal_status == moving, 'no answer')
         return not result.done() or result.result().status != GoalStatus.STATUS_ABORTED
 
     def call(self, name, until=None):
@@ -248,12 +239,11 @@ class Team(Node):
 
     def ask(self, stamp, robots=('rover',), step=0):
         self.batch += 1
-        members = [
-            BatchMember(robot=name, decision=3, measurement=self.batch + 6) for name in robots
-        ]
-        self.batches.publish(
-            MeasurementBatch(id=self.batch, step=step, stamp=stamp_to_ros(stamp), members=members)
-        )
+        number = self.batch + 6
+        members = [BatchMember(robot=name, decision=3, measurement=number) for name in robots]
+        batch = MeasurementBatch(id=self.batch, step=step, stamp=stamp_to_ros(stamp))
+        batch.members = members
+        self.batches.publish(batch)
 
     def answer(self, number=1):
         self.until(lambda: len(self.detections) >= number, 'no detections')

@@ -21,9 +21,8 @@ def test_a_marker_is_measured_to_millimetres(rule, dimension):
     settings = drone_camera(segmentation={'rule': rule})
     pose = Pose.from_yaw([0.1, 0.2, 1.0], 0.8)
     target = np.array([0.16, 0.11, 0.0])
-    seen = MarkerDetector(settings, dimension).detect(
-        one_image(settings, [target[:2].tolist()], pose), pose
-    )
+    image = one_image(settings, [target[:2].tolist()], pose)
+    seen = MarkerDetector(settings, dimension).detect(image, pose)
     offset = target - pose.position
     expected = [np.hypot(*offset[:2]), np.arctan2(offset[1], offset[0])]
     if dimension == 3:
@@ -38,17 +37,13 @@ def test_a_marker_is_measured_to_millimetres(rule, dimension):
 @pytest.mark.parametrize('seed', range(900, 908))
 def test_the_robust_rule_on_hard_sequences(seed):
     result = score(drone_camera(), hard_floor(seed), seed, 30)
-    assert result.recall >= 0.98
-    assert result.false_per_image <= 0.2
-    assert result.rmse <= 0.005
+    assert result.recall >= 0.98 and result.false_per_image <= 0.2 and result.rmse <= 0.005
 
 
 @pytest.mark.parametrize('rule', ['paper', 'robust'])
 def test_both_rules_on_a_moderate_floor(rule):
     result = score(drone_camera(segmentation={'rule': rule}), RenderSettings(), 31, 60)
-    assert result.recall >= 0.98
-    assert result.false_per_image <= 0.02
-    assert result.rmse <= 0.001
+    assert result.recall >= 0.98 and result.false_per_image <= 0.02 and result.rmse <= 0.001
 
 
 @pytest.mark.parametrize(
@@ -136,11 +131,9 @@ def photograph(camera, pose, markers, dictionary):
     printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f'DICT_{dictionary}'))
     for number, centre in markers.items():
         sheet = cv2.aruco.generateImageMarker(printed, number, 240)
-        half = 0.04
-        corners = half * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+        corners = 0.04 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
         seen = camera.project(corners + np.array([*centre, 0.0]), pose).astype(np.float32)
-        end = 240 - 0.5
-        sheet_corners = np.array([[-0.5, -0.5], [end, -0.5], [end, end], [-0.5, end]], np.float32)
+        sheet_corners = np.array([[0, 0], [240, 0], [240, 240], [0, 240]], np.float32) - 0.5
         turn = cv2.getPerspectiveTransform(sheet_corners, seen)
         size = (camera.width, camera.height)
         warped = cv2.warpPerspective(sheet, turn, size, flags=cv2.INTER_AREA)

@@ -14,13 +14,12 @@ import pytest
 import yaml
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_allclose
-from robot_team import rendered, stamped
 
 from maasi_drivers.agent.agent_driver import AgentDriver
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.camera_input import CameraInput
-from maasi_filter.models.pose import Pose, compose, inverse
-from maasi_filter.ros.conversions import pose_from_ros, stamp_from_ros
+from maasi_filter.models.pose import compose, inverse
+from maasi_filter.ros.conversions import pose_from_ros
 from maasi_filter.ros.parameters import unflatten
 from maasi_msgs.msg import AgentState
 
@@ -56,9 +55,8 @@ class Rover:
         state = self.body.robot_state()
         own = compose(inverse(self.start), state.pose)
         forward = math.hypot(state.velocity[0], state.velocity[1])
-        report = {'x': own.position[0], 'y': own.position[1], 'yaw': own.yaw}
-        report |= {'forward': forward, 'turn': state.angular_velocity[2], 'battery': 0.8}
-        return report | self.extra
+        report = {'x': own.position[0], 'y': own.position[1], 'yaw': own.yaw, 'battery': 0.8}
+        return report | {'forward': forward, 'turn': state.angular_velocity[2]} | self.extra
 
 
 @pytest.fixture
@@ -77,26 +75,14 @@ def rover_and_team(play):
     rover.link.close()
 
 
-def test_it_goes_where_it_is_sent_and_tells_what_it_sees(rover_and_team):
+def test_it_goes_where_it_is_sent(rover_and_team):
     rover, team, _ = rover_and_team
     assert_allclose(pose_from_ros(team.state.pose.pose).position, team.start.position, atol=0.01)
     assert team.state.battery == pytest.approx(0.8)
-    # Sent to a waypoint.
     waypoint = team.start.position + np.array([0.35, 0.15, 0.0])
     _, result = team.send_accepted(waypoint, live=rover.live)
     assert team.ended(result, rover.live)[0] == GoalStatus.STATUS_SUCCEEDED
-    place = rover.body.robot_state().pose
-    assert np.linalg.norm(place.position - waypoint) < 0.08
-    # Asked what it sees: a marker.
-    ahead = place.position + place.rotation() @ [0.05, 0.05, 0.0]
-    stamp, pose = stamp_from_ros(team.state.header.stamp), pose_from_ros(team.state.pose.pose)
-    team.ask(stamp)
-    image = rendered(team, [ahead[:2].tolist()], Pose.from_yaw(pose.position, pose.yaw))
-    team.images.publish(stamped(image, stamp))
-    team.until(lambda: rover.live() or team.detections, 'no detections')
-    (seen,) = team.detections[0].detections
-    spot = pose.position[:2] + seen.range * np.array([np.cos(seen.bearing), np.sin(seen.bearing)])
-    assert_allclose(spot, ahead[:2], atol=0.01)
+    assert np.linalg.norm(rover.body.robot_state().pose.position - waypoint) < 0.08
 
 
 def test_a_rover_that_is_silent_or_talks_nonsense_is_stopped_and_said(rover_and_team):

@@ -6,13 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from maasi_drivers.agent.odometry import (
-    MapOdometry,
-    PoseHistory,
-    PoseSpeed,
-    StampedPose,
-    interpolate,
-)
+from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, PoseSpeed, StampedPose
 from maasi_filter.models.pose import Pose, compose
 
 
@@ -66,7 +60,10 @@ def test_interpolation_goes_the_short_way_round(first, turn, part, sign):
     b = Pose.from_yaw([2.0, 0.0, 3.5], first + turn)
     # The sign of a quaternion does not matter.
     b = StampedPose(1000, Pose(b.position, sign * b.orientation))
-    pose = interpolate(a, b, part).pose
+    history = PoseHistory()
+    history.add(a)
+    history.add(b)
+    pose = history.at(part).pose
     assert_allclose(pose.position, [1 + part / 1e3, 2 - part / 500, 3 + part / 2e3], atol=1e-9)
     difference = pose.yaw - (first + turn * part / 1000)
     assert_allclose(np.mod(difference + np.pi, 2 * np.pi), np.pi, atol=1e-6)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from maasi_drivers.agent.sensor_reading import measured
 from maasi_drivers.settings.camera import CameraSettings
-from maasi_drivers.vision.camera_model import Camera, box_view_margin, rotation_from_rpy
+from maasi_drivers.vision.camera_model import Camera, box_view_margin
 from maasi_drivers.vision.detector import blobs_at
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
@@ -128,13 +128,7 @@ def test_right_over_a_target_the_bearing_says_nothing(model, offset):
         ({}, [-0.215, -0.215], [0.215, 0.215], 0.9, False),
         (TILTED, [-0.115, -0.115], [0.215, 0.215], 0.0, True),
         (TILTED, [-0.3, -0.1], [0.2, 0.2], 0.0, False),
-        (
-            {'mount': {'position': [0.05, 0.0, 0.1], 'rpy': [0] * 3}},
-            [-0.1] * 2,
-            [0.2] * 2,
-            0,
-            False,
-        ),
+        ({'mount': {'position': [0, 0, 0.1], 'rpy': [0] * 3}}, [-0.1] * 2, [0.2] * 2, 0, False),
         ({'distortion': DISTORTION}, [-0.115, -0.115], [0.215, 0.215], 1.0, True),
     ],
 )
@@ -147,13 +141,3 @@ def test_the_margin_of_a_box_is_that_of_its_worst_place(changes, low, high, heig
     margin = box_view_margin(view, low, high, height)
     assert (margin >= 0) == fits
     assert margin == worst == -np.inf or worst - 3.0 < margin <= worst
-
-
-def test_fixed_axis_angles():
-    roll, pitch, yaw = 0.3, -0.4, 1.2
-    expected = (
-        cv2.Rodrigues(np.array([0, 0, yaw]))[0]
-        @ cv2.Rodrigues(np.array([0, pitch, 0]))[0]
-        @ cv2.Rodrigues(np.array([roll, 0, 0]))[0]
-    )
-    assert_allclose(rotation_from_rpy(roll, pitch, yaw), expected, atol=1e-12)

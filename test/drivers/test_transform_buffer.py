@@ -45,9 +45,8 @@ def test_chains_are_composed_up_and_down(buffer):
 
 
 def test_times_between_are_interpolated_and_nothing_is_extrapolated(buffer):
-    for part in (0.0, 0.3, 1.0):
-        found = buffer.pose('odom', 'base', round((1.0 + part) * SECOND))
-        assert_allclose([found.position[0], found.yaw], [1.0 + part, 0.2 + 0.4 * part], atol=1e-6)
+    found = buffer.pose('odom', 'base', round(1.3 * SECOND))
+    assert_allclose([found.position[0], found.yaw], [1.3, 0.32], atol=1e-6)
     for stamp in (SECOND - 1, 2 * SECOND + 1):
         with pytest.raises(TransformError, match=f'{SECOND} to {2 * SECOND}'):
             buffer.pose('map', 'base', stamp)

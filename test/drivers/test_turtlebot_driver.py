@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_allclose, assert_array_equal
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, numbers, parameters_of, stamped
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, parameters_of, stamped
 from sensor_msgs.msg import LaserScan
 
 from maasi_drivers.drivers import TurtlebotDriver
@@ -25,9 +25,6 @@ from maasi_sim.world.sensors import LaserScanner, LaserSettings
 
 HERE = Path(__file__).parent
 SCANNING = {'scan': {'timeout': 1.0, 'blocked_timeout': 3.0}}
-
-
-# ---- the laser scan --------------------------------------------------------------------------
 
 
 class Scanned:
@@ -95,7 +92,8 @@ def test_a_waypoint_that_cannot_be_reached_is_given_up(play):
 # ---- Nav2 ------------------------------------------------------------------------------------
 
 
-def nav2_environment(cache):
+@pytest.fixture(scope='module')
+def with_nav2(request):
     """Return an environment with nav2_msgs: Nav2's own, or the one beside this file, built once."""
     probe = [sys.executable, '-c', 'from nav2_msgs.action import NavigateToPose']
     if subprocess.run(probe, capture_output=True, check=False).returncode == 0:
@@ -103,7 +101,7 @@ def nav2_environment(cache):
     source = HERE / 'nav2_msgs'
     content = b''.join(path.read_bytes() for path in sorted(source.rglob('*')) if path.is_file())
     key = hashlib.sha256(content + sys.version.encode()).hexdigest()[:12]
-    folder = cache / f'nav2_msgs_{key}'
+    folder = Path(request.config.cache.mkdir('maasi_interfaces')) / f'nav2_msgs_{key}'
     install = folder / 'install'
     if not (folder / 'built').exists():
         command = [sys.executable, '-m', 'colcon', '--log-base', str(folder / 'log'), 'build']
@@ -125,47 +123,25 @@ def nav2_environment(cache):
     return environment
 
 
-@pytest.fixture(scope='module')
-def with_nav2(request):
-    return nav2_environment(Path(request.config.cache.mkdir('maasi_interfaces')))
-
-
 @pytest.fixture
 def nav2(context, with_nav2):
     """Start what plays Nav2; return a queue of what it says, and its process."""
     environment = with_nav2 | {
         name: os.environ[name] for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')
     }
-    process = subprocess.Popen(
-        [sys.executable, str(HERE / 'play_nav2.py')],
-        env=environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, str(HERE / 'play_nav2.py')]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
     said = queue.Queue()
 
-    def read():
-        for line in process.stdout:
-            said.put(json.loads(line))
-
-    reader = threading.Thread(target=read, daemon=True)
+    reader = threading.Thread(
+        target=lambda: [said.put(json.loads(line)) for line in process.stdout], daemon=True
+    )
     reader.start()
     assert said.get(timeout=60.0)['event'] == 'ready'
     yield said, process
     process.kill()
     process.wait()
     reader.join()
-
-
-@pytest.fixture
-def driven(nav2, with_nav2, process, team):
-    """Start a driver that hands its waypoints to Nav2; return team, process of Nav2, driver."""
-    driver = process(
-        environment=with_nav2, navigation='nav2', pose_source='odometry', odometry_timeout=0.5
-    )
-    team.connect()
-    team.awaken()
-    return team, nav2[1], driver
 
 
 @pytest.fixture
@@ -190,21 +166,19 @@ def hear(team, stand, nav2):
 
 def send_first(team, position, stand):
     """Send a goal until Nav2 is there: the driver may find it later than the team the driver."""
-    for _ in range(1000):
+    moving = AgentState.MOVING
+    while True:
         _, result = team.send_accepted(position, live=stand)
-        team.until(
-            lambda result=result: (
-                stand() or result.done() or team.state.goal_status == AgentState.MOVING
-            )
-        )
+        team.until(lambda r=result: stand() or r.done() or team.state.goal_status == moving)
         if not result.done() or result.result().result.reached:
             return result
         assert 'Nav2 is not there' in result.result().result.reason
-    raise AssertionError(f'no goal is taken: {team.states[-1:]}')
 
 
-def test_nav2_drives_to_the_waypoints(driven, stand, hear):
-    team, nav2, _ = driven
+def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, hear):
+    process(environment=with_nav2, navigation='nav2', pose_source='odometry', odometry_timeout=0.5)
+    team.connect()
+    team.awaken()
 
     def send(x):
         return team.send_accepted([x, 0.8, 0.0], live=stand)
@@ -221,8 +195,7 @@ def test_nav2_drives_to_the_waypoints(driven, stand, hear):
     assert line['frame'] == 'map'
     assert_allclose(line['position'], [0.3, 0.8, 0.0])
     offset = np.array([0.3, 0.8]) - team.start.position[:2]
-    heading = 2.0 * math.atan2(*line['turn'])
-    assert_allclose(heading, math.atan2(offset[1], offset[0]), atol=0.02)
+    assert_allclose(2.0 * math.atan2(*line['turn']), math.atan2(*offset[::-1]), atol=0.02)
     team.ended(result, stand)
     assert result.result().result.reached
     # Given up by Nav2, and refused by it.
@@ -260,7 +233,7 @@ def test_nav2_drives_to_the_waypoints(driven, stand, hear):
     # Nav2 dies on the way.
     result = send(0.7)[1]
     hear('goal')
-    nav2.kill()
+    nav2[1].kill()
     reason = team.aborted(result, stand)
     assert_array_equal(team.command, np.zeros(4))
     # On a busy machine odometry may have been missed first, so it is sent until Nav2 is the reason.
@@ -268,31 +241,6 @@ def test_nav2_drives_to_the_waypoints(driven, stand, hear):
         assert 'no odometry for' in reason
         reason = team.aborted(send(0.7)[1], stand)
     assert 'no answer or feedback of Nav2 for' in reason or 'Nav2 is' in reason
-
-
-def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(
-    driven, nav2, stand, hear, start_guard
-):
-    team, _, driver = driven
-    said, _ = nav2
-    guard = start_guard()
-    send_first(team, [0.7, 0.8, 0.0], stand)
-    hear('goal')
-    # No odometry.
-    team.until(lambda: not said.empty())
-    assert said.get()['event'] == 'cancelled'
-    team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
-    team.until(lambda: stand() or team.state.goal_status == AgentState.ABORTED)
-    team.send([0.9, 0.8, 0.0], live=stand)
-    hear('goal')
-    team.until(guard._nav2.service_is_ready)
-    driver.kill()
-    driver.wait()
-    known = len(team.commands)
-    team.until(lambda: not said.empty())
-    assert said.get()['event'] == 'cancelled'
-    team.until(lambda: len(team.commands) >= known + 3)
-    assert not np.any([numbers(item) for item in team.commands[known:]])
 
 
 def test_nav2_does_not_drive_a_robot_whose_pose_is_not_known(nav2, with_nav2, process, make_team):

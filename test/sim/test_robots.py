@@ -116,17 +116,6 @@ def test_two_runs_are_the_same_to_the_bit_and_another_robot_is_not():
     assert_array_equal(runs[0].image(40, 2.0), runs[1].image(40, 2.0))
 
 
-@pytest.mark.parametrize('command', [(np.nan, 0, 0, 0), (np.inf, 0, 0, 0), (0.1, 0.2)])
-def test_an_unfit_command_is_refused_and_the_last_one_holds(command):
-    one = robot('unicycle', GROUND)
-    drive(one, 40, (0.2, 0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match='velocity command: got'):
-        one.command(command)
-    before = one.state.pose.position[0]
-    one.step(41, 0.05)
-    assert one.state.pose.position[0] - before > 0.005
-
-
 def test_an_obstacle_stops_a_robot_short_of_it():
     place = world(obstacles=[{'centre': [1.0, 0.3], 'radius': 0.2}])
     one = robot('unicycle', GROUND, place=place)

@@ -41,11 +41,7 @@ SCENARIO = {
     'targets': {'positions': [[1.9, 1.95], [0.3, 0.4]]},
     'robots': {
         'mambo': {'type': 'mambo', 'start': [1.9, 1.9, 1.0], 'yaw': 0.5, 'candidates': GRID},
-        'turtlebot': {
-            'type': 'turtlebot3_burger',
-            'start': [0.0, 0.0, 0.0],
-            'candidates': GRID,
-        },
+        'turtlebot': {'type': 'turtlebot3_burger', 'start': [0.0] * 3, 'candidates': GRID},
     },
     'stop': 'planner_done',
 }
@@ -66,18 +62,13 @@ LINKED = {
         },
     },
     'events': [
-        {'at': at, 'robot': 'drone', 'do': do} for at, do in ((6.0, 'leave'), (9.0, 'back'))
+        {'at': 6.0, 'robot': 'drone', 'do': 'leave'},
+        {'at': 9.0, 'robot': 'drone', 'do': 'back'},
     ],
 }
 FORWARD = (0.2, 0.0, 0.0, 0.0)
-TOPICS = {
-    'odom': Odometry,
-    'camera/image_raw': Image,
-    'camera/camera_info': CameraInfo,
-    'scan': LaserScan,
-    'battery_state': BatteryState,
-    'ranges': RangeArray,
-}
+TOPICS = {'odom': Odometry, 'camera/image_raw': Image, 'camera/camera_info': CameraInfo}
+TOPICS |= {'scan': LaserScan, 'battery_state': BatteryState, 'ranges': RangeArray}
 
 
 class Member(Node):
@@ -149,10 +140,12 @@ class Team:
         self.filter.listen('/ground_truth/targets', PoseArray, LATCHED)
         self.filter.listen('/ground_truth/markers', MarkerArray, LATCHED)
 
-    def start(self):
+    def start(self, ready):
         assert self.sim.trigger_configure().name == 'SUCCESS', self.sim.problem
         assert self.sim.trigger_activate().name == 'SUCCESS'
         self.executor.add_node(self.sim)
+        if ready:
+            self.say_ready()
         return self
 
     def add(self, name, robot=''):
@@ -163,10 +156,6 @@ class Team:
     @property
     def members(self):
         return [*self.drivers.values(), self.filter, self.planner]
-
-    @property
-    def waits_for(self):
-        return self.sim.status()['waits for']
 
     def say_ready(self):
         for member in self.members:
@@ -198,10 +187,10 @@ class Team:
 def make_team(context, tmp_path):
     teams = []
 
-    def make(content=SCENARIO, **options):
+    def make(content=SCENARIO, ready=True, **options):
         # Known before it starts: nodes that are not destroyed keep the log topic of their name.
         teams.append(Team(context, tmp_path, content, **options))
-        return teams[-1].start()
+        return teams[-1].start(ready)
 
     yield make
     for team in teams:
@@ -218,15 +207,13 @@ def steps_of(messages, stamp='header.stamp'):
 
 def test_every_topic_comes_at_its_rate_with_the_stamps_of_the_steps(make_team):
     team = make_team()
-    team.say_ready()
     team.run(50)
     mambo, turtlebot = team.drivers['mambo'], team.drivers['turtlebot']
+    periods = {'odom': 1, 'camera/image_raw': 2, 'camera/camera_info': 2, 'battery_state': 20}
     for driver in (mambo, turtlebot):
-        assert steps_of(driver.of('odom'))[:51] == list(range(51))
-        assert steps_of(driver.of('camera/image_raw'))[:26] == list(range(0, 51, 2))
-        assert steps_of(driver.of('camera/camera_info'))[:26] == list(range(0, 51, 2))
-        assert steps_of(driver.of('battery_state'))[:3] == [0, 20, 40]
-    assert steps_of(turtlebot.of('scan'))[:13] == list(range(0, 51, 4))
+        for topic, period in periods.items() | ({('scan', 4)} if driver is turtlebot else set()):
+            expected = list(range(0, 51, period))
+            assert steps_of(driver.of(topic))[: len(expected)] == expected
     assert not mambo.of('scan') and not mambo.of('ranges')
     steps = team.filter.steps[:51]
     assert [message.step for message in steps] == list(range(51))
@@ -265,9 +252,8 @@ def test_every_topic_comes_at_its_rate_with_the_stamps_of_the_steps(make_team):
 def test_nothing_is_published_until_everybody_is_there(make_team, monkeypatch):
     monkeypatch.setattr('maasi_sim.sim_node._PATIENCE', 0.0)
     team = make_team(recorder=True)
-    team.say_ready()
     team.settle()
-    assert team.waits_for == '/recorder'
+    assert team.sim.status()['waits for'] == '/recorder'
     # It always comes last.
     assert team.sim._said != 'waits for /recorder'
     assert not team.drivers['mambo'].of('odom') and not team.filter.steps
@@ -288,9 +274,8 @@ def test_the_time_starts_only_when_no_subscription_would_miss_it(make_team, monk
     matched = Publisher.get_subscription_count
     monkeypatch.setattr(Publisher, 'get_subscription_count', late)
     counts['/clock'] = 0
-    team.say_ready()
     team.settle()
-    assert team.waits_for == '' and team.sim.step < 0
+    assert team.sim.status()['waits for'] == '' and team.sim.step < 0
     assert not team.filter.steps and not team.filter.seen['/clock']
     del counts['/clock']
     team.run(2)
@@ -302,13 +287,12 @@ def test_a_step_waits_for_everybody_and_for_every_command(make_team):
     team.filter.quiet = True
     turtlebot, mambo = team.drivers['turtlebot'], team.drivers['mambo']
     turtlebot.stamp_shift = -STEP
-    team.say_ready()
     team.spin_until(lambda: team.sim.dropped['stale command'] == 1)
     team.settle()
-    assert team.waits_for == '/filter_node, turtlebot/cmd_vel'
+    assert team.sim.status()['waits for'] == '/filter_node, turtlebot/cmd_vel'
     team.filter.say_done(0)
     team.settle()
-    assert team.waits_for == 'turtlebot/cmd_vel'
+    assert team.sim.status()['waits for'] == 'turtlebot/cmd_vel'
     turtlebot.stamp_shift = 0
     team.filter.quiet = False
     turtlebot.send(FORWARD, 0.0)
@@ -323,7 +307,6 @@ def test_a_step_waits_for_everybody_and_for_every_command(make_team):
 def test_a_robot_that_is_away_is_silent_stands_still_and_goes_on_from_there(make_team):
     leave = {'at': 1.0, 'robot': 'turtlebot', 'do': 'leave'}
     team = make_team(SCENARIO | {'events': [leave, leave | {'at': 2.0, 'do': 'back'}]})
-    team.say_ready()
     team.run(60)
     turtlebot = team.drivers['turtlebot']
     there = [*range(20), *range(40, 61)]
@@ -340,7 +323,6 @@ def test_a_robot_that_is_away_is_silent_stands_still_and_goes_on_from_there(make
 def test_a_filter_that_was_started_again_gets_the_step_anew(make_team):
     team = make_team()
     team.planner.quiet = True
-    team.say_ready()
     team.spin_until(lambda: team.sim._waiting == {'/planner_node'})
     team.executor.remove_node(team.filter)
     team.filter.destroy_node()
@@ -365,7 +347,6 @@ def test_free_running_goes_on_by_itself_and_the_last_command_holds(make_team):
     driver = team.drivers['mambo']
     for member in team.members:
         member.quiet = True
-    team.say_ready()
     team.spin_until(lambda: team.sim.step >= 0)
     driver.send((0.3, 0.0, 0.0, 0.0), 0.0)
     team.run(60)
@@ -382,7 +363,6 @@ def test_free_running_goes_on_by_itself_and_the_last_command_holds(make_team):
 
 def test_lockstep_keeps_to_the_rate_that_is_asked_for(make_team):
     team = make_team(rate=10.0)
-    team.say_ready()
     team.spin_until(lambda: team.sim.step >= 0)
     begin = time.monotonic()
     team.run(40)
@@ -422,21 +402,18 @@ def test_a_linked_robot_is_cut_off_while_it_is_away(make_team, tmp_path):
             link.vehicle.active = True
             return link.vehicle.permit(time.monotonic()) == ''
 
-    def flies():
-        return link.vehicle.flying
-
     try:
-        team = make_team(content, robots=('drone',), lockstep=False, rate=1.0)
+        team = make_team(content, ready=False, robots=('drone',), lockstep=False, rate=1.0)
         # It lives before the time starts.
         team.spin_until(permitted)
-        team.spin_until(flies)
+        team.spin_until(lambda: link.vehicle.flying)
         team.say_ready()
         drone = team.drivers['drone']
         team.spin_until(lambda: drone.of('ranges'))
         assert drone.of('ranges')[0].ranges[0].range == pytest.approx(4.0, abs=2.0)
-        team.spin_until(lambda: not flies())
+        team.spin_until(lambda: not link.vehicle.flying)
         assert link.vehicle.fault == 'link: nothing heard from system 1'
-        team.spin_until(flies)
+        team.spin_until(lambda: link.vehicle.flying)
         assert not drone.of('odom') and not drone.of('battery_state')
         assert drone.command.get_subscription_count() == 0
     finally:
@@ -446,8 +423,8 @@ def test_a_linked_robot_is_cut_off_while_it_is_away(make_team, tmp_path):
 def test_a_robot_that_another_program_moves_brings_its_own_time(make_team):
     content = deepcopy(SCENARIO)
     content['robots'] = {'turtlebot': content['robots']['turtlebot'] | {'body': 'external'}}
-    pace = {'lockstep': False, 'rate': 1.0}
-    team = make_team(content, robots=('turtlebot',), use_sim_time=True, **pace)
+    options = {'lockstep': False, 'rate': 1.0, 'use_sim_time': True}
+    team = make_team(content, robots=('turtlebot',), **options)
     robot = team.drivers['turtlebot']
     clock = robot.create_publisher(Clock, '/clock', 10)
     states = robot.create_publisher(AgentState, '/turtlebot/state', 10)
@@ -463,8 +440,7 @@ def test_a_robot_that_another_program_moves_brings_its_own_time(make_team):
         states.publish(state)
         states.publish(bad)
 
-    team.say_ready()
-    team.spin_until(lambda: team.waits_for == '/clock')
+    team.spin_until(lambda: team.sim.status()['waits for'] == '/clock')
     team.spin_until(lambda: go_on() or len(robot.of('camera/image_raw')) >= 3)
     stamps = [seconds(image.header.stamp) for image in robot.of('camera/image_raw')]
     assert 57.0 <= stamps[0] < stamps[-1] <= now
