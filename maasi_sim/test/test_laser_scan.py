@@ -32,9 +32,7 @@ def test_far_is_infinite_and_near_is_minus_infinite():
     ranges = scanner(settings).scan(Pose.from_yaw([1.0, 0.5, 0.0], 0.0), 0)
     assert_array_equal(ranges[[0, 270]], [np.inf, -np.inf])
     assert_allclose(ranges[90], 1.6)
-
-
-def test_outside_its_walls_it_sees_nothing_behind_and_inside_a_circle_zero():
+    # Outside its walls it sees nothing behind, inside a circle zero.
     ranges = scanner().scan(Pose.from_yaw([4.0, 3.0, 0.0], 0.0), 0)
     assert np.isinf(ranges[[0, 90]]).all()
     here = Pose.from_yaw([1.0, 0.5, 0.0], 0.0)

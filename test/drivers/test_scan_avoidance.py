@@ -90,10 +90,6 @@ def test_a_robot_touches_nothing_whatever_stands_there(seed):
     assert drive([2.0, 1.6], centres, np.full(8, 0.12), yaw=2.0)
 
 
-def test_a_waypoint_inside_of_something_is_not_driven_at():
-    assert not drive([1.0, 0.0], [[1.0, 0.0]], [0.2], seconds=30.0)
-
-
 def test_a_robot_that_touches_something_may_leave():
     model = ScanUnicycle(MOTION, Obstacles.none(), RADIUS, ScanSettings())
     for place, leaves in ((-0.1, True), (0.1, False)):

@@ -41,8 +41,7 @@ def test_the_papers_mask_is_equation_16_to_the_half_grey_level():
 
 def test_the_papers_rule_leaves_out_specks_and_takes_the_plain_centroid_of_the_pixels():
     image = draw_disc(floor(), 80.0, 60.0, 3.0)
-    for row, column in [(10, 20), (10, 21), (11, 20), (12, 20)]:
-        image[row, column] = BLUE
+    image[[10, 10, 11, 12], [20, 21, 20, 20]] = BLUE
     image[20, 30:33] = BLUE
     blobs = segment(image, PAPER)
     assert_allclose(blobs.centroids[0], [20.25, 10.75])
