@@ -13,7 +13,6 @@ AREAS = ('filter', 'planner', 'cuboid', 'drivers', 'system', 'view')
 
 
 def show(row: dict[str, Any]) -> str:
-    """Return one result as a line."""
     text = f'{row["name"]:<36} {row["value"]:>12.4g} {row["unit"]:<6}'
     if row['baseline'] is not None:
         text += f' {row["ratio"]:>10.4g} x faster than {row["baseline"]}'
@@ -21,7 +20,6 @@ def show(row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run the benchmarks of some areas, or of all."""
     parser = argparse.ArgumentParser(prog='bench', description=__doc__)
     parser.add_argument('areas', nargs='*', metavar='AREA', help=f'{", ".join(AREAS)}; all if none')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the results there as well')

@@ -136,21 +136,16 @@ def _expected_end(
 
 
 class Clairvoyant(Planner):
-    """Sends the robots along the best routes over the true targets that are not found yet.
-
-    `missing` returns these, (n, 3) [m].
-    """
+    """Sends the robots along the best routes over the targets of `missing`, (n, 3) [m]."""
 
     def __init__(self, settings: PlannerSettings, missing: Callable[[], FloatArray]) -> None:
         super().__init__(settings)
         self._missing = missing
 
     def finished(self, team: TeamView) -> str | None:
-        """See `Planner.finished`."""
         return None if len(self._missing()) else 'all targets are found'
 
     def decide(self, team: TeamView) -> Decision:
-        """See `Planner.decide`."""
         targets = self._missing()
         routes, stops = _best_routes(team, targets)
         places = waiting_places(team)

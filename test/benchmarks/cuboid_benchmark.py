@@ -58,8 +58,6 @@ def against_scip(number: int) -> dict[str, object]:
 
 
 def run(share: float = 1.0) -> list[dict[str, object]]:
-    """Return the figures: name, value, unit, baseline, ratio; `share` of all problems."""
-
     def few(number: int) -> int:
         return max(1, round(share * number))
 

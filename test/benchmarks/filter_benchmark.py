@@ -12,13 +12,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from quality_conditions import NOISES
 from timing import entry, median_time
 
 from maasi_filter import (
     AgentMeasurement,
     FilterSettings,
     IcPhdFilter,
-    NoiseSettings,
     PmbFilter,
     Pose,
     SensorSettings,
@@ -33,14 +33,9 @@ DETECTED = 3
 CLUTTER = 1e-6
 
 
-# The papers' noise in its two readings.
-RADIANS = NoiseSettings(range=1.5, bearing=0.175, elevation=0.295)
-DEGREES = NoiseSettings(range=1.5, bearing=0.175, elevation=0.295, as_='variance', angles='degrees')
-
-
-def sensor(noise: NoiseSettings = RADIANS) -> Any:
+def sensor(noise: str = 'radians') -> Any:
     """Return the papers' 3D sensor; the wide clouds of angles in radians cost most."""
-    return SensorSettings(noise=noise).build('bench', 3)
+    return SensorSettings(noise=NOISES[noise]).build('bench', 3)
 
 
 def cloud(number: int) -> tuple[FloatArray, FloatArray]:
@@ -73,7 +68,6 @@ def batch(
 
 
 def precise_batch(targets: FloatArray, robots: int) -> list[AgentMeasurement]:
-    """Return a batch with small errors of angles."""
     covariance = np.diag(np.square([1.5, 0.05, 0.05]))
     return batch(np.random.default_rng(2), sensor(), targets, robots, covariance)
 
@@ -97,7 +91,7 @@ def phd_step_time(number: int, robots: int, repeats: int, threads: int | None) -
     return median_time(step, repeats, prepare)
 
 
-def pmb_step_time(noise: NoiseSettings, number: int, robots: int, steps: int) -> float:
+def pmb_step_time(noise: str, number: int, robots: int, steps: int) -> float:
     """Return the median time of a search's steps [s]; the first ten are not counted."""
     generator = np.random.default_rng(3)
     targets = 20.0 + 220.0 * generator.random((number, 3))
@@ -128,8 +122,6 @@ def phd_update_time() -> float:
 
 
 def run(share: float = 1.0) -> list[dict[str, Any]]:
-    """Return all figures; `share` of all calls."""
-
     def few(number: int) -> int:
         return max(1, round(share * number))
 
@@ -143,9 +135,9 @@ def run(share: float = 1.0) -> list[dict[str, Any]]:
         'ic_phd_step_1m': phd_step_time(1_000_000, 1, few(9), None),
         'ic_phd_step_ten_robots': phd_step_time(10_000, 10, few(100), 1),
         'ic_phd_update': phd_update_time(),
-        'pmb_step_degrees': pmb_step_time(DEGREES, TARGETS, 1, steps),
-        'pmb_step_radians': pmb_step_time(RADIANS, TARGETS, 1, steps),
-        'pmb_step_100_targets': pmb_step_time(DEGREES, 100, 1, few(200)),
-        'pmb_step_ten_robots': pmb_step_time(DEGREES, TARGETS, 10, steps),
+        'pmb_step_degrees': pmb_step_time('degrees', TARGETS, 1, steps),
+        'pmb_step_radians': pmb_step_time('radians', TARGETS, 1, steps),
+        'pmb_step_100_targets': pmb_step_time('degrees', 100, 1, few(200)),
+        'pmb_step_ten_robots': pmb_step_time('degrees', TARGETS, 10, steps),
     }
     return [entry(name, 1e3 * seconds) for name, seconds in times.items()]

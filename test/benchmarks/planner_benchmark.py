@@ -33,7 +33,6 @@ PAPER = PlannerSettings(objective='paper', alpha=0.5, beta=0.5, control_weight=0
 
 
 def half_explored(bounds: np.ndarray, spacing: float, seed: int = 0) -> UnexploredMap:
-    """Return an exploration function in the middle of a search."""
     exploration = UnexploredMap(bounds, spacing)
     exploration.values[...] = np.random.default_rng(seed).uniform(size=exploration.values.shape)
     return exploration
@@ -129,7 +128,6 @@ def whole_grid_decision(team: TeamView) -> int:
 
 
 def run(share: float = 1.0) -> list[dict[str, object]]:
-    """Return the figures: name, value, unit, baseline, ratio; `share` of all calls."""
     warm_up()
     figures: list[dict[str, object]] = []
 

@@ -97,7 +97,6 @@ def prepared(
 
 
 def run_one(condition: str, method: str, seed: int, settings: dict[str, Any] | None = None) -> Run:
-    """Run one search up to its number of measurements."""
     scenario = prepared(condition, method, seed, settings)
     measure, besides = RangingSensor.measure, RETURNS.get(condition)
 
@@ -156,7 +155,6 @@ def row(runs: Sequence[Run], others: Sequence[Run] | None, cap: int) -> list[str
 
 
 def runs_in(path: Path | None) -> dict[tuple[str, str, int], Run]:
-    """Return the runs of a file by condition, method and seed."""
     kept = {}
     if path is not None and path.exists():
         for line in path.read_text(encoding='utf-8').splitlines():
@@ -167,7 +165,6 @@ def runs_in(path: Path | None) -> dict[tuple[str, str, int], Run]:
 
 
 def main() -> int:
-    """Run the searches and print the table."""
     parser = argparse.ArgumentParser(prog='quality', description=__doc__)
     parser.add_argument('--method', nargs='*', choices=METHODS, default=METHODS)
     parser.add_argument(

@@ -37,14 +37,12 @@ def comparison(regime: str, kinds: Sequence[str]) -> Experiment:
 
 
 def write(path: Path, text: str) -> None:
-    """Put the tables between their marks in a document."""
     before, rest = path.read_text(encoding='utf-8').split(BEGIN)
     after = rest.split(END)[1]
     path.write_text(f'{before}{BEGIN}\n{text}{END}{after}', encoding='utf-8')
 
 
 def main() -> int:
-    """Run the searches and print the tables."""
     parser = argparse.ArgumentParser(prog='search_quality', description=__doc__)
     parser.add_argument('--planner', nargs='*', choices=tuple(KINDS), default=list(KINDS))
     parser.add_argument(

@@ -63,7 +63,6 @@ class View:
     pose: Pose
 
     def probability(self, state: Any) -> float:
-        """Return pi at the mean of a state."""
         place = np.asarray(state.mean, float).reshape(1, 3)
         return min(float(self.sensor.detection.probability(place, self.pose)[0]), 0.999)
 
@@ -74,7 +73,6 @@ class ViewedHypothesiser(PDAHypothesiser):
     view: View = Property(doc='Sensor and pose')
 
     def hypothesise(self, track: Any, detections: Any, timestamp: Any, **kwargs: Any) -> Any:
-        """Return the hypotheses of a track."""
         self.prob_detect = Probability(max(self.view.probability(track.state), 1e-6))
         return super().hypothesise(track, detections, timestamp, **kwargs)
 
@@ -130,7 +128,6 @@ class StoneSoup:
         self.tracker = MultiTargetMixtureTracker(initiator, deleter, None, associator, updater)
 
     def step(self, scan: AgentMeasurement, seconds: float) -> None:
-        """Process a scan."""
         self.view.sensor, self.view.pose = scan.sensor, scan.pose
         now = START + datetime.timedelta(seconds=seconds)
         # Stone Soup's order is elevation, bearing, range.

@@ -35,28 +35,17 @@ class TimedNode(ReplayNode):
     times: ClassVar[list[float]] = []
 
     def publish(self, batch: Batch) -> None:
-        """See `ReplayNode.publish`."""
         self._begin = time.perf_counter()
         super().publish(batch)
 
     def spin(self, timeout: float = 0.05) -> None:
-        """See `ReplayNode.spin`."""
         before = len(self.updates)
         super().spin(timeout)
         if len(self.updates) > before:
             self.times.append(time.perf_counter() - self._begin)
 
 
-def latencies(bag: Path, folder: Path) -> list[float]:
-    """Return the times of the batches of a recording."""
-    with patch.object(replay_node, 'ReplayNode', TimedNode), redirect_stdout(io.StringIO()) as said:
-        if replay_node.replay(bag, folder, None, lambda: False) != replay_node.EQUAL:
-            raise RuntimeError(said.getvalue())
-    return TimedNode.times
-
-
 def run(share: float = 1.0) -> list[dict[str, Any]]:
-    """Run the benchmarks; `share` of the simulated time."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         # The first run finds everything cold.
@@ -66,7 +55,12 @@ def run(share: float = 1.0) -> list[dict[str, Any]]:
         start = start_of(folder / 'start', begin)
         floor = run_scenario('mambo_turtlebot', folder / 'floor', share * SECONDS)
         space = run_scenario('ranging_pair_3d', folder / 'space', 2.0 * share * SECONDS)
-        times = latencies(folder / 'floor' / 'bag', folder / 'replay')
+        timed = patch.object(replay_node, 'ReplayNode', TimedNode)
+        with timed, redirect_stdout(io.StringIO()) as said:
+            bag = folder / 'floor' / 'bag'
+            if replay_node.replay(bag, folder / 'replay', None, lambda: False) != replay_node.EQUAL:
+                raise RuntimeError(said.getvalue())
+        times = TimedNode.times
         return [
             entry('demo_real_time_factor', floor, 'x'),
             entry('ranging_pair_real_time_factor', space, 'x'),

@@ -49,8 +49,6 @@ def read(address: str) -> None:
 
 
 def streams(number: int) -> Callable[[str], None]:
-    """Return what watches a run with so many readers."""
-
     def watch(address: str) -> None:
         for _ in range(number):
             threading.Thread(target=read, args=(address,), daemon=True).start()
@@ -99,7 +97,6 @@ def long_log() -> EventLog:
 
 
 def seeks(folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield how long seeks take in a long run."""
     log = long_log()
     file = folder / 'long.html'
     # Not thinned: all of it is to be sought in.
@@ -128,7 +125,6 @@ def seeks(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def run(share: float = 1.0) -> Iterator[dict[str, Any]]:
-    """Yield the results; `share` of the simulated time."""
     kinds: dict[str, Callable[[str], Any] | None] = {
         'none': None,
         'one': streams(1),

@@ -46,7 +46,6 @@ class ExactPmbm:
         return options
 
     def density(self):
-        """Return the expected number of detected targets in each cell."""
         return sum(
             weight * r * density
             for weight, components in self.hypotheses

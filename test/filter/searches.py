@@ -29,7 +29,6 @@ PLANE = np.array([[0.0, SIDE]] * 2)
 
 
 def same(one, other):
-    """Check that the states of two filters are equal to the bit."""
     first, second = pack(one.state()), pack(other.state())
     assert first.keys() == second.keys()
     for name in first:
@@ -97,7 +96,6 @@ def separated(generator, number, lower, upper, apart, dimension):
 
 
 def plane_sensor(probability=0.9, clutter=0.0, range_noise=3.0, bearing=0.08):
-    """Return a sensor for the plane."""
     return SensorSettings(
         detection=DetectionSettings(
             kind='gaussian', probability=probability, size=[60.0, 60.0, 60.0]
@@ -122,7 +120,6 @@ def plane_filter(seed=0, particles=1000, **settings):
 
 
 def measured(sensor, position, values, step=0, robot='robot'):
-    """Return a measurement of a robot at a position."""
     d = sensor.dimension
     pose = Pose(np.asarray(position, float))
     return AgentMeasurement(robot, pose, sensor, np.reshape(values, (-1, d)), None, step)

@@ -10,19 +10,16 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from own_context import own_context
+from player import Player
 from rcl_interfaces.msg import Log
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from waiting import PATIENCE, wait_until
+from searches import same
+from waiting import PATIENCE
 
 from maasi_filter import FilterSettings, make_filter
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.conversions import MOST_DETECTIONS
 from maasi_filter.ros.node_settings import FilterNodeSettings
-from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
-from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.msg import (
     BatchMember,
     Detection,
@@ -44,37 +41,19 @@ SETTINGS = FilterNodeSettings.model_validate(
 )
 
 
-class Team:
-    """A filter node, and the rest of the team: planner and drivers."""
+class Team(Player):
+    """The rest of the team: planner and drivers."""
 
-    def __init__(self, context, settings):
-        overrides = [Parameter(name, value=value) for name, value in flatten(settings).items()]
-        self.filter = FilterNode(context=context, parameter_overrides=overrides)
-        self.node = Node('team', context=context)
-        self.own = executor_of(self.filter, context)
-        self.other = SingleThreadedExecutor(context=context)
-        self.other.add_node(self.node)
-        self.updates = self.heard(FilterUpdate, 'filter_update', UPDATES)
-        self.found = self.heard(FoundTargetArray, 'found_targets', LATCHED)
+    def __init__(self, context):
+        super().__init__(context, 'team')
+        self.updates = self.hear(FilterUpdate, 'filter_update', UPDATES)
+        self.found = self.hear(FoundTargetArray, 'found_targets', LATCHED)
         self.batch = self.node.create_publisher(MeasurementBatch, 'measurement_batch', RELIABLE)
         self.detections = {
             name: self.node.create_publisher(DetectionArray, f'{name}/detections', RELIABLE)
             for name in ('a', 'b')
         }
         self.counts = dict.fromkeys(('a', 'b'), 0)
-
-    def heard(self, kind, topic, quality=10):
-        """Return the list of the messages to come."""
-        messages = []
-        self.node.create_subscription(kind, topic, messages.append, quality)
-        return messages
-
-    def until(self, condition):
-        def turn():
-            self.own.spin_once(0.01)
-            self.other.spin_once(timeout_sec=0.01)
-
-        return wait_until(condition, turn)
 
     def measure(self, number, seen, robots=None, **changes):
         """Publish a batch, and what its robots see from (1, 1): lists of range and bearing."""
@@ -113,21 +92,16 @@ class Team:
 
 @contextmanager
 def running(**changes):
-    """Run a node with the team around it."""
     with own_context() as context:
-        team = Team(context, SETTINGS.model_copy(update=changes))
+        team = Team(context)
         try:
-            assert team.filter.trigger_configure().name == 'SUCCESS', team.filter.problem
-            team.filter.trigger_activate()
+            team.filter = team.start(FilterNode, SETTINGS.model_copy(update=changes))
             writers = [team.batch, *team.detections.values()]
             team.until(lambda: all(item.get_subscription_count() for item in writers))
             team.until(lambda: team.node.count_publishers('/filter_update') == 1)
             yield team
         finally:
-            team.own.shutdown()
-            team.other.shutdown()
-            team.filter.destroy_node()
-            team.node.destroy_node()
+            team.close()
 
 
 @pytest.fixture
@@ -161,7 +135,7 @@ def test_the_filter_of_the_papers_counts_detections_of_found_targets_which_are_n
         preset='paper_000', found_radius=0.05, removal_distance=0.1, jitter_deviation=0.003
     )
     with running(filter=settings) as team:
-        reports = team.heard(DiagnosticArray, '/diagnostics')
+        reports = team.hear(DiagnosticArray, '/diagnostics')
         for number in range(1, 20):
             team.step(number, {'a': SEEN, 'b': SEEN})
         status = team.filter.status()
@@ -174,8 +148,8 @@ def test_the_filter_of_the_papers_counts_detections_of_found_targets_which_are_n
 
 
 def test_detections_that_do_not_fit_are_said_in_log_and_diagnostics(team):
-    reports = team.heard(DiagnosticArray, '/diagnostics')
-    lines = team.heard(Log, '/rosout', LATCHED_ALL)
+    reports = team.hear(DiagnosticArray, '/diagnostics')
+    lines = team.hear(Log, '/rosout', LATCHED_ALL)
     team.until(lambda: team.node.count_publishers('/rosout') >= 2)
     generator = np.random.default_rng(1)
     for number in range(1, 41):
@@ -227,7 +201,7 @@ def test_what_is_said_again_counts_once():
     ],
 )
 def test_what_is_wrong_is_dropped_and_counted_and_the_node_goes_on(team, changes, reason):
-    reports = team.heard(DiagnosticArray, '/diagnostics')
+    reports = team.hear(DiagnosticArray, '/diagnostics')
     assert team.step(1, {'a': SEEN}, **changes).expected_number == 0.0
     assert team.filter.dropped[reason] == 1
     if changes == {'robot': 'nobody'}:
@@ -278,25 +252,15 @@ def test_an_absurd_batch_is_refused_and_the_next_one_is_not(team, number):
 
 def test_a_node_saves_on_a_timer_and_another_one_goes_on_to_the_bit(tmp_path):
     file = tmp_path / 'state.maasi'
-    with running() as team:
-        team.see(*range(1, 9))
-        team.until(lambda: team.found[-1].batch_id == 8)
-        expected = [update.expected_number for update in team.updates]
-        targets = list(team.found[-1].targets)
-    assert len(targets) == 2
     with running(save_file=str(file), save_period=0.05) as team:
-        team.see(1)
+        team.see(*range(1, 9))
         file.unlink(missing_ok=True)
         team.until(file.exists)
-        first = [update.expected_number for update in team.updates]
+        before = team.filter.filter
+    assert len(before.found_targets) == 2
     # The file is the timer's: the node was destroyed without being told to end.
     with running(save_file=str(file)) as team:
-        team.see(*range(2, 9))
-        team.until(lambda: team.found[-1].batch_id == 8)
-        assert first + [update.expected_number for update in team.updates] == expected
-        for now, before in zip(team.found[-1].targets, targets, strict=True):
-            assert now.position == before.position
-            assert list(now.covariance) == list(before.covariance)
+        same(team.filter.filter, before)
 
 
 def test_a_node_that_cannot_save_goes_on(tmp_path):

@@ -204,7 +204,6 @@ def test_whatever_is_measured_the_expected_number_stays_sound(seed, births, dime
 
 
 def test_warm_up_leaves_nothing_to_compile():
-    """A second call only runs what the first one compiled."""
     from maasi_filter.ic_phd import births, clusters, corrector
 
     warm_up()

@@ -81,9 +81,6 @@ def test_noise_in_space_is_that_of_drawn_measurements(dimension):
     np.testing.assert_allclose(spread, expected, atol=0.05 * np.trace(expected))
 
 
-# The corrector.
-
-
 @pytest.mark.parametrize('detections', [1, 4, 40])
 @pytest.mark.parametrize('dimension', [2, 3])
 def test_the_corrector_is_equation_13(dimension, detections):
@@ -107,9 +104,6 @@ def test_the_corrector_is_equation_13(dimension, detections):
     np.testing.assert_allclose(factor, missed + (psi / expected[:, None]).sum(axis=0), rtol=1e-9)
 
 
-# Resampling.
-
-
 def test_copies_are_in_proportion_to_the_weights():
     generator = np.random.default_rng(0)
     weights = np.array([0.0, 1.0, 2.0, 0.0, 5.0, 2.0, 0.0])
@@ -131,9 +125,6 @@ def test_first_copies_stay_and_further_ones_move_within_the_bounds():
     assert ((moved >= 0.0) & (moved <= 10.0)).all()
     assert moved[5001:, 1].std() == pytest.approx(0.1, rel=0.05)
     assert len(np.unique(moved[5000:, 1])) == 5000
-
-
-# Clusters.
 
 
 def test_kmeans_separates_clouds_and_keeps_a_warm_start():
@@ -160,9 +151,6 @@ def test_kmeans_of_one_point_many_times_over_ends():
     label, centres = kmeans(particles, np.ones(50), 4, np.random.default_rng(0), np.empty((0, 3)))
     clusters = clusters_of(particles, np.ones(50), label, len(centres))
     assert sum(cluster.mass for cluster in clusters.values()) == pytest.approx(50.0)
-
-
-# Found targets.
 
 
 def found_at(*positions):

@@ -7,6 +7,7 @@ from functools import reduce
 
 import pytest
 import yaml
+from player import parameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -27,17 +28,10 @@ SETTINGS = FilterNodeSettings.model_validate(
 
 
 @pytest.fixture
-def make(context):
-    nodes = []
-
-    def start():
-        overrides = [Parameter(name, value=value) for name, value in flatten(SETTINGS).items()]
-        nodes.append(FilterNode(context=context, parameter_overrides=overrides))
-        return nodes[-1]
-
-    yield start
-    for node in nodes:
-        node.destroy_node()
+def node(context):
+    made = FilterNode(context=context, parameter_overrides=parameters(SETTINGS))
+    yield made
+    made.destroy_node()
 
 
 @pytest.fixture
@@ -101,8 +95,7 @@ def ended(node, *, ask=False):
     return node.returncode, said
 
 
-def test_numbers_have_real_ranges(make):
-    node = make()
+def test_numbers_have_real_ranges(node):
     described = {item.name: item for item in node.describe_parameters(['step', 'seed'])}
     found = described['step'].floating_point_range[0]
     assert (found.from_value, found.to_value) == (0.0, 10.0)
@@ -114,8 +107,7 @@ def test_numbers_have_real_ranges(make):
     assert not refused.successful and 'greater than 0' in refused.reason
 
 
-def test_rates_and_timeouts_can_be_set_while_the_node_runs(make):
-    node = make()
+def test_rates_and_timeouts_can_be_set_while_the_node_runs(node):
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     assert node.trigger_activate().name == 'SUCCESS'
     for name, value in (('batch_timeout', 2.5), ('markers_rate', 1.0), ('particles_rate', 0.0)):
@@ -128,8 +120,7 @@ def test_rates_and_timeouts_can_be_set_while_the_node_runs(make):
     assert node.settings.batch_timeout == 2.5
 
 
-def test_what_a_preset_resolves_to_can_be_read(make):
-    node = make()
+def test_what_a_preset_resolves_to_can_be_read(node):
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     assert node.get_parameter('filter.particles').value == 5000
     assert node.filter.settings.resolved().particles == 5000

@@ -229,10 +229,7 @@ def test_two_that_cause_two_detections_of_a_scan_are_two_targets(caused, known):
 
 
 def answering(share, targets, scans=80, seed=0, later=None):
-    """Return a filter of places that answer with a share of pi each, and whether each is found.
-
-    After 20 scans the shares are those of `later`.
-    """
+    """Return a filter, and which places it found that answer with a share of pi, later another."""
     generator = np.random.default_rng(seed)
     search = plane_filter(seed=seed, expected_targets=5.0)
     for step in range(scans):

@@ -12,15 +12,10 @@ VALUES = np.array([[0.1, 0.3]])
 PLACE = np.array([1.0 + 0.1 * np.cos(0.3), 1.0 + 0.1 * np.sin(0.3)])
 
 
-@pytest.fixture(params=['ic_phd', 'pmb'], autouse=True)
-def method(request):
-    """Both filters share in the same way."""
-    return request.param
-
-
-@pytest.fixture
-def new_filter(method):
+@pytest.fixture(params=['ic_phd', 'pmb'])
+def new_filter(request):
     """Return a function that makes a filter with the lengths of the floor."""
+    method = request.param
     # A target is not found at its first detection.
     lengths = {**FLOOR_LENGTHS, 'found_radius': 0.01} if method == 'ic_phd' else {}
     settings = FilterSettings(method=method, **lengths)

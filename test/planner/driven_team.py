@@ -193,14 +193,12 @@ class World(Player):
         for robot in self.robots.values():
             robot.move(self.step, share)
         now = time.monotonic()
+        # On a busy machine a driver may not have answered the present step.
         while time.monotonic() < now + TURN or (
-            self._is_behind() and time.monotonic() < now + LONGEST_TURN
+            time.monotonic() < now + LONGEST_TURN
+            and any(item.states and item.state.step < self.step for item in self.robots.values())
         ):
             super().turn()
-
-    def _is_behind(self):
-        """Tell whether a driver has not answered the present step, on a busy machine."""
-        return any(robot.states and robot.state.step < self.step for robot in self.robots.values())
 
     def pass_steps(self, steps):
         """Let the robots do some steps, each heard by the planner."""
@@ -209,7 +207,6 @@ class World(Player):
         self.until(lambda: min(item.step for item in self.planner._heard.values()) >= last)
 
     def logged(self, text):
-        """Return what was logged with a text."""
         return [item.msg for item in self._logs if text in item.msg]
 
     def send(self, name, position, number):
@@ -230,7 +227,6 @@ class World(Player):
         return future.result(), future.result().get_result_async()
 
     def run(self, *words):
-        """Return a process of Python that takes part."""
         return subprocess.Popen(
             [sys.executable, *words],
             env={**os.environ, 'ROS_DOMAIN_ID': str(self.context.get_domain_id())},

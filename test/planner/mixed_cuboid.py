@@ -169,7 +169,6 @@ class MixedProblem:
                 self.squares.append((s.smoothness_weight, pair, [1.0, -1.0], 0.0))
 
     def value(self, x):
-        """Return the objective of columns x."""
         total = float(np.dot(self.cost, x))
         for weight, columns, coefficients, constant in self.squares:
             total += weight * (np.dot(coefficients, x[columns]) + constant) ** 2

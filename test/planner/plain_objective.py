@@ -44,7 +44,6 @@ def shots_of(team, name, options, choice, weights, horizon):
 
 
 def objective_of(team, weights, options, choice, name, refinement, exploration):
-    """Return T, E and J of a robot."""
     way, w = options[name].prediction, choice[name]
     norm = way.distances()[w] if weights.per_distance else way.lengths[w]
     gain = weights.alpha * refinement + weights.beta * exploration

@@ -21,7 +21,6 @@ def random_team(
     radius=0.0,
     spacing=None,
 ):
-    """Return a team of random robots in all situations, with clusters and half-seen places."""
     size = 2.0 if dimension == 2 else 200.0
     bounds = np.array([[0.0, size]] * dimension)
     exploration = UnexploredMap(bounds, spacing or size / 9.7)

@@ -28,7 +28,6 @@ def search(world, *words):
 
 
 def robot(world, *words):
-    """Return a process of robot_command."""
     return world.run('-m', 'maasi_drivers.robot_command', *words)
 
 

@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from maasi_filter.models.pose import Pose
 from maasi_planner.coordinator import Coordinator, Member, PresentRobot
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners.intermittent import Intermittent
 from maasi_planner.team import Decision, single_choice, stay
-from maasi_sim.experiments.papers import experiments
 
 ROBOT = {
     'candidates': {'grid': [4, 4], 'spacing': 2.0, 'corner': [2.0, 2.0]},
@@ -39,11 +37,8 @@ def make(robots=BOTH, spacing=None, **planner):
     )
 
 
-def there(free=True, **positions):
-    return {
-        name: PresentRobot(RobotState.at_rest([*place, 0.0]), free)
-        for name, place in positions.items()
-    }
+def there(free=True, **at):
+    return {name: PresentRobot(RobotState.at_rest([*at[name], 0.0]), free) for name in at}
 
 
 def started(**planner):
@@ -93,12 +88,6 @@ def test_one_left_alone_plans_alone_and_the_other_joins_again():
     assert list(coordinator.plan(5, there(a=(2.0, 2.0))).robots) == ['a']
     robots = there(free=False, a=(3.0, 2.0)) | there(b=(9.0, 9.0))
     assert list(coordinator.plan(9, robots).robots) == ['b']
-
-
-def test_exploration_follows_the_poses_of_the_measurements():
-    coordinator = make()
-    coordinator.absorb({'a': Pose.from_yaw([5.0, 5.0, 0.0], 0.0)}, [])
-    assert coordinator.exploration.at([[5.0, 5.0], [8.0, 8.0]]) == pytest.approx([0.1, 1.0])
 
 
 @pytest.mark.parametrize(
@@ -266,11 +255,3 @@ def test_of_two_waypoints_passed_in_a_row_each_is_measured(monkeypatch):
     coordinator.plans['a'].turning_distance = 1.0
     assert coordinator.plan(3, robots) is not None
     assert [item.robot for item in coordinator.measuring(3, robots)] == ['a']
-
-
-def test_the_experiments_of_the_papers_stop_at_each_waypoint():
-    for name, experiment in experiments().items():
-        for case in experiment.cases(True):
-            robots = case.settings.get('scenario', {}).get('robots', {})
-            for robot in robots.values():
-                assert robot['motion']['arrival_radius'] == 0.0, (name, case.name)

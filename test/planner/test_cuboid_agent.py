@@ -19,7 +19,6 @@ from maasi_planner.buildings.conversions import (
 from maasi_planner.buildings.preplanning import plan_mission
 from maasi_planner.buildings.settings import CuboidMethodSettings, HazardSettings
 from maasi_planner.buildings.sharing import Broadcast, assigned, rewards
-from maasi_planner.buildings.way_finder import WayFinder
 
 HOME = [166.0, 235.0, 5.0]
 
@@ -105,21 +104,6 @@ def test_assignment_shares_the_nearest_cuboids():
         assert [assigned(places, own, centres, unvisited) for own in (0, 1)] == expected
 
 
-def test_way_around_a_wall():
-    wall = np.array([[[48.0, 52.0], [0.0, 80.0], [0.0, 80.0]]])
-    area = np.array([[0.0, 100.0], [0.0, 100.0], [0.0, 80.0]])
-    ways = WayFinder(wall, area, 15.0, 3.0)
-    place, target = np.array([20.0, 20.0, 5.0]), np.array([80.0, 20.0, 5.0])
-    corner = ways.first_corner(place, target)
-    assert corner[:2].tolist() == [45.0, 83.0]
-    assert ways.first_corner(corner, target)[:2].tolist() == [55.0, 83.0]
-    clear = np.array([20.0, 90.0, 5.0])
-    assert (ways.first_corner(place, clear) == clear).all()
-    closed = WayFinder(np.array([[[48.0, 52.0], [-1.0, 101.0], [-1.0, 81.0]]]), area, 15.0, 3.0)
-    assert not closed.reaches(place, target)
-    assert ways.reaches(place, target)
-
-
 def test_snapshot_looks_along_the_normal_and_says_its_probability():
     agent = make_agent()
     agent.observe(0, agent.mission.centres[5] + np.array([1.0, 0.5, -2.0]), np.zeros(3))
@@ -132,16 +116,6 @@ def test_snapshot_looks_along_the_normal_and_says_its_probability():
     assert shot.detection_probability == pytest.approx(1 - (distance - 17) / 73)
     agent.observe(1, agent.mission.centres[5], np.zeros(3))
     assert len(agent.snapshots) == 1
-
-
-def test_maps_are_merged_and_not_visited_again():
-    agent = make_agent()
-    agent.observe(0, HOME, np.zeros(3))
-    theirs = np.ones(32, dtype=bool)
-    theirs[9] = False
-    plan = agent.decide([heard(visited=theirs)], random())
-    assert np.flatnonzero(~agent.visited).tolist() == [9]
-    assert {n for _, n in plan.visits} <= {9}
 
 
 def test_nothing_left_to_do_holds_the_place():

@@ -88,13 +88,6 @@ def test_segments_keep_off_obstacles_unless_as_printed(between):
     assert any(cut) != between
 
 
-def test_plans_around_a_corner_keep_off_it():
-    solver = solver_for(10)
-    for y in np.linspace(30.0, 70.0, 9):
-        problem = problem_at([36, y, 10], [2, 3, 0], [64, 60, 10], obstacles=[CUBE])
-        assert not cuts(next(flown(solver, problem, 1)), problem)
-
-
 def test_falling_stops_above_the_floor():
     solver = solver_for(5)
     # About 50 m are needed to stop from 15 m/s.
@@ -140,14 +133,6 @@ def test_start_at_a_bound_or_a_rounding_beyond(beyond):
         assert solver.solve(problem_at(position, velocity, target)) is not None
     face = problem_at([40 + beyond, 50, 10], [0, 0, 0], [20, 50, 10], obstacles=[CUBE])
     assert solver.solve(face) is not None
-
-
-def test_flies_home_and_stays():
-    problem = problem_at([80, 80, 40], [5, -5, 2], [20, 30, 0], [[[70.0, 90.0]] * 3], homing=True)
-    plans = list(flown(solver_for(10), problem, 60))
-    assert not any(plan.visits for plan in plans)
-    assert plans[-1].positions[1] == pytest.approx([20, 30, 0], abs=0.5)
-    assert plans[-1].velocities[1] == pytest.approx([0, 0, 0], abs=0.2)
 
 
 def test_limits_return_the_best_plan_so_far(monkeypatch):

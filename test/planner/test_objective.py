@@ -84,7 +84,6 @@ def test_terms_are_those_of_the_plain_objective(case, kind, change):
 @pytest.mark.parametrize('kind', ['paper', 'information'])
 @pytest.mark.parametrize('case', [*CASES, {'dimension': 2, 'planning': 2, 'waiting': 2}])
 def test_search_is_enumeration(case, kind):
-    """The pruned search returns the maximum over all joint candidates (26)."""
     for seed in range(4):
         rng = np.random.default_rng(1000 + seed)
         team = random_team(rng, candidates=6, radius=0.05, **case)
@@ -104,7 +103,6 @@ def test_search_is_enumeration(case, kind):
 
 
 def test_bound_prunes():
-    """Two robots far apart are decided without looking at all pairs."""
     rng = np.random.default_rng(5)
     team = random_team(rng, dimension=2, planning=2, waiting=0, candidates=40)
     _, _, exact, evaluated = built(team, PlannerSettings(objective='paper'))[0].search()
@@ -160,7 +158,6 @@ def test_order_of_robots_does_not_matter():
 
 
 def test_reported_terms_belong_to_the_choice():
-    """The sum of the chosen J is the objective, and J is made of C, T, E and K."""
     rng = np.random.default_rng(22)
     team = random_team(rng, dimension=2, planning=2, waiting=1, candidates=6)
     settings = PlannerSettings(objective='paper', alpha=0.3, beta=0.9, control_weight=0.2)

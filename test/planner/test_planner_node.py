@@ -124,7 +124,6 @@ class Team(Player):
         return CancelResponse.ACCEPT
 
     def tell(self, step):
-        """Let both robots say where they are."""
         for name in ROBOTS:
             self.states[name].publish(state_of(name, step))
         self.until(lambda: [item.step for item in self.tested._heard.values()] == [step, step])
@@ -138,18 +137,15 @@ class Team(Player):
         self.until(lambda: self.batches)
 
     def answer(self):
-        """Answer the last batch."""
         self.updates.publish(update_of(self.batches[-1].id, self.batches[-1].members))
 
     def status(self):
-        """Return the last diagnostics of the planner."""
         statuses = [item for array in self.diagnostics for item in array.status]
         return next((item for item in statuses[::-1] if 'planner_node' in item.name), None)
 
 
 @contextmanager
 def running(**changes):
-    """Run a node with the team around it."""
     with own_context() as context:
         team = Team(context, SETTINGS.model_copy(update=changes))
         try:

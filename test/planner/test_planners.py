@@ -39,7 +39,6 @@ def one_robot(seed=0, **options):
 
 
 def decide(name, team, **settings):
-    """Return the decision for the robot that plans."""
     decision = make_planner(name, PlannerSettings(name=name, **settings)).decide(team)
     return decision.robots[team.planning()[0]]
 
@@ -79,10 +78,7 @@ def test_finished_says_why():
 
 
 def brute_active_search(team, settings, seen):
-    """Return the best joint value over all first waypoints and sequences (001, 002).
-
-    T of a sequence of a robot is seen(robot, sequence).
-    """
+    """Return the best joint value over all sequences (001, 002), T of each is seen(robot, it)."""
     low, high = team.bounds[:, 0] - 1e-9, team.bounds[:, 1] + 1e-9
 
     def scored(name):

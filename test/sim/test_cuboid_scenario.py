@@ -70,7 +70,6 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
 
 
 def placed(**changes):
-    """Return a change of the robot of a scenario."""
     return lambda content: content['robots']['red'].update(changes)
 
 
@@ -100,7 +99,6 @@ def planned(**changes):
             r'planner\.objects: no cuboid can be reached .*outside the area',
         ),
         (planned(objects=[]), r'planner\.objects: got none'),
-        (planned(horizon=1), r'planner\.horizon'),
         (planned(hoizon=5), r'planner\.hoizon'),
         (
             lambda content: content['events'].append({'at': 5.0, 'robot': 'rad', 'do': 'leave'}),

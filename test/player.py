@@ -28,16 +28,14 @@ class Player:
         self.tested = self.own = None
 
     def start(self, kind, settings, **options):
-        """Activate a node, which is tested from now on."""
         options = {'context': self.context, 'parameter_overrides': parameters(settings)} | options
         self.tested = kind(**options)
-        assert self.tested.trigger_configure().name == 'SUCCESS'
-        assert self.tested.trigger_activate().name == 'SUCCESS'
         self.own = executor_of(self.tested, self.context)
+        assert self.tested.trigger_configure().name == 'SUCCESS', self.tested.problem
+        assert self.tested.trigger_activate().name == 'SUCCESS'
         return self.tested
 
     def end(self):
-        """End the node that is tested."""
         self.tested.destroy_node()
         self.own.shutdown()
         self.tested = self.own = None
@@ -51,7 +49,6 @@ class Player:
         self.node.destroy_node()
 
     def turn(self):
-        """Do what waits to be done."""
         if self.own is not None:
             self.own.spin_once(0.002)
         self.executor.spin_once(timeout_sec=0.002)
@@ -66,7 +63,6 @@ class Player:
         return heard
 
     def call(self, service):
-        """Return the answer of a service."""
         client = self.node.create_client(Trigger, service)
         self.until(client.service_is_ready, f'no service {service}')
         future = client.call_async(Trigger.Request())
