@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import inspect
@@ -152,13 +153,11 @@ class OwnSettings:
 def own_settings(info: FieldInfo, values: Mapping[str, Any], prefix: str = '') -> Any:
     """Return the model of a field marked with `OwnSettings`, or None."""
     for mark in info.metadata:
-        if isinstance(mark, OwnSettings):
-            name = values.get(prefix + mark.selector)
-            try:
-                return mark.group.settings(name) if isinstance(name, str) else None
-            except PluginError:
-                # Reported where the name is checked.
-                return None
+        name = values.get(prefix + mark.selector) if isinstance(mark, OwnSettings) else None
+        if isinstance(name, str):
+            # An error is reported where the name is checked.
+            with contextlib.suppress(PluginError):
+                return mark.group.settings(name)
     return None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -174,11 +175,9 @@ def draw_batteries_and_ranges(figure: Figure, results: Results) -> None:
             runs = results.runs.get(f'profile {profile}, C_R 50 m, {agents} agents')
             if runs:
                 searching = [run.columns['active'] for run in runs]
-                table = np.full((len(runs), max(map(len, searching))), np.nan)
-                for row, values in zip(table, searching):
-                    row[: len(values)] = values
+                table = np.array([*zip_longest(*searching, fillvalue=np.nan)], float)
                 label = f'profile {profile}, {agents} agents'
-                places[2].plot(np.nanmean(table, axis=0), line, label=label)
+                places[2].plot(np.nanmean(table, axis=1), line, label=label)
     _label(places[2], 'step', 'robots that search')
 
 

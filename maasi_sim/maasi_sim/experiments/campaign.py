@@ -244,7 +244,8 @@ def plan(
             except DamagedRun as error:
                 result.complaints[file] = str(error)
                 run = None
-            if run is not None and run.identity() == (*wanted, case.digest()):
+            found = run and (run.experiment, run.case, run.number, run.seed, run.digest)
+            if run is not None and found == (*wanted, case.digest()):
                 result.done[case.name, number] = run
             else:
                 task = Task(wanted[0], case, number, wanted[3], experiment.run, code_digest())

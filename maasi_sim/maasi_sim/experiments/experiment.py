@@ -126,10 +126,6 @@ class Run(Outcome):
     digest: str
     machine: dict[str, str]
 
-    def identity(self) -> tuple[str, str, int, int, str]:
-        """Return what tells it from other runs."""
-        return self.experiment, self.case, self.number, self.seed, self.digest
-
     def value(self, quantity: str) -> float | None:
         """Return a measured quantity; None if the run has none."""
         read = self.summary.get(quantity, self.timing.get(quantity))

@@ -14,7 +14,7 @@ import yaml
 from maasi_sim.experiments.campaign import Campaign, maps_in, plan
 from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
 from maasi_sim.experiments.figures import as_png
-from maasi_sim.experiments.papers import experiments, introduction, title_of
+from maasi_sim.experiments.papers import FOLDER, experiments, title_of
 from maasi_sim.experiments.runs import runs_text, steps_text, write_file
 from maasi_sim.experiments.tables import (
     beside_paper,
@@ -142,7 +142,8 @@ def page(sections: dict[str, Section]) -> str:
     for name, experiment in known.items():
         rests = sections[name].rests if name in sections else '**not run**'
         rows.append([f'[{name}](#{name})' if name in sections else name, experiment.title, rests])
-    parts = [introduction(), '## What was run\n', markdown_table(rows)]
+    introduction = (FOLDER / 'introduction.txt').read_text(encoding='utf-8')
+    parts = [introduction, '## What was run\n', markdown_table(rows)]
     papers: dict[str, list[Experiment]] = {}
     for name in known:
         if name in sections:

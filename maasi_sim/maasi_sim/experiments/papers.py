@@ -48,7 +48,7 @@ FIGURES: dict[str, Callable[..., None]] = {
     'decision_times': buildings.draw_decision_times,
 }
 PAPERS = ('000', '001', '002', '003', '004')
-_FOLDER = Path(__file__).with_name('papers')
+FOLDER = Path(__file__).with_name('papers')
 
 
 def experiments() -> dict[str, Experiment]:
@@ -70,14 +70,9 @@ def find(name: str) -> Experiment:
 
 @cache
 def _paper(number: str) -> dict[str, Any]:
-    text = (_FOLDER / f'{number}.yaml').read_text(encoding='utf-8')
+    text = (FOLDER / f'{number}.yaml').read_text(encoding='utf-8')
     content: dict[str, Any] = yaml.safe_load(text)
     return content
-
-
-def introduction() -> str:
-    """Return the beginning of the page of all experiments, in Markdown."""
-    return (_FOLDER / 'introduction.txt').read_text(encoding='utf-8')
 
 
 def title_of(paper: str) -> str:

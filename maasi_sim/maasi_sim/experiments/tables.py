@@ -277,7 +277,10 @@ class SearchTable:
         if self.differences:
             table = [[f'minus {self.cases[0]}', 'seeds', *heads[: len(_COMPARED)]]]
             for case, gaps in self.differences.items():
-                spans = [_gap(gaps[item.name]) for item in _COMPARED]
+                spans = [
+                    f'{_digits(gap.mean, "+")} [{_digits(gap.low, "+")}, {_digits(gap.high, "+")}]'
+                    for gap in (gaps[item.name] for item in _COMPARED)
+                ]
                 table.append([case, str(gaps[COMPLETE.name].number), *spans])
             text += '\n' + markdown_table(table)
         return text
@@ -364,10 +367,6 @@ def _mean(mean: Interval, short: bool) -> str:
     scale = 1e3 if short else 1.0
     half = f' ± {_digits(scale * mean.half_width)}' if mean.number > 1 else ''
     return _digits(scale * mean.mean) + half
-
-
-def _gap(gap: Difference) -> str:
-    return f'{_digits(gap.mean, "+")} [{_digits(gap.low, "+")}, {_digits(gap.high, "+")}]'
 
 
 def compared_page(tables: Sequence[SearchTable], seeds: Sequence[int]) -> str:
