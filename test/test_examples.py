@@ -82,8 +82,7 @@ def run(tmp_path_factory):
     content['planner'] = {'name': 'random_planner:RandomPlanner', 'settings': {'seed': 5}}
     content['limits'] = {'time': 20.0}
     (folder / 'robots').symlink_to(EXAMPLES / 'robots')
-    (folder / 'search.yaml').write_text(yaml.safe_dump(content))
-    done = run_scenario(folder / 'search.yaml', folder / 'out', '--lockstep')
+    done = run_scenario(content, folder / 'out', '--lockstep')
     assert done.code in (0, 1), done.output
     return done
 

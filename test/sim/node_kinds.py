@@ -7,13 +7,7 @@ from typing import Any
 import yaml
 from rclpy.parameter import Parameter
 
-from maasi_drivers.drivers import (
-    MamboDriver,
-    MavlinkCameraDriver,
-    MavlinkDriver,
-    RangingDriver,
-    TurtlebotDriver,
-)
+from maasi_drivers import drivers
 from maasi_drivers.guard_node import GuardNode
 from maasi_drivers.settings.driver import DriverSettings, GuardSettings
 from maasi_filter.filter_node import FilterNode
@@ -127,11 +121,11 @@ KINDS = {
     'cuboid_planner': Kind(
         CuboidPlannerNode, CuboidPlannerSettings.model_validate(BUILDING), '/rover'
     ),
-    'turtlebot': Kind(TurtlebotDriver, driver(DRIVER), '/rover'),
-    'mambo': Kind(MamboDriver, driver(FLYING), '/rover'),
-    'ranging': Kind(RangingDriver, driver(RANGING), '/rover'),
-    'mavlink': Kind(MavlinkDriver, driver(RANGING), '/rover'),
-    'mavlink_camera': Kind(MavlinkCameraDriver, driver(FLYING), '/rover'),
+    'turtlebot': Kind(drivers.TurtlebotDriver, driver(DRIVER), '/rover'),
+    'mambo': Kind(drivers.MamboDriver, driver(FLYING), '/rover'),
+    'ranging': Kind(drivers.RangingDriver, driver(RANGING), '/rover'),
+    'mavlink': Kind(drivers.MavlinkDriver, driver(RANGING), '/rover'),
+    'mavlink_camera': Kind(drivers.MavlinkCameraDriver, driver(FLYING), '/rover'),
     'guard': Kind(GuardNode, GuardSettings(), '/rover'),
     'sim': Kind(SimNode, SimNodeSettings(scenario='mambo_turtlebot')),
     'cuboid_sim': Kind(CuboidSimNode, SimNodeSettings(scenario='buildings_one')),

@@ -14,16 +14,7 @@ from rclpy.serialization import serialize_message
 from report_check import check_report
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_msgs.msg import (
-    AgentState,
-    BatchMember,
-    FilterUpdate,
-    FoundTarget,
-    FoundTargetArray,
-    LockstepStep,
-    PlanDecision,
-    RobotDecision,
-)
+from maasi_msgs import msg
 from maasi_sim.run.bag import load_types
 from maasi_sim.run.report_files import write_report
 from maasi_sim.run.run_record import RunEnd
@@ -63,26 +54,26 @@ class Run:
         self.observer.add(topic, serialize_message(message))
 
     def state(self, time, robot, position, status=1, reason=''):
-        state = AgentState(robot=robot, goal_status=status, reason=reason)
+        state = msg.AgentState(robot=robot, goal_status=status, reason=reason)
         state.pose.pose.position = point(position)
         self.send(f'/{robot}/state', state, time)
 
     def decide(self, time, robots, explored=0.0):
         """Publish a decision; `robots`: name to waypoint, or None for one that stays."""
         made = [
-            RobotDecision(robot=name, chosen=-1 if place is None else 0, waypoint=point(place))
+            msg.RobotDecision(robot=name, chosen=-1 if place is None else 0, waypoint=point(place))
             for name, place in robots.items()
         ]
-        self.send('/decisions', PlanDecision(explored=explored, robots=made), time)
+        self.send('/decisions', msg.PlanDecision(explored=explored, robots=made), time)
 
     def give_up(self, time):
-        decision = PlanDecision(explored=0.99, reason=f'nothing left for {self.namespace}')
+        decision = msg.PlanDecision(explored=0.99, reason=f'nothing left for {self.namespace}')
         self.send('/decisions', decision, time)
 
     def declare(self, time, position, robot='mambo', deviation=0.01):
         """Add a found target to what the next update publishes."""
         size = self.scenario.dimension
-        found = FoundTarget(id=len(self.found) + 1, position=point(position), robot=robot)
+        found = msg.FoundTarget(id=len(self.found) + 1, position=point(position), robot=robot)
         found.covariance = deviation**2 * np.diag(np.arange(3) < size).reshape(-1)
         found.measurement, found.batch_id = 3, self.batch + 1
         found.stamp = stamp_to_ros(round(time * 1e9))
@@ -92,11 +83,11 @@ class Run:
     def update(self, time, robots=('mambo',), latched=True):
         self.batch += 1
         if latched:
-            array = FoundTargetArray(batch_id=self.batch, targets=self.found)
+            array = msg.FoundTargetArray(batch_id=self.batch, targets=self.found)
             self.send('/found_targets', array, time)
-        update = FilterUpdate(
+        update = msg.FilterUpdate(
             batch_id=self.batch,
-            members=[BatchMember(robot=name, measurement=self.batch) for name in robots],
+            members=[msg.BatchMember(robot=name, measurement=self.batch) for name in robots],
             expected_number=1.5,
             found=len(self.found),
             newly_found=[item for item in self.found if item.batch_id == self.batch],
@@ -105,7 +96,7 @@ class Run:
         self.observer.settle()
 
     def step(self, time, robots):
-        self.send('/lockstep/step', LockstepStep(robots=robots), time)
+        self.send('/lockstep/step', msg.LockstepStep(robots=robots), time)
 
     def record(self, reason='time_limit', time=1.0, wall=1.0, events=()):
         return self.observer.record(RunEnd(reason, time, wall, list(events)))

@@ -11,15 +11,7 @@ from geometry_msgs.msg import Point, Pose, PoseArray
 from nav_msgs.msg import OccupancyGrid
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_msgs.msg import (
-    AgentState,
-    Candidate,
-    FoundTarget,
-    FoundTargetArray,
-    LockstepStep,
-    PlanDecision,
-    RobotDecision,
-)
+from maasi_msgs import msg
 from maasi_sim.missions import load_mission
 from maasi_sim.search import search
 from maasi_sim.view.event_log import EventLog, line, thin
@@ -30,7 +22,7 @@ from maasi_sim.view.scene import empty_scene, scene_of, scene_of_facts
 
 
 def state(seconds, **fields):
-    message = AgentState(robot='rover', **fields)
+    message = msg.AgentState(robot='rover', **fields)
     message.header.stamp = stamp_to_ros(round(seconds * 1e9))
     message.pose.pose.orientation.w = 1.0
     return message
@@ -62,18 +54,18 @@ def test_states_are_one_per_period_except_where_the_robot_says_something_else(ta
     taken.take('/rover/state', broken)
     for step in range(10):
         battery = math.inf if step == 0 else 0.5
-        moving = state(0.05 * step, goal_status=AgentState.MOVING, battery=battery)
+        moving = state(0.05 * step, goal_status=msg.AgentState.MOVING, battery=battery)
         taken.take('/rover/state', moving)
     assert [event[4] for event in taken.of('robot')] == [-1.0] + 4 * [0.5]
-    lost = state(0.5, goal_status=AgentState.UNAVAILABLE, reason='its link is lost')
+    lost = state(0.5, goal_status=msg.AgentState.UNAVAILABLE, reason='its link is lost')
     taken.take('/rover/state', lost)
-    assert taken.of('robot')[-1][5:] == [AgentState.UNAVAILABLE, 'its link is lost']
+    assert taken.of('robot')[-1][5:] == [msg.AgentState.UNAVAILABLE, 'its link is lost']
     assert [event[5] for event in taken.of('log')] == ['cannot go on: its link is lost']
     assert all(json.loads(line(event)) for event in taken.events)
 
 
 def step(seconds, *robots):
-    return LockstepStep(robots=list(robots), stamp=stamp_to_ros(round(seconds * 1e9)))
+    return msg.LockstepStep(robots=list(robots), stamp=stamp_to_ros(round(seconds * 1e9)))
 
 
 def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_end(taken):
@@ -83,7 +75,7 @@ def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_en
         # One falls silent; the other's driver still publishes after it has left.
         for name in ('rover', 'crawler', 'walker'):
             if name != 'crawler' or seconds < 2:
-                message = state(float(seconds), goal_status=AgentState.MOVING)
+                message = state(float(seconds), goal_status=msg.AgentState.MOVING)
                 message.robot = name
                 taken.take(f'/{name}/state', message)
     taken.maker.end()
@@ -109,9 +101,12 @@ def test_what_comes_before_the_first_step_is_taken_at_its_time(taken):
 
 
 def test_candidates_that_are_not_allowed_have_no_objective(taken):
-    candidates = [Candidate(objective=-1e30), Candidate(objective=0.5, length=7, measurements=2)]
-    robot = RobotDecision(robot='rover', chosen=1, candidates=candidates)
-    taken.take('/decisions', PlanDecision(planner='maasi', robots=[robot], explored=0.25))
+    candidates = [
+        msg.Candidate(objective=-1e30),
+        msg.Candidate(objective=0.5, length=7, measurements=2),
+    ]
+    robot = msg.RobotDecision(robot='rover', chosen=1, candidates=candidates)
+    taken.take('/decisions', msg.PlanDecision(planner='maasi', robots=[robot], explored=0.25))
     (plan,) = taken.of('plan')
     assert plan[3:5] == ['maasi', 0.25]
     assert [item[6:] for item in plan[7][0][4]] == [[None, 0, 0], [0.5, 7, 2]]
@@ -135,12 +130,15 @@ def test_found_targets_are_scored_where_the_truth_is_known():
     truth = PoseArray(poses=[Pose(position=Point(x=x, y=y)) for x, y in targets])
     taken.take('/ground_truth/targets', truth)
     place = Point(x=targets[0][0] + 0.01, y=targets[0][1])
-    both = [FoundTarget(id=1, robot='mambo', position=place), FoundTarget(id=2, robot='turtlebot')]
+    both = [
+        msg.FoundTarget(id=1, robot='mambo', position=place),
+        msg.FoundTarget(id=2, robot='turtlebot'),
+    ]
     # A filter of one robot counts only what it found itself.
-    taken.take('/mambo/found_targets', FoundTargetArray(targets=both))
+    taken.take('/mambo/found_targets', msg.FoundTargetArray(targets=both))
     assert [item[0] for item in taken.of('found')[-1][3]] == [1]
     assert taken.of('score')[-1][3:7] == [1, 11, 0, pytest.approx(0.01, abs=1e-4)]
-    taken.take('/team/found_targets', FoundTargetArray(targets=both))
+    taken.take('/team/found_targets', msg.FoundTargetArray(targets=both))
     assert [item[0] for item in taken.of('found')[-1][3]] == [1, 2]
 
 

@@ -87,6 +87,11 @@ def started(words, folder, environment=None, **options):
 
 
 def start(scenario, folder, *options, environment=None):
+    """Start a run of a scenario: its name, its file, or its content, which is written beside."""
+    if isinstance(scenario, dict):
+        file = folder.parent / 'search.yaml'
+        file.write_text(yaml.safe_dump(scenario))
+        scenario = file
     return started(command(scenario, folder, *options), folder, environment)
 
 

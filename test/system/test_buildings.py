@@ -5,7 +5,6 @@ import signal
 
 import numpy as np
 import pytest
-import yaml
 from scenario_runs import of_topic, run_scenario, start
 
 from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
@@ -13,16 +12,13 @@ from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
 pytestmark = pytest.mark.system
 
 
-def small(tmp_path, **changes):
-    """Return the file of a search of one building by two robots, 16 cuboids."""
+def small(**changes):
+    """Return a search of one building by two robots, 16 cuboids."""
     content = load_cuboid_scenario('buildings_four').content()
     content['robots'] = {name: content['robots'][name] for name in ('blue', 'green')}
     content['planner']['objects'] = content['planner']['objects'][:1]
     content['planner'].update(horizon=6, time_limit=1e9)
-    content.update(changes)
-    file = tmp_path / 'small.yaml'
-    file.write_text(yaml.safe_dump(content))
-    return file
+    return content | changes
 
 
 def place_of(state):
@@ -30,8 +26,7 @@ def place_of(state):
 
 
 def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path):
-    file = small(tmp_path)
-    run = run_scenario(file, tmp_path / 'run', '--lockstep', '--seed', 3)
+    run = run_scenario(small(), tmp_path / 'run', '--lockstep', '--seed', 3)
     assert run.code == 0, run.output
     report = run.report
     assert report['cuboids']['visited'] == report['cuboids']['total'] == 16
@@ -52,7 +47,7 @@ def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path
     nodes = [f'{robot}_{node}' for robot in robots for node in ('cuboid_planner', 'guard')]
     assert logs == [*nodes, 'sim_node']
 
-    mission = mission_of(load_cuboid_scenario(file, {'seed': (('seed',), 3)}))
+    mission = mission_of(load_cuboid_scenario(tmp_path / 'search.yaml', {'seed': (('seed',), 3)}))
     record = mission.run(200)
     assert report['time_to_find_all'] == record.steps
     for name, path in record.paths.items():
@@ -66,17 +61,15 @@ def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path
 
 
 def test_the_link_has_a_range_and_batteries_fail(tmp_path):
-    content = yaml.safe_load(small(tmp_path).read_text())
-    for robot in content['robots'].values():
-        robot['hazard'].update(alpha=14.0, recharge_steps=[2, 4])
-    content['planner'].update(communication_range=40.0)
     events = [
         {'at': 4.0, 'robot': 'green', 'do': 'leave'},
         {'at': 9.0, 'robot': 'green', 'do': 'back'},
     ]
-    file = tmp_path / 'small.yaml'
-    file.write_text(yaml.safe_dump({**content, 'stop': 'planner_done', 'events': events}))
-    run = run_scenario(file, tmp_path / 'run', '--lockstep', '--time-limit', 300)
+    content = small(stop='planner_done', events=events)
+    for robot in content['robots'].values():
+        robot['hazard'].update(alpha=14.0, recharge_steps=[2, 4])
+    content['planner'].update(communication_range=40.0)
+    run = run_scenario(content, tmp_path / 'run', '--lockstep', '--time-limit', 300)
     assert run.code == 0, run.output
     report = run.report
     assert report['end_reason'] == 'planner_done' and report['missed'] == 0
@@ -96,8 +89,7 @@ def test_the_link_has_a_range_and_batteries_fail(tmp_path):
 
 
 def test_a_killed_planner_stops_nobody_and_takes_up_its_work(tmp_path):
-    file = small(tmp_path, on_exit='respawn')
-    with start(file, tmp_path / 'run', '--rate', 4) as run:
+    with start(small(on_exit='respawn'), tmp_path / 'run', '--rate', 4) as run:
         run.wait_for(r' [1-9]\d* visited of')
         os.kill(*run.processes('/green/cuboid_planner'), signal.SIGKILL)
         run.finish()

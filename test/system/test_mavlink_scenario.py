@@ -2,9 +2,9 @@
 
 import socket
 from contextlib import ExitStack
+from copy import deepcopy
 
 import pytest
-import yaml
 from scenario_runs import run_scenario
 
 from maasi_sim.scenario.loading import load_scenario
@@ -20,8 +20,8 @@ def free_ports(number):
         return [probe.getsockname()[1] for probe in probes]
 
 
-def short_search(folder):
-    """Write a small scenario of three vehicles under three autopilots, linked by MAVLink."""
+def short_search():
+    """Return a small scenario of three vehicles under three autopilots, linked by MAVLink."""
     scenario = load_scenario('drone_rov').content()
     scenario['environment']['bounds'] = [[0.0, 40.0], [0.0, 40.0]]
     scenario['targets'] |= {'count': 5, 'margin': 2.0}
@@ -30,7 +30,7 @@ def short_search(folder):
     robots['drone']['start'] = [4.0, 4.0, 3.0]
     robots['rov']['candidates'] |= {'grid': [7, 7], 'spacing': 6.0, 'corner': [2.0, 2.0]}
     robots['rov']['start'] = [20.0, 20.0, -1.5]
-    robots['other'] = yaml.safe_load(yaml.safe_dump(robots['drone']))
+    robots['other'] = deepcopy(robots['drone'])
     robots['other'] |= {'start': [36.0, 36.0, 2.5]}
     robots['other']['autopilot'] |= {'firmware': 'px4', 'parameters': {'COM_OF_LOSS_T': 5.0}}
     for number, port in enumerate(free_ports(3)):
@@ -44,13 +44,11 @@ def short_search(folder):
             'link_timeout': 3.0,
         }
     scenario['limits']['time'] = 150.0
-    file = folder / 'short.yaml'
-    file.write_text(yaml.safe_dump(scenario))
-    return file
+    return scenario
 
 
 def test_three_vehicles_find_all_through_the_real_protocol(tmp_path):
-    run = run_scenario(short_search(tmp_path), tmp_path / 'run', '--seed', 1)
+    run = run_scenario(short_search(), tmp_path / 'run', '--seed', 1)
     assert run.code == 0, run.output
     report = run.report
     assert report['true_found'] == 5
@@ -64,8 +62,8 @@ def test_three_vehicles_find_all_through_the_real_protocol(tmp_path):
         assert 'no LOCAL_POSITION_NED yet' not in log
 
 
-def small_demo(folder):
-    """Write a small scenario of the demo's robots, the Mambo linked as the real one."""
+def small_demo():
+    """Return a small scenario of the demo's robots, the Mambo linked as the real one."""
     scenario = load_scenario('mambo_turtlebot').content()
     scenario['environment']['bounds'] = [[-0.3, 1.2], [-0.3, 1.2]]
     scenario['targets']['count'] = 4
@@ -77,13 +75,11 @@ def small_demo(folder):
     robots['mambo']['candidates']['grid'] = [4, 4]
     robots['turtlebot']['candidates']['grid'] = [5, 5]
     scenario['limits']['time'] = 150.0
-    file = folder / 'short.yaml'
-    file.write_text(yaml.safe_dump(scenario))
-    return file
+    return scenario
 
 
 def test_a_mambo_reached_by_pyparrot_and_a_turtlebot_find_all(tmp_path):
-    run = run_scenario(small_demo(tmp_path), tmp_path / 'run', '--seed', 1)
+    run = run_scenario(small_demo(), tmp_path / 'run', '--seed', 1)
     assert run.code == 0, run.output
     report = run.report
     assert report['true_found'] == 4

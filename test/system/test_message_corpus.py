@@ -148,10 +148,6 @@ class Corpus:
         return choices[int(self.random.integers(len(choices)))]
 
 
-def frame_of(topic):
-    return 'odom' if topic.endswith('/odom') else 'map'
-
-
 def stamped(message, seconds, frame='map'):
     message.header.frame_id, message.header.stamp = frame, stamp_to_ros(round(seconds * 1e9))
     return message
@@ -266,7 +262,8 @@ def send_corpus(world, topics):
         # Now and then all stamps are before zero.
         stamp = (100, 50_000_000 * round_) if round_ % 4 else (-5, 0)
         for topic, type_name in topics.items():
-            world.publish(topic, corpus.message(kind_of(type_name)(), frame_of(topic), stamp))
+            frame = 'odom' if topic.endswith('/odom') else 'map'
+            world.publish(topic, corpus.message(kind_of(type_name)(), frame, stamp))
         if round_ % 4 == 3:
             world.call(
                 {

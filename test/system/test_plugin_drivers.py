@@ -52,7 +52,6 @@ def test_robots_with_drivers_of_their_own(tmp_path):
     scenario['limits'] = {'time': 8.0}
     scenario['robots']['left']['driver'] = 'slow_driver:SlowDriver'
     scenario['robots']['right']['driver'] = 'blind'
-    (tmp_path / 'search.yaml').write_text(yaml.safe_dump(scenario))
     (tmp_path / 'robots').symlink_to(EXAMPLES / 'robots')
     (tmp_path / 'slow_driver.py').write_text(SLOW)
     # An entry point in a dist-info folder on the path is one of an installed package.
@@ -63,12 +62,7 @@ def test_robots_with_drivers_of_their_own(tmp_path):
     (info.parent / 'blind_driver.py').write_text(BLIND)
 
     path = f'{info.parent}{os.pathsep}{os.environ.get("PYTHONPATH", "")}'
-    run = run_scenario(
-        tmp_path / 'search.yaml',
-        tmp_path / 'run',
-        '--lockstep',
-        environment={'PYTHONPATH': path},
-    )
+    run = run_scenario(scenario, tmp_path / 'run', '--lockstep', environment={'PYTHONPATH': path})
     assert run.code == 1, run.output
     assert run.report['end_reason'] == 'time_limit'
     fastest, seen = {}, {}

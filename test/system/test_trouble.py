@@ -5,7 +5,6 @@ import os
 import signal
 
 import pytest
-import yaml
 from scenario_runs import Operator, beside, of_topic, run_scenario, start
 from test_mavlink_scenario import short_search
 
@@ -23,9 +22,7 @@ def test_the_others_plan_on_when_a_robot_leaves(tmp_path):
         {'at': 22.0, 'robot': 'mambo', 'do': 'back'},
     ]
     scenario['limits']['time'] = 27.0
-    file = tmp_path / 'leaving.yaml'
-    file.write_text(yaml.safe_dump(scenario))
-    run = run_scenario(file, tmp_path / 'run', '--seed', 1, '--lockstep')
+    run = run_scenario(scenario, tmp_path / 'run', '--seed', 1, '--lockstep')
     assert run.code in (0, 1), run.output
     events = {(item['agent'], item['event']) for item in run.report['events']}
     assert {('mambo', 'lost'), ('mambo', 'joined')} <= events
@@ -70,14 +67,12 @@ class Watcher(Operator):
 
 
 def test_robots_whose_planner_is_killed_while_they_pass_waypoints_stop_at_the_last_one(tmp_path):
-    file = short_search(tmp_path)
-    content = yaml.safe_load(file.read_text())
+    content = short_search()
     del content['robots']['rov']
     content['robots']['other']['link'] = 'topics'
-    file.write_text(yaml.safe_dump(content))
     with beside(Watcher) as watcher:
         states = watcher.states
-        with start(file, tmp_path / 'run', *watcher.options, '--no-record') as run:
+        with start(content, tmp_path / 'run', *watcher.options, '--no-record') as run:
             watcher.until(lambda: all(map(watcher.passes, states)), 'the robots pass waypoints')
             # It would stop the robots at once.
             run.process.send_signal(signal.SIGSTOP)
