@@ -199,7 +199,9 @@ def check_script(script, arguments):
     elif module:
         check_module(module[1], arguments)
     elif file:
-        check_options(arguments, re.findall(r"'(--[\w-]+)'", (ROOT / file[1]).read_text()))
+        # Options that several commands have are added in a module beside them.
+        texts = [path.read_text() for path in (ROOT / file[1]).parent.glob('*.py')]
+        check_options(arguments, re.findall(r"'(--[\w-]+)'", '\n'.join(texts)))
 
 
 def check_module(name, arguments):
