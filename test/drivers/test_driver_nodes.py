@@ -114,9 +114,6 @@ def test_a_goal_that_makes_no_sense_is_refused(play, capfd):
     assert team.takes([2.5, 0.5, 0.0])
 
 
-# ---- odometry that is bad, or of another time ------------------------------------------------
-
-
 def test_bad_odometry_is_counted_and_nothing_else(play):
     driver, team = play()
     team.move(3)
@@ -160,9 +157,6 @@ def test_a_jump_of_the_stamps_begins_anew(play):
     assert 'the robot cannot go on: no odometry' in team.refused([1.0, 1.0, 0.0])
     team.move()
     assert team.takes([1.0, 1.0, 0.0])
-
-
-# ---- measurements ----------------------------------------------------------------------------
 
 
 def test_a_batch_is_answered_with_what_the_image_shows(play):

@@ -137,6 +137,5 @@ def test_read_only_and_strided_images_give_the_same():
     padded[:, :160] = image
     frozen = np.frombuffer(image.tobytes(), dtype=np.uint8).reshape(image.shape)
     for rule in (PAPER, ROBUST):
-        expected = segment(image, rule).centroids
-        assert_array_equal(segment(frozen, rule).centroids, expected)
-        assert_array_equal(segment(padded[:, :160], rule).centroids, expected)
+        found = [segment(item, rule).centroids for item in (image, frozen, padded[:, :160])]
+        assert_array_equal(found[1:], [found[0]] * 2)

@@ -80,10 +80,8 @@ class MarkerDetector:
             reach /= settings.marker_diameter
         sized = np.ones(len(blobs), dtype=bool)
         if settings.segmentation.rule == 'robust':
-            least, most = (
-                settings.segmentation.minimum_diameter,
-                settings.segmentation.maximum_diameter,
-            )
+            least = settings.segmentation.minimum_diameter
+            most = settings.segmentation.maximum_diameter
             # Of a marker that the border cuts enough must be left to tell it from other things.
             sized = (parts <= most**2) & (parts >= np.where(blobs.border_cut, 0.4, least**2))
             sized &= ~blobs.border_cut | (reach <= most)

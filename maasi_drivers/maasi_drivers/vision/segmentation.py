@@ -114,9 +114,10 @@ def _compact(
     labels: NDArray[np.int32],
     boxes: IntArray,
     gains: FloatArray,
-    gates: tuple[float, float, float],
+    peak: float,
+    settings: SegmentationSettings,
 ) -> list[int]:
-    """Return the components within the gates: least peak blueness, aspect, solidity."""
+    """Return the components with this peak of blueness, and an allowed aspect and solidity."""
     if not len(boxes):
         return []
     columns, rows = cv2.findNonZero((labels > 0).view(np.uint8))[:, 0].T
@@ -135,9 +136,10 @@ def _compact(
     long, short = middle + apart, np.maximum(middle - apart, 1e-9)
     peaks = np.full(len(count), -np.inf)
     np.maximum.at(peaks, owners, _blueness(gains * image[rows, columns]))
-    keep = (peaks >= gates[0]) & (long <= gates[1] * gates[1] * short)
+    aspect = settings.maximum_aspect
+    keep = (peaks >= peak) & (long <= aspect * aspect * short)
     # An ellipse has area 4 pi root(long short).
-    keep &= count >= gates[2] * 4.0 * np.pi * np.sqrt(long * short)
+    keep &= count >= settings.minimum_solidity * 4.0 * np.pi * np.sqrt(long * short)
     return [int(index) for index in np.flatnonzero(keep)]
 
 
@@ -200,13 +202,9 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     red, green, blue = _planes(image)
     _robust_mask(red, green, blue, gains.astype(np.float32), threshold, mask)
     labels, boxes, blobs = _components(mask)
-    gates = (
-        max(settings.peak_saturation, threshold),
-        settings.maximum_aspect,
-        settings.minimum_solidity,
-    )
     found = []
-    for blob in _compact(image, labels, boxes, gains, gates):
+    peak = max(settings.peak_saturation, threshold)
+    for blob in _compact(image, labels, boxes, gains, peak, settings):
         if (measured := _weigh(image, labels, boxes[blob], blob, gains)) is not None:
             found.append((blob, *measured))
     chosen = np.array([item[0] for item in found], dtype=int)
