@@ -30,9 +30,6 @@ from maasi_filter.ros.qos import RELIABLE, SENSOR, sensor_reader
 # Decodes an image, or returns the blobs found on board; called only for images that answer a batch.
 Picture = Callable[[], ImageArray | Blobs]
 
-# Largest share of clipped pixels.
-_MOST_CLIPPED = 0.01
-
 
 class CameraInput(SensorInput[Picture]):
     """A camera that sees markers on the floor.
@@ -135,11 +132,11 @@ class CameraInput(SensorInput[Picture]):
         if isinstance(picture, Blobs):
             return reading
         share = float(np.mean(picture[::4, ::4].max(axis=2) == 255))
-        if share > _MOST_CLIPPED:
+        if share > 0.01:
             self.driver.warn_throttled(
                 'exposure',
-                f'image: {share:.0%} of the pixels are clipped at 255, good is at most '
-                f'{_MOST_CLIPPED:.0%}: lower the exposure, or markers are missed or misplaced',
+                f'image: {share:.0%} of the pixels are clipped at 255, good is at most 1%: '
+                'lower the exposure, or markers are missed or misplaced',
             )
         return reading
 
