@@ -9,7 +9,7 @@ setup(
     package_data={
         'maasi_sim.experiments': ['papers/*'],
         'maasi_sim.run': ['discovery.xml', 'report.schema.json'],
-        'maasi_sim.view': ['page/*'],
+        'maasi_sim.run.view': ['page/*'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/maasi_sim']),

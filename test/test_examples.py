@@ -22,9 +22,9 @@ from maasi_filter.ros.parameters import flatten
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.node_plan import RunSettings
+from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario import load_scenario
 from maasi_sim.search import search
-from maasi_sim.targets.mission import TargetMission
 
 EXAMPLES = Path(__file__).resolve().parents[1] / 'examples'
 

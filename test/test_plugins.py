@@ -16,9 +16,9 @@ from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
 from maasi_planner.settings import PLANNERS, PlannerSettings
 from maasi_sim.run.node_plan import RunSettings
+from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario import ScenarioError, load_scenario
 from maasi_sim.search import search
-from maasi_sim.targets.mission import TargetMission
 
 ONE_BY_ONE = '''
 from pydantic import BaseModel, ConfigDict, Field

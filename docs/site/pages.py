@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from maasi_filter.ros.parameters import ParameterField, choices, parameters_of
-from maasi_sim.buildings.scenario import CuboidScenario
+from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.run.launch_arguments import ending
 from maasi_sim.scenario.schema import Scenario
 
@@ -58,15 +58,15 @@ NODES = [
 ]
 PARSERS = [
     'maasi_sim.run.run_options',
-    'maasi_sim.view.view_run',
+    'maasi_sim.run.view.view_run',
     'maasi_sim.experiments.reproduce',
     'maasi_sim.experiments.compare',
     'maasi_planner.search_command',
     'maasi_drivers.robot_command',
     'maasi_drivers.calibrate_sensor',
     'maasi_drivers.measure_mambo',
-    'maasi_sim.emulators.mambo.fake_mambo',
-    'maasi_sim.emulators.mavlink.fake_mavlink_vehicle',
+    'maasi_sim.simulation.emulators.mambo.fake_mambo',
+    'maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle',
 ]
 KINDS = {
     bool: 'true or false',

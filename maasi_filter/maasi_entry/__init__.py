@@ -55,10 +55,12 @@ mambo_onboard_driver = partial(_run, 'maasi_drivers.drivers:mambo_onboard_driver
 robot_command = partial(_run, 'maasi_drivers.robot_command:main')
 measure_mambo = partial(_run, 'maasi_drivers.measure_mambo:main')
 guard_node = partial(_run, 'maasi_drivers.guard_node:main')
-cuboid_sim_node = partial(_run, 'maasi_sim.buildings.cuboid_sim_node:main')
-sim_node = partial(_run, 'maasi_sim.sim_node:main')
-fake_mambo = partial(_run, 'maasi_sim.emulators.mambo.fake_mambo:main')
-fake_mavlink_vehicle = partial(_run, 'maasi_sim.emulators.mavlink.fake_mavlink_vehicle:main')
-view_node = partial(_run, 'maasi_sim.view.view_node:main')
+cuboid_sim_node = partial(_run, 'maasi_sim.run.buildings.cuboid_sim_node:main')
+sim_node = partial(_run, 'maasi_sim.simulation.sim_node:main')
+fake_mambo = partial(_run, 'maasi_sim.simulation.emulators.mambo.fake_mambo:main')
+fake_mavlink_vehicle = partial(
+    _run, 'maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle:main'
+)
+view_node = partial(_run, 'maasi_sim.run.view.view_node:main')
 compare = partial(_run, 'maasi_sim.experiments.compare:main')
 run_scenario = partial(_run, 'maasi_sim.run.run_scenario:main')

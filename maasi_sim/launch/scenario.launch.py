@@ -27,7 +27,7 @@ def end_launch(event: ProcessExited, context: LaunchContext) -> EmitEvent:
 
 def show(scenario: str, team: str) -> Node:
     """Return RViz with the view of a scenario, for a team in a namespace."""
-    from maasi_sim.missions import load_mission
+    from maasi_sim.run.missions import load_mission
     from maasi_sim.run.rviz_view import shown_topics
     from maasi_sim.scenario.loading import config_folder
 

@@ -28,8 +28,8 @@ _SEARCH = (
     'maasi_planner',
     'maasi_drivers',
     'maasi_sim.scenario',
-    'maasi_sim.world',
-    'maasi_sim.targets',
+    'maasi_sim.simulation',
+    'maasi_sim.run.targets',
     'maasi_sim.search',
     'maasi_sim.search_result',
 )

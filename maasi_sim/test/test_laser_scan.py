@@ -4,7 +4,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
 from maasi_filter.models.pose import Pose
-from maasi_sim.world.sensors import LaserScanner, LaserSettings
+from maasi_sim.simulation.sensors import LaserScanner, LaserSettings
 
 BOUNDS = np.array([[0.0, 3.0], [0.0, 2.0]])
 EXACT = LaserSettings(noise=0.0, wall_margin=0.0, minimum_range=0.0)

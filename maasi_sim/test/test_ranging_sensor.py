@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
-from maasi_sim.world.sensors import RangingSensor
+from maasi_sim.simulation.sensors import RangingSensor
 
 POSE = Pose.from_yaw([100.0, 120.0, 80.0], 0.4)
 

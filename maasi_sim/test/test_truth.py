@@ -10,11 +10,11 @@ from maasi_planner.motion import RobotState
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
-from maasi_sim.world.odometry import OdometryModel, OdometrySettings
-from maasi_sim.world.robots import SimulatedSettings
-from maasi_sim.world.sensors import RangingSensor
-from maasi_sim.world.simulation import Simulation
-from maasi_sim.world.world import World
+from maasi_sim.simulation.odometry import OdometryModel, OdometrySettings
+from maasi_sim.simulation.robots import SimulatedSettings
+from maasi_sim.simulation.sensors import RangingSensor
+from maasi_sim.simulation.simulated_world import Simulation
+from maasi_sim.simulation.world import World
 
 CUBE = np.array([[0.0, 260.0]] * 3)
 POSE = Pose.from_yaw([100.0, 120.0, 80.0], 0.4)

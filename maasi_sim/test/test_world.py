@@ -6,7 +6,7 @@ from numpy.testing import assert_array_equal
 from scipy.spatial.distance import pdist
 
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.world.world import TargetSettings, World, noise_stream
+from maasi_sim.simulation.world import TargetSettings, World, noise_stream
 
 FLOOR = {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]}
 CUBE = {'bounds': [[0, 260], [0, 260], [0, 260]]}

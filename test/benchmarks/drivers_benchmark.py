@@ -13,9 +13,9 @@ from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.world.camera import CameraRenderer
-from maasi_sim.world.floor import RenderSettings, scene_of
-from maasi_sim.world.world import TargetSettings, World
+from maasi_sim.simulation.camera import CameraRenderer
+from maasi_sim.simulation.floor import RenderSettings, scene_of
+from maasi_sim.simulation.world import TargetSettings, World
 
 
 def _image(settings: CameraSettings, seed: int = 1) -> tuple[np.ndarray, Pose, CameraRenderer]:

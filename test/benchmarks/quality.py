@@ -31,11 +31,11 @@ from maasi_filter.vector_math import squared_distance
 from maasi_sim.experiments.campaign import run_command
 from maasi_sim.experiments.searches import merged
 from maasi_sim.experiments.statistics import mean_interval, paired_difference
+from maasi_sim.run.targets.scoring import scoring_radius
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
-from maasi_sim.targets.scoring import scoring_radius
-from maasi_sim.world.sensors import RangingSensor
+from maasi_sim.simulation.sensors import RangingSensor
 
 METHODS = ('ic_phd', 'pmb')
 CUBE = 'ranging_drone_3d'

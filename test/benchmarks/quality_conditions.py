@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from maasi_filter import NoiseSettings
-from maasi_sim.world.world import noise_stream
+from maasi_sim.simulation.world import noise_stream
 
 # What is tuned is tuned on the first block and looked at again on the second; the third is for
 # the numbers in the documents, and never used for anything else.

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from timing import entry, run_scenario
 
-from maasi_sim.missions import load_mission
-from maasi_sim.view.event_log import Event, EventLog
-from maasi_sim.view.page_file import write_replay
-from maasi_sim.view.scene import scene_of
+from maasi_sim.run.missions import load_mission
+from maasi_sim.run.view.event_log import Event, EventLog
+from maasi_sim.run.view.page_file import write_replay
+from maasi_sim.run.view.scene import scene_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from maasi_sim.emulators.mambo.fake_mambo import free_port
+from maasi_sim.simulation.emulators.mambo.fake_mambo import free_port
 
 SEARCH_NODES = (
     '/sim_node',

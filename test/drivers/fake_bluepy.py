@@ -14,7 +14,7 @@ import time
 from functools import partial
 from types import ModuleType, SimpleNamespace
 
-from maasi_sim.emulators.mambo.fake_mambo import ALL_STATES, obey
+from maasi_sim.simulation.emulators.mambo.fake_mambo import ALL_STATES, obey
 
 _SERVICES = {
     'fa00': ('fa0a', 'fa0b', 'fa0c', 'fa1e'),

@@ -13,9 +13,9 @@ from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.measurement import RangeBearing
 from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.world.camera import CameraRenderer
-from maasi_sim.world.floor import RenderSettings, scene_of
-from maasi_sim.world.world import TargetSettings, World
+from maasi_sim.simulation.camera import CameraRenderer
+from maasi_sim.simulation.floor import RenderSettings, scene_of
+from maasi_sim.simulation.world import TargetSettings, World
 
 BOX, GATE = 0.2, 0.03
 MODEL = RangeBearing()

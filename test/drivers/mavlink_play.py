@@ -6,8 +6,8 @@ from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.links.mavlink.vehicle import Phase, Vehicle
 from maasi_drivers.settings.vehicles import MavlinkSettings
-from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
-from maasi_sim.emulators.mavlink.fake_autopilot import FakeAutopilot
+from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.simulation.emulators.mavlink.fake_autopilot import FakeAutopilot
 
 PERIOD = 0.02
 HEIGHTS = {'arducopter': 2.0, 'px4': 2.0, 'ardusub': -1.5}

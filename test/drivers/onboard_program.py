@@ -14,7 +14,7 @@ import zlib
 
 import numpy as np
 
-from maasi_sim.emulators.mavlink.flight_model import FlightModel
+from maasi_sim.simulation.emulators.mavlink.flight_model import FlightModel
 
 _STEP, _FEED_PERIOD = 0.02, 0.1
 GROUND, AIR, LANDING = range(3)

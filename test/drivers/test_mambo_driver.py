@@ -29,9 +29,13 @@ from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_to_ros
 from maasi_msgs.msg import AgentState
-from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
-from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState, MamboFirmware
-from maasi_sim.world.odometry import OdometrySettings
+from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
+from maasi_sim.simulation.emulators.mambo.firmware import (
+    FirmwareSettings,
+    FlyingState,
+    MamboFirmware,
+)
+from maasi_sim.simulation.odometry import OdometrySettings
 
 START, YAW = [1.0, 1.2, 0.4], 0.6
 GOAL = [1.7, 0.8, 0.5]

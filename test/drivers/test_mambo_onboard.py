@@ -27,7 +27,7 @@ from maasi_drivers.vision.measurement_feed import (
     encode,
 )
 from maasi_filter.models.pose import Pose, compose
-from maasi_sim.emulators.mambo.fake_mambo import free_address, free_port
+from maasi_sim.simulation.emulators.mambo.fake_mambo import free_address, free_port
 
 START, YAW, GROUND_HEIGHT = [1.0, 1.2, 0.6], 0.6, 0.1
 GOAL = [1.7, 0.8, 0.7]

@@ -13,7 +13,7 @@ from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
 from maasi_drivers.links.mambo.reckoning import Course, DeadReckoning, TiltModel
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
-from maasi_sim.emulators.mambo.firmware import FlyingState
+from maasi_sim.simulation.emulators.mambo.firmware import FlyingState
 
 # What a fault may take until the robot hovers or lands [s].
 AT_MOST = 1.5

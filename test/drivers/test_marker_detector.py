@@ -10,7 +10,7 @@ from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.vision.marker_detector import MarkerDetector, read_markers
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
-from maasi_sim.world.floor import RenderSettings
+from maasi_sim.simulation.floor import RenderSettings
 
 DOWN = Pose([0.0, 0.0, 1.0])
 

@@ -27,8 +27,8 @@ from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose, compose
 from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
 from maasi_msgs.msg import AgentState
-from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
-from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import FakeVehicle
+from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle import FakeVehicle
 
 SPEED, STOPPED = 1.0, 0.1
 START = [1.0, 2.0, 0.8]

@@ -13,7 +13,7 @@ from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
-from maasi_sim.world.sensors import LaserScanner, LaserSettings
+from maasi_sim.simulation.sensors import LaserScanner, LaserSettings
 
 RADIUS = 0.11
 STEP = 0.05

@@ -16,8 +16,8 @@ from waiting import wait_until
 
 from maasi_drivers.measure_mambo import Leg, MeasurementError, MeasuringFlight, fit_speed, main
 from maasi_filter.models.pose import Pose
-from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
-from maasi_sim.emulators.mambo.firmware import FlyingState, MamboFirmware
+from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
+from maasi_sim.simulation.emulators.mambo.firmware import FlyingState, MamboFirmware
 
 # Longest wait for anything; the machine may be busy.
 LIMIT = 60.0

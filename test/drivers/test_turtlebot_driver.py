@@ -21,7 +21,7 @@ from maasi_drivers.drivers import TurtlebotDriver
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState
-from maasi_sim.world.sensors import LaserScanner, LaserSettings
+from maasi_sim.simulation.sensors import LaserScanner, LaserSettings
 
 HERE = Path(__file__).parent
 SCANNING = {'scan': {'timeout': 1.0, 'blocked_timeout': 3.0}}

@@ -13,11 +13,11 @@ import numpy as np
 
 from maasi_filter import IcPhdFilter, PmbFilter, SearchFilter
 from maasi_planner.coordinator import Coordinator
-from maasi_sim.buildings.mission import CuboidMission
-from maasi_sim.buildings.scenario import CuboidScenario, mission_of
 from maasi_sim.experiments.experiment import Experiment
 from maasi_sim.experiments.papers import experiments
-from maasi_sim.missions import load_mission
+from maasi_sim.run.buildings.mission import CuboidMission
+from maasi_sim.run.buildings.scenario import CuboidScenario, mission_of
+from maasi_sim.run.missions import load_mission
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.search import search
 

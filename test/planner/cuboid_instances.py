@@ -8,7 +8,7 @@ from maasi_planner.buildings.agent import inflated
 from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.problem import PlanSolver, Problem
 from maasi_planner.buildings.settings import CuboidMethodSettings, CuboidSettings, SearcherSettings
-from maasi_sim.buildings.mission import CuboidMission
+from maasi_sim.run.buildings.mission import CuboidMission
 
 AREA = np.array([[0.0, 250.0], [0.0, 400.0], [0.0, 80.0]])
 OBJECTS = [

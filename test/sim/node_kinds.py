@@ -17,9 +17,9 @@ from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
 from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
-from maasi_sim.buildings.cuboid_sim_node import CuboidSimNode
+from maasi_sim.run.buildings.cuboid_sim_node import CuboidSimNode
 from maasi_sim.run.processes import find_executable
-from maasi_sim.sim_node import SimNode, SimNodeSettings
+from maasi_sim.simulation.sim_node import SimNode, SimNodeSettings
 
 BOUNDS = [[-0.3, 2.4], [-0.3, 2.4]]
 SPACE = [[0.0, 30.0], [0.0, 30.0], [0.0, 30.0]]

@@ -5,7 +5,7 @@ import pytest
 
 from maasi_planner.buildings.agent import SearchAgent
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
-from maasi_sim.buildings.mission import CuboidMission, within_range
+from maasi_sim.run.buildings.mission import CuboidMission, within_range
 
 AREA = [[0, 300], [0, 300], [0, 80]]
 BUILDING = {'centre': [175, 130], 'size': [60, 60, 60]}

@@ -11,10 +11,10 @@ from report_check import check_report
 from maasi_filter.ros.parameters import unflatten
 from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.settings import CuboidPlannerSettings
-from maasi_sim.buildings.building_mission import BuildingMission
-from maasi_sim.buildings.observer import CuboidRecord
-from maasi_sim.buildings.scenario import check_cuboid_scenario, load_cuboid_scenario
-from maasi_sim.buildings.simulation import CuboidSimulation
+from maasi_sim.run.buildings.building_mission import BuildingMission
+from maasi_sim.run.buildings.observer import CuboidRecord
+from maasi_sim.run.buildings.scenario import check_cuboid_scenario, load_cuboid_scenario
+from maasi_sim.run.buildings.simulation import CuboidSimulation
 from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.run.report_files import write_report
 from maasi_sim.scenario.layering import Layer

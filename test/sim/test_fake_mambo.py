@@ -15,11 +15,15 @@ from waiting import PATIENCE, wait_until
 
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
 from maasi_filter.models.pose import Pose
-from maasi_sim.emulators.linked_robots import linked_robot, with_addresses
-from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port, main
-from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState, MamboFirmware
 from maasi_sim.scenario.loading import load_scenario
-from maasi_sim.world.robots import BatterySettings
+from maasi_sim.simulation.emulators.linked_robots import linked_robot, with_addresses
+from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port, main
+from maasi_sim.simulation.emulators.mambo.firmware import (
+    FirmwareSettings,
+    FlyingState,
+    MamboFirmware,
+)
+from maasi_sim.simulation.robots import BatterySettings
 
 START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
 
@@ -178,7 +182,13 @@ def test_that_of_a_scenario_stands_below_its_start_and_flies_to_its_height():
 
 def test_the_command_runs_a_fake_that_a_link_finds():
     address = free_address()
-    command = [sys.executable, '-m', 'maasi_sim.emulators.mambo.fake_mambo', '--address', address]
+    command = [
+        sys.executable,
+        '-m',
+        'maasi_sim.simulation.emulators.mambo.fake_mambo',
+        '--address',
+        address,
+    ]
     process = subprocess.Popen([*command, '--charge', '0.4'], stdout=subprocess.PIPE, text=True)
     link = MamboLink('wifi', address, free_port())
     try:

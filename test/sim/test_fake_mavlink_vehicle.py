@@ -7,14 +7,14 @@ import sys
 import pytest
 
 from maasi_drivers.links.mavlink.link import open_connection
-from maasi_sim.emulators.mambo.fake_mambo import free_port
-from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import main
+from maasi_sim.simulation.emulators.mambo.fake_mambo import free_port
+from maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle import main
 
 
 def test_it_is_heard_in_mavlink_2():
     port = free_port()
     connection = open_connection(f'udpin:127.0.0.1:{port}', 255, 190)
-    command = [sys.executable, '-m', 'maasi_sim.emulators.mavlink.fake_mavlink_vehicle']
+    command = [sys.executable, '-m', 'maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle']
     command += ['--system', '7', '--firmware', 'ardusub', '--url', f'udpout:127.0.0.1:{port}']
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as vehicle:
         try:

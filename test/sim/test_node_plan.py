@@ -10,10 +10,10 @@ from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_sim.run.node_plan import NodePlan, RunSettings, in_team, with_followed_clock
+from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario.loading import config_folder, load_scenario
 from maasi_sim.scenario.schema import ScenarioError
-from maasi_sim.sim_node import SimNodeSettings
-from maasi_sim.targets.mission import TargetMission
+from maasi_sim.simulation.sim_node import SimNodeSettings
 
 SCENARIOS = sorted(
     path.stem

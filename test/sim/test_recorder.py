@@ -17,8 +17,8 @@ from waiting import wait_until
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState, LockstepStep
-from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import Bag, BagWriter, load_types
+from maasi_sim.run.missions import load_mission
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.topics import STEP

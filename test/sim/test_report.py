@@ -18,13 +18,13 @@ from maasi_msgs import msg
 from maasi_sim.run.bag import load_types
 from maasi_sim.run.report_files import write_report
 from maasi_sim.run.run_record import RunEnd
+from maasi_sim.run.targets.mission import TargetMission
+from maasi_sim.run.targets.observer import TargetObserver
+from maasi_sim.run.targets.report import build_report, target_summary
+from maasi_sim.run.targets.report_figure import plot_report
+from maasi_sim.run.targets.scoring import score, scoring_radius
 from maasi_sim.run.topics import within
 from maasi_sim.scenario.loading import load_scenario
-from maasi_sim.targets.mission import TargetMission
-from maasi_sim.targets.observer import TargetObserver
-from maasi_sim.targets.report import build_report, target_summary
-from maasi_sim.targets.report_figure import plot_report
-from maasi_sim.targets.scoring import score, scoring_radius
 
 TYPES = load_types()
 

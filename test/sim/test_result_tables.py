@@ -15,12 +15,12 @@ from small_field import SMALL_FIELD
 
 from maasi_filter.records import FoundTarget, Label
 from maasi_sim.run.node_plan import RunSettings
+from maasi_sim.run.targets.mission import TargetMission
+from maasi_sim.run.targets.tables import csv_text, found_rows, geodetic, geojson_text
 from maasi_sim.scenario.base import OriginSettings
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
-from maasi_sim.targets.mission import TargetMission
-from maasi_sim.targets.tables import csv_text, found_rows, geodetic, geojson_text
 
 ORIGIN = OriginSettings(latitude=46.0, longitude=23.5, altitude=350.0)
 COVARIANCE = np.array([[0.04, 0.01, 0.02], [0.01, 0.09, 0.03], [0.02, 0.03, 0.16]])

@@ -12,11 +12,11 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings, SensorSettings
 from maasi_planner.motion import RobotState
 from maasi_planner.settings import MotionSettings
-from maasi_sim.world.floor import RenderSettings
-from maasi_sim.world.odometry import OdometryModel, OdometrySettings
-from maasi_sim.world.robots import BatterySettings, Equipment, SimulatedRobot
-from maasi_sim.world.sensors import LaserSettings
-from maasi_sim.world.world import TargetSettings, World
+from maasi_sim.simulation.floor import RenderSettings
+from maasi_sim.simulation.odometry import OdometryModel, OdometrySettings
+from maasi_sim.simulation.robots import BatterySettings, Equipment, SimulatedRobot
+from maasi_sim.simulation.sensors import LaserSettings
+from maasi_sim.simulation.world import TargetSettings, World
 
 PERFECT = OdometrySettings(position_noise=0.0, heading_noise=0.0, velocity_noise=0.0)
 DRONE = Pose.from_yaw([1.0, 1.0, 1.0], 0.3)

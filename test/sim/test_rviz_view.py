@@ -7,7 +7,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.ros.conversions import MarkerBoard
-from maasi_sim.missions import load_mission
+from maasi_sim.run.missions import load_mission
 from maasi_sim.run.rviz_view import view_text
 
 

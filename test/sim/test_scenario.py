@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from maasi_sim.missions import load_mission
+from maasi_sim.run.missions import load_mission
 from maasi_sim.scenario.layering import ScenarioWarning
 from maasi_sim.scenario.loading import config_folder, find_scenario, load_scenario
 from maasi_sim.scenario.schema import ScenarioError

@@ -27,7 +27,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_filter.ros.qos import LATCHED, RELIABLE
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, RangeArray
-from maasi_sim.sim_node import SimNode
+from maasi_sim.simulation.sim_node import SimNode
 
 STEP = 0.05
 GRID = {'grid': [2, 2], 'spacing': 1.0, 'corner': [0.5, 0.5]}
@@ -250,7 +250,7 @@ def test_every_topic_comes_at_its_rate_with_the_stamps_of_the_steps(make_team):
 
 
 def test_nothing_is_published_until_everybody_is_there(make_team, monkeypatch):
-    monkeypatch.setattr('maasi_sim.sim_node._PATIENCE', 0.0)
+    monkeypatch.setattr('maasi_sim.simulation.sim_node._PATIENCE', 0.0)
     team = make_team(recorder=True)
     team.settle()
     assert team.sim.status()['waits for'] == '/recorder'

@@ -9,10 +9,10 @@ from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import Trigger
 from waiting import PATIENCE, wait_until
 
-from maasi_sim.view import control_node
-from maasi_sim.view.control_node import Control
-from maasi_sim.view.server import Hub, ViewServer
-from maasi_sim.view.view_node import main
+from maasi_sim.run.view import control_node
+from maasi_sim.run.view.control_node import Control
+from maasi_sim.run.view.server import Hub, ViewServer
+from maasi_sim.run.view.view_node import main
 
 
 def serve(context, name, services, called):

@@ -12,13 +12,13 @@ from nav_msgs.msg import OccupancyGrid
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs import msg
-from maasi_sim.missions import load_mission
+from maasi_sim.run.missions import load_mission
+from maasi_sim.run.view.event_log import EventLog, line, thin
+from maasi_sim.run.view.event_maker import ENDED, LEFT, SILENT, EventMaker
+from maasi_sim.run.view.messages import MessageEvents, is_shown
+from maasi_sim.run.view.page_file import REPLAY, empty_page, write_replay
+from maasi_sim.run.view.scene import empty_scene, scene_of, scene_of_facts
 from maasi_sim.search import search
-from maasi_sim.view.event_log import EventLog, line, thin
-from maasi_sim.view.event_maker import ENDED, LEFT, SILENT, EventMaker
-from maasi_sim.view.messages import MessageEvents, is_shown
-from maasi_sim.view.page_file import REPLAY, empty_page, write_replay
-from maasi_sim.view.scene import empty_scene, scene_of, scene_of_facts
 
 
 def state(seconds, **fields):

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from browsers import chromium, needs_chromium
 
-from maasi_sim.buildings.picture import NAMED
-from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import load_types
+from maasi_sim.run.buildings.picture import NAMED
+from maasi_sim.run.missions import load_mission
 from maasi_sim.run.rviz_view import shown_topics
+from maasi_sim.run.view import video
+from maasi_sim.run.view.event_log import EventLog
+from maasi_sim.run.view.event_maker import EventMaker
+from maasi_sim.run.view.page_file import FOLDER, write_replay
+from maasi_sim.run.view.scene import scene_of
+from maasi_sim.run.view.video import write_video
+from maasi_sim.run.view.view_run import main
 from maasi_sim.scenario.loading import config_folder
 from maasi_sim.search import search
-from maasi_sim.view import video
-from maasi_sim.view.event_log import EventLog
-from maasi_sim.view.event_maker import EventMaker
-from maasi_sim.view.page_file import FOLDER, write_replay
-from maasi_sim.view.scene import scene_of
-from maasi_sim.view.video import write_video
-from maasi_sim.view.view_run import main
 
 
 def frames(log, path, speed=1e3):

@@ -12,10 +12,10 @@ import pytest
 from browsers import chromium, needs_chromium
 from waiting import PATIENCE, wait_until
 
-from maasi_sim.view import live_view
-from maasi_sim.view.event_log import STATE_PERIOD
-from maasi_sim.view.live_view import LiveView
-from maasi_sim.view.server import (
+from maasi_sim.run.view import live_view
+from maasi_sim.run.view.event_log import STATE_PERIOD
+from maasi_sim.run.view.live_view import LiveView
+from maasi_sim.run.view.server import (
     LARGEST_BODY,
     MOST_BROWSERS,
     MOST_IDLE,

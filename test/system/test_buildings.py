@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenario_runs import of_topic, run_scenario, start
 
-from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
+from maasi_sim.run.buildings.scenario import load_cuboid_scenario, mission_of
 
 pytestmark = pytest.mark.system
 

@@ -12,13 +12,13 @@ from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.run.topics import message_class
-from maasi_sim.view.event_log import EventLog
-from maasi_sim.view.live_view import RunPage
-from maasi_sim.view.messages import is_shown, read_events
-from maasi_sim.view.page_file import REPLAY, write_replay
-from maasi_sim.view.scene import empty_scene
-from maasi_sim.view.view_node import ViewNode
-from maasi_sim.view.view_run import main
+from maasi_sim.run.view.event_log import EventLog
+from maasi_sim.run.view.live_view import RunPage
+from maasi_sim.run.view.messages import is_shown, read_events
+from maasi_sim.run.view.page_file import REPLAY, write_replay
+from maasi_sim.run.view.scene import empty_scene
+from maasi_sim.run.view.view_node import ViewNode
+from maasi_sim.run.view.view_run import main
 
 pytestmark = pytest.mark.system
 

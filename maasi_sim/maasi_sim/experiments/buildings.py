@@ -11,10 +11,10 @@ import numpy as np
 from maasi_planner.buildings.agent import inflated
 from maasi_planner.buildings.preplanning import plan_mission
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
-from maasi_sim.buildings.mission import CuboidMission
-from maasi_sim.buildings.picture import draw_mission, legend
 from maasi_sim.experiments.experiment import Outcome, Quantity, Results
 from maasi_sim.experiments.statistics import mean_interval
+from maasi_sim.run.buildings.mission import CuboidMission
+from maasi_sim.run.buildings.picture import draw_mission, legend
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,11 +17,11 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.settings import PLANNERS
-from maasi_sim.buildings.scenario import is_cuboid_scenario
 from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Quantity
 from maasi_sim.experiments.figures import draw_comparison
 from maasi_sim.experiments.tables import SearchTable
 from maasi_sim.machine import code_digest
+from maasi_sim.run.buildings.scenario import is_cuboid_scenario
 from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import (
     find_scenario,
@@ -33,7 +33,7 @@ from maasi_sim.scenario.loading import (
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import leaving, search
 from maasi_sim.search_result import SearchResult
-from maasi_sim.world.world import noise_stream
+from maasi_sim.simulation.world import noise_stream
 
 QUANTITIES = (
     Quantity('measurements_to_find_all', 'measurements to find all', '', 'restricted', 'limit'),

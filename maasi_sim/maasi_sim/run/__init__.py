@@ -1,1 +1,1 @@
-"""Runs of scenarios: processes, recording, observation, report and replay."""
+"""A run: its two missions, processes, supervision, recording, report, and what shows it."""

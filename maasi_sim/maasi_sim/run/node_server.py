@@ -87,7 +87,7 @@ def _load(started_by: int) -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     gc.disable()
     # Not rclpy, which starts threads.
-    importlib.import_module('maasi_sim.warm_up').prepare_nodes()
+    importlib.import_module('maasi_sim.run.warm_up').prepare_nodes()
     # What exists now is never garbage: nodes share its memory.
     gc.freeze()
     gc.enable()

@@ -31,7 +31,7 @@ from maasi_msgs.msg import LockstepDone, LockstepStep
 from maasi_sim.run.bag import BagError, BagWriter, topic_qos
 from maasi_sim.run.run_record import Observer
 from maasi_sim.run.topics import CLOCK, STEP, message_class, stamp_of, time_at, within
-from maasi_sim.view.messages import is_shown
+from maasi_sim.run.view.messages import is_shown
 
 NAME = 'recorder'
 READY, DONE = '/lockstep/ready', '/lockstep/done'

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import BagError, BagWriter, load_types
 from maasi_sim.run.domain import Domain
 from maasi_sim.run.ending import (
@@ -24,6 +23,7 @@ from maasi_sim.run.ending import (
     Ending,
     Interruption,
 )
+from maasi_sim.run.missions import load_mission
 from maasi_sim.run.node_plan import (
     NodePlan,
     RunSettings,
@@ -41,11 +41,11 @@ from maasi_sim.run.run_options import Options
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
+from maasi_sim.run.view.live_view import RunPage
+from maasi_sim.run.view.messages import read_events
+from maasi_sim.run.view.page_file import REPLAY, write_replay
+from maasi_sim.run.view.scene import scene_of
 from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning, to_yaml
-from maasi_sim.view.live_view import RunPage
-from maasi_sim.view.messages import read_events
-from maasi_sim.view.page_file import REPLAY, write_replay
-from maasi_sim.view.scene import scene_of
 
 # Bytes that may wait for the disk when the recorder reports a step done.
 _BACKLOG = 8 * 2**20

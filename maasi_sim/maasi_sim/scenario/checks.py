@@ -15,7 +15,7 @@ from maasi_sim.scenario.base import BaseScenario, EventSettings
 from maasi_sim.scenario.layering import Key, unknown
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.scenario.visibility import robot_candidates
-from maasi_sim.world.robots import SimulatedSettings
+from maasi_sim.simulation.robots import SimulatedSettings
 
 Problems = Iterator[tuple[Key, str]]
 

@@ -14,14 +14,14 @@ from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.settings import FilterSettings, Finite, SensorSettings, Settings, Vector3
 from maasi_planner.node_settings import PlannedRobotSettings, PlannerNodeSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
-from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import ScenarioError
-from maasi_sim.world.floor import RenderSettings
-from maasi_sim.world.odometry import OdometrySettings
-from maasi_sim.world.robots import BatterySettings, SimulatedSettings
-from maasi_sim.world.sensors import LaserSettings
-from maasi_sim.world.world import TargetSettings, World
+from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.simulation.floor import RenderSettings
+from maasi_sim.simulation.odometry import OdometrySettings
+from maasi_sim.simulation.robots import BatterySettings, SimulatedSettings
+from maasi_sim.simulation.sensors import LaserSettings
+from maasi_sim.simulation.world import TargetSettings, World
 
 
 class RobotSettings(Settings):

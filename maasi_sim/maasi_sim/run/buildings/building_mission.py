@@ -1,0 +1,82 @@
+"""A search of buildings, as a run sees it: its nodes, observer and report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rosbags.typesys.store import Typestore
+
+from maasi_filter.ros.parameters import flatten
+from maasi_planner.buildings.settings import CuboidPlannerSettings
+from maasi_sim.run.buildings.observer import CuboidObserver, CuboidRecord
+from maasi_sim.run.buildings.report import build_cuboid_report, cuboid_summary
+from maasi_sim.run.buildings.scenario import CuboidScenario
+from maasi_sim.run.mission import Mission
+from maasi_sim.run.node_plan import SIMULATED, NodePlan, RunSettings, guard_plan, sim_plan
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class BuildingMission(Mission[CuboidRecord]):
+    """See `Mission`. All links are topics, and planners simulate the snapshots."""
+
+    found_word = 'visited'
+
+    def __init__(self, name: str, scenario: CuboidScenario) -> None:
+        self.name = name
+        self.scenario = scenario
+
+    def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
+        """Return the simulation, and for each robot a planner and a guard."""
+        scenario = self.scenario
+        common = run.common(scenario)
+        plans = [sim_plan('cuboid_sim_node', scenario, run)]
+        for name in scenario.names():
+            plans.append(_planner_plan(name, scenario, common))
+            # It plans once per step, and a command is valid for one step.
+            plans.append(guard_plan(name, common, scenario.step))
+        return plans
+
+    def observer(self, types: Typestore) -> CuboidObserver:
+        """See `Mission.observer`."""
+        return CuboidObserver(self.name, self.scenario, self.scenario.seed, types)
+
+    report = staticmethod(build_cuboid_report)
+    summary = staticmethod(cuboid_summary)
+
+    def figure(self, record: CuboidRecord) -> Figure:
+        """See `Mission.figure`."""
+        # Deferred: Matplotlib takes long to import.
+        from maasi_sim.run.buildings.report_figure import plot_cuboid_report
+
+        return plot_cuboid_report(record)
+
+
+def _planner_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -> NodePlan:
+    """Return the planner of a robot that searches buildings for itself."""
+    robot, search = scenario.robots[name], scenario.planner
+    floor = float(scenario.environment.array()[2, 0])
+    settings = CuboidPlannerSettings.model_validate(
+        {
+            **common,
+            'environment': scenario.environment.of_nodes(),
+            'start': robot.start,
+            'yaw': robot.yaw,
+            'dynamics': robot.dynamics,
+            'hazard': robot.hazard,
+            'planner': search.model_dump(exclude={'name', 'objects', 'obstacles'}),
+            'objects': [item.numbers(floor) for item in search.objects],
+            'faces': [' '.join(item.faces) for item in search.objects],
+            'obstacles': [item.numbers(floor) for item in search.obstacles],
+        }
+    )
+    return NodePlan(
+        'maasi_planner',
+        'cuboid_planner_node',
+        'cuboid_planner',
+        name,
+        {**flatten(settings), **SIMULATED},
+        given={'search_on_start': True},
+        drives=True,
+    )

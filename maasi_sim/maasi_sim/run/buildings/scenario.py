@@ -1,0 +1,137 @@
+"""Scenario files of searches of buildings (004): `planner: {name: cuboid_mpc}`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from maasi_planner.buildings.agent import SearchAgent
+from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
+from maasi_planner.buildings.settings import CuboidSettings, DynamicsSettings, SearcherSettings
+from maasi_sim.run.buildings.mission import CuboidMission
+from maasi_sim.scenario.base import BaseScenario, ScenarioEnvironment
+from maasi_sim.scenario.checks import check_names, event_problems
+from maasi_sim.scenario.layering import Key, Layer, ScenarioError
+from maasi_sim.scenario.loading import checked, read_scenario
+from maasi_sim.simulation.odometry import OdometrySettings
+from maasi_sim.simulation.robots import BatterySettings
+from maasi_sim.simulation.world import TargetSettings, World
+
+NAME = 'cuboid_mpc'
+
+
+class SearchRobotSettings(SearcherSettings):
+    """One robot: its type's settings with the scenario's own on top."""
+
+    type: str = Field(description='Name of the type: a file in config/robots')
+    description: str = Field(default='', description='What it is, in words')
+    link: Literal['topics'] = Field(
+        default='topics', description='How its planner reaches it; the other end is simulated'
+    )
+    dynamics: DynamicsSettings = Field(description='Its body')
+    odometry: OdometrySettings = Field(
+        default_factory=OdometrySettings, description='Errors of its simulated odometry'
+    )
+    battery: BatterySettings = Field(
+        default_factory=BatterySettings, description='Its battery as it is shown, simulated'
+    )
+
+    # The simulation moves it, and it flies from the start.
+    external: ClassVar[bool] = False
+    takes_off: ClassVar[bool] = False
+
+
+class CuboidPlanner(CuboidSettings):
+    """The planner of each robot, and what is searched."""
+
+    name: Literal['cuboid_mpc'] = Field(description='Planner')
+
+
+class CuboidScenario(BaseScenario):
+    """A scenario file of a search of buildings, all layers merged."""
+
+    environment: ScenarioEnvironment = Field(description='Where robots may be, in 3D')
+    step: float = Field(default=1.0, gt=0.0, le=10.0, description='dT [s]')
+    robots: dict[str, SearchRobotSettings] = Field(min_length=1, description='Robots by name')
+    planner: CuboidPlanner = Field(description='Planner of each robot, and what is searched')
+
+    def namespaces(self) -> dict[str, list[str]]:
+        """Return nothing: there is no filter, and no planner of the team."""
+        return {}
+
+    def mission(self) -> CoveragePlan:
+        """Return what is searched."""
+        return plan_mission(self.planner, self.environment.array())
+
+    def world(self, seed: int) -> World:
+        """Return the true world of a run: there are no targets."""
+        return World.from_settings(self.environment, TargetSettings(count=0), seed)
+
+
+def is_cuboid_scenario(layer: Layer) -> bool:
+    """Return whether a tree of values is a scenario of a search of buildings."""
+    planner = layer.data.get('planner')
+    return isinstance(planner, dict) and planner.get('name') == NAME
+
+
+def check_cuboid_scenario(
+    layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> CuboidScenario:
+    """Return the scenario of a tree of values with all layers merged."""
+    return checked(CuboidScenario, layer, overrides, _problems)
+
+
+def load_cuboid_scenario(
+    path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> CuboidScenario:
+    """Read a scenario file of a search of buildings, as `load_scenario` does."""
+    layer = read_scenario(path)
+    if not is_cuboid_scenario(layer):
+        raise ScenarioError(f"{path}: planner.name: allowed is '{NAME}'")
+    return check_cuboid_scenario(layer, overrides)
+
+
+def _problems(scenario: CuboidScenario) -> Iterator[tuple[Key, str]]:
+    """Yield what is wrong between the keys: key and text."""
+    if scenario.dimension != 3:
+        yield (
+            ('environment', 'bounds'),
+            f'read {scenario.dimension} axes, allowed are three: buildings are searched in 3D',
+        )
+        return
+    if scenario.environment.obstacles:
+        yield (
+            ('environment', 'obstacles'),
+            'read some, allowed is none: those of this planner are boxes, planner.obstacles',
+        )
+    for name in scenario.names():
+        for text in check_names(name):
+            yield ('robots', name), text
+    yield from event_problems(scenario.events, scenario.names())
+    try:
+        mission = scenario.mission()
+    except ValueError as error:
+        yield _split(('planner',), str(error))
+        return
+    for name, robot in scenario.robots.items():
+        try:
+            SearchAgent(name, scenario.planner, mission, robot, scenario.step)
+        except ValueError as error:
+            yield _split(('robots',), str(error).replace(': ', '.', 1))
+
+
+def _split(head: Key, text: str) -> tuple[Key, str]:
+    """Return the key that a message begins with, and what is left of it."""
+    key, _, rest = text.partition(': ')
+    parts = tuple(int(part) if part.isdigit() else part for part in re.findall(r'\w+', key))
+    return ((*head, *parts), rest) if rest else (head, text)
+
+
+def mission_of(scenario: CuboidScenario) -> CuboidMission:
+    """Return a search of buildings in this process, as its nodes carry it out."""
+    area = scenario.environment.array()
+    return CuboidMission(scenario.planner, area, scenario.robots, scenario.step, scenario.seed)

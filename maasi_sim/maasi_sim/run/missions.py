@@ -1,0 +1,37 @@
+"""The one place where a scenario file becomes a mission."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from maasi_sim.run.buildings.building_mission import BuildingMission
+from maasi_sim.run.buildings.scenario import NAME, check_cuboid_scenario, is_cuboid_scenario
+from maasi_sim.run.mission import Mission
+from maasi_sim.run.targets.mission import TargetMission
+from maasi_sim.scenario.layering import Key, ScenarioError
+from maasi_sim.scenario.loading import check_scenario, find_scenario, read_scenario
+
+
+def load_mission(
+    path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> Mission[Any]:
+    """Read a scenario file; parameters and errors as of `load_scenario`."""
+    path = find_scenario(path)
+    layer = read_scenario(path)
+    if is_cuboid_scenario(layer):
+        for origin, (key, value) in (overrides or {}).items():
+            if key == ('planner', 'name') and value != NAME:
+                raise ScenarioError(
+                    f"{origin}: read '{value}'; {path} is a search of buildings, for which only "
+                    f"'{NAME}' is allowed"
+                )
+        return BuildingMission(path.stem, check_cuboid_scenario(layer, overrides))
+    for origin, given in (overrides or {}).items():
+        if given == (('planner', 'name'), NAME):
+            raise ScenarioError(
+                f"{origin}: read '{NAME}', which searches buildings; {path} is a search for "
+                'targets, for which any other planner is allowed'
+            )
+    return TargetMission(path.stem, check_scenario(layer, overrides))

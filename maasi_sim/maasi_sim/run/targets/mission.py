@@ -1,0 +1,167 @@
+"""A search for targets, as a run sees it: its nodes, observer and report."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+from rosbags.typesys.store import Typestore
+
+from maasi_drivers.settings.driver import DRIVERS, DriverSettings
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.parameters import flatten
+from maasi_filter.settings import unsuitable_lengths, unused_settings
+from maasi_sim.run.node_plan import SIMULATED, NodePlan, RunSettings, guard_plan, sim_plan
+from maasi_sim.run.targets.observer import TargetObserver
+from maasi_sim.run.targets.report import build_report, target_summary
+from maasi_sim.run.targets.tables import csv_text, found_rows, geojson_text
+from maasi_sim.run.targets.tally import TargetRecord
+from maasi_sim.run.topics import BATCH, within
+from maasi_sim.scenario.layering import ScenarioError
+from maasi_sim.scenario.schema import RobotSettings, Scenario, planner_settings
+from maasi_sim.scenario.visibility import never_seen
+from maasi_sim.simulation.emulators.linked_robots import with_addresses
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Settings of a robot that its driver has as well.
+_OF_THE_DRIVER = ['start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'battery_unit', 'link']
+
+
+class TargetMission:
+    """See `Mission`."""
+
+    found_word = 'found'
+
+    def __init__(self, name: str, scenario: Scenario) -> None:
+        self.name = name
+        self.scenario = scenario
+
+    def prepare(self) -> None:
+        """See `Mission.prepare`."""
+        self.scenario = with_addresses(self.scenario)
+
+    def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
+        """Return the simulation, drivers and guards, filters and planners."""
+        scenario = self.scenario
+        scenario.check_pace(run.lockstep, run.rate)
+        common = run.common(scenario)
+        plans = [sim_plan('sim_node', scenario, run)]
+        for name in scenario.names():
+            plans += _robot_plans(name, scenario.robots[name], scenario, common)
+        for namespace, names in scenario.namespaces().items():
+            plans += _team_plans(namespace, names, scenario, common)
+        return plans
+
+    def warning(self) -> str:
+        """See `Mission.warning`."""
+        settings = self.scenario.filter
+        lengths = unsuitable_lengths(settings, self.scenario.environment.array())
+        return '\n'.join(
+            filter(None, (never_seen(self.scenario), lengths, unused_settings(settings)))
+        )
+
+    def observer(self, types: Typestore) -> TargetObserver:
+        """See `Mission.observer`."""
+        return TargetObserver(self.name, self.scenario, self.scenario.seed, types)
+
+    report = staticmethod(build_report)
+    summary = staticmethod(target_summary)
+
+    def tables(self, record: TargetRecord) -> dict[str, str]:
+        """See `Mission.tables`."""
+        origin = self.scenario.environment.origin
+        tally = record.tally
+        rows = found_rows(tally.found, tally.truth, tally.scores().match.pairs, origin)
+        files = {'found_targets.csv': csv_text(rows, record.scenario.dimension, origin)}
+        if origin is not None:
+            files['found_targets.geojson'] = geojson_text(rows)
+        return files
+
+    def figure(self, record: TargetRecord) -> Figure:
+        """See `Mission.figure`."""
+        # Deferred: Matplotlib takes long to import.
+        from maasi_sim.run.targets.report_figure import plot_report
+
+        return plot_report(record)
+
+
+def _team_plans(
+    namespace: str, names: list[str], scenario: Scenario, common: dict[str, Any]
+) -> list[NodePlan]:
+    """Return filter and planner of robots that share them."""
+    others = [name for name in scenario.names() if name not in names]
+    filter_settings = FilterNodeSettings.model_validate(
+        {
+            **common,
+            'environment': scenario.environment.of_nodes(),
+            'filter': scenario.filter,
+            'robots': {name: {'sensor': scenario.robots[name].sensor} for name in names},
+            'share_with': others,
+        }
+    )
+    return [
+        NodePlan(
+            'maasi_filter',
+            'filter_node',
+            'filter_node',
+            namespace,
+            {**flatten(filter_settings.resolved()), **SIMULATED},
+        ),
+        NodePlan(
+            'maasi_planner',
+            'planner_node',
+            'planner_node',
+            namespace,
+            {**flatten(planner_settings(scenario, names, common)), **SIMULATED},
+            given={'search_on_start': True},
+        ),
+    ]
+
+
+def _plugin(name: str, driver: str, scenario: Scenario) -> tuple[str, ...]:
+    """Return the arguments of `plugin_driver` for a driver of a user's own."""
+    if driver in DRIVERS.own:
+        return ()
+    arguments = (driver, *scenario.plugin_path)
+    command = [sys.executable, '-m', 'maasi_drivers.plugin_driver', '--check', *arguments]
+    tried = subprocess.run(command, capture_output=True, text=True, check=False)
+    if tried.returncode:
+        lines = tried.stderr.strip().splitlines() or ['it cannot be loaded']
+        raise ScenarioError(f'robots.{name}.driver: {lines[-1].removeprefix("error: ")}')
+    return arguments
+
+
+def _robot_plans(
+    name: str, robot: RobotSettings, scenario: Scenario, common: dict[str, Any]
+) -> list[NodePlan]:
+    """Return a robot's driver, and its guard if it has one."""
+    settings = DriverSettings.model_validate(
+        {
+            **common,
+            'environment': scenario.environment.of_nodes(),
+            **{name: getattr(robot, name) for name in _OF_THE_DRIVER},
+            'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,
+            'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
+        }
+    )
+    own = name in scenario.namespaces()
+    plans = [
+        NodePlan(
+            'maasi_drivers',
+            robot.driver if robot.driver in DRIVERS.own else 'plugin_driver',
+            'driver',
+            name,
+            {**flatten(settings), **SIMULATED},
+            # A robot with its own planner gets its batches from that one.
+            remaps={BATCH: within(name, BATCH)} if own else {},
+            drives=True,
+            arguments=_plugin(name, robot.driver, scenario),
+        )
+    ]
+    guarded = robot.link == 'topics' if robot.guard is None else robot.guard
+    if guarded:
+        plans.append(guard_plan(name, common, 0.0))
+    return plans

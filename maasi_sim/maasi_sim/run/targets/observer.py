@@ -1,0 +1,154 @@
+"""Gathers the data of the report of a search for targets from its messages."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from typing import Any
+
+import numpy as np
+from rosbags.typesys.store import Typestore
+
+from maasi_filter.models.pose import Pose
+from maasi_sim.run.run_record import UNAVAILABLE, Observer, RunEnd, rows
+from maasi_sim.run.targets.tally import Tally, TargetRecord
+from maasi_sim.run.topics import DECISIONS, FOUND, UPDATE, point, within
+from maasi_sim.scenario.schema import Scenario
+
+
+class TargetObserver(Observer):
+    """Gathers the data of a report from serialised messages, in the order of arrival.
+
+    Decisions, filter updates and found targets are decoded at once, as the end of a run depends on
+    them; the rest is decoded by `record`.
+    """
+
+    def __init__(self, name: str, scenario: Scenario, seed: int, types: Typestore) -> None:
+        spaces = scenario.namespaces()
+        # Namespaces of filters and planners, by topic.
+        self._updates = {within(space, UPDATE): space for space in spaces}
+        self._arrays = {within(space, FOUND): space for space in spaces}
+        self._planners = {within(space, DECISIONS): space for space in spaces}
+        # Step, robot and place of each.
+        self._waypoints: list[tuple[int, str, tuple[float, float, float]]] = []
+        self._detections: dict[str, list[bytes]] = {
+            f'/{name}/detections': [] for name in scenario.names()
+        }
+        topics = [*self._updates, *self._arrays, *self._planners, *self._detections]
+        super().__init__(name, scenario, seed, types, topics)
+        self.update_topics = list(self._updates)
+        self.world = scenario.world(seed)
+        self.total = len(self.world.targets)
+        self._tally = Tally(scenario, self.world, self)
+        self._new_updates: list[tuple[str, Any]] = []
+        self._new_arrays: dict[str, list[Any]] = {space: [] for space in spaces}
+        # Updates of several filters, with the found targets that came with them.
+        self._history: list[tuple[str, Any, Any]] = []
+        # Planners that expect no further gain: since which step, and why.
+        self._settled: dict[str, tuple[int, str]] = {}
+        # Step at which all planners were settled.
+        self._ending: int | None = None
+        self._explored: dict[str, float] = {}
+
+    def add(self, topic: str, data: bytes) -> None:
+        """See `Observer.add`."""
+        super().add(topic, data)
+        if topic in self._planners:
+            decision = self.decode(data, 'PlanDecision')
+            self._waypoints += [
+                (int(decision.step), item.robot, point(item.waypoint))
+                for item in decision.robots
+                if item.chosen >= 0
+            ]
+            self._explored[topic] = float(decision.explored)
+            self.explored = max(self._explored.values())
+            # Of a planner that is settled.
+            if decision.reason and not decision.robots:
+                step = int(decision.step)
+                self._settled.setdefault(self._planners[topic], (step, decision.reason))
+                self._note_ending(step)
+        elif topic in self._detections:
+            self._detections[topic].append(data)
+        elif topic in self._states and self._settled and self.robots is None:
+            self._note_ending(int(self.decode(data, 'AgentState').step))
+        elif topic in self._updates:
+            update = self.decode(data, 'FilterUpdate')
+            self._new_updates.append((self._updates[topic], update))
+        elif topic in self._arrays:
+            array = self.decode(data, 'FoundTargetArray')
+            self._new_arrays[self._arrays[topic]].append(array)
+
+    def _note_step(self, step: Any) -> None:
+        before = self.robots
+        super()._note_step(step)
+        if self._settled and self.robots != before:
+            self._note_ending(int(step.step))
+
+    def settle(self) -> None:
+        """See `Observer.settle`; a filter publishes found targets before their update."""
+        updates, self._new_updates = self._new_updates, []
+        several = len(self._updates) > 1
+        for space, update in updates:
+            if self._ending is not None and update.step > self._ending:
+                continue
+            # Updates of the same step from other filters may still arrive.
+            if self.completed and not (several and update.step <= self.completed.step):
+                continue
+            found, waiting = None, self._new_arrays[space]
+            while waiting and waiting[0].batch_id <= update.batch_id:
+                found = waiting.pop(0)
+            if several:
+                self._history.append((space, update, found))
+            self.news = self._tally.take(space, update, found) or self.news
+            self.found = self._tally.progress[-1].found
+            self.measurements = self._tally.progress[-1].measurements
+            self.completed = self._tally.completed
+            if self.completed is not None:
+                self.end_step = self.completed.step
+
+    def _note_ending(self, step: int) -> None:
+        """Note the end of the search: all planners that have a robot are settled."""
+        if self._ending is not None:
+            return
+        spaces = self.scenario.namespaces()
+        searching = {space for space, names in spaces.items() if any(map(self._takes_part, names))}
+        # Without any robot left, the planners that were settled decide.
+        if self._settled.keys() >= (searching or spaces.keys()):
+            last, self.settled = max(self._settled.values())
+            self._ending = max(step, last)
+            if self.completed is None:
+                self.end_step = self._ending
+
+    def _takes_part(self, name: str) -> bool:
+        if self.robots is not None:
+            return name in self.robots
+        states = self._states[f'/{name}/state']
+        return not states or self.decode(states[-1], 'AgentState').goal_status != UNAVAILABLE
+
+    def record(self, end: RunEnd) -> TargetRecord:
+        """See `Observer.record`."""
+        tally = self._tally
+        if self._history:
+            # Several filters in the order of steps and names, not in that of arrival.
+            tally = Tally(self.scenario, self.world, self)
+            self._history.sort(key=lambda item: (item[1].step, item[0], item[1].batch_id))
+            for space, update, found in self._history:
+                if tally.completed is not None and update.step > tally.completed.step:
+                    break
+                tally.take(space, update, found)
+        end_time, last = end.time, math.inf
+        if tally.completed is not None:
+            end_time, last = tally.completed.time, tally.completed.step
+        record = TargetRecord(self.name, self.scenario, self.seed, tally, end_time=end_time)
+        for name, messages in zip(self.scenario.names(), self._detections.values()):
+            ways = [at for step, who, at in self._waypoints if who == name and step <= last]
+            record.waypoints[name] = rows(ways, 3)
+            record.measured_from[name] = []
+            for item in self._until('DetectionArray', messages, end_time):
+                place, turn = point(item.pose.pose.position), item.pose.pose.orientation
+                # An invalid pose is left out.
+                with contextlib.suppress(ValueError):
+                    pose = Pose(np.array(place), np.array([turn.w, turn.x, turn.y, turn.z]))
+                    record.measured_from[name] += [pose] if item.batch_id else []
+        self._complete(record, end)
+        return record

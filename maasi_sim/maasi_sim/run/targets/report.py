@@ -1,0 +1,75 @@
+"""The report of a search for targets as plain values, and in words."""
+
+from __future__ import annotations
+
+from itertools import takewhile
+from typing import Any
+
+from maasi_filter.arrays import FloatArray
+from maasi_sim.run.report_files import finite, summary, whole_report
+from maasi_sim.run.targets.tally import TargetRecord
+
+
+def build_report(record: TargetRecord) -> dict[str, Any]:
+    """Return the report of a run as plain values."""
+    tally = record.tally
+    scores, total = tally.scores(), len(tally.truth)
+    # All targets were found, and stayed so, since the last of these.
+    stayed = list(takewhile(lambda item: item.true_found == total, tally.progress[::-1]))
+    complete = stayed[-1] if total and stayed else None
+    true = dict(scores.match.pairs)
+    found = [
+        {
+            'id': target.id,
+            'position': _numbers(target.position),
+            'covariance': [_numbers(row) for row in target.covariance],
+            'agent': target.robot,
+            'measurement': target.measurement,
+            'time': target.time,
+            'class_id': target.label.class_id,
+            'score': target.label.score,
+            'identity': target.label.identity,
+            'target': true.get(index),
+        }
+        for index, target in enumerate(tally.found)
+    ]
+    parts = ('total', 'localisation', 'missed', 'false')
+    content = {
+        'targets': [_numbers(position) for position in tally.truth],
+        'found': found,
+        'true_found': scores.match.true_found,
+        'missed': scores.match.missed,
+        'false_found': scores.match.false_found,
+        'rmse': finite(scores.match.rmse),
+        'gospa': {part: getattr(scores.gospa, part) for part in parts},
+        'measurements': dict(sorted(tally.measurements.items())),
+        'measurements_to_find_all': complete.measurements if complete else None,
+        'time_to_find_all': complete.time if complete else None,
+        'decisions': sum(map(len, record.waypoints.values())),
+        'scoring': {'radius': scores.radius, 'c': scores.radius, 'p': scores.order},
+    }
+    return whole_report(record, 'targets', content)
+
+
+def target_summary(report: dict[str, Any]) -> str:
+    """Return the report in a few lines."""
+    found = f'{report["true_found"]} of {len(report["targets"])} targets found'
+    if report['false_found']:
+        found += f', {report["false_found"]} false'
+    if report['rmse'] is not None:
+        found += f', RMSE {report["rmse"]:.3g} m'
+    measurements = sum(report['measurements'].values())
+    counts = f'{measurements} measurements, {report["decisions"]} decisions'
+    if report['time_to_find_all'] is not None:
+        counts += f'; all found after {to_find_all(report)}'
+    return summary(report, found, counts)
+
+
+def to_find_all(report: dict[str, Any]) -> str:
+    """Return in words what it took to find all targets."""
+    time, measurements = report['time_to_find_all'], report['measurements_to_find_all']
+    return '-' if time is None else f'{measurements} measurements and {time:.1f} s'
+
+
+def _numbers(values: FloatArray) -> list[float | None]:
+    return [finite(value) for value in values]

@@ -1,0 +1,236 @@
+"""The page of a running run, of its messages, and of a search in this process."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from maasi_filter.records import AgentMeasurement, FilterResult, FoundTarget
+from maasi_planner.coordinator import Coordinator
+from maasi_planner.motion.base import RobotState
+from maasi_planner.team import Decision
+from maasi_sim.run.bag import load_types
+from maasi_sim.run.run_options import ViewOptions
+from maasi_sim.run.view.event_log import STATE_PERIOD, Event, EventLog, Scene
+from maasi_sim.run.view.event_maker import EventMaker
+from maasi_sim.run.view.messages import MARKERS, MessageEvents
+from maasi_sim.run.view.page_file import open_browser
+from maasi_sim.run.view.scene import scene_of
+from maasi_sim.run.view.server import Commander, Hub, ViewServer
+from maasi_sim.scenario.schema import Scenario
+
+# For browsers to take the last events [s].
+_FAREWELL = 2.0
+# Between exploration functions of a search [s].
+_MAP_PERIOD = 1.0
+# Calls that wait at most, and wait for more before they are made, so that the run has the
+# processor [s].
+MOST_WAITING = 50_000
+_PERIOD = 0.05
+# Patience at the end for calls that wait [s].
+_PATIENCE = 5.0
+
+
+class LiveView:
+    """Serve the page of a run in progress; address and commands as of `ViewServer`.
+
+    Its events are made in a thread of its own, for which nothing waits.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        port: int | None = None,
+        host: str = '127.0.0.1',
+        commander: Commander | None = None,
+    ) -> None:
+        self._scene = scene if commander is None else {**scene, 'control': True}
+        self.hub = Hub(self._scene)
+        self.maker = EventMaker(dict(scene), self.hub.put)
+        self.server = ViewServer(self.hub, port, host, commander)
+        self._waiting: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
+        self._ended = threading.Event()
+        self._feed = threading.Thread(target=self._work, name='view feed', daemon=True)
+        self._feed.start()
+
+    def announce(self, say: Callable[[str], object]) -> None:
+        """Say where the page is, and open it where there is a browser."""
+        server = self.server
+        if server.wanted_port not in (0, server.port):
+            say(f'warning: port {server.wanted_port} is in use: the page is at {server.port}')
+        say(f'view: {server.address}')
+        if not server.is_private:
+            say('view: other machines see it, by this whole link only')
+        open_browser(server.address)
+
+    def put(self, function: Callable[..., object], *arguments: Any) -> None:
+        """Have a function called with the maker of events and further arguments; never wait.
+
+        Where too many wait it is dropped.
+        """
+        if len(self._waiting) < MOST_WAITING:
+            self._waiting.append((function, arguments))
+
+    def _work(self) -> None:
+        ended = False
+        while not ended:
+            ended = self._ended.wait(_PERIOD)
+            while self._waiting:
+                function, arguments = self._waiting.popleft()
+                # A message that cannot be shown must not end the view.
+                with contextlib.suppress(
+                    ValueError, ArithmeticError, LookupError, AttributeError, TypeError
+                ):
+                    function(self.maker, *arguments)
+
+    def restart(self) -> EventMaker:
+        """Forget all events: another run begins."""
+        self.hub.restart(self._scene)
+        self.maker = EventMaker(dict(self._scene), self.hub.put)
+        return self.maker
+
+    def close(self, text: str = 'closed') -> None:
+        """Show what waits, say how the run ended, let browsers take the rest, and stop serving."""
+        self._ended.set()
+        self._feed.join(_PATIENCE)
+        self.maker.message(self.maker.latest, 'run', 'team', text)
+        self.hub.close()
+        deadline = time.monotonic() + _FAREWELL
+        while self.server.browsers and time.monotonic() < deadline:
+            time.sleep(0.02)
+        self.server.close()
+
+
+class RunPage(LiveView):
+    """Serves the page of a scene with serialised messages; OSError if it cannot be served.
+
+    `waits`: the run begins with a `LockstepStep`; what comes before it is shown at its time, and
+    the page says when the run has ended.
+    """
+
+    def __init__(
+        self, scene: Scene, options: ViewOptions, domain: int, team: str, waits: bool = True
+    ) -> None:
+        self._control = None
+        if options.control:
+            # Only this part of the view needs ROS.
+            from maasi_sim.run.view.control_node import Control
+
+            self._control = Control(domain, team)
+        super().__init__(scene, options.port, options.host, self._control)
+        self._types = load_types()
+        self._waits = waits
+        self._known = 'bounds' in scene
+        self._messages = MessageEvents(self.maker, waits, None if waits else self.restart)
+
+    def put_message(self, topic: str, type_name: str, data: bytes) -> None:
+        """Take a message of a topic that is shown; never waits."""
+        if not (self._known and type_name == MARKERS):
+            decode, take = self._types.deserialize_cdr, self._messages.take
+            self.put(lambda _: take(topic, type_name, decode(data, type_name)))
+
+    def end(self) -> None:
+        """Show the queued messages, and stop serving."""
+        if self._waits:
+            self.put(EventMaker.end)
+        self.close('the run has ended' if self._waits else 'the view was closed')
+        if self._control is not None:
+            self._control.close()
+
+
+class SearchTrace:
+    """Gathers calls that make the events of a search; they are carried out when it is shown.
+
+    Only references are kept, so that it costs a search little.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self.scenario = scenario
+        self.seed = seed
+        self._live: LiveView | None = None
+        self._calls: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
+        self._last_states = -np.inf
+        self._last_maps: dict[str, float] = {}
+
+    def add(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Have a method of `EventMaker` called with these arguments, which do not change."""
+        self._calls.append((function, arguments))
+        if self._live is not None:
+            self._live.put(function, *arguments)
+
+    def show(self) -> None:
+        """Serve the page of the search from now on, and say where."""
+        self._live = LiveView(scene_of('search', self.scenario, self.seed))
+        self._live.announce(print)
+        for function, arguments in self._calls:
+            self._live.put(function, *arguments)
+
+    def end(self, reason: str) -> None:
+        """Stop serving the page; what was gathered stays."""
+        if self._live is not None:
+            self._live.put(EventMaker.end)
+            self._live.close(f'ended: {reason}')
+
+    def robots(self, time: float, states: Mapping[str, RobotState]) -> None:
+        """Add where robots are; no more often than is shown."""
+        if time - self._last_states >= STATE_PERIOD - 1e-9:
+            self._last_states = time
+            for name, state in states.items():
+                pose = (*state.pose.position.tolist(), float(state.pose.yaw))
+                self.add(EventMaker.robot, time, name, pose)
+
+    def decision(
+        self, time: float, space: str, decision: Decision, coordinator: Coordinator
+    ) -> None:
+        """Add a joint decision."""
+        indices = {name: coordinator.plans[name].decision for name in decision.robots}
+        explored = coordinator.exploration.explored_fraction()
+        planner = self.scenario.planner.name
+        self.add(EventMaker.plan, time, space, planner, decision, indices, explored)
+        self._last_maps.pop(space, None)
+        self._explored(time, space, coordinator)
+
+    def update(
+        self,
+        time: float,
+        space: str,
+        measurements: Sequence[AgentMeasurement],
+        result: FilterResult,
+        found: Sequence[FoundTarget] | None,
+        coordinator: Coordinator,
+    ) -> None:
+        """Add measurements and the filter's update; found targets only where they have changed."""
+        for item in measurements:
+            seen = item.pose.position, item.values, item.covariances
+            self.add(EventMaker.seen, time, item.robot, *seen)
+        if found is not None:
+            self.add(EventMaker.found, time, space, found)
+        members = [(item.robot, item.index) for item in measurements]
+        numbers = result.expected_number, result.clusters, members
+        self.add(EventMaker.filter, time, space, *numbers)
+        self._explored(time, space, coordinator)
+
+    def _explored(self, time: float, space: str, coordinator: Coordinator) -> None:
+        """Add the exploration function; as the planner node, once a second and at decisions."""
+        if time - self._last_maps.get(space, -np.inf) >= _MAP_PERIOD - 1e-9:
+            self._last_maps[space] = time
+            explored = coordinator.exploration
+            # As coarse as it is shown.
+            ninths = np.rint(9.0 * explored.values).astype(np.uint8)
+            grid = explored.bounds[:, 0], explored.step, ninths
+            self.add(EventMaker.map, time, space, *grid, explored.explored_fraction())
+
+    def log(self, name: str = 'search') -> EventLog:
+        """Return the event log of the search."""
+        events: list[Event] = []
+        maker = EventMaker(scene_of(name, self.scenario, self.seed), events.append)
+        for function, arguments in self._calls:
+            function(maker, *arguments)
+        maker.end()
+        return EventLog(maker.scene, events)

@@ -1,0 +1,56 @@
+"""The page that shows a run, as one HTML file: alone for a live run, or with a run inside."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import sys
+import webbrowser
+from functools import cache
+from pathlib import Path
+
+from maasi_sim.run.run_folder import write_text
+from maasi_sim.run.view.event_log import LARGEST, EventLog
+
+FOLDER = Path(__file__).with_name('page')
+REPLAY = 'replay.html'
+# Each uses only what is before it.
+_MODULES = 'run_log camera colours text shapes buildings map why panels curve live main'
+
+
+def empty_page() -> str:
+    """Return the page without a run: it asks the server that it came from."""
+    return _with('RUN', _page(), '')
+
+
+def write_replay(log: EventLog, path: Path, largest: int = LARGEST) -> None:
+    """Write the page with a run inside, thinned to a size [characters]."""
+    write_text(path, _with('RUN', _page(), log.packed(largest)))
+
+
+@cache
+def _page() -> str:
+    """Return the page with style and modules: browsers load no modules beside a local file."""
+    names = ('index.html', 'page.css', *(f'{name}.js' for name in _MODULES.split()))
+    text, style, *modules = ((FOLDER / name).read_text(encoding='utf-8') for name in names)
+    # In one scope nothing is imported.
+    script = re.sub(r'^(import .*;\n|export )', '', '\n'.join(modules), flags=re.MULTILINE)
+    return _with('SCRIPT', _with('STYLE', text, style), script)
+
+
+def _with(place: str, text: str, content: str) -> str:
+    before, mark, after = text.partition(f'/*{place}*/')
+    assert mark, place
+    return before + content + after
+
+
+def open_browser(address: str) -> bool:
+    """Open an address in a browser; return whether there is one with a display."""
+    if sys.platform.startswith('linux') and not (
+        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
+    ):
+        return False
+    with contextlib.suppress(webbrowser.Error, OSError):
+        return webbrowser.open(address)
+    return False

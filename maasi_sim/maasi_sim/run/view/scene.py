@@ -1,0 +1,125 @@
+"""The scene of a run: what does not change, from its scenario or from its messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from maasi_drivers.agent.flight_rules import make_fence
+from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
+from maasi_filter.settings import DETECTIONS
+from maasi_planner.settings import PlannerSettings
+from maasi_sim.run.buildings.scenario import NAME as BUILDINGS
+from maasi_sim.run.buildings.scenario import CuboidScenario
+from maasi_sim.run.targets.scoring import scoring_radius
+from maasi_sim.run.view.event_log import Scene
+from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.scenario.schema import RobotSettings, Scenario
+
+
+def empty_scene(name: str = '') -> Scene:
+    """Return the scene of a run of which nothing is known yet."""
+    return {'name': name, 'robots': {}}
+
+
+def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scene:
+    """Return the scene of a scenario; the seed of a run is that of the scenario if not given."""
+    seed = scenario.seed if seed is None else seed
+    scene: Scene = {
+        'name': name,
+        'description': scenario.description,
+        'seed': seed,
+        'planner': scenario.planner.name,
+        'step': scenario.step,
+        'bounds': rounded(scenario.environment.array()),
+    }
+    if isinstance(scenario, CuboidScenario):
+        return scene | _buildings(scenario)
+    assert isinstance(scenario, Scenario)
+    truth = np.asarray(scenario.world(seed).targets, dtype=float)
+    return scene | {
+        'obstacles': [
+            [*map(float, obstacle.centre), float(obstacle.radius)]
+            for obstacle in scenario.environment.obstacles
+        ],
+        'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},
+        'targets': len(truth),
+        'expected_targets': scenario.planner.expected_targets,
+        **_objective(scenario.planner),
+        'scoring_radius': scoring_radius(scenario, truth) if len(truth) else None,
+        'scoring_order': scenario.scoring.order,
+    }
+
+
+def scene_of_facts(facts: Mapping[str, Any]) -> Scene:
+    """Return the scene of what a recording says of its run; of another version, what is known."""
+    content = facts['scenario']
+    buildings = content.get('planner', {}).get('name') == BUILDINGS
+    model: type[BaseScenario] = CuboidScenario if buildings else Scenario
+    return scene_of(str(facts.get('name', '')), model.model_validate(content), facts.get('seed'))
+
+
+def rounded(values: ArrayLike) -> list[Any]:
+    """Return an array as nested lists, to a tenth of a millimetre."""
+    return list(np.round(np.asarray(values, dtype=float), 4).tolist())
+
+
+def _objective(settings: PlannerSettings) -> Scene:
+    """Return what J is made of, for planners whose J is that of `PlannerSettings`."""
+    # Planners that choose by (17).
+    if settings.name not in ('asi', 'maasi'):
+        return {}
+    names = ('control', 'alpha', 'beta', 'per_distance')
+    weights = {name: getattr(settings.weights(), name) for name in names}
+    return {'objective': settings.objective, 'weights': weights}
+
+
+def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
+    detection = robot.sensor.detection
+    view: dict[str, Any] = {'kind': detection.kind, 'turns': detection.frame == 'robot'}
+    if detection.kind == 'box':
+        view |= {'lower': list(detection.lower), 'upper': list(detection.upper)}
+    elif detection.kind not in DETECTIONS.own:
+        _, parameters = detection.build(scenario.dimension).kernel()
+        view['size'] = [1.0 / float(parameters[1])] * scenario.dimension
+    else:
+        view['size'] = list(detection.size)[: scenario.dimension]
+    deviations = [float(value) for value in robot.sensor.noise.deviations(scenario.dimension)]
+    fence = {}
+    if robot.link != 'topics':
+        # As its driver makes it.
+        flies = robot.link == 'mambo_wifi'
+        limits = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
+        bounds = scenario.environment.array()
+        made = make_fence(bounds, robot.radius, robot.start[2], limits)
+        fence = {} if made is None else {'fence': rounded(made)}
+    return {
+        'type': robot.type,
+        'description': robot.description,
+        'radius': robot.radius,
+        'clearance': robot.motion.clearance,
+        'view': view,
+        'deviations': [*deviations, 0.0][:3],
+        **fence,
+    }
+
+
+def _buildings(scenario: CuboidScenario) -> Scene:
+    mission = scenario.mission()
+    return {
+        'objects': rounded(mission.objects),
+        'blocks': rounded(mission.obstacles),
+        'cuboids': rounded(mission.boxes),
+        'robots': {
+            name: {
+                'type': robot.type,
+                'description': robot.description,
+                'radius': 1.0,
+                'reach': scenario.planner.communication_range,
+            }
+            for name, robot in scenario.robots.items()
+        },
+    }

@@ -1,0 +1,115 @@
+"""A node that shows any search: beside real robots, or beside a bag that is played."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from functools import partial
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy
+from rclpy.utilities import remove_ros_args
+
+from maasi_filter.ros.qos import reader_of
+from maasi_sim.run.missions import load_mission
+from maasi_sim.run.run_options import ViewOptions, add_view_options
+from maasi_sim.run.topics import message_class
+from maasi_sim.run.view.event_log import Scene
+from maasi_sim.run.view.live_view import RunPage
+from maasi_sim.run.view.messages import is_shown
+from maasi_sim.run.view.scene import empty_scene, scene_of
+from maasi_sim.scenario.layering import ScenarioError
+
+DONE, WRONG_INPUT = 0, 2
+# Period of looks for new topics [s].
+_DISCOVERY = 0.5
+
+
+class ViewNode(Node):
+    """Hands messages of topics that show a search to a function that never waits.
+
+    It takes topic, type and serialised message.
+
+    Subscribes
+    ----------
+    every topic of a type in `maasi_sim.run.view.messages.TOPICS`, as its publishers offer it
+    """
+
+    def __init__(self, put: Callable[[str, str, bytes], None]) -> None:
+        super().__init__('view_node')
+        self._put = put
+        self._known: set[str] = set()
+        self.create_timer(_DISCOVERY, self._discover)
+        self._discover()
+
+    def _discover(self) -> None:
+        """Subscribe to the topics that have appeared."""
+        for topic, types in self.get_topic_names_and_types():
+            if topic in self._known or not is_shown(topic, types[0]):
+                continue
+            offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+            if not offers:
+                continue
+            self._known.add(topic)
+            qos = reader_of(offers)
+            # A bounded history: no publisher waits for the page.
+            qos.history = HistoryPolicy.KEEP_LAST
+            self.create_subscription(
+                message_class(types[0]), topic, partial(self._put, topic, types[0]), qos, raw=True
+            )
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='view_node', description='Shows a search in a browser, from its topics.'
+    )
+    parser.add_argument(
+        '--scenario',
+        metavar='FILE',
+        help='what is searched, where it is known: fields of view, obstacles, scores',
+    )
+    parser.add_argument('--namespace', default='', metavar='NS', help='of the team to control')
+    add_view_options(parser)
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node until it is interrupted."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = build_parser().parse_args(remove_ros_args(['', *given])[1:])
+    scene: Scene = empty_scene('live')
+    if options.scenario:
+        try:
+            mission = load_mission(options.scenario)
+        except ScenarioError as error:
+            print(f'error: {error}', file=sys.stderr)
+            return WRONG_INPUT
+        scene = scene_of(mission.name, mission.scenario)
+    rclpy.init(args=given)
+    domain = rclpy.get_default_context().get_domain_id()
+    try:
+        served = ViewOptions(options.port, options.host, options.control)
+        page = RunPage(scene, served, domain, options.namespace, waits=False)
+    except OSError as error:
+        print(f'error: {options.host}: {error.strerror or error}', file=sys.stderr)
+        rclpy.try_shutdown()
+        return WRONG_INPUT
+    node = ViewNode(page.put_message)
+    page.announce(partial(print, flush=True))
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.destroy_node()
+        page.end()
+        rclpy.try_shutdown()
+    return DONE
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

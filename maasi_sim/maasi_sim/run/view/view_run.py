@@ -1,0 +1,83 @@
+"""Make the page, or a video, that shows a recorded run."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from maasi_sim.arguments import Parser
+from maasi_sim.run.bag import BagError
+from maasi_sim.run.run_folder import ResultsError
+from maasi_sim.run.view.messages import read_events
+from maasi_sim.run.view.page_file import REPLAY, open_browser, write_replay
+
+DONE, WRONG_INPUT, NOT_WRITTEN = 0, 2, 4
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = Parser(
+        prog='view',
+        description=f'Makes {REPLAY}, a page with the whole run inside, and opens it.',
+        epilog='Exit codes: 0 done, 2 no recording of a search, 4 it could not be written.',
+    )
+    parser.add_argument(
+        'recording',
+        type=Path,
+        nargs='?',
+        metavar='BAG_OR_RUN',
+        help='recording, or folder of a run (default: the newest in runs)',
+    )
+    parser.add_argument(
+        '--out', type=Path, metavar='FILE', help=f'page (default: {REPLAY} beside the recording)'
+    )
+    parser.add_argument(
+        '--video', type=Path, metavar='FILE', help='a video instead: FILE.mp4 or FILE.gif'
+    )
+    parser.add_argument(
+        '--speed', type=float, default=5.0, metavar='X', help='of the video (default: 5)'
+    )
+    parser.add_argument('--no-open', action='store_true', help='do not open a browser')
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line."""
+    parser = build_parser()
+    options = parser.parse_args(arguments)
+    if options.video is not None and options.video.suffix not in ('.mp4', '.gif'):
+        parser.error(f"--video: read '{options.video}', allowed are FILE.mp4 and FILE.gif")
+    if not 0.0 < options.speed < 1e4:
+        parser.error(f"--speed: read '{options.speed:g}', allowed are numbers above 0, below 1e4")
+    bags = sorted(Path('runs').glob('*/bag/metadata.yaml'), key=lambda item: item.stat().st_mtime)
+    if options.recording is None and not bags:
+        parser.error('there is no run in runs: name a recording')
+    recording = options.recording or bags[-1].parents[1]
+    try:
+        log = read_events(recording)
+        if options.video is not None:
+            # Deferred: Matplotlib takes long to import.
+            from maasi_sim.run.view.video import write_video
+
+            write_video(log, options.video, options.speed)
+            print(options.video)
+            return DONE
+        # In the folder of its run, or beside the recording.
+        folder = recording if (recording / 'bag').is_dir() else recording.resolve().parent
+        file = options.out or folder / REPLAY
+        write_replay(log, file)
+    except BagError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return WRONG_INPUT
+    except (ResultsError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return NOT_WRITTEN
+    print(file)
+    if not options.no_open:
+        open_browser(file.resolve().as_uri())
+    return DONE
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,63 @@
+"""What nodes need at their start, done once in the process that they are forked from."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+
+import maasi_filter
+import maasi_planner
+from maasi_drivers.vision.marker_detector import warm_up as warm_up_drivers
+from maasi_planner.settings import PLANNERS
+from maasi_sim.run.buildings.scenario import load_cuboid_scenario, mission_of
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.simulation.simulated_world import simulated_robot
+
+# What most nodes exchange; importing messages starts no threads.
+_MESSAGES = (
+    'diagnostic_msgs',
+    'lifecycle_msgs',
+    'maasi_msgs',
+    'nav_msgs',
+    'rcl_interfaces',
+    'rosgraph_msgs',
+    'sensor_msgs',
+    'tf2_msgs',
+    'visualization_msgs',
+)
+
+
+def warm_up() -> None:
+    """Compile, or load from the cache, the kernels of simulations."""
+    _play_robots()
+    mission_of(load_cuboid_scenario('buildings_four')).run(1)
+
+
+def _play_robots() -> None:
+    """Play one step of simulated robots of each kind."""
+    for name in ('mambo_turtlebot_obstacles', 'ranging_pair_3d'):
+        scenario = load_scenario(name)
+        world = scenario.world(scenario.seed)
+        for robot_name in scenario.names():
+            robot = simulated_robot(robot_name, scenario, world, scenario.seed)
+            robot.warm_up()
+            robot.step(1, scenario.step)
+
+
+def prepare_nodes() -> None:
+    """Do once what nodes would do at their start, for nodes that are forked from here.
+
+    Kernels are those of searches for targets: in a search of buildings each node loads its own.
+    """
+    maasi_filter.warm_up()
+    maasi_planner.warm_up()
+    warm_up_drivers()
+    _play_robots()
+    for package in _MESSAGES:
+        importlib.import_module(f'{package}.msg')
+    # Messages import it at their first use.
+    importlib.import_module('rosidl_generator_py')
+    # Searches of all installed packages and of all modules, which a node needs for its parameters
+    # and for its first log message.
+    PLANNERS.names()
+    inspect.getmodule(inspect.currentframe())

@@ -1,0 +1,186 @@
+"""The floor in view of simulated cameras: how it is rendered, and the objects on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field, model_validator
+
+from maasi_filter.settings import Settings, Vector3
+from maasi_sim.simulation.world import World, noise_stream
+
+
+class DistractorSettings(Settings):
+    """Things on the floor that are not markers; drawn at random over the bounds."""
+
+    sheets: int = Field(default=0, ge=0, description='Pale blue sheets of 10 to 25 cm [1]')
+    lines: int = Field(default=0, ge=0, description='Blue lines of 20 to 80 cm, 3 to 8 mm wide [1]')
+    purple: int = Field(default=0, ge=0, description="Purple discs of the markers' size [1]")
+    cyan: int = Field(
+        default=0, ge=0, description="Pale greenish-blue discs of the markers' size [1]"
+    )
+    large: int = Field(
+        default=0, ge=0, description='Blue discs of three times the size of markers [1]'
+    )
+
+
+class RenderSettings(Settings):
+    """Disturbances of the simulated camera: moderate by default, none with `ideal()`."""
+
+    marker_diameter: float = Field(default=0.03, gt=0, description='Diameter of the markers [m]')
+    marker_colour: Vector3 = Field(
+        default=[0.08, 0.17, 0.62],
+        description='Reflectance of the markers in R, G, B, 0 to 1',
+    )
+    floor_colour: Vector3 = Field(
+        default=[0.47, 0.47, 0.46],
+        description='Reflectance of the floor in R, G, B, 0 to 1',
+    )
+    floor_texture: float = Field(
+        default=0.03, ge=0, le=1, description='Relative amplitude of the speckle of the floor [-]'
+    )
+    light_variation: float = Field(
+        default=0.15,
+        ge=0,
+        lt=1,
+        description='Relative amplitude of the light over the floor [-]',
+    )
+    light_wavelength: float = Field(
+        default=3.0, gt=0, description='Wavelength of the light over the floor [m]'
+    )
+    vignetting: float = Field(
+        default=0.1,
+        ge=0,
+        lt=1,
+        description='Part of the light lost in the corners of the image [-]',
+    )
+    exposure_drift: float = Field(
+        default=0.08, ge=0, lt=1, description='Relative amplitude of the drift of exposure [-]'
+    )
+    white_balance_drift: float = Field(
+        default=0.03,
+        ge=0,
+        lt=1,
+        description="Relative amplitude of the drift of each channel's gain [-]",
+    )
+    drift_period: float = Field(default=20.0, gt=0, description='Period of the drifts, about [s]')
+    shot_noise: float = Field(
+        default=0.06,
+        ge=0,
+        description='Variance of the noise for each grey level of signal [grey level]',
+    )
+    read_noise: float = Field(
+        default=1.5, ge=0, description='Deviation of the noise in the dark [grey level]'
+    )
+    exposure_time: float = Field(
+        default=0.006, ge=0, description='Time over which motion blurs the image [s]'
+    )
+    blur: float = Field(default=0.5, ge=0, description='Deviation of the blur of the lens [px]')
+    jpeg_quality: int | None = Field(
+        default=None,
+        ge=1,
+        le=100,
+        description='Quality of JPEG compression; none: no JPEG [1]',
+    )
+    distractors: DistractorSettings = Field(
+        default_factory=DistractorSettings, description='Objects like markers'
+    )
+
+    @model_validator(mode='after')
+    def _colours(self) -> RenderSettings:
+        for name in ('marker_colour', 'floor_colour'):
+            colour = getattr(self, name)
+            if not all(0 <= value <= 1 for value in colour):
+                raise ValueError(f'{name}: got {colour}, allowed are numbers from 0 to 1')
+        return self
+
+    @classmethod
+    def ideal(cls, **changes: object) -> RenderSettings:
+        """Return settings without noise, blur, drift or uneven light, but for the changes given."""
+        drifts = ('exposure_drift', 'white_balance_drift', 'light_variation', 'vignetting')
+        noises = ('floor_texture', 'shot_noise', 'read_noise', 'exposure_time', 'blur')
+        return cls.model_validate(dict.fromkeys((*drifts, *noises), 0.0) | changes)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A flat object on the floor: centre [m, map], colour (reflectance, 0 to 1).
+
+    Half its size is its radius twice, or half the sides of a rectangle [m]; the angle is that of
+    its first side from the x axis [rad].
+    """
+
+    centre: tuple[float, float]
+    half_size: tuple[float, float]
+    colour: Sequence[float]
+    rectangle: bool = False
+    angle: float = 0.0
+
+
+def disc(centre: ArrayLike, radius: float, colour: Sequence[float]) -> Shape:
+    """Return a disc on the floor: centre [m, map], radius [m], reflectance."""
+    x, y = (float(value) for value in np.asarray(centre, dtype=float)[:2])
+    return Shape((x, y), (radius, radius), tuple(colour))
+
+
+def draw_distractors(
+    settings: RenderSettings, world: World, generator: np.random.Generator
+) -> list[Shape]:
+    """Draw distractors. Only sheets may touch a marker: one partly covered is not detected."""
+    counts = settings.distractors
+    low, high = world.bounds[:2, 0], world.bounds[:2, 1]
+    radius = 0.5 * settings.marker_diameter
+    shapes: list[Shape] = []
+
+    def draw(clear: float, along: ArrayLike = (0.0, 0.0)) -> tuple[float, float] | None:
+        """Return a centre whose markers are farther than `clear` from it, or from a line."""
+        half = float(np.hypot(*np.asarray(along)))
+        axis = np.asarray(along) / (half or 1.0)
+        for _ in range(1000):
+            centre = generator.uniform(low, high)
+            offsets = world.targets[:, :2] - centre
+            nearest = np.clip(offsets @ axis, -half, half)[:, None] * axis
+            gaps = np.linalg.norm(offsets - nearest, axis=1)
+            if gaps.min(initial=np.inf) > clear:
+                return float(centre[0]), float(centre[1])
+        return None
+
+    for _ in range(counts.sheets):
+        centre = draw(-1.0)
+        sides = generator.uniform(0.05, 0.125, size=2)
+        pale = np.array([0.60, 0.68, 0.80]) * generator.uniform(0.85, 1.15)
+        if centre is not None:
+            angle = float(generator.uniform(0, np.pi))
+            sizes = (float(sides[0]), float(sides[1]))
+            shapes.append(Shape(centre, sizes, pale.tolist(), True, angle))
+    for _ in range(counts.lines):
+        half = float(generator.uniform(0.1, 0.4))
+        width = float(generator.uniform(0.0015, 0.004))
+        angle = float(generator.uniform(0, np.pi))
+        line = draw(2.5 * radius, half * np.array([np.cos(angle), np.sin(angle)]))
+        if line is not None:
+            shapes.append(Shape(line, (half, width), settings.marker_colour, True, angle))
+    for count, size, colour in (
+        (counts.purple, 1.0, [0.42, 0.12, 0.50]),
+        (counts.cyan, 1.0, [0.35, 0.55, 0.62]),
+        (counts.large, 3.0, settings.marker_colour),
+    ):
+        for _ in range(count):
+            centre = draw((size + 2.0) * radius)
+            if centre is not None:
+                shapes.append(disc(centre, size * radius, colour))
+    return shapes
+
+
+def scene_of(world: World, settings: RenderSettings, seed: int) -> list[Shape]:
+    """Return the objects on the floor, bottom first: distractors, obstacles, markers."""
+    shapes = draw_distractors(settings, world, noise_stream(seed, purpose='distractors'))
+    shapes += [
+        disc(centre, float(radius), (0.25, 0.24, 0.23))
+        for centre, radius in zip(world.obstacles.centres, world.obstacles.radii)
+    ]
+    radius = 0.5 * settings.marker_diameter
+    return shapes + [disc(target, radius, settings.marker_colour) for target in world.targets]

@@ -1,0 +1,221 @@
+"""Simulated odometry: starts at zero, with noise, and drift that grows with the distance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from maasi_filter.arrays import FloatArray
+from maasi_filter.models.pose import Pose, inverse
+from maasi_filter.settings import Settings
+from maasi_planner.motion import RobotState
+from maasi_sim.simulation.world import noise_stream
+
+# Reported variances stay positive: consumers invert them.
+_LEAST_VARIANCE = 1e-12
+
+
+class OdometrySettings(Settings):
+    """Errors of a robot's odometry; all zero: perfect."""
+
+    position_noise: float = Field(
+        default=0.002, ge=0.0, description='Deviation of each coordinate, independent each step [m]'
+    )
+    heading_noise: float = Field(
+        default=0.002, ge=0.0, description='Deviation of the heading, independent each step [rad]'
+    )
+    velocity_noise: float = Field(
+        default=0.005, ge=0.0, description='Deviation of each part of the velocity [m/s]'
+    )
+    position_drift: float = Field(
+        default=0.0,
+        ge=0.0,
+        description='Deviation of the drift of x and y after one metre; grows with its root [m]',
+    )
+    heading_drift: float = Field(
+        default=0.0,
+        ge=0.0,
+        description='Deviation of the drift of the heading after one metre; grows with its root '
+        '[rad]',
+    )
+    position_offset: float = Field(
+        default=0.0,
+        ge=0.0,
+        description='Length of a constant error of the position, in a direction drawn for each '
+        'run; level where the robot is on the floor [m]',
+    )
+
+
+@dataclass(frozen=True)
+class OdometryReading:
+    """Odometry of one step, as in ``nav_msgs/Odometry``.
+
+    The pose is in the frame of the robot at the start, with its covariance (6, 6) [m, rad]; the
+    velocities are in the robot's frame [m/s, rad/s].
+    """
+
+    pose: Pose
+    covariance: FloatArray
+    velocity: FloatArray
+    angular_velocity: FloatArray
+
+
+class OdometryModel:
+    """A robot's odometry, which stands at zero at its start.
+
+    Height, roll and pitch are measured absolutely and have noise at most; x, y and heading are
+    integrated, and drift. The covariance describes the errors of `reported`, by default those of
+    `settings`.
+    """
+
+    def __init__(
+        self,
+        settings: OdometrySettings,
+        start: Pose,
+        seed: int,
+        robot: str,
+        reported: OdometrySettings | None = None,
+    ) -> None:
+        self.settings = settings
+        self.reported = reported or settings
+        self.seed = seed
+        self.robot = robot
+        # Plain numbers: arrays of this size take several times as long.
+        to_start = inverse(Pose.from_yaw(start.position, start.yaw))
+        self._shift = to_start.position.tolist()
+        self._rotation = to_start.rotation().tolist()
+        self._quaternion = to_start.orientation.tolist()
+        self._last = self._from_start(*start.position.tolist())
+        self._offset = (0.0, 0.0)
+        self._turn = 0.0
+        axes = 3 if start.position[2] > 0.0 else 2
+        # The constant error of the position [m].
+        self._constant = np.zeros(3)
+        if settings.position_offset > 0.0:
+            drawn = noise_stream(seed, robot, 0, 'offset').standard_normal(axes)
+            self._constant[:axes] = drawn * (settings.position_offset / math.hypot(*drawn))
+        offset = np.zeros(3)
+        offset[:axes] = self.reported.position_offset**2 / axes
+        self._noise_covariance = np.diag(
+            [*(self.reported.position_noise**2 + _LEAST_VARIANCE + offset)]
+            + [_LEAST_VARIANCE] * 2
+            + [self.reported.heading_noise**2 + _LEAST_VARIANCE]
+        )
+        # Covariance of the drift of x, y of the estimate and heading h: xx, xy, yy, xh, yh, hh.
+        self._drift = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def step(self, state: RobotState, step: int) -> OdometryReading:
+        """Return the odometry of the next true state; the discrete step keys the noise."""
+        settings = self.settings
+        generator = noise_stream(self.seed, self.robot, step, 'odometry')
+        dx, dy, dh, nx, ny, nz, nh, *twist_noise = generator.standard_normal(13).tolist()
+        x, y, z = self._from_start(*state.pose.position.tolist())
+        move_x, move_y = x - self._last[0], y - self._last[1]
+        way = math.sqrt(move_x * move_x + move_y * move_y)
+        drifts = (settings, self.reported)
+        if way > 0.0 and any(item.position_drift + item.heading_drift > 0.0 for item in drifts):
+            root = math.sqrt(way)
+            before = self._place(x, y)
+            self._turn += settings.heading_drift * root * dh
+            # The error of heading turns the estimate about the robot, not about the origin.
+            after = self._place(x, y)
+            drift = settings.position_drift * root
+            self._offset = (
+                self._offset[0] + before[0] - after[0] + drift * dx,
+                self._offset[1] + before[1] - after[1] + drift * dy,
+            )
+            self._grow(move_x, move_y, way)
+        self._last = (x, y, z)
+        noise = settings.position_noise
+        place = self._place(x, y)
+        half = 0.5 * (self._turn + settings.heading_noise * nh)
+        w1, z1 = math.cos(half), math.sin(half)
+        attitude = state.pose.orientation.tolist()
+        w2, x2, y2, z2 = _product(self._quaternion, attitude)
+        linear, angular = settings.velocity_noise, settings.heading_noise
+        velocity = _into_body(attitude, state.velocity.tolist())
+        turning = state.angular_velocity.tolist()
+        return OdometryReading(
+            Pose(
+                np.array([place[0] + noise * nx, place[1] + noise * ny, z + noise * nz])
+                + self._constant,
+                np.array(
+                    [w1 * w2 - z1 * z2, w1 * x2 - z1 * y2, w1 * y2 + z1 * x2, w1 * z2 + z1 * w2]
+                ),
+            ),
+            self._covariance(),
+            np.array([v + linear * n for v, n in zip(velocity, twist_noise[:3])]),
+            np.array([v + angular * n for v, n in zip(turning, twist_noise[3:])]),
+        )
+
+    def _from_start(self, x: float, y: float, z: float) -> tuple[float, float, float]:
+        """Return a position of the map in the frame of the start."""
+        (a, b, c), (d, e, f), (g, h, i) = self._rotation
+        tx, ty, tz = self._shift
+        return (
+            tx + a * x + b * y + c * z,
+            ty + d * x + e * y + f * z,
+            tz + g * x + h * y + i * z,
+        )
+
+    def _place(self, x: float, y: float) -> tuple[float, float]:
+        """Return the estimated position of a robot at x, y."""
+        cosine, sine = math.cos(self._turn), math.sin(self._turn)
+        return (
+            self._offset[0] + cosine * x - sine * y,
+            self._offset[1] + sine * x + cosine * y,
+        )
+
+    def _grow(self, move_x: float, move_y: float, way: float) -> None:
+        """Propagate the covariance of the drift over a move; an error of heading turns the move."""
+        cosine, sine = math.cos(self._turn), math.sin(self._turn)
+        # d(x, y) / d(heading).
+        a = -(sine * move_x + cosine * move_y)
+        b = cosine * move_x - sine * move_y
+        xx, xy, yy, xh, yh, hh = self._drift
+        place = way * self.reported.position_drift**2
+        self._drift = (
+            xx + 2.0 * a * xh + a * a * hh + place,
+            xy + a * yh + b * xh + a * b * hh,
+            yy + 2.0 * b * yh + b * b * hh + place,
+            xh + a * hh,
+            yh + b * hh,
+            hh + way * self.reported.heading_drift**2,
+        )
+
+    def _covariance(self) -> FloatArray:
+        covariance = self._noise_covariance.copy()
+        xx, xy, yy, xh, yh, hh = self._drift
+        covariance[0, 0] += xx
+        covariance[1, 1] += yy
+        covariance[5, 5] += hh
+        covariance[0, 1] = covariance[1, 0] = xy
+        covariance[0, 5] = covariance[5, 0] = xh
+        covariance[1, 5] = covariance[5, 1] = yh
+        return covariance
+
+
+def _product(first: list[float], second: list[float]) -> tuple[float, float, float, float]:
+    """Return the Hamilton product of two quaternions w, x, y, z."""
+    w1, x1, y1, z1 = first
+    w2, x2, y2, z2 = second
+    return (
+        w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+        w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+        w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+        w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+    )
+
+
+def _into_body(orientation: list[float], vector: list[float]) -> tuple[float, float, float]:
+    """Return a vector of the map in the axes of a body with an orientation w, x, y, z."""
+    w, x, y, z = orientation
+    a, b, c = vector
+    return (
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c,
+        2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c,
+        2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    )

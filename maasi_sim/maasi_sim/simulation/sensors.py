@@ -1,0 +1,175 @@
+"""Simulated sensors of ranges: range, bearing and elevation of targets, and a laser scanner."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.models.measurement import wrap_angle
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.settings import Settings
+from maasi_sim.simulation.world import noise_stream
+
+
+class RangingSensor:
+    """A robot's ranging sensor (000, eq. (3) to (9)); seed, robot and step key its random numbers.
+
+    Shapes and units: targets (n, 2 or 3), true positions [m, map]; reach [m], of clutter.
+    """
+
+    def __init__(
+        self, sensor: Sensor, targets: FloatArray, seed: int, robot: str, reach: float = 0.0
+    ) -> None:
+        self.sensor = sensor
+        self.targets = np.asarray(targets, dtype=float)
+        self.seed = seed
+        self.robot = robot
+        self.reach = min(reach, sensor.maximum_range)
+        self._spread = np.linalg.cholesky(sensor.covariance)
+
+    def measure(
+        self, pose: Pose, step: int, targets: FloatArray | None = None
+    ) -> tuple[FloatArray, IntArray]:
+        """Return one sweep in random order, and the index of each return's target, -1 for clutter.
+
+        Shapes and units: targets (n, 2 or 3) [m, map], where they have moved; returned (m, d) [m,
+        rad], bearings from the map's x axis, and (m,).
+        """
+        dimension = self.sensor.dimension
+        generator = noise_stream(self.seed, self.robot, step, 'ranging')
+        count = len(self.targets)
+        # The number of draws does not depend on detections: targets do not affect each other.
+        chance = generator.random(count)
+        noise = generator.standard_normal((count, dimension))
+        positions = (self.targets if targets is None else targets)[:, :dimension]
+        values = self.sensor.measurement.measure(positions, pose)
+        seen = chance < self.sensor.detection.probability(positions, pose)
+        seen &= values[:, 0] <= self.sensor.maximum_range
+        # Summed in a fixed order: the result must not depend on the linear algebra library.
+        errors = np.zeros((count, dimension))
+        for column in range(dimension):
+            errors += noise[:, column, None] * self._spread[:, column]
+        returns, causes = (values + errors)[seen], np.flatnonzero(seen)
+        if self.sensor.clutter > 0.0 and self.reach > 0.0:
+            # Uniform in range and angles.
+            low = np.array([0.0, -math.pi, -0.5 * math.pi][:dimension])
+            high = np.array([self.reach, math.pi, 0.5 * math.pi][:dimension])
+            number = generator.poisson(self.sensor.clutter * float(np.prod(high - low)))
+            clutter = generator.uniform(low, high, size=(number, dimension))
+            returns = np.concatenate([returns, clutter])
+            causes = np.concatenate([causes, np.full(len(clutter), -1)])
+        order = generator.permutation(len(returns))
+        returns, causes = returns[order], causes[order]
+        returns[:, 0] = np.maximum(returns[:, 0], 1e-6)
+        returns[:, 1] = wrap_angle(returns[:, 1])
+        if dimension == 3:
+            returns[:, 2] = np.clip(returns[:, 2], -0.5 * math.pi, 0.5 * math.pi)
+        return returns, causes
+
+
+class LaserSettings(Settings):
+    """A planar laser scanner; the defaults are those of the TurtleBot3's."""
+
+    beams: int = Field(default=360, ge=1, le=100_000, description='Beams of a full turn [1]')
+    minimum_range: float = Field(default=0.12, ge=0.0, description='Nearest return [m]')
+    maximum_range: float = Field(default=3.5, gt=0.0, description='Farthest return [m]')
+    noise: float = Field(default=0.01, ge=0.0, description='Deviation of a range [m]')
+    rate: float = Field(default=5.0, gt=0.0, description='Turns per second [Hz]')
+    wall_margin: float = Field(
+        default=0.3, ge=0.0, description='Distance of the walls outside the bounds [m]'
+    )
+
+    @model_validator(mode='after')
+    def _ordered(self) -> LaserSettings:
+        if self.maximum_range <= self.minimum_range:
+            raise ValueError(
+                f'maximum_range: got {self.maximum_range}, '
+                f'allowed is more than minimum_range ({self.minimum_range})'
+            )
+        return self
+
+
+@njit(cache=True)
+def _cast(x, y, yaw, count, circles, walls, ranges):  # type: ignore[no-untyped-def]
+    """Ranges (count,) of beams from yaw on, anticlockwise, to circles (n, 3) and walls (4,)."""
+    for beam in range(count):
+        angle = yaw + 2.0 * math.pi * beam / count
+        dx, dy = math.cos(angle), math.sin(angle)
+        nearest = np.inf
+        # Walls: lower and upper x, lower and upper y; seen from inside only.
+        if dx > 0.0 and x < walls[1]:
+            nearest = min(nearest, (walls[1] - x) / dx)
+        elif dx < 0.0 and x > walls[0]:
+            nearest = min(nearest, (walls[0] - x) / dx)
+        if dy > 0.0 and y < walls[3]:
+            nearest = min(nearest, (walls[3] - y) / dy)
+        elif dy < 0.0 and y > walls[2]:
+            nearest = min(nearest, (walls[2] - y) / dy)
+        for i in range(circles.shape[0]):
+            ox, oy = circles[i, 0] - x, circles[i, 1] - y
+            along = ox * dx + oy * dy
+            gap = ox * ox + oy * oy - along * along
+            square = circles[i, 2] * circles[i, 2] - gap
+            if square >= 0.0:
+                half = math.sqrt(square)
+                if along - half > 0.0:
+                    nearest = min(nearest, along - half)
+                elif along + half > 0.0:
+                    nearest = 0.0
+        ranges[beam] = nearest
+
+
+class LaserScanner:
+    """One robot's laser scanner, at its origin, first beam straight ahead; walls around the bounds.
+
+    Shapes and units: bounds (d, 2); centres (n, 2 or 3) and radii (n,) of the obstacles [m].
+    """
+
+    def __init__(
+        self,
+        settings: LaserSettings,
+        bounds: FloatArray,
+        centres: ArrayLike,
+        radii: ArrayLike,
+        seed: int,
+        robot: str,
+    ) -> None:
+        self.settings = settings
+        self.seed = seed
+        self.robot = robot
+        margin = settings.wall_margin
+        low, high = bounds[:2, 0] - margin, bounds[:2, 1] + margin
+        self._walls = np.array([low[0], high[0], low[1], high[1]])
+        self._circles = _circles(centres, radii)
+
+    def scan(
+        self, pose: Pose, step: int, centres: ArrayLike = (), radii: ArrayLike = ()
+    ) -> NDArray[np.float32]:
+        """Return the ranges of one turn (beams,), anticlockwise from straight ahead [m].
+
+        Infinite without a return, minus infinite below the minimum range (REP 117). `centres` and
+        `radii` are those of further circles: the other robots.
+        """
+        settings = self.settings
+        circles = np.concatenate([self._circles, _circles(centres, radii)])
+        ranges = np.empty(settings.beams)
+        x, y = float(pose.position[0]), float(pose.position[1])
+        _cast(x, y, pose.yaw, settings.beams, circles, self._walls, ranges)
+        noise = noise_stream(self.seed, self.robot, step, 'laser').standard_normal(settings.beams)
+        ranges += settings.noise * noise
+        ranges[ranges > settings.maximum_range] = np.inf
+        ranges[ranges < settings.minimum_range] = -np.inf
+        return ranges.astype(np.float32)
+
+
+def _circles(centres: ArrayLike, radii: ArrayLike) -> FloatArray:
+    radius = np.asarray(radii, dtype=float).reshape(-1)
+    centre = np.asarray(centres, dtype=float)
+    centre = centre.reshape(len(radius), centre.shape[-1] if centre.ndim > 1 else 2)
+    return np.concatenate([centre[:, :2], radius[:, None]], axis=1)

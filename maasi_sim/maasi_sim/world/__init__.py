@@ -1,1 +1,0 @@
-"""The simulated world: targets, robots and their sensors, on one clock."""
