@@ -22,3 +22,5 @@ def own_context():
             yield context
         finally:
             rclpy.try_shutdown(context=context)
+            # Services of type descriptions stay in the domain as well, which others may get next.
+            gc.collect()

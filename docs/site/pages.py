@@ -53,8 +53,8 @@ NODES = [
     ('maasi_planner', 'buildings.cuboid_planner_node', 'CuboidPlannerNode'),
     ('maasi_drivers', 'agent.agent_driver', 'AgentDriver'),
     ('maasi_drivers', 'guard_node', 'GuardNode'),
-    ('maasi_sim', 'sim_node', 'SimNode'),
-    ('maasi_sim', 'buildings.cuboid_sim_node', 'CuboidSimNode'),
+    ('maasi_sim', 'simulation.sim_node', 'SimNode'),
+    ('maasi_sim', 'run.buildings.cuboid_sim_node', 'CuboidSimNode'),
 ]
 PARSERS = [
     'maasi_sim.run.run_options',

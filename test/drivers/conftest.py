@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 from contextlib import ExitStack, closing
 from types import SimpleNamespace
@@ -108,6 +109,19 @@ def play(start_node, make_team):
     return start
 
 
+def end_process(process):
+    """End a process by SIGTERM; one that hangs is killed."""
+    # A killed one may leave the others a broken port in the shared memory of Fast DDS, on which
+    # they crash when they end.
+    process.send_signal(signal.SIGCONT)
+    process.terminate()
+    try:
+        process.wait(5.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
 @pytest.fixture
 def process(context, tmp_path):
     """Return a function that starts a driver as a process of its own."""
@@ -119,8 +133,7 @@ def process(context, tmp_path):
             file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
             arguments = ['--ros-args', '--remap', '__ns:=/rover', '--params-file', str(file)]
             made = subprocess.Popen([*program, *arguments], env=os.environ | (environment or {}))
-            stack.callback(made.wait)
-            stack.callback(made.kill)
+            stack.callback(end_process, made)
             return made
 
         yield start

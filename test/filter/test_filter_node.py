@@ -95,7 +95,7 @@ def running(**changes):
     with own_context() as context:
         team = Team(context)
         try:
-            team.filter = team.start(FilterNode, SETTINGS.model_copy(update=changes))
+            team.start(FilterNode, SETTINGS.model_copy(update=changes))
             writers = [team.batch, *team.detections.values()]
             team.until(lambda: all(item.get_subscription_count() for item in writers))
             team.until(lambda: team.node.count_publishers('/filter_update') == 1)
@@ -127,7 +127,7 @@ def test_a_target_seen_again_and_again_is_found_with_class_and_identity(team):
     assert [update.batch_id for update in team.updates] == list(range(1, 9))
     assert [item.robot for item in team.updates[0].members] == ['a', 'b']
     assert {item.pose.position.x for item in team.updates[-1].members} == {1.0}
-    assert not team.filter.dropped
+    assert not team.tested.dropped
 
 
 def test_the_filter_of_the_papers_counts_detections_of_found_targets_which_are_no_fault():
@@ -138,9 +138,9 @@ def test_the_filter_of_the_papers_counts_detections_of_found_targets_which_are_n
         reports = team.hear(DiagnosticArray, '/diagnostics')
         for number in range(1, 20):
             team.step(number, {'a': SEEN, 'b': SEEN})
-        status = team.filter.status()
+        status = team.tested.status()
         assert status['found'] == 1 and status['detections of found targets'] > 0
-        assert not team.filter.dropped
+        assert not team.tested.dropped
         reports.clear()
         team.until(lambda: reports)
         status = reports[-1].status[0]
@@ -182,7 +182,7 @@ def test_what_is_said_again_counts_once():
         team.step(2, {'a': []})
         assert [update.batch_id for update in team.updates] == [1, 2]
         assert [item.robot for item in team.updates[0].members] == ['a', 'b']
-        assert not team.filter.dropped
+        assert not team.tested.dropped
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_what_is_said_again_counts_once():
 def test_what_is_wrong_is_dropped_and_counted_and_the_node_goes_on(team, changes, reason):
     reports = team.hear(DiagnosticArray, '/diagnostics')
     assert team.step(1, {'a': SEEN}, **changes).expected_number == 0.0
-    assert team.filter.dropped[reason] == 1
+    assert team.tested.dropped[reason] == 1
     if changes == {'robot': 'nobody'}:
         team.until(lambda: reports and reports[-1].status[0].level == DiagnosticStatus.WARN)
         assert reports[-1].status[0].message == 'active; dropped: bad detections 1'
@@ -212,7 +212,7 @@ def test_what_is_wrong_is_dropped_and_counted_and_the_node_goes_on(team, changes
 
 def test_detections_of_a_far_too_large_message_are_not_read(team):
     update = team.step(1, {'a': [(0.3, 1e-4 * index) for index in range(4000)]})
-    assert team.filter.dropped == {'too large message': 1} and list(update.missing) == ['a']
+    assert team.tested.dropped == {'too large message': 1} and list(update.missing) == ['a']
     assert not team.step(2, {'a': SEEN}).missing
 
 
@@ -230,15 +230,15 @@ def test_one_stamp_before_or_far_after_the_others_does_not_silence_its_robot(tea
     ):
         update = team.step(number, {'a': SEEN}, **change)
         assert list(update.missing) == (['a'] if change in (early, far) else [])
-        assert team.filter.dropped['bad detections'] == dropped
+        assert team.tested.dropped['bad detections'] == dropped
 
 
 def test_detections_that_are_equal_or_too_many_are_counted_and_cost_no_time(team):
     assert team.step(1, {'a': SEEN * 3_000}).found == 0
-    assert team.filter.dropped['equal detection'] == 2_999
+    assert team.tested.dropped['equal detection'] == 2_999
     begin = time.monotonic()
     team.step(2, {'a': [(0.3 + 1e-5 * k, 0.5) for k in range(3_000)]})
-    assert team.filter.dropped['too many detections'] == 3_000 - MOST_DETECTIONS
+    assert team.tested.dropped['too many detections'] == 3_000 - MOST_DETECTIONS
     assert time.monotonic() - begin < 10.0
 
 
@@ -246,7 +246,7 @@ def test_detections_that_are_equal_or_too_many_are_counted_and_cost_no_time(team
 def test_an_absurd_batch_is_refused_and_the_next_one_is_not(team, number):
     team.step(1, {'a': []})
     team.batch.publish(MeasurementBatch(id=number, step=number))
-    team.until(lambda: team.filter.dropped['bad batch'] == 1)
+    team.until(lambda: team.tested.dropped['bad batch'] == 1)
     assert team.step(2, {'a': []}).batch_id == 2
 
 
@@ -256,17 +256,17 @@ def test_a_node_saves_on_a_timer_and_another_one_goes_on_to_the_bit(tmp_path):
         team.see(*range(1, 9))
         file.unlink(missing_ok=True)
         team.until(file.exists)
-        before = team.filter.filter
+        before = team.tested.filter
     assert len(before.found_targets) == 2
     # The file is the timer's: the node was destroyed without being told to end.
     with running(save_file=str(file)) as team:
-        same(team.filter.filter, before)
+        same(team.tested.filter, before)
 
 
 def test_a_node_that_cannot_save_goes_on(tmp_path):
     with running(save_file=str(tmp_path / 'nowhere' / 'state'), save_period=0.01) as team:
         team.see(1, 2, 3)
-        team.filter.trigger_deactivate()
+        team.tested.trigger_deactivate()
         assert team.updates[-1].found == 2
 
 

@@ -34,7 +34,7 @@ def test_a_restarted_node_goes_on_after_its_last_batch_to_the_bit(options):
                 team.counts['a'] = first - 2
                 team.measure(first - 1, {'a': []})
             team.see(*range(first, last + 1))
-            assert not team.filter.dropped
+            assert not team.tested.dropped
             updates += team.updates
             team.until(lambda: team.found)
             again = list(team.found[-1].targets)
@@ -54,7 +54,7 @@ def test_a_state_that_cannot_be_used_is_set_aside(options, tmp_path):
         assert file.with_name('state.refused').read_bytes() == bytes(content)
         assert load_state(file)[1].batch == 2
         # A new search forgets the file.
-        team.filter.reset()
+        team.tested.reset()
         assert not file.exists()
 
 
@@ -73,10 +73,10 @@ def kept():
 def test_a_node_without_state_takes_found_targets_from_the_latched_topic(kept):
     with running() as team:
         publisher = team.node.create_publisher(FoundTargetArray, 'found_targets/kept', LATCHED)
-        team.until(lambda: team.filter.count_publishers('/found_targets/kept') == 1)
+        team.until(lambda: team.tested.count_publishers('/found_targets/kept') == 1)
         # The batch waits for the message: a new target would get the id of a kept one.
         team.measure(20, THREE)
-        pending = team.filter._batches.pending
+        pending = team.tested._batches.pending
         team.until(lambda: 20 in pending and not pending[20].missing)
         assert not team.updates
         publisher.publish(kept)
@@ -108,7 +108,7 @@ def test_kept_targets_that_cannot_be_used_are_dropped(kept, fault):
     with running() as team:
         publisher = team.node.create_publisher(FoundTargetArray, 'found_targets/kept', LATCHED)
         publisher.publish(kept)
-        team.until(lambda: team.filter.dropped['bad found targets'] == 1)
+        team.until(lambda: team.tested.dropped['bad found targets'] == 1)
         team.see(1)
 
 
@@ -116,5 +116,5 @@ def test_the_wait_for_kept_targets_has_a_bound(monkeypatch):
     monkeypatch.setattr(filter_node, '_KEPT_PATIENCE', 0.5)
     with running() as team:
         team.node.create_publisher(FoundTargetArray, 'found_targets/kept', LATCHED)
-        team.until(lambda: team.filter.count_publishers('/found_targets/kept') == 1)
+        team.until(lambda: team.tested.count_publishers('/found_targets/kept') == 1)
         team.see(1, 2)

@@ -174,8 +174,8 @@ class World(Player):
     def close(self):
         self.planner = None
         super().close()
-        for driver in self.drivers:
-            driver.destroy_node()
+        while self.drivers:
+            self.drivers.pop().destroy_node()
 
     def _take_diagnostics(self, message):
         for status in message.status:
