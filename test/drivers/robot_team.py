@@ -73,7 +73,7 @@ KINDS = {
 
 
 class Team(Node):
-    """The robot, its camera, and whoever the driver talks to; `deaf`: it hears no commands."""
+    """The robot, its camera and the driver's peers; `deaf`: it receives no commands."""
 
     def __init__(self, context, settings, executor, wants=None, deaf=False):
         super().__init__('robot', context=context, namespace='/rover')

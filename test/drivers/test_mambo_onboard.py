@@ -122,7 +122,7 @@ def test_nothing_takes_off_without_arm(fly):
 def test_a_drone_that_is_not_heard_is_told_to_hover_then_to_land(fly):
     flight = fly()
     result = flight.on_its_way()
-    # It does what it is told, however late that comes.
+    # It obeys commands, however late they come.
     flight.drone.patience = math.inf
     flight.drone.silent = True
     known = len(flight.drone.kinds)

@@ -178,7 +178,7 @@ def test_a_guard_that_has_gone_is_reported(play, start_guard, capfd):
 
 @pytest.mark.parametrize('unit', ['percent', 'fraction'])
 def test_a_battery_is_read_in_its_unit_and_a_low_one_ends_the_way(play, capfd, monkeypatch, unit):
-    # It is said that no charge comes; what is said of wrong ones would wait for a while then.
+    # The warning that no charge arrives would delay those about wrong values.
     if unit == 'percent':
         monkeypatch.setattr('maasi_drivers.agent.watchdog._CHARGE_PATIENCE', 0.3)
     driver, team = play(battery_minimum=0.2, battery_unit=unit)

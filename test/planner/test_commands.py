@@ -186,7 +186,7 @@ def test_robot_command_shows_sends_and_stops_a_robot(world):
     process.send_signal(signal.SIGINT)
     code, said = world.ended(process)
     assert code == FAILED and 'not reached: cancelled' in said, said
-    world.until(lambda: not a.moves, 'it goes on')
+    world.until(lambda: not a.moves, 'it still moves')
 
 
 @pytest.mark.parametrize(('words', 'height'), [(['1', '2'], 5.0), (['1', '2', '3'], 3.0)])

@@ -63,7 +63,7 @@ def test_free_robots_plan_together_and_measure_at_once_then_every_period():
 def test_who_arrives_plans_alone_and_starts_its_period_anew():
     coordinator = started()
     robots = there(a=(2.0, 2.0)) | there(free=False, b=(8.5, 8.5))
-    # The planner is told where the other one goes, and when it measures next.
+    # The planner receives the other's destination and its next measurement.
     view = coordinator._team(5, robots, ['a'], ()).robots['b']
     assert view.phase == 3
     assert view.remaining_path == pytest.approx(coordinator.plans['b'].positions[5:])

@@ -27,7 +27,7 @@ PATIENCE = 400.0
 
 
 class Run:
-    """A run: its process while it goes on, then its exit code and output, and what it left."""
+    """A run: its process while it lasts, then its exit code, output and files."""
 
     code = None
     output = ''
@@ -170,7 +170,7 @@ class Operator:
 
 @contextmanager
 def reserved_domain():
-    """Reserve a domain for a run that is told which to use, and locks it itself.
+    """Reserve a domain for a run that gets its number, and locks it itself.
 
     It is one of the last, so that no run that takes the first free one gets it.
     """

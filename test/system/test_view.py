@@ -24,7 +24,7 @@ pytestmark = pytest.mark.system
 
 
 def watch(run, address):
-    """Note what a browser sees of a run while it goes on."""
+    """Note what a browser sees of a run that is under way."""
     with chromium() as shown:
         shown.open(address)
         shown.until('maasi.log.duration > 1')

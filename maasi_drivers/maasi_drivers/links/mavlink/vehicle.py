@@ -318,7 +318,7 @@ class Vehicle:
         if self._phase_at == -math.inf:
             self._phase_at = now
         if self._permission.expired(now):
-            # Whoever requested it may not expect it any more.
+            # The client that requested it may not expect it any more.
             text = self.log.recent_text(now)
             why = f' ({text})' if text else ''
             limit = f'{self.settings.arm_timeout:g} s'
