@@ -7,7 +7,7 @@ import sys
 # Side by side; they share few kernels.
 PARTS = (
     ('maasi_filter', 'maasi_planner'),
-    ('maasi_sim.run.warm_up', 'maasi_drivers.vision.marker_detector'),
+    ('maasi_sim.run.warm_up',),
 )
 PART = 'import importlib, sys\nfor name in sys.argv[1:]: importlib.import_module(name).warm_up()'
 

@@ -127,9 +127,3 @@ def read_markers(
     """
     covariance = pose.covariance if pose.covariance.any() else None
     return detector.detect(picture, pose.pose, covariance).in_field_of_view(sensor, pose.pose)
-
-
-def warm_up() -> None:
-    """Compile, so that the first image is not late."""
-    grey = np.full((120, 160, 3), 120, dtype=np.uint8)
-    MarkerDetector(CameraSettings()).detect(grey, Pose(np.array([0.0, 0.0, 1.0])))

@@ -5,38 +5,34 @@ All rules take an RGB image (h, w, 3) and return `Blobs`; `segment` chooses by n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from maasi_drivers.settings.camera import SegmentationSettings
+from maasi_drivers.settings.camera import DETECTORS, SegmentationSettings
 from maasi_drivers.vision.detector import Blobs
-from maasi_filter.arrays import FloatArray, ImageArray, IntArray
+from maasi_filter.arrays import BoolArray, FloatArray, ImageArray, IntArray
 
 # Added to the mean of the channels before dividing by it: noise in the dark is not blue.
 _DARK = 6.0
 
 
-def paper_mask(image: ImageArray, threshold: float = 35.0) -> ImageArray:
-    """Return 1 where B - R/2 - G/2 > threshold, else 0 (001, eq. (16)).
+def paper_mask(image: ImageArray, threshold: float = 35.0) -> BoolArray:
+    """Return where B - R/2 - G/2 > threshold (001, eq. (16)).
 
     Computed in whole numbers of half grey levels, so nothing is rounded or clipped.
     """
-    red, green, blue = (plane.astype(np.int16) for plane in _planes(image))
-    return (2 * blue - red - green > int(np.floor(2.0 * threshold))).astype(np.uint8)
+    # Plane by plane, which is faster.
+    red, green, blue = (plane.astype(np.int16) for plane in cv2.split(image))
+    return np.asarray(2 * blue - red - green > int(np.floor(2.0 * threshold)))
 
 
-def _planes(image: ImageArray) -> list[ImageArray]:
-    # Masks are computed plane by plane, which is faster.
-    return [np.asarray(plane, dtype=np.uint8) for plane in cv2.split(image)]
-
-
-def _components(mask: ImageArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
+def _components(mask: BoolArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
     """Return the 8-connected components of a mask (h, w), in the order of rows.
 
     Labels (h, w), component plus one, 0: background; boxes (n, 4): left, top, width, height; and
@@ -44,7 +40,7 @@ def _components(mask: ImageArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
     """
     # Labelled pixel by pixel: other algorithms number them in the order of blocks of pixels.
     _, labels, stats, centroids = cv2.connectedComponentsWithStatsWithAlgorithm(
-        mask, 8, cv2.CV_32S, cv2.CCL_SAUF
+        mask.view(np.uint8), 8, cv2.CV_32S, cv2.CCL_SAUF
     )
     boxes, areas = stats[1:, :4], stats[1:, 4]
     low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
@@ -70,11 +66,9 @@ def _median(counts: NDArray[Any]) -> float:
     return value - 0.5 + float(half - before) / float(counts[value])
 
 
-def _blueness(balanced: FloatArray) -> FloatArray:
-    """Return (B - max(R, G)) over the mean of the channels of pixels (..., 3), -3 to 3."""
-    red, green, blue = np.moveaxis(balanced, -1, 0)
-    ratio: FloatArray = 3.0 * (blue - np.maximum(red, green)) / (red + green + blue + 3.0 * _DARK)
-    return ratio
+def _blueness(red: FloatArray, green: FloatArray, blue: FloatArray) -> FloatArray:
+    """Return (B - max(R, G)) over the mean of the channels, -3 to 3."""
+    return 3.0 * (blue - np.maximum(red, green)) / (red + green + blue + 3.0 * _DARK)
 
 
 def _floor_statistics(image: ImageArray) -> tuple[FloatArray, float, float]:
@@ -86,7 +80,7 @@ def _floor_statistics(image: ImageArray) -> tuple[FloatArray, float, float]:
     # Bounded, as an image of mostly marker or coloured sheet is no reference.
     gains = np.clip(medians.sum() / 3.0 / medians, 0.6, 1.7)
     # Blueness is between -3 and 3: bins of 1/256.
-    bins = np.floor(_blueness(gains * sample) * 256.0).astype(np.int64) + 768
+    bins = np.floor(_blueness(*(gains * sample).T) * 256.0).astype(np.int64) + 768
     counts = np.bincount(np.clip(bins, 0, 1535), minlength=1536)
     places = (np.arange(1536) + 0.5 - 768.0) / 256.0
     centre = (_median(counts) + 0.5 - 768.0) / 256.0
@@ -95,78 +89,38 @@ def _floor_statistics(image: ImageArray) -> tuple[FloatArray, float, float]:
     return gains, centre, deviation
 
 
-@njit(cache=True)
-def _robust_mask(red, green, blue, gains, threshold, mask):
-    """Set mask to 1 where the blueness exceeds the threshold; several times as fast as NumPy."""
-    red_gain, green_gain, blue_gain = gains
-    slope, offset = np.float32(threshold / 3.0), np.float32(threshold * _DARK)
-    for row in range(mask.shape[0]):
-        for column in range(mask.shape[1]):
-            r = red_gain * np.float32(red[row, column])
-            g = green_gain * np.float32(green[row, column])
-            b = blue_gain * np.float32(blue[row, column])
-            # Without a division per pixel.
-            mask[row, column] = np.uint8(b - max(r, g) - offset > slope * (r + g + b))
-
-
-def _compact(
-    image: ImageArray,
-    labels: NDArray[np.int32],
-    boxes: IntArray,
-    gains: FloatArray,
-    peak: float,
-    settings: SegmentationSettings,
-) -> list[int]:
-    """Return the components with this peak of blueness, and an allowed aspect and solidity."""
-    if not len(boxes):
-        return []
-    columns, rows = cv2.findNonZero((labels > 0).view(np.uint8))[:, 0].T
-    owners = labels[rows, columns] - 1
-    count = np.bincount(owners)
-    moments = [
-        np.bincount(owners, weights=values)
-        for x, y in [(columns - boxes[owners, 0], rows - boxes[owners, 1])]
-        for values in (x, y, x * x, y * y, x * y)
-    ]
-    mx, my, xx, yy, xy = (values / count for values in moments)
+def _is_compact(own: BoolArray, settings: SegmentationSettings) -> bool:
+    """Return whether a component (h, w) has an allowed aspect and solidity."""
+    moments = cv2.moments(own.astype(np.uint8), binaryImage=True)
+    xx, yy, xy = (moments[name] / moments['m00'] for name in ('mu20', 'mu02', 'mu11'))
     # Each pixel is a square with a second moment of 1/12.
-    vxx, vyy, vxy = xx - mx * mx + 1.0 / 12.0, yy - my * my + 1.0 / 12.0, xy - mx * my
-    middle, apart = 0.5 * (vxx + vyy), np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
+    middle, apart = 0.5 * (xx + yy) + 1.0 / 12.0, math.hypot(0.5 * (xx - yy), xy)
     # The lengths of the axes go as the roots of the principal second moments.
-    long, short = middle + apart, np.maximum(middle - apart, 1e-9)
-    peaks = np.full(len(count), -np.inf)
-    np.maximum.at(peaks, owners, _blueness(gains * image[rows, columns]))
-    aspect = settings.maximum_aspect
-    keep = (peaks >= peak) & (long <= aspect * aspect * short)
+    long, short = middle + apart, middle - apart
+    if long > settings.maximum_aspect**2 * short:
+        return False
     # An ellipse has area 4 pi root(long short).
-    keep &= count >= settings.minimum_solidity * 4.0 * np.pi * np.sqrt(long * short)
-    return [int(index) for index in np.flatnonzero(keep)]
+    return moments['m00'] >= settings.minimum_solidity * 4.0 * math.pi * math.sqrt(long * short)
 
 
 def _weigh(
-    image: ImageArray, labels: NDArray[np.int32], box: IntArray, blob: int, gains: FloatArray
+    image: ImageArray, own: BoolArray, floor: BoolArray, gains: FloatArray
 ) -> tuple[float, FloatArray, FloatArray] | None:
     """Return area, centroid and its variances (2,), by how much of each pixel is marker.
 
-    None where that is much less than the pixels of the component.
+    `own` and `floor` (h, w) are the pixels of the component, and those of none. None where the area
+    is much less than the pixels of the component.
     """
-    left, top, width, height = box.tolist()
-    # The component's box and three pixels around it.
-    first_row, first_column = max(top - 3, 0), max(left - 3, 0)
-    window = np.s_[first_row : top + height + 3, first_column : left + width + 3]
-    red, green, blue = np.moveaxis(gains * image[window], -1, 0)
+    red, green, blue = np.moveaxis(gains * image, -1, 0)
     # O_p of 001, which is linear in how much of a pixel is marker.
     excess = blue - 0.5 * (red + green)
-    labels = labels[window]
-    own, floor = labels == blob + 1, labels == 0
     # The excess of a pixel inside a marker: the mean of the upper half of the component.
     values = np.sort(excess[own])
     upper = float(values[len(values) // 2 :].mean())
+    pixels = np.argwhere(own)
+    (top, left), (bottom, right) = np.maximum(pixels.min(axis=0) - 1, 0), pixels.max(axis=0) + 2
     around = floor.copy()
-    around[
-        max(top - 1 - first_row, 0) : top + height + 1 - first_row,
-        max(left - 1 - first_column, 0) : left + width + 1 - first_column,
-    ] = False
+    around[top:bottom, left:right] = False
     outside = excess[around]
     background = float(outside.mean()) if len(outside) else 0.0
     noise = float(outside.var()) if len(outside) else 0.0
@@ -178,10 +132,8 @@ def _weigh(
     area = float(weights.sum())
     if area < 0.25 * len(values):
         return None
-    middle = np.argwhere(own).mean(axis=0)
-    variances = noise / (contrast * area) ** 2 * ((places - middle) ** 2).sum(axis=0)
-    centroid = weights @ places / area + [first_row, first_column]
-    return area, centroid[::-1], variances[::-1]
+    variances = noise / (contrast * area) ** 2 * ((places - pixels.mean(axis=0)) ** 2).sum(axis=0)
+    return area, (weights @ places / area)[::-1], variances[::-1]
 
 
 def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
@@ -189,34 +141,41 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
 
     White balance from the median of the image (the floor); blueness (B - max(R, G)) over the mean
     of the channels, which neither gradients nor exposure change, and which tells purple and pale
-    blue from blue; a threshold on it, raised where the floor is noisy (median absolute deviation);
-    gates on the blueness at the peak, on aspect and solidity; centroids weighted by how much of
-    each pixel is marker. Sizes are gated where the geometry is known, in
-    `maasi_drivers.vision.marker_detector`.
+    blue from blue; a threshold on it, raised where the floor is noisy (median absolute deviation),
+    and a higher one that each blob has to reach (hysteresis); gates on aspect and solidity;
+    centroids weighted by how much of each pixel is marker. Sizes are gated where the geometry is
+    known, in `maasi_drivers.vision.marker_detector`.
     """
-    # One memory layout: kernels are compiled for the layouts that they meet.
-    image = np.ascontiguousarray(image)
     gains, centre, deviation = _floor_statistics(image)
     threshold = max(settings.saturation, centre + settings.noise_factor * deviation)
-    mask = np.empty(image.shape[:2], dtype=np.uint8)
-    red, green, blue = _planes(image)
-    _robust_mask(red, green, blue, gains.astype(np.float32), threshold, mask)
-    labels, boxes, blobs = _components(mask)
+    planes = zip(gains.astype(np.float32), cv2.split(image))
+    blueness = _blueness(*(gain * plane.astype(np.float32) for gain, plane in planes))
+    labels, boxes, blobs = _components(blueness > threshold)
+    reached = np.unique(labels[blueness >= max(settings.peak_saturation, threshold)])
     found = []
-    peak = max(settings.peak_saturation, threshold)
-    for blob in _compact(image, labels, boxes, gains, peak, settings):
-        if (measured := _weigh(image, labels, boxes[blob], blob, gains)) is not None:
-            found.append((blob, *measured))
+    for blob in (reached[reached > 0] - 1).tolist():
+        left, top, width, height = boxes[blob].tolist()
+        # The component's box and three pixels around it, for the floor.
+        first = np.maximum([left - 3, top - 3], 0)
+        window = np.s_[first[1] : top + height + 3, first[0] : left + width + 3]
+        own, floor = labels[window] == blob + 1, labels[window] == 0
+        if not _is_compact(own, settings):
+            continue
+        if (measured := _weigh(image[window], own, floor, gains)) is not None:
+            area, centroid, variances = measured
+            found.append((blob, area, centroid + first, np.diag(variances)))
     chosen = np.array([item[0] for item in found], dtype=int)
-    covariances = np.zeros((len(found), 2, 2))
-    covariances[:, [0, 1], [0, 1]] = np.reshape([item[3] for item in found], (-1, 2))
     return Blobs(
         np.reshape([item[2] for item in found], (-1, 2)),
         np.array([item[1] for item in found]),
         blobs.extents[chosen],
         blobs.border_cut[chosen],
-        covariances,
+        np.reshape([item[3] for item in found], (-1, 2, 2)),
     )
+
+
+# Corners of a marker in its own plane, in the order of the detector.
+_SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=np.float32)
 
 
 def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blobs:
@@ -227,20 +186,18 @@ def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blob
     """
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     found, ids, _ = _detector(settings.dictionary).detectMarkers(grey)
-    corners = np.array(found, dtype=float).reshape(-1, 4, 2)
+    corners = np.reshape(np.array(found, dtype=np.float32), (-1, 4, 2))
+    middle = np.array([[[0.5, 0.5]]])
+    centres = [
+        cv2.perspectiveTransform(middle, cv2.getPerspectiveTransform(_SQUARE, item))
+        for item in corners
+    ]
     count = len(corners)
     names = [] if ids is None else [f'{settings.dictionary}:{number}' for number in ids.ravel()]
-    following = np.roll(corners, -1, axis=1)
-    products = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
-    one, two = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
-    gap = corners[:, 1] - corners[:, 0]
-    share = (gap[:, 0] * two[:, 1] - gap[:, 1] * two[:, 0]) / (
-        one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
-    )
     return Blobs(
-        corners[:, 0] + share[:, None] * one,
-        0.5 * np.abs(products.sum(axis=1)),
-        np.ptp(corners, axis=1) if count else np.zeros((0, 2)),
+        np.reshape(np.array(centres, dtype=float), (-1, 2)),
+        np.array([cv2.contourArea(item) for item in corners]),
+        np.ptp(corners, axis=1).astype(float),
         np.zeros(count, np.bool_),
         np.zeros((count, 2, 2)),
         tuple(names),
@@ -255,13 +212,7 @@ def _detector(name: str) -> cv2.aruco.ArucoDetector:
     return cv2.aruco.ArucoDetector(dictionary, parameters)
 
 
-RULES: dict[str, Callable[[ImageArray, SegmentationSettings], Blobs]] = {
-    'paper': segment_paper,
-    'robust': segment_robust,
-    'aruco': segment_fiducials,
-}
-
-
 def segment(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     """Find marker blobs in an image (h, w, 3), uint8, by the rule that the settings name."""
-    return RULES[settings.rule](image, settings)
+    rule: Callable[[ImageArray, SegmentationSettings], Blobs] = DETECTORS.load(settings.rule)
+    return rule(image, settings)

@@ -7,7 +7,6 @@ import inspect
 
 import maasi_filter
 import maasi_planner
-from maasi_drivers.vision.marker_detector import warm_up as warm_up_drivers
 from maasi_planner.settings import PLANNERS
 from maasi_sim.run.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario
@@ -51,7 +50,6 @@ def prepare_nodes() -> None:
     """
     maasi_filter.warm_up()
     maasi_planner.warm_up()
-    warm_up_drivers()
     _play_robots()
     for package in _MESSAGES:
         importlib.import_module(f'{package}.msg')
