@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.sensor_input import RangingMount
 from maasi_drivers.settings.driver import RangingSettings
-from maasi_drivers.vision.camera_model import rotation_from_rpy
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
 
@@ -31,7 +31,7 @@ def mount(dimension=3):
 
 def sweep_of(targets):
     """Return slant ranges and angles as the sensor gives them: an independent way round."""
-    turn = POSE.rotation() @ rotation_from_rpy(*MOUNT['rpy'])
+    turn = POSE.rotation() @ Rotation.from_euler('xyz', MOUNT['rpy']).as_matrix()
     seen = (targets - POSE.position - POSE.rotation() @ np.array(MOUNT['position'])) @ turn
     ranges = np.linalg.norm(seen, axis=1)
     angles = np.arctan2(seen[:, 1], seen[:, 0]), np.arcsin(seen[:, 2] / ranges)
@@ -58,7 +58,9 @@ def test_covariances_are_those_of_many_sweeps(dimension, attitude):
         values = []
         for _ in range(1000):
             # The sensor is turned a little more than its pose says.
-            error = rotation_from_rpy(*attitude * AXES * generator.normal(size=3))
+            error = Rotation.from_euler(
+                'xyz', attitude * AXES * generator.normal(size=3)
+            ).as_matrix()
             turned = POSE.position + (TARGETS[[index]] - POSE.position) @ error
             noisy = sweep_of(turned) + generator.normal(size=(20, 3)) * sigma
             values.append(mounted.measurements(noisy, stamped())[0])

@@ -21,18 +21,6 @@ _UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-13)
 _MISSED = 1e-6
 
 
-def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> FloatArray:
-    """Return the (3, 3) rotation Rz(yaw) Ry(pitch) Rx(roll); angles about fixed axes [rad]."""
-    cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
-
-
 @dataclass(frozen=True)
 class Camera:
     """A calibrated camera mounted on a robot.
@@ -58,6 +46,7 @@ class Camera:
             (settings.height - 1) / 2.0,
         )
         fx, fy = settings.focal_length
+        mount = Pose.from_rpy(settings.mount.position, settings.mount.rpy)
         distortion = np.zeros(5)
         distortion[: len(settings.distortion)] = settings.distortion
         k1, k2, _, _, k3 = distortion
@@ -69,8 +58,8 @@ class Camera:
             height=settings.height,
             matrix=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
             distortion=distortion,
-            position=np.array(settings.mount.position, dtype=np.float64),
-            rotation=rotation_from_rpy(*settings.mount.rpy) @ _OPTICAL_TO_BODY,
+            position=mount.position,
+            rotation=mount.rotation() @ _OPTICAL_TO_BODY,
             largest_radius=float(np.sqrt(ends.min(initial=np.inf))),
         )
 
@@ -109,10 +98,6 @@ class Camera:
         In normalised coordinates; not a number where the distortion has no inverse.
         """
         given = np.reshape(np.asarray(pixels, float), (-1, 2))
-        focal = self.matrix[[0, 1], [0, 1]]
-        if not self.distortion.any():
-            points = (given - self.matrix[:2, 2]) / focal
-            return points, np.tile(np.diag(1.0 / focal), (len(given), 1, 1))
         points = np.empty((0, 2))
         if len(given):
             rays = cv2.undistortPointsIter(
@@ -167,12 +152,9 @@ class Camera:
 
         Negative outside, minus infinity where the camera cannot see at all.
         """
-        pixels = self.project(positions, pose)
+        pixels, last = self.project(positions, pose), np.array([self.width, self.height]) - 1.0
         # The image reaches half a pixel beyond the outermost pixel centres.
-        margins = np.minimum(
-            np.minimum(pixels[:, 0] + 0.5, self.width - 0.5 - pixels[:, 0]),
-            np.minimum(pixels[:, 1] + 0.5, self.height - 0.5 - pixels[:, 1]),
-        )
+        margins = np.minimum(pixels, last - pixels).min(axis=1) + 0.5
         return np.where(np.isnan(margins), -np.inf, margins)
 
 
@@ -186,7 +168,6 @@ def box_view_margin(
     """
     (left, bottom), (right, top) = (np.asarray(corner, float)[:2] for corner in (lower, upper))
     corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
-    along = np.linspace(0.0, 1.0, 33)[:, None]
-    sides = zip(corners, np.roll(corners, -1, axis=0))
-    rim = np.pad(np.concatenate([a + along * (b - a) for a, b in sides]), ((0, 0), (0, 1)))
+    sides = np.linspace(corners, np.roll(corners, -1, axis=0), 33)
+    rim = np.pad(sides.reshape(-1, 2), ((0, 0), (0, 1)))
     return float(camera.margin(rim, Pose.from_yaw([0.0, 0.0, robot_height], 0.0)).min())

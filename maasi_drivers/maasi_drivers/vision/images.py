@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from array import array
+from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -128,8 +129,8 @@ class VideoSource:
         self.error = ''
         #: Whether a file has come to its end.
         self.ended = False
-        self._frame: VideoFrame | None = None
-        self._taken = 0
+        # The newest one, until it is taken.
+        self._frames: deque[VideoFrame] = deque(maxlen=1)
         self._count = 0
         self._closing = threading.Event()
         self._first = None if self.live else self._open()
@@ -138,11 +139,7 @@ class VideoSource:
 
     def take(self) -> VideoFrame | None:
         """Return the newest frame, or None if it was returned before."""
-        frame = self._frame
-        if frame is None or frame.number == self._taken:
-            return None
-        self._taken = frame.number
-        return frame
+        return self._frames.popleft() if self._frames else None
 
     def close(self) -> None:
         """Close the source."""
@@ -196,4 +193,4 @@ class VideoSource:
             self._count += 1
             self.error = ''
             turned = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            self._frame = VideoFrame(turned, time.monotonic(), self._count)
+            self._frames.append(VideoFrame(turned, time.monotonic(), self._count))
