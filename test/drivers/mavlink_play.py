@@ -4,7 +4,7 @@ import numpy as np
 
 from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.protocol import mavlink
-from maasi_drivers.links.mavlink.vehicle import Phase, Vehicle
+from maasi_drivers.links.mavlink.vehicle import Vehicle, VehiclePhase
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.simulation.emulators.mavlink.fake_autopilot import FakeAutopilot
@@ -82,7 +82,7 @@ class Play:
             mavlink.MAVLink(wire, *self.station).heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4)
             for message in wire.take():
                 self.autopilot.handle(message, link=1)
-        if self._permitted and self.phase is not Phase.CONNECTING:
+        if self._permitted and self.phase is not VehiclePhase.CONNECTING:
             self._permitted = False
             self.permit()
         self.autopilot.advance(PERIOD)
@@ -117,7 +117,7 @@ class Play:
 
     def lead(self):
         """Set the set-point a short way ahead, as the driver does."""
-        if self.phase is Phase.FLYING:
+        if self.phase is VehiclePhase.FLYING:
             ahead = self.vehicle.estimate.telemetry.position + np.array([0.4, 0.0, 0.0])
             self.vehicle.set_target(ahead, 0.3)
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from maasi_drivers.links.mambo.link import PositionEvent
-from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
+from maasi_drivers.links.mambo.pilot import MamboPhase, MamboPilot
 from maasi_drivers.measure_mambo import MeasuringFlight, fit_speed
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
@@ -84,7 +84,7 @@ class Flight:
                     self.heard_at = self.time
                     self._send_position()
             self.pilot.update(self.time)
-            if self.goal is not None and self.pilot.phase is Phase.FLYING:
+            if self.goal is not None and self.pilot.phase is MamboPhase.FLYING:
                 self.pilot.fly(self.motion.command(self.pilot.ahead(), self.goal))
 
     def _send_position(self):
@@ -111,7 +111,7 @@ class Flight:
 
     def up(self):
         """Return itself, in the air."""
-        self.until(lambda: self.pilot.phase is Phase.FLYING)
+        self.until(lambda: self.pilot.phase is MamboPhase.FLYING)
         return self
 
     def flown(self):

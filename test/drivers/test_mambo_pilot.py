@@ -9,7 +9,7 @@ from simulated_mambo import FENCE, HOME, STEP, TILT, Flight, full_speed, measure
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.links.mambo.link import PositionEvent
-from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
+from maasi_drivers.links.mambo.pilot import MamboPhase, MamboPilot
 from maasi_drivers.links.mambo.reckoning import Course, DeadReckoning, TiltModel
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
@@ -84,7 +84,7 @@ def test_a_velocity_that_cannot_be_stopped_before_the_geofence_is_not_flown(end,
         along = speed * np.array([math.cos(HOME.yaw), -math.sin(HOME.yaw), 0.0, 0.0])
         flight.pilot.fly(along)
         assert flight.where[0] < end + 0.02
-    assert flight.where[0] > end - 0.2 and flight.pilot.phase is Phase.FLYING
+    assert flight.where[0] > end - 0.2 and flight.pilot.phase is MamboPhase.FLYING
 
 
 @pytest.mark.parametrize('pose', ['events', 'pose'])
@@ -105,7 +105,7 @@ def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
     flight.goal = np.array([1.5, 0.3, 1.0])
     while flight.time < 30.0:
         step()
-    assert flight.pilot.phase is Phase.FLYING
+    assert flight.pilot.phase is MamboPhase.FLYING
     assert max(step() for _ in range(100)) < 0.03
     # Without a pose it hovers.
     flight.sent, began = 'none', flight.time
@@ -137,7 +137,7 @@ def test_what_keeps_it_on_the_ground(changes, text):
     flight.firmware.take_off()
     flight.goal = HOME.position + np.array([0.9, -0.6, 0.0])
     flight.step(200)
-    assert flight.pilot.phase is Phase.GROUND and flight.speed < 1e-6
+    assert flight.pilot.phase is MamboPhase.GROUND and flight.speed < 1e-6
 
 
 def test_each_call_of_the_service_is_for_one_take_off():
@@ -152,7 +152,7 @@ def test_each_call_of_the_service_is_for_one_take_off():
     flight.up()
     assert flight.pilot.permit(flight.time) == 'it is in the air already'
     # A driver before this one left it in the air.
-    flight.pilot.phase = Phase.GROUND
+    flight.pilot.phase = MamboPhase.GROUND
     flight.step(20)
     assert flight.pilot.problem == f'in the air, not by this driver, {UNTIL_ARM}'
     assert flight.pilot.permit(flight.time) == ''
@@ -177,7 +177,7 @@ def test_what_is_lost_stops_it_then_lands_it(fault, reason):
     assert flight.pilot.problem.startswith('link lost')
     flight.cut_down = False
     flight.until(lambda: not flight.pilot.problem)
-    assert flight.pilot.phase is Phase.FLYING
+    assert flight.pilot.phase is MamboPhase.FLYING
     flight.goal = HOME.position
     flight.step(40)
     assert flight.speed > 0.2
@@ -240,7 +240,7 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     flight.step(20)
     flight.pilot.goal_taken()
     flight.step(200)
-    assert flight.pilot.phase is Phase.FLYING
+    assert flight.pilot.phase is MamboPhase.FLYING
     flight.flown().goal = None
     flight.pilot.goal_cancelled(flight.time)
     hovers = flight.until_it_is(FlyingState.HOVERING)
@@ -261,7 +261,7 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     assert flight.firmware.take_offs == 2
 
 
-@pytest.mark.parametrize('phase', [Phase.TAKING_OFF, Phase.CLIMBING])
+@pytest.mark.parametrize('phase', [MamboPhase.TAKING_OFF, MamboPhase.CLIMBING])
 def test_a_stop_ends_a_take_off(phase):
     flight = Flight()
     flight.until(lambda: flight.pilot.phase is phase)
@@ -277,7 +277,7 @@ def test_a_permission_ends_with_the_link():
     flight = Flight(pose='pose')
     # No pose yet: it stands.
     flight.step(20)
-    assert flight.pilot.phase is Phase.GROUND
+    assert flight.pilot.phase is MamboPhase.GROUND
     flight.cut_down = True
     flight.step(60)
     flight.cut_down = False
@@ -286,7 +286,7 @@ def test_a_permission_ends_with_the_link():
     for _ in range(100):
         flight.pilot.take_pose(flight.time, state)
         flight.step()
-    assert flight.pilot.phase is Phase.GROUND and UNTIL_ARM in flight.pilot.problem
+    assert flight.pilot.phase is MamboPhase.GROUND and UNTIL_ARM in flight.pilot.problem
     assert flight.firmware.take_offs == 0
     # Nor is there one while it is not heard.
     flight.cut_down = True

@@ -20,7 +20,7 @@ from maasi_drivers.links.mavlink.estimate import (
 from maasi_drivers.links.mavlink.firmware import identify
 from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.protocol import ReportLog
-from maasi_drivers.links.mavlink.vehicle import Phase
+from maasi_drivers.links.mavlink.vehicle import VehiclePhase
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose
 
@@ -102,7 +102,7 @@ def test_nothing_is_armed(firmware, changes, parameters, text):
     play = Play(firmware, {'parameters': parameters or {}}, **changes)
     play.vehicle.active = parameters is not None
     play.run(10.0)
-    assert play.phase is Phase.WAITING
+    assert play.phase is VehiclePhase.WAITING
     assert f'vehicle: not armed: {text}' in play.fault
     assert not play.commands(ARM) and not play.commands(MODE) and not play.sent(SETPOINT)
     for name, value in (parameters or {}).items():
@@ -122,7 +122,7 @@ def test_nothing_is_armed(firmware, changes, parameters, text):
 def test_a_permission_that_is_not_used_or_stopped_ends(stopped):
     play = Play(autopilot={'charge': 0.01}, arm_timeout=10.0)
     play.run(8.0)
-    assert play.phase is Phase.ARMING and 'PreArm: Battery below minimum' in play.fault
+    assert play.phase is VehiclePhase.ARMING and 'PreArm: Battery below minimum' in play.fault
     assert 'MAV_CMD_COMPONENT_ARM_DISARM: FAILED' in play.said
     if stopped:
         play.vehicle.forbid()
@@ -192,14 +192,14 @@ def test_a_vehicle_that_does_not_rise_lands_and_says_why():
     assert not play.autopilot.armed
 
 
-@pytest.mark.parametrize('phase', [Phase.ARMING, Phase.RISING])
+@pytest.mark.parametrize('phase', [VehiclePhase.ARMING, VehiclePhase.RISING])
 def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on(phase):
-    play = Play(autopilot={'charge': 0.01 if phase is Phase.ARMING else 1.0})
+    play = Play(autopilot={'charge': 0.01 if phase is VehiclePhase.ARMING else 1.0})
     play.until(lambda: play.phase is phase)
     play.autopilot.take_mode('LOITER')
     play.run(3.0)
-    assert play.phase is Phase.RELEASED and play.mode == 'LOITER'
-    if phase is Phase.RISING:
+    assert play.phase is VehiclePhase.RELEASED and play.mode == 'LOITER'
+    if phase is VehiclePhase.RISING:
         return
     play.autopilot.charge = 1.0
     play.autopilot.take_mode('GUIDED')
@@ -277,10 +277,10 @@ def test_an_autopilot_that_restarts_in_the_air_is_left_alone():
 def test_a_disarmed_vehicle_is_not_armed_by_a_request_without_an_answer():
     play = Play()
     play.autopilot._sender.command_ack_send = lambda *_: None
-    play.until(lambda: play.phase is Phase.RISING)
+    play.until(lambda: play.phase is VehiclePhase.RISING)
     play.autopilot.disarm('Disarming motors')
     play.run(8.0)
-    assert play.phase is Phase.STOPPED and not play.autopilot.armed
+    assert play.phase is VehiclePhase.STOPPED and not play.autopilot.armed
 
 
 @firmwares
@@ -348,7 +348,7 @@ def test_a_restarted_driver_has_the_map_and_the_heights_of_before(tmp_path, orig
     assert before[2] < -0.2
     if landed:
         play.vehicle.finish('land')
-        play.until(lambda: play.phase is Phase.STOPPED)
+        play.until(lambda: play.phase is VehiclePhase.STOPPED)
     play.start_driver()
     play.run(6.0)
     assert_allclose(play.vehicle.estimate.origin, before, atol=1e-6)
@@ -397,7 +397,7 @@ def test_a_stop_ends_a_take_off(firmware, share):
     play = Play(firmware)
     height = abs(play.height)
     play.until(lambda: abs(play.body.position[2]) > share * height)
-    assert play.phase is Phase.RISING
+    assert play.phase is VehiclePhase.RISING
     play.vehicle.stop()
     places = []
     play.run(20.0, lambda: places.append(abs(play.body.position[2])))
@@ -557,7 +557,7 @@ def test_a_pilot_who_takes_the_mode_while_it_is_told_to_land_has_it(firmware, an
     asked = len(play.commands(MODE))
     play.autopilot.take_mode(PILOT[firmware])
     play.run(3.0)
-    assert play.phase is Phase.RELEASED and play.mode == PILOT[firmware]
+    assert play.phase is VehiclePhase.RELEASED and play.mode == PILOT[firmware]
     assert len(play.commands(MODE)) == asked
 
 

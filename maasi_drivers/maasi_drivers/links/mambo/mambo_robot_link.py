@@ -16,7 +16,7 @@ from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.robot_topics import OdometryTopic, PoseTopic
 from maasi_drivers.agent.waypoint_follower import Goal
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
-from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
+from maasi_drivers.links.mambo.pilot import MamboPhase, MamboPilot
 from maasi_drivers.settings.vehicles import LEAST_TILT, MOST_TILT, MamboSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
@@ -29,7 +29,7 @@ POLL_PERIOD = 0.05
 _LANDING_TIME, _LANDING_PERIOD = 1.0, 0.02
 # Share of a new difference of positions in the velocity.
 _SMOOTHING = 0.5
-_RISING = (Phase.TAKING_OFF, Phase.CLIMBING)
+_RISING = (MamboPhase.TAKING_OFF, MamboPhase.CLIMBING)
 
 
 class MamboRobotLink(RobotLink):
@@ -51,7 +51,7 @@ class MamboRobotLink(RobotLink):
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
         self._mambo = driver.settings.mambo or MamboSettings()
-        self._phase = Phase.CONNECTING
+        self._phase = MamboPhase.CONNECTING
         self._speed = PoseSpeed()
 
     def prepare(self) -> None:
@@ -84,7 +84,7 @@ class MamboRobotLink(RobotLink):
             OdometryTopic(driver)
         elif self._mambo.pose == 'pose':
             PoseTopic(driver, self._take_pose)
-        driver.expect(lambda: self._pilot.phase is Phase.FLYING)
+        driver.expect(lambda: self._pilot.phase is MamboPhase.FLYING)
 
     def close(self) -> None:
         """Leave the drone to its firmware."""
@@ -92,7 +92,7 @@ class MamboRobotLink(RobotLink):
 
     def activate(self) -> None:
         """Begin a flight."""
-        self._phase = Phase.CONNECTING
+        self._phase = MamboPhase.CONNECTING
         self._pilot = MamboPilot(
             self._link, self._motion, self._mambo, self.driver.start_pose, self.fence
         )
@@ -206,13 +206,13 @@ class MamboRobotLink(RobotLink):
     def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
         """Return the command for the state at which it takes effect, and the goal reached."""
         pilot = self._pilot
-        if pilot.phase is Phase.FLYING and pilot.has_pose:
+        if pilot.phase is MamboPhase.FLYING and pilot.has_pose:
             robot = pilot.ahead()
         return super().steer(robot, step)
 
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
         """Return whether pose and images must change: a command on the ground moves nothing."""
-        return self._pilot.phase is Phase.FLYING and super().is_moving(placed, command)
+        return self._pilot.phase is MamboPhase.FLYING and super().is_moving(placed, command)
 
     def goal_taken(self, goal: Goal) -> None:
         """Keep the drone in the air."""

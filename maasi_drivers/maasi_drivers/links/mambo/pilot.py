@@ -35,7 +35,7 @@ _STILL = np.zeros(4)
 NOT_ALLOWED = 'on the ground: it may not take off (parameter mambo.arm)'
 
 
-class Phase(Enum):
+class MamboPhase(Enum):
     """Of a flight."""
 
     CONNECTING = 'connecting'
@@ -66,7 +66,7 @@ class MamboPilot:
         self.settings = settings
         self.home = home
         self.fence = fence
-        self.phase = Phase.CONNECTING
+        self.phase = MamboPhase.CONNECTING
         self.problem = 'connecting to the Mambo'
         speed = settings.full_speed or _UNKNOWN_SPEED
         model = TiltModel(link.tilt, speed, link.climb, settings.full_turn)
@@ -94,7 +94,7 @@ class MamboPilot:
     @property
     def flying(self) -> bool:
         """Whether it follows commands."""
-        return self.phase in (Phase.CLIMBING, Phase.FLYING)
+        return self.phase in (MamboPhase.CLIMBING, MamboPhase.FLYING)
 
     @property
     def state(self) -> RobotState | None:
@@ -133,7 +133,7 @@ class MamboPilot:
         if not np.isfinite(command).all():
             self.hover()
             raise ValueError(f'command: got {command.tolist()}, allowed are finite numbers')
-        if self.phase is Phase.FLYING and self.has_pose:
+        if self.phase is MamboPhase.FLYING and self.has_pose:
             self._steer(command)
 
     def hover(self) -> None:
@@ -184,11 +184,11 @@ class MamboPilot:
         return problem
 
     def _objection(self, now: float) -> str:
-        if self.phase is Phase.LANDING:
+        if self.phase is MamboPhase.LANDING:
             return 'it lands'
-        if self.phase not in (Phase.CONNECTING, Phase.GROUND):
+        if self.phase not in (MamboPhase.CONNECTING, MamboPhase.GROUND):
             return 'it is in the air already'
-        unheard = self.problem if self.phase is Phase.CONNECTING else ''
+        unheard = self.problem if self.phase is MamboPhase.CONNECTING else ''
         silent = self._missing(now) if self._is_silent(now) else ''
         return self.link.error or self._unfit() or self._low_battery() or unheard or silent
 
@@ -209,14 +209,14 @@ class MamboPilot:
 
     def goal_cancelled(self, now: float) -> None:
         """Note that its goal was cancelled: it hovers, and lands if no other follows."""
-        if self.phase in (Phase.CONNECTING, Phase.GROUND):
+        if self.phase in (MamboPhase.CONNECTING, MamboPhase.GROUND):
             self._permission.end()
         self.hover()
         self._cancelled_at = now
 
     def stop(self, now: float) -> None:
         """Give up a take-off, and land; in flight as after a cancelled goal."""
-        if self.phase in (Phase.TAKING_OFF, Phase.CLIMBING):
+        if self.phase in (MamboPhase.TAKING_OFF, MamboPhase.CLIMBING):
             self.end('its take-off was stopped')
         else:
             self.goal_cancelled(now)
@@ -224,12 +224,12 @@ class MamboPilot:
     def end(self, reason: str) -> str:
         """Land, and do not take off again; return the reason."""
         self._ended = self._ended or reason
-        if self.phase not in (Phase.CONNECTING, Phase.GROUND):
+        if self.phase not in (MamboPhase.CONNECTING, MamboPhase.GROUND):
             self._land()
         return reason
 
     def _land(self) -> None:
-        self.phase = Phase.LANDING
+        self.phase = MamboPhase.LANDING
         self._command = _STILL
         self.reckoning.command(self._now, _STILL)
         self.link.land()
@@ -250,10 +250,10 @@ class MamboPilot:
     def _advance(self, now: float) -> str:
         """Do what the phase needs; return why it takes no goals, or nothing."""
         link = self.link
-        if self.phase is Phase.CONNECTING:
+        if self.phase is MamboPhase.CONNECTING:
             if not link.connected:
                 return link.error or 'connecting to the Mambo'
-            self.phase = Phase.GROUND
+            self.phase = MamboPhase.GROUND
         if link.error:
             self._ended = link.error
             return self._ended
@@ -263,12 +263,12 @@ class MamboPilot:
             self._lost_since = None
         elif self._lost_since is None:
             self._lost_since = now
-        if self.phase is Phase.GROUND:
+        if self.phase is MamboPhase.GROUND:
             return self._stand(now)
-        if self.phase is Phase.LANDING:
+        if self.phase is MamboPhase.LANDING:
             if link.flying_state != 'landed':
                 return f'landing: {self._ended or "its goal was cancelled"}'
-            self.phase = Phase.GROUND
+            self.phase = MamboPhase.GROUND
             self._ended = f'landed: {self._ended}' if self._ended else ''
             return f'{self._ended or "landed: its goal was cancelled"}, {UNTIL_ARM}'
         if link.flying_state == 'emergency':
@@ -303,9 +303,9 @@ class MamboPilot:
                 return f'on the ground: {self._missing(now) or "no position yet"}'
             self.link.take_off()
         # In the air it was brought by an earlier driver.
-        return self._begin(Phase.TAKING_OFF, now)
+        return self._begin(MamboPhase.TAKING_OFF, now)
 
-    def _begin(self, phase: Phase, now: float) -> str:
+    def _begin(self, phase: MamboPhase, now: float) -> str:
         self._permission.end()
         self.phase, self._since = phase, now
         return phase.value
@@ -321,27 +321,27 @@ class MamboPilot:
             return self.end(text) if too_long else text
         flying_state, timeout = self.link.flying_state, self.settings.take_off_timeout
         late = now - self._since > timeout
-        if self.phase is Phase.TAKING_OFF:
+        if self.phase is MamboPhase.TAKING_OFF:
             if flying_state in ('hovering', 'flying'):
-                self._begin(Phase.CLIMBING, now)
+                self._begin(MamboPhase.CLIMBING, now)
             elif late:
                 return self.end(f'it did not take off in {timeout:g} s: {flying_state}')
-            return Phase.TAKING_OFF.value
+            return MamboPhase.TAKING_OFF.value
         if flying_state in ('landed', 'landing'):
             return self.end(f'the Mambo is {flying_state} by itself')
         if outside := outside_fence(self.fence, self.reckoning.course.position):
             return self.end(outside)
-        if self.phase is Phase.CLIMBING:
+        if self.phase is MamboPhase.CLIMBING:
             offset = self.reckoning.course.position[2] - self.home.position[2]
             if abs(offset) <= ALTITUDE_TOLERANCE:
-                self._begin(Phase.FLYING, now)
+                self._begin(MamboPhase.FLYING, now)
                 return ''
             if late:
                 return self.end(f'it did not come to its altitude in {timeout:g} s')
             ahead = self.ahead()
             above = np.array([*ahead.pose.position[:2], self.home.position[2]])
             self._steer(self.motion.command(ahead, above))
-            return f'{Phase.CLIMBING.value}, {offset:+.2f} m from its altitude'
+            return f'{MamboPhase.CLIMBING.value}, {offset:+.2f} m from its altitude'
         cancelled = self._cancelled_at
         if cancelled is not None and now - cancelled >= self.settings.cancel_landing:
             self._cancelled_at = None

@@ -20,7 +20,7 @@ from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 from maasi_filter.arrays import FloatArray
 
 
-class Phase(Enum):
+class VehiclePhase(Enum):
     """How far the driver is with a vehicle; the value says why it does not continue from there."""
 
     CONNECTING = 'nothing heard yet'
@@ -37,7 +37,13 @@ class Phase(Enum):
 
 
 #: Phases in which the driver commands the vehicle.
-COMMANDED = (Phase.STARTING, Phase.ARMING, Phase.RISING, Phase.FLYING, Phase.ENDING)
+COMMANDED = (
+    VehiclePhase.STARTING,
+    VehiclePhase.ARMING,
+    VehiclePhase.RISING,
+    VehiclePhase.FLYING,
+    VehiclePhase.ENDING,
+)
 
 
 _MODE, _TAKE_OFF = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_NAV_TAKEOFF
@@ -50,7 +56,12 @@ _STREAM_AHEAD = 1.2
 # The height is reached within this; a smaller change is no progress [m].
 _REACHED, _PROGRESS = 0.2, 0.1
 # Phases in which the service `arm` is refused with the fault.
-_UNABLE = (Phase.CONNECTING, Phase.RELEASED, Phase.ENDING, Phase.REFUSED)
+_UNABLE = (
+    VehiclePhase.CONNECTING,
+    VehiclePhase.RELEASED,
+    VehiclePhase.ENDING,
+    VehiclePhase.REFUSED,
+)
 
 
 class Vehicle:
@@ -66,7 +77,7 @@ class Vehicle:
         self.settings = settings
         # Over its origin; a copter's is on the ground [m].
         self.height = start[2] - settings.ground
-        self.phase = Phase.CONNECTING
+        self.phase = VehiclePhase.CONNECTING
         self.active = False
         self.log = ReportLog()
         self._place = FlightOrigin(settings, start, memory, self.log)
@@ -92,7 +103,7 @@ class Vehicle:
     @property
     def flying(self) -> bool:
         """Whether it follows set-points, with a link that works."""
-        return self.phase is Phase.FLYING and not self._autopilot.lost
+        return self.phase is VehiclePhase.FLYING and not self._autopilot.lost
 
     @property
     def in_air(self) -> bool:
@@ -111,7 +122,7 @@ class Vehicle:
         """Whether nothing is left to command when the driver ends."""
         if self.phase not in COMMANDED or not self._autopilot.armed:
             return True
-        return self.phase is Phase.ENDING and _MODE in self._autopilot.accepted
+        return self.phase is VehiclePhase.ENDING and _MODE in self._autopilot.accepted
 
     @property
     def fault(self) -> str:
@@ -120,7 +131,7 @@ class Vehicle:
             return f'link: nothing heard from system {self.settings.system}'
         if self._place.problem:
             return f'vehicle: {self._place.problem}'
-        flying = self.phase is Phase.FLYING
+        flying = self.phase is VehiclePhase.FLYING
         problem = self.estimate.problem(self._fix_needed) if flying else ''
         what = problem or ': '.join(part for part in (self.phase.value, self._detail) if part)
         return f'vehicle: {what}' if what else ''
@@ -152,33 +163,33 @@ class Vehicle:
             raise ValueError(
                 f'setpoint: got {target.tolist()}, {yaw}, allowed are finite numbers [m, rad]'
             )
-        if self.phase is Phase.FLYING:
+        if self.phase is VehiclePhase.FLYING:
             self._target, self._yaw = target, float(yaw)
 
     def permit(self, now: float) -> str:
         """Let it take off once, or be taken over where it flies; return why not, or nothing."""
         problem = self._permission.ask(now, self._objection(now))
-        if not problem and self.phase is Phase.STOPPED:
-            self._enter(Phase.PREPARING)
+        if not problem and self.phase is VehiclePhase.STOPPED:
+            self._enter(VehiclePhase.PREPARING)
         return problem
 
     def forbid(self) -> None:
         """End the permission: arming is given up, a flight continues."""
         self._permission.end()
-        if self.phase in (Phase.STARTING, Phase.ARMING):
+        if self.phase in (VehiclePhase.STARTING, VehiclePhase.ARMING):
             self._autopilot.commands.clear()
-            self._enter(Phase.WAITING)
+            self._enter(VehiclePhase.WAITING)
 
     def stop(self) -> None:
         """End the permission; a take-off is given up, and it lands; a flight continues."""
-        if self.phase is Phase.RISING:
+        if self.phase is VehiclePhase.RISING:
             self.finish('land', 'its take-off was stopped')
         self.forbid()
 
     def _objection(self, now: float) -> str:
         """Return why it must not be armed, or taken over."""
         autopilot = self._autopilot
-        if self.phase in (Phase.RISING, Phase.FLYING):
+        if self.phase in (VehiclePhase.RISING, VehiclePhase.FLYING):
             return 'it is in the air already'
         if self._displaced:
             return 'the autopilot has restarted: start the driver again'
@@ -188,7 +199,7 @@ class Vehicle:
             return f'it is flown in {autopilot.firmware.mode_name(autopilot.mode)}'
         if not (self.settings.arm or autopilot.armed):
             return 'mavlink.arm is false'
-        if self.phase is Phase.WAITING and autopilot.failsafes is not None:
+        if self.phase is VehiclePhase.WAITING and autopilot.failsafes is not None:
             return autopilot.failsafes.problem(now)
         return ''
 
@@ -198,14 +209,14 @@ class Vehicle:
         A vehicle that others fly is left alone; on the ground it is not armed any more.
         """
         self._permission.end()
-        if self.phase is Phase.ENDING and self._ending == ending:
+        if self.phase is VehiclePhase.ENDING and self._ending == ending:
             return
         if self._autopilot.armed and self.phase in COMMANDED:
             self._ending = ending
             self._reason = f', {reason}' if reason else ''
             self._autopilot.commands.clear()
             what = 'it lands' if ending == 'land' else 'it holds its position'
-            self._enter(Phase.ENDING, what + self._reason)
+            self._enter(VehiclePhase.ENDING, what + self._reason)
         self.forbid()
 
     # ---- what comes in -----------------------------------------------------------------------
@@ -215,14 +226,14 @@ class Vehicle:
         before = self._autopilot.handle(message, now)
         if before is not None:
             self._judge_mode(*before, now)
-        elif self._autopilot.refusal and self.phase is not Phase.REFUSED:
-            self._enter(Phase.REFUSED, self._autopilot.refusal)
+        elif self._autopilot.refusal and self.phase is not VehiclePhase.REFUSED:
+            self._enter(VehiclePhase.REFUSED, self._autopilot.refusal)
 
     def _judge_mode(self, was_armed: bool, before: int, now: float) -> None:
         """Give the vehicle up where the pilot, a failsafe or a disarming has taken it."""
         firmware, mode, armed = self._firmware, self._autopilot.mode, self._autopilot.armed
-        if self.phase is Phase.CONNECTING:
-            self._enter(Phase.PREPARING)
+        if self.phase is VehiclePhase.CONNECTING:
+            self._enter(VehiclePhase.PREPARING)
         elif was_armed and not armed:
             self._on_disarmed(now)
         elif mode not in self._own_modes(before):
@@ -232,44 +243,44 @@ class Vehicle:
             self._autopilot.commands.clear()
             self._permission.end()
             self._target = None
-            self._enter(Phase.RELEASED, f'mode {name}')
-        elif self.phase is Phase.ENDING:
+            self._enter(VehiclePhase.RELEASED, f'mode {name}')
+        elif self.phase is VehiclePhase.ENDING:
             self._autopilot.accepted.discard(_MODE)
             if mode == self._ending_mode:
                 self._autopilot.accepted.add(_MODE)
                 self._autopilot.commands.clear()
-        elif self.phase is Phase.RELEASED:
+        elif self.phase is VehiclePhase.RELEASED:
             name = firmware.mode_name(mode)
             if mode == firmware.external and armed and not firmware.px4:
                 self.log.add(WARNING, f'the pilot gives {name} back')
                 self._begin_flying()
             elif mode == firmware.external and not armed:
                 self.log.add(INFO, f'{name} is back: {UNTIL_ARM}')
-                self._enter(Phase.PREPARING)
+                self._enter(VehiclePhase.PREPARING)
             elif mode != before:
                 self._detail = f'mode {name}'
 
     def _own_modes(self, before: int) -> set[int]:
         """Return the allowed modes: any other one is the pilot's or a failsafe's."""
         external = self._firmware.external
-        if self.phase in (Phase.ARMING, Phase.RISING, Phase.FLYING):
+        if self.phase in (VehiclePhase.ARMING, VehiclePhase.RISING, VehiclePhase.FLYING):
             return {external}
-        if self.phase is Phase.STARTING:
+        if self.phase is VehiclePhase.STARTING:
             return {before, external}
-        if self.phase is Phase.ENDING:
+        if self.phase is VehiclePhase.ENDING:
             return {before, external, self._ending_mode}
         return {self._autopilot.mode}
 
     def _on_disarmed(self, now: float) -> None:
         self._autopilot.commands.clear()
         self._permission.end()
-        if self.phase is Phase.ENDING:
-            self._enter(Phase.STOPPED, f'it has landed{self._reason}, {UNTIL_ARM}')
-        elif self.phase not in (Phase.PREPARING, Phase.WAITING):
+        if self.phase is VehiclePhase.ENDING:
+            self._enter(VehiclePhase.STOPPED, f'it has landed{self._reason}, {UNTIL_ARM}')
+        elif self.phase not in (VehiclePhase.PREPARING, VehiclePhase.WAITING):
             text = self.log.recent_text(now, 2)
             why = f'by the autopilot or the pilot{f" ({text})" if text else ""}'
             self.log.add(WARNING, f'it has been disarmed {why}')
-            self._enter(Phase.STOPPED, f'{why}, {UNTIL_ARM}')
+            self._enter(VehiclePhase.STOPPED, f'{why}, {UNTIL_ARM}')
 
     def _on_restart(self) -> None:
         """Begin anew with an autopilot that was restarted: its local frame is another one."""
@@ -279,12 +290,12 @@ class Vehicle:
         # It has reset the rates of its messages.
         self._autopilot.requested_at = -math.inf
         self._permission.end()
-        if self.phase in (Phase.CONNECTING, Phase.PREPARING, Phase.WAITING):
+        if self.phase in (VehiclePhase.CONNECTING, VehiclePhase.PREPARING, VehiclePhase.WAITING):
             self._autopilot.read_failsafes()
-            self._enter(Phase.PREPARING)
+            self._enter(VehiclePhase.PREPARING)
         else:
             self._displaced = True
-            self._enter(Phase.STOPPED, f'{text}: start the driver again')
+            self._enter(VehiclePhase.STOPPED, f'{text}: start the driver again')
 
     # ---- the phases --------------------------------------------------------------------------
 
@@ -297,7 +308,7 @@ class Vehicle:
         if autopilot.check_link(now):
             if autopilot.lost:
                 self.forbid()
-            elif self.phase is Phase.FLYING:
+            elif self.phase is VehiclePhase.FLYING:
                 self._begin_flying()
         autopilot.request_data(now)
         self._continue(now)
@@ -307,11 +318,11 @@ class Vehicle:
 
     @property
     def _streams_setpoints(self) -> bool:
-        if self.phase is Phase.FLYING:
+        if self.phase is VehiclePhase.FLYING:
             return True
-        if self.phase is Phase.RISING:
+        if self.phase is VehiclePhase.RISING:
             return self._firmware.rise == 'setpoint'
-        return self._firmware.px4 and self.phase in (Phase.STARTING, Phase.ARMING)
+        return self._firmware.px4 and self.phase in (VehiclePhase.STARTING, VehiclePhase.ARMING)
 
     def _continue(self, now: float) -> None:
         """Do what the present phase needs."""
@@ -325,12 +336,12 @@ class Vehicle:
             self.log.add(WARNING, f'not armed within {limit}{why}, {UNTIL_ARM}')
             self.forbid()
         work = {
-            Phase.PREPARING: self._prepare,
-            Phase.WAITING: self._wait,
-            Phase.STARTING: self._take_mode,
-            Phase.ARMING: self._arm,
-            Phase.RISING: self._rise,
-            Phase.ENDING: self._end,
+            VehiclePhase.PREPARING: self._prepare,
+            VehiclePhase.WAITING: self._wait,
+            VehiclePhase.STARTING: self._take_mode,
+            VehiclePhase.ARMING: self._arm,
+            VehiclePhase.RISING: self._rise,
+            VehiclePhase.ENDING: self._end,
         }.get(self.phase)
         if work is not None:
             work(now)
@@ -348,7 +359,7 @@ class Vehicle:
         estimate = self.estimate
         ready = estimate.telemetry is not None and not estimate.problem(fix_needed=False)
         if self._autopilot.failsafes.complete and ready:
-            self._enter(Phase.WAITING)
+            self._enter(VehiclePhase.WAITING)
             self._wait(now)
 
     def _wait(self, now: float) -> None:
@@ -378,7 +389,7 @@ class Vehicle:
                 self._permission.end()
             elif permitted:
                 self._target, self._yaw = self._position(), None
-                self._enter(Phase.STARTING)
+                self._enter(VehiclePhase.STARTING)
                 return
             self._detail = f'{problem}, {UNTIL_ARM}' if problem else UNTIL_ARM
 
@@ -386,7 +397,7 @@ class Vehicle:
         if self._firmware.px4 and now - self._phase_at < _STREAM_AHEAD:
             return
         if self._autopilot.in_external_mode:
-            self._enter(Phase.ARMING)
+            self._enter(VehiclePhase.ARMING)
         elif self._is_due(now, _ARMING_PERIOD):
             self._autopilot.request_mode(self._firmware.external)
 
@@ -407,7 +418,7 @@ class Vehicle:
             self.estimate.origin[2] = self._target[2]
             self._place.keep(self.estimate.origin, self.estimate.booted)
         self._least_left, self._nearer_at = math.inf, now
-        self._enter(Phase.RISING)
+        self._enter(VehiclePhase.RISING)
 
     def _rise(self, now: float) -> None:
         estimate, top, timeout = self.estimate, self._top, self.settings.rise_timeout
@@ -434,20 +445,20 @@ class Vehicle:
 
     def _begin_flying(self) -> None:
         position = self._position()
-        if self.phase is Phase.RISING:
+        if self.phase is VehiclePhase.RISING:
             position[2] = self._top
         self._target, self._yaw = position, None
-        if self.phase is not Phase.FLYING:
+        if self.phase is not VehiclePhase.FLYING:
             self._fix_needed = self.estimate.has_fix
         self._autopilot.commands.clear()
-        self._enter(Phase.FLYING)
+        self._enter(VehiclePhase.FLYING)
 
     def _end(self, now: float) -> None:
         # Not again once accepted: a pilot may have taken another mode since the last heartbeat.
         if _MODE not in self._autopilot.accepted and self._is_due(now, _ENDING_PERIOD):
             self._autopilot.request_mode(self._ending_mode)
 
-    def _enter(self, phase: Phase, detail: str = '') -> None:
+    def _enter(self, phase: VehiclePhase, detail: str = '') -> None:
         self._autopilot.accepted.clear()
         self.phase, self._detail = phase, detail
         self._phase_at = self._tried_at = -math.inf
