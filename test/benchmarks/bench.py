@@ -1,25 +1,22 @@
 """Measure the speed of the suite, against baselines in the same run."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 AREAS = ('filter', 'planner', 'cuboid', 'drivers', 'system', 'view')
 
 
-def show(row: dict[str, Any]) -> str:
+def show(row):
     text = f'{row["name"]:<36} {row["value"]:>12.4g} {row["unit"]:<6}'
     if row['baseline'] is not None:
         text += f' {row["ratio"]:>10.4g} x faster than {row["baseline"]}'
     return text
 
 
-def main() -> None:
+def main():
     parser = argparse.ArgumentParser(prog='bench', description=__doc__)
     parser.add_argument('areas', nargs='*', metavar='AREA', help=f'{", ".join(AREAS)}; all if none')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the results there as well')
@@ -35,7 +32,7 @@ def main() -> None:
     for area in options.areas:
         if area not in AREAS:
             parser.error(f'unknown area {area!r}, known are {", ".join(AREAS)}')
-    rows: list[dict[str, Any]] = []
+    rows = []
     for area in options.areas or AREAS:
         for row in import_module(f'{area}_benchmark').run(0.1 if options.quick else 1.0):
             rows.append(row)

@@ -5,60 +5,40 @@ additional time. A target counts as found with its second detection, and the rou
 expected time until all are found, by local search. Available in the search in one process only.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.detection import detection_probability_at
-from maasi_planner.planners.base import (
-    Planner,
-    explain,
-    options_of,
-    waiting_places,
-)
-from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
-
-Routes = list[list[int]]
+from maasi_planner.planners.base import Planner, explain, options_of, waiting_places
+from maasi_planner.team import Decision, single_choice, stay
 
 # A robot moves to its next target when the present one is found with this probability.
 SURE = 0.8
 # Weight of the mean time to find a target beside the time to find all.
 MEAN_WEIGHT = 1.0
-# Longest simulated search [measurement periods].
-TICKS = 4000
-# Rounds of local search.
-ROUNDS = 80
+# Longest simulated search [measurement periods], and rounds of local search.
+TICKS, ROUNDS = 4000, 80
 
 
 class _Robots(NamedTuple):
     """The R robots in units of ticks, the shortest measurement period."""
 
-    remaining_path: FloatArray  # (R, n, 3) path until each is free [m], padded by its last position
-    free: IntArray  # (R,) when each is free
-    speed: FloatArray  # (R,) [m]
-    pause: FloatArray  # (R,) additional time of a turn
-    period: IntArray  # (R,)
-    kind: IntArray  # (R,)
-    parameters: FloatArray  # (R, PARAMETERS)
-    yaw: FloatArray  # (R,) constant heading [rad], nan: along its motion
+    remaining_path: np.ndarray  # (R, n, 3) path until each is free [m], padded by its last position
+    free: np.ndarray  # (R,) when each is free
+    speed: np.ndarray  # (R,) [m]
+    pause: np.ndarray  # (R,) additional time of a turn
+    period: np.ndarray  # (R,)
+    kind: np.ndarray  # (R,) of its detection, and its parameters
+    parameters: np.ndarray  # (R, PARAMETERS)
+    yaw: np.ndarray  # (R,) constant heading [rad], nan: along its motion
 
 
 @njit(cache=True)
-def _expected_end(
-    robots: _Robots,
-    routes: IntArray,
-    targets: FloatArray,
-    detected: BoolArray,
-    dimension: int,
-    stops: FloatArray,
-) -> float:
+def _expected_end(robots, routes, targets, detected, dimension, stops):
     """Return the expected time to find all on `routes` (R, n), -1 after the last, in ticks.
 
     Sets `stops` (R, 3) to the position where each robot leaves for its second target.
@@ -68,19 +48,17 @@ def _expected_end(
     none = np.where(detected, 0.0, 1.0)
     one = np.where(detected, 1.0, 0.0)
     place = robots.remaining_path[:, 0].copy()
-    cosine = np.ones(number)
-    sine = np.zeros(number)
+    travels = np.isnan(robots.yaw)
+    cosine = np.where(travels, 1.0, np.cos(robots.yaw))
+    sine = np.where(travels, 0.0, np.sin(robots.yaw))
     wait = np.zeros(number)
     current = np.zeros(number, np.int64)
-    for r in range(number):
-        if not np.isnan(robots.yaw[r]):
-            cosine[r] = np.cos(robots.yaw[r])
-            sine[r] = np.sin(robots.yaw[r])
-        stops[r] = robots.remaining_path[r, -1]
+    stops[:] = robots.remaining_path[:, -1]
     cost = 0.0
     for tick in range(TICKS):
         for r in range(number):
             goal = place[r].copy()
+            share = 1.0
             if tick < robots.free[r]:
                 goal = robots.remaining_path[r, tick].copy()
             else:
@@ -98,11 +76,10 @@ def _expected_end(
             if distance > 0.0 and wait[r] >= 1.0:
                 wait[r] -= 1.0
             elif distance > 0.0:
-                if np.isnan(robots.yaw[r]) and abs(offset[0]) + abs(offset[1]) > 0.0:
-                    level = np.hypot(offset[0], offset[1])
+                level = np.hypot(offset[0], offset[1])
+                if travels[r] and level > 0.0:
                     cosine[r] = offset[0] / level
                     sine[r] = offset[1] / level
-                share = 1.0
                 if tick >= robots.free[r]:
                     share = min(1.0, robots.speed[r] / distance)
                 place[r] += share * offset
@@ -120,13 +97,9 @@ def _expected_end(
                     )
                     one[j] += none[j] * chance - one[j] * chance
                     none[j] *= 1.0 - chance
-        complete = 1.0
-        left = 0.0
-        for j in range(len(targets)):
-            missing = none[j] + one[j]
-            complete *= 1.0 - missing
-            left += missing
-        cost += 1.0 - complete + MEAN_WEIGHT * left / len(targets)
+        missing = none + one
+        complete = np.prod(1.0 - missing)
+        cost += 1.0 - complete + MEAN_WEIGHT * missing.mean()
         if complete > 0.99:
             break
     for r in range(number):
@@ -138,40 +111,36 @@ def _expected_end(
 class Clairvoyant(Planner):
     """Sends the robots along the best routes over the targets of `missing`, (n, 3) [m]."""
 
-    def __init__(self, settings: PlannerSettings, missing: Callable[[], FloatArray]) -> None:
+    def __init__(self, settings, missing):
         super().__init__(settings)
         self._missing = missing
 
-    def finished(self, team: TeamView) -> str | None:
+    def finished(self, team):
         return None if len(self._missing()) else 'all targets are found'
 
-    def decide(self, team: TeamView) -> Decision:
+    def decide(self, team):
         targets = self._missing()
         routes, stops = _best_routes(team, targets)
         places = waiting_places(team)
         decision = Decision(step=team.step)
-        for name in team.planning():
-            index = team.names().index(name)
-            wanted = np.vstack([stops[index], targets[[*routes[index], *range(len(targets))]]])
-            robot = self._sent(team, name, wanted, places)
-            decision.robots[name] = robot
-            places.append((robot.waypoint, team.robots[name].radius))
+        for name, route, stop in zip(team.names(), routes, stops):
+            view = team.robots[name]
+            if view.planning:
+                wanted = np.vstack([stop, targets[route], targets])
+                decision.robots[name] = robot = self._sent(team, name, wanted, places)
+                places.append((robot.waypoint, view.radius))
         return explain(decision)
 
     @staticmethod
-    def _sent(
-        team: TeamView,
-        name: str,
-        wanted: FloatArray,
-        places: list[tuple[FloatArray, float]],
-    ) -> RobotDecision:
+    def _sent(team, name, wanted, places):
         """Return the decision for the first of the wanted waypoints that can be reached."""
         view = team.robots[name]
+        here = view.state.pose.position
         if team.dimension == 2:
-            wanted[:, 2] = view.state.pose.position[2]
+            wanted[:, 2] = here[2]
         # Skip a waypoint nearer than a measurement period.
         least = view.motion.settings.speed * view.period_steps * team.step_time
-        if len(wanted) > 1 and np.linalg.norm(wanted[0] - view.state.pose.position) < least:
+        if np.linalg.norm(wanted[0] - here) < least:
             wanted = wanted[1:]
         for point in [*wanted, *view.candidates]:
             robots = {name: replace(view, candidates=point[None, :])}
@@ -181,21 +150,24 @@ class Clairvoyant(Planner):
         return stay(view, 'stays: no target can be reached')
 
 
-def _best_routes(team: TeamView, targets: FloatArray) -> tuple[Routes, FloatArray]:
+def _best_routes(team, targets):
     """Return a route over the targets for each robot, and the end of its first leg, (R, 3)."""
-    robots = _robots(team, targets)
-    detected = np.array([_has_cluster(team, target) for target in targets], np.bool_)
-    number = len(robots.free)
-    stops = np.zeros((number, 3))
+    robots, d = _robots(team, targets), team.dimension
+    detected = np.zeros(len(targets), np.bool_)
+    for cluster in team.clusters:
+        # A target was detected where a cluster is near it.
+        gaps = ((cluster.position[:d] - targets[:, :d]) ** 2).sum(axis=1)
+        detected |= gaps <= 9.0 * np.trace(cluster.covariance[:d, :d])
+    stops = np.zeros((len(robots.free), 3))
 
-    def cost(routes: Routes) -> float:
-        array = np.full((number, len(targets) + 1), -1, np.int64)
+    def cost(routes):
+        array = np.full((len(routes), len(targets) + 1), -1, np.int64)
         for row, route in zip(array, routes):
             row[: len(route)] = route
-        return float(_expected_end(robots, array, targets, detected, team.dimension, stops))
+        return _expected_end(robots, array, targets, detected, d, stops)
 
     # Whichever target a robot reaches first is the next of its route.
-    routes: Routes = [[] for _ in range(number)]
+    routes = [[] for _ in stops]
     ends, times = robots.remaining_path[:, -1].copy(), robots.free.astype(float)
     left = list(range(len(targets)))
     while left:
@@ -215,7 +187,7 @@ def _best_routes(team: TeamView, targets: FloatArray) -> tuple[Routes, FloatArra
     return routes, stops
 
 
-def _neighbours(routes: Routes) -> Iterator[Routes]:
+def _neighbours(routes):
     """Yield routes with one target moved, or a part of one reversed."""
     for r, route in enumerate(routes):
         for i, target in enumerate(route):
@@ -229,17 +201,7 @@ def _neighbours(routes: Routes) -> Iterator[Routes]:
                 yield [*routes[:r], turned, *routes[r + 1 :]]
 
 
-def _has_cluster(team: TeamView, target: FloatArray) -> bool:
-    """Return whether a target was detected: a cluster is near it."""
-    d = team.dimension
-    offsets = [cluster.position[:d] - target[:d] for cluster in team.clusters]
-    return any(
-        offset @ offset <= 9.0 * float(np.trace(cluster.covariance[:d, :d]))
-        for offset, cluster in zip(offsets, team.clusters)
-    )
-
-
-def _robots(team: TeamView, targets: FloatArray) -> _Robots:
+def _robots(team, targets):
     """Return all robots of a team for the simulation."""
     views = [team.robots[name] for name in team.names()]
     tick = min(view.period_steps for view in views)
@@ -256,25 +218,16 @@ def _robots(team: TeamView, targets: FloatArray) -> _Robots:
             goals[:, 2] = here[2]
         lengths = view.motion.predict(view.state, goals, team.step_time).lengths
         over = lengths - np.linalg.norm(goals - here, axis=1) / speed
+        pause = max(0.0, float(np.median(over))) / tick
         travels = settings.model == 'unicycle' or settings.heading == 'travel'
         yaw = np.nan if travels else view.state.pose.yaw
         period = max(1, round(view.period_steps / tick))
-        pause = max(0.0, float(np.median(over))) / tick
         rows.append((speed * tick, pause, period, *view.sensor.detection.kernel(), yaw))
-    speeds, pauses, periods, kinds, parameters, yaws = map(np.array, zip(*rows))
     longest = max(map(len, paths))
-    return _Robots(
-        np.stack([np.pad(path, ((0, longest - len(path)), (0, 0)), mode='edge') for path in paths]),
-        np.array([len(path) - 1 if len(path) > 2 else 0 for path in paths], np.int64),
-        speeds,
-        pauses,
-        periods,
-        kinds,
-        parameters,
-        yaws,
-    )
+    padded = [np.pad(path, ((0, longest - len(path)), (0, 0)), mode='edge') for path in paths]
+    free = np.array([len(path) - 1 if len(path) > 2 else 0 for path in paths], np.int64)
+    return _Robots(np.stack(padded), free, *map(np.array, zip(*rows)))
 
 
-def clairvoyant(settings: PlannerSettings, missing: Callable[[], FloatArray]) -> Clairvoyant:
-    """Return the planner of a group; `search` takes a class for one without `missing`."""
-    return Clairvoyant(settings, missing)
+# `search` takes a class for one that needs settings alone.
+clairvoyant = partial(Clairvoyant)

@@ -1,16 +1,13 @@
-"""Time of the planners' decisions: `run()` returns a list of figures.
+"""Median times of whole decisions, predicted trajectories included: `run()` yields figures.
 
-Each figure is the median time of a whole decision, predicted trajectories included. Baselines are
-measured in the same run: the same objective with e updated on the whole grid, as (21) is written.
+The baseline is measured in the same run: the same objective with e updated on the whole grid, as
+(21) is written.
 """
-
-from __future__ import annotations
 
 import numpy as np
 from timing import entry, median_time
 
 from maasi_filter.models.detection import ExponentialDetection
-from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
@@ -26,135 +23,101 @@ from maasi_planner import (
     make_planner,
     warm_up,
 )
+from maasi_planner.planners.base import options_of
 
 CUBE = np.array([[0.0, 260.0]] * 3)
 FLOOR = np.array([[-0.3, 2.4]] * 2)
 PAPER = PlannerSettings(objective='paper', alpha=0.5, beta=0.5, control_weight=0.01)
 
 
-def half_explored(bounds: np.ndarray, spacing: float, seed: int = 0) -> UnexploredMap:
+def robot(place, bounds, grid, motion, size, noise, period=10, radius=0.1):
+    """Return a robot that plans now, with a grid of candidates (numbers, spacing, corner)."""
+    numbers, spacing, corner = grid
+    settings = CandidateSettings(grid=numbers, spacing=spacing, corner=corner)
+    detection = ExponentialDetection(0.98, size)
+    return RobotView(
+        state=RobotState.at_rest(place),
+        candidates=CandidateSet(settings, bounds, place[2]).at(np.array(place)),
+        motion=make_motion(MotionSettings(**motion)),
+        sensor=Sensor.ranging('robot', detection, np.diag(noise) ** 2),
+        period_steps=period,
+        radius=radius,
+    )
+
+
+def team_of(robots, step, bounds, spacing, rng, deviation):
+    """Return a team with six clusters in a half explored environment."""
+    dimension, side = len(bounds), bounds[0, 1] if len(bounds) == 3 else 2.0
+    covariance = deviation**2 * np.eye(dimension)
+    centres = [rng.uniform(0.0, side, dimension) for _ in range(6)]
+    clusters = [Cluster(centre, covariance, deviation, 0.8) for centre in centres]
     exploration = UnexploredMap(bounds, spacing)
-    exploration.values[...] = np.random.default_rng(seed).uniform(size=exploration.values.shape)
-    return exploration
+    exploration.values[...] = np.random.default_rng(0).uniform(size=exploration.values.shape)
+    return TeamView(0, step, robots, clusters, exploration)
 
 
-def drones(number: int, model: str = 'constant_speed') -> TeamView:
-    """Return ranging drones in the papers' cube that all plan now, 27 candidates each.
+def drones(number, model='constant_speed'):
+    """Return ranging drones in the papers' cube, 27 candidates each.
 
     They measure every 12 m, as in 000, section 5.1; the first one stands in the middle.
     """
     rng = np.random.default_rng(1)
     # 12 m/s, a measurement each second; the Mambo at 4 m/s every 3 s.
     speed, period = (12.0, 10) if model == 'constant_speed' else (4.0, 30)
-    motion = make_motion(MotionSettings(model=model, speed=speed, tolerance=1.0))
-    sensor = Sensor.ranging(
-        'drone',
-        ExponentialDetection(0.98, [25.0, 25.0, 25.0]),
-        np.diag([1.5, 0.175, 0.295]) ** 2,
-    )
-    candidates = CandidateSet(
-        CandidateSettings(grid=[3, 3, 3], spacing=120.0, corner=[10.0, 10.0, 10.0]), CUBE
-    )
-    robots = {}
-    for index in range(number):
-        place = np.array([120.0, 125.0, 118.0]) if index == 0 else rng.uniform(0.0, 260.0, 3)
-        robots[f'drone{index}'] = RobotView(
-            state=RobotState.at_rest(place),
-            candidates=candidates.at(place),
-            motion=motion,
-            sensor=sensor,
-            period_steps=period,
-            radius=1.0,
-        )
-    clusters = [Cluster(rng.uniform(0.0, 260.0, 3), 25.0 * np.eye(3), 5.0, 0.8) for _ in range(6)]
-    return TeamView(0, 0.1, robots, clusters, half_explored(CUBE, 10.0))
+    motion = {'model': model, 'speed': speed, 'tolerance': 1.0}
+    grid = [3, 3, 3], 120.0, [10.0] * 3
+    places = [[120.0, 125.0, 118.0], *(rng.uniform(0.0, 260.0, 3) for _ in range(number - 1))]
+    robots = {
+        f'drone{n}': robot(place, CUBE, grid, motion, [25.0] * 3, [1.5, 0.175, 0.295], period, 1.0)
+        for n, place in enumerate(places)
+    }
+    return team_of(robots, 0.1, CUBE, 10.0, rng, 5.0)
 
 
-def floor_pair() -> TeamView:
+def floor_pair():
     """Return Mambo and TurtleBot on the floor of 000, section 7.1.3: 9 and 64 candidates."""
-    rng = np.random.default_rng(2)
-    robots = {}
-    for name, settings, size, noise, grid, place in (
-        (
-            'mambo',
-            MotionSettings(model='mambo', speed=0.4),
-            0.3,
-            [0.016, 0.052],
-            CandidateSettings(grid=[3, 3], spacing=0.6, corner=[0.1, 0.1]),
-            [1.9, 1.9, 1.0],
+    mambo = {'model': 'mambo', 'speed': 0.4}
+    turtlebot = {'model': 'unicycle', 'speed': 0.2, 'yaw_rate': 2.84, 'acceleration': 2.5}
+    grids = ([3, 3], 0.6, [0.1, 0.1]), ([8, 8], 0.25, [0.0, 0.0])
+    robots = {
+        'mambo': robot([1.9, 1.9, 1.0], FLOOR, grids[0], mambo, [0.3] * 2, [0.016, 0.052]),
+        'turtlebot': robot(
+            [0.1, 0.1, 0.0], FLOOR, grids[1], turtlebot, [0.15] * 2, [0.011, 0.0311]
         ),
-        (
-            'turtlebot',
-            MotionSettings(model='unicycle', speed=0.2, yaw_rate=2.84, acceleration=2.5),
-            0.15,
-            [0.011, 0.0311],
-            CandidateSettings(grid=[8, 8], spacing=0.25, corner=[0.0, 0.0]),
-            [0.1, 0.1, 0.0],
-        ),
-    ):
-        robots[name] = RobotView(
-            state=RobotState.at_rest(place),
-            candidates=CandidateSet(grid, FLOOR, place[2]).at(place),
-            motion=make_motion(settings),
-            sensor=Sensor.ranging(
-                name, ExponentialDetection(0.98, [size, size]), np.diag(noise) ** 2
-            ),
-            period_steps=10,
-            radius=0.1,
-        )
-    clusters = [Cluster(rng.uniform(0.0, 2.0, 2), 0.01 * np.eye(2), 0.1, 0.8) for _ in range(6)]
-    return TeamView(0, 0.05, robots, clusters, half_explored(FLOOR, 0.1))
+    }
+    return team_of(robots, 0.05, FLOOR, 0.1, np.random.default_rng(2), 0.1)
 
 
-def whole_grid_decision(team: TeamView) -> int:
-    """Decide for one robot with (17) to (22) as they are written, e on the whole grid."""
-    name = team.planning()[0]
-    view = team.robots[name]
-    weights = PAPER.weights()
-    prediction = view.motion.predict(view.state, view.candidates, team.step_time)
-    centres = np.stack([cluster.position for cluster in team.clusters])
-    values = []
-    for w, length in enumerate(prediction.lengths):
-        explored = team.exploration.copy()
-        gain = 0.0
-        for k in range(0, int(length), view.period_steps):
-            pose = Pose.from_yaw(prediction.positions[w, k], prediction.yaws[w, k])
-            explored.update(view.sensor.detection, pose)
-            gain += weights.beta * float(explored.at(pose.position)[0])
-            gain += weights.alpha * float(view.sensor.detection.probability(centres, pose).sum())
-        cost = weights.control * prediction.control_cost[w]
-        values.append((gain - cost) / max(int(length), 1))
-    return int(np.argmax(values))
+def whole_grid_decision(team):
+    """Return the best value of one robot by (17) to (22) as they are written."""
+    from plain_objective import plain_terms
+
+    (name,) = team.planning()
+    options = {name: options_of(team, name, [])}
+    choices = range(len(options[name].points))
+    return max(plain_terms(team, PAPER, options, {name: w})[name][2] for w in choices)
 
 
-def run(share: float = 1.0) -> list[dict[str, object]]:
+def run(share=1.0):
     warm_up()
-    figures: list[dict[str, object]] = []
-
-    def add(
-        name: str,
-        team: TeamView,
-        repeats: int,
-        settings: PlannerSettings = PAPER,
-        baseline: str | None = None,
-        against: float | None = None,
-    ) -> None:
-        planner = make_planner('maasi', settings)
-        planner.decide(team)
-        value = median_time(lambda: planner.decide(team), max(1, round(share * repeats)))
-        ratio = None if against is None else against / value
-        figures.append(entry(name, 1e3 * value, 'ms', baseline, ratio))
-
-    single = drones(1)
+    single, pair, floor = drones(1), drones(2), floor_pair()
     whole_grid_decision(single)
     whole = median_time(lambda: whole_grid_decision(single), 3)
-    add('asi_decision', single, 200, baseline='e on the whole grid, h = 10 m', against=whole)
-    add('asi_decision_mambo', drones(1, 'mambo'), 50)
-    add('maasi_decision_pair', drones(2), 60)
-    add('maasi_decision_mambo_turtlebot', floor_pair(), 60)
-    add('maasi_decision_ten', drones(10), 20)
     information = PlannerSettings()
-    add('asi_decision_information', single, 50, information)
-    add('maasi_decision_pair_information', drones(2), 30, information)
-    add('maasi_decision_mambo_turtlebot_information', floor_pair(), 30, information)
-    return figures
+    for name, team, repeats, settings in (
+        ('asi_decision', single, 200, PAPER),
+        ('asi_decision_mambo', drones(1, 'mambo'), 50, PAPER),
+        ('maasi_decision_pair', pair, 60, PAPER),
+        ('maasi_decision_mambo_turtlebot', floor, 60, PAPER),
+        ('maasi_decision_ten', drones(10), 20, PAPER),
+        ('asi_decision_information', single, 50, information),
+        ('maasi_decision_pair_information', pair, 30, information),
+        ('maasi_decision_mambo_turtlebot_information', floor, 30, information),
+    ):
+        planner = make_planner('maasi', settings)
+        planner.decide(team)
+        value = median_time(lambda: planner.decide(team), max(1, round(share * repeats)))  # noqa: B023
+        compared = (
+            ('e on the whole grid, h = 10 m', whole / value) if name == 'asi_decision' else ()
+        )
+        yield entry(name, 1e3 * value, 'ms', *compared)

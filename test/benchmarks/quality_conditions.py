@@ -1,16 +1,12 @@
 """Conditions under which filters are compared, and the seeds for it."""
 
-from __future__ import annotations
-
-import argparse
 import math
-from collections.abc import Callable, Iterable
-from copy import deepcopy
-from typing import Any
 
 import numpy as np
 
 from maasi_filter import NoiseSettings
+from maasi_sim.experiments.searches import merged
+from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.simulation.world import noise_stream
 
 # What is tuned is tuned on the first block and looked at again on the second; the third is for
@@ -31,45 +27,35 @@ SIDE = 260.0
 # The space of the sensor's measurements: ranges up to the cube's diagonal, all angles [m rad^2].
 SPACE = SIDE * math.sqrt(3.0) * 2.0 * math.pi * math.pi
 
-Content = dict[str, Any]
-# A layer over the scenario, its `every_robot` over each robot; or what makes other content of it.
-Change = Content | Callable[[Content, int], Content]
+
+def endless(scenario, *changes):
+    """Return the content of a scenario whose planner ends no search, with changes on top."""
+    content = load_scenario(scenario).model_dump(by_alias=True, exclude_unset=True)
+    never_done = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
+    return merged(content, {'planner': never_done}, *changes)
 
 
-def robots(**values: Any) -> Content:
+# A condition is a list of changes: a layer over the content of the scenario, its `every_robot` over
+# each robot, or a function that makes other content of it and the seed.
+
+
+def robots(**values):
     """Other settings of each robot: `odometry` is what it reports, `simulated` what is true."""
     return {'every_robot': values}
 
 
-def noise(name: str) -> Content:
+def noise(name):
     """The sensor's noise, as believed and true."""
     return robots(sensor={'noise': NOISES[name].model_dump(by_alias=True)})
 
 
-def clutter(per_scan: float, told: bool) -> Content:
-    """False detections, which the filter knows of or not."""
-    believed = {'sensor': {'clutter': per_scan / SPACE}} if told else {}
-    return robots(simulated={'clutter_per_scan': per_scan}, **believed)
-
-
-def untold(**values: Any) -> Content:
+def untold(**values):
     """Errors of the robots' positions that are not in the covariances they report."""
-    return robots(
-        simulated={'odometry': {'position_noise': 0.05, 'heading_noise': 0.001, **values}}
-    )
+    odometry = {'position_noise': 0.05, 'heading_noise': 0.001, **values}
+    return robots(simulated={'odometry': odometry})
 
 
-def pmb(**values: Any) -> Content:
-    """Other settings of the multi-Bernoulli filter."""
-    return {'filter': {'pmb': values}}
-
-
-def targets(**values: Any) -> Content:
-    """Other true targets."""
-    return {'targets': values}
-
-
-def pairs(content: Content, seed: int) -> Content:
+def pairs(content, seed):
     """Six pairs of targets, 3 m apart."""
     generator = np.random.default_rng([seed, 77])
     centres = generator.uniform(10.0, SIDE - 10.0, (6, 3))
@@ -79,12 +65,12 @@ def pairs(content: Content, seed: int) -> Content:
     return content | {'targets': {'positions': positions.tolist()}}
 
 
-def two(name: str, start: list[float], **values: Any) -> Change:
+def two(name, start, **values):
     """A second robot of the same kind that starts elsewhere."""
 
-    def change(content: Content, seed: int) -> Content:
+    def change(content, seed):
         robot = content['robots'][name]
-        other = {**deepcopy(robot), 'start': start, **values}
+        other = merged(robot, {'start': start}, values)
         return content | {'robots': {f'{name}1': robot, f'{name}2': other}}
 
     return change
@@ -93,7 +79,7 @@ def two(name: str, start: list[float], **values: Any) -> Change:
 # What sensors return besides: these are called with what `RangingSensor.measure` has returned.
 
 
-def duplicates(sensor: Any, pose: Any, step: int, values: Any, causes: Any) -> tuple[Any, Any]:
+def duplicates(sensor, pose, step, values, causes):
     """One in five detections comes twice, 0.3 of the noise's deviations apart."""
     generator = noise_stream(sensor.seed, sensor.robot, step, 'duplicates')
     again = generator.random(len(values)) < 0.2
@@ -102,7 +88,7 @@ def duplicates(sensor: Any, pose: Any, step: int, values: Any, causes: Any) -> t
     return np.concatenate([values, twice]), np.concatenate([causes, causes[again]])
 
 
-def reflections(sensor: Any, pose: Any, step: int, values: Any, causes: Any) -> tuple[Any, Any]:
+def reflections(sensor, pose, step, values, causes):
     """Five fixed places without a target return with 0.3 of pi."""
     at = np.random.default_rng([sensor.seed, 78]).uniform(10.0, SIDE - 10.0, (5, 3))
     generator = noise_stream(sensor.seed, sensor.robot, step, 'reflections')
@@ -114,65 +100,65 @@ def reflections(sensor: Any, pose: Any, step: int, values: Any, causes: Any) -> 
 
 DEGREES, RADIANS = noise('degrees'), noise('radians')
 
-# By name: what is changed in the scenario, in this order.
-CONDITIONS: dict[str, tuple[Change, ...]] = {
-    'degrees': (DEGREES,),
-    'radians': (RADIANS,),
+# By name: what is changed in the scenario, in this order; in the cube, after `DEGREES`.
+CONDITIONS = {
+    'degrees': [],
+    'radians': [RADIANS],
     **{
-        f'{name}, {per_scan:g} false per scan, {"told" if told else "not told"}': (
+        f'{name}, {per_scan:g} false per scan, {"told" if told else "not told"}': [
             noise(name),
-            clutter(per_scan, told),
-        )
+            robots(
+                simulated={'clutter_per_scan': per_scan},
+                sensor={'clutter': per_scan / SPACE} if told else {},
+            ),
+        ]
         for name in NOISES
         for per_scan in (0.2, 1.0, 3.0)
         for told in (True, False)
     },
-    'pi 0.7 of believed': (DEGREES, robots(simulated={'probability_factor': 0.7})),
-    'pi 0.9 of believed': (DEGREES, robots(simulated={'probability_factor': 0.9})),
-    'positions off by 1 m': (DEGREES, robots(odometry={'position_noise': 1.0})),
-    'positions off by 3 m': (DEGREES, robots(odometry={'position_noise': 3.0})),
+    'pi 0.7 of believed': [robots(simulated={'probability_factor': 0.7})],
+    'pi 0.9 of believed': [robots(simulated={'probability_factor': 0.9})],
+    'positions off by 1 m': [robots(odometry={'position_noise': 1.0})],
+    'positions off by 3 m': [robots(odometry={'position_noise': 3.0})],
     **{
-        f'{drones}{errors}{", estimated" if estimated else ""}': (
-            DEGREES,
+        f'{drones}{errors}{estimated}': [
             robots(odometry=change),
-            *((two('drone', [250.0, 250.0, 250.0]),) if drones else ()),
-            *((pmb(offset=told),) if estimated else ()),
-        )
+            *([two('drone', [250.0, 250.0, 250.0])] if drones else []),
+            *([{'filter': {'pmb': {'offset': told}}}] if estimated else []),
+        ]
         for errors, change, told in (
             ('drift 0.08 m/sqrt(m)', {'position_drift': 0.08}, {'drift': 0.08}),
             # Of a length of 1 m, on each axis.
             ('constant bias 1 m', {'position_offset': 1.0}, {'deviation': 0.577}),
         )
         for drones in ('', 'two drones, ')
-        for estimated in (False, True)
+        for estimated in ('', ', estimated')
     },
-    'noise 1.5 of believed': (DEGREES, robots(simulated={'noise_factor': 1.5})),
-    'noise 0.67 of believed': (DEGREES, robots(simulated={'noise_factor': 0.67})),
-    '1 target': (DEGREES, targets(count=1)),
-    '3 targets': (DEGREES, targets(count=3)),
-    '40 targets': (DEGREES, targets(count=40)),
-    '100 targets': (DEGREES, targets(count=100)),
-    'radians, 40 targets': (RADIANS, targets(count=40)),
-    'N0 ten times too small': (DEGREES, {'filter': {'expected_targets': 1.2}}),
-    'N0 ten times too large': (DEGREES, {'filter': {'expected_targets': 120.0}}),
-    'four tight groups of three': (
-        DEGREES,
-        targets(distribution='clustered', clusters=4, spread=4.0, separation=3.0),
-    ),
-    'pairs at 3 m': (DEGREES, pairs),
-    'pairs at 3 m, identified': (DEGREES, pairs, targets(identified=True)),
-    'walk 0.1 m/sqrt(s), told': (DEGREES, targets(walk=0.1), pmb(walk=0.1)),
-    'walk 0.3 m/sqrt(s), told': (DEGREES, targets(walk=0.3), pmb(walk=0.3)),
-    'pi 0.5 of believed': (DEGREES, robots(simulated={'probability_factor': 0.5})),
-    'one in five detections twice': (DEGREES,),
-    'five reflections': (DEGREES,),
-    'positions off by 3 m, not told': (DEGREES, untold(position_noise=3.0)),
-    'drift 0.08 m/sqrt(m), not told': (DEGREES, untold(position_drift=0.08)),
-    'walk 0.2 m/sqrt(s), not told': (DEGREES, targets(walk=0.2)),
-    'demo': (),
-    'mambo': (),
-    'drone_rov': (),
-    'two TurtleBots': (two('turtlebot', [2.1, 2.1, 0.0], yaw=3.14),),
+    'noise 1.5 of believed': [robots(simulated={'noise_factor': 1.5})],
+    'noise 0.67 of believed': [robots(simulated={'noise_factor': 0.67})],
+    '1 target': [{'targets': {'count': 1}}],
+    '3 targets': [{'targets': {'count': 3}}],
+    '40 targets': [{'targets': {'count': 40}}],
+    '100 targets': [{'targets': {'count': 100}}],
+    'radians, 40 targets': [RADIANS, {'targets': {'count': 40}}],
+    'N0 ten times too small': [{'filter': {'expected_targets': 1.2}}],
+    'N0 ten times too large': [{'filter': {'expected_targets': 120.0}}],
+    'four tight groups of three': [
+        {'targets': {'distribution': 'clustered', 'clusters': 4, 'spread': 4.0, 'separation': 3.0}}
+    ],
+    'pairs at 3 m': [pairs],
+    'pairs at 3 m, identified': [pairs, {'targets': {'identified': True}}],
+    'walk 0.1 m/sqrt(s), told': [{'targets': {'walk': 0.1}, 'filter': {'pmb': {'walk': 0.1}}}],
+    'walk 0.3 m/sqrt(s), told': [{'targets': {'walk': 0.3}, 'filter': {'pmb': {'walk': 0.3}}}],
+    'one in five detections twice': [],
+    'five reflections': [],
+    'positions off by 3 m, not told': [untold(position_noise=3.0)],
+    'drift 0.08 m/sqrt(m), not told': [untold(position_drift=0.08)],
+    'walk 0.2 m/sqrt(s), not told': [{'targets': {'walk': 0.2}}],
+    'demo': [],
+    'mambo': [],
+    'drone_rov': [],
+    'two TurtleBots': [two('turtlebot', [2.1, 2.1, 0.0], yaw=3.14)],
 }
 # What the sensor returns besides, by condition.
 RETURNS = {'one in five detections twice': duplicates, 'five reflections': reflections}
@@ -185,9 +171,7 @@ SCENARIOS = {
 }
 
 
-def wanted(
-    parser: argparse.ArgumentParser, known: Iterable[str], runs: int, jobs: int
-) -> tuple[argparse.Namespace, list[str], range]:
+def wanted(parser, known, runs, jobs):
     """Parse the command line with what is common; return options, names and seeds."""
     parser.add_argument('names', nargs='*', help='names, or parts of names; none: all')
     parser.add_argument('--seeds', choices=sorted(SEEDS), default='development')

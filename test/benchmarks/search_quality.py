@@ -1,48 +1,142 @@
 """Quality of whole searches with each planner, side by side: `./scripts/search_quality`.
 
-Compares the planners in the regimes of `search_regimes.py` and prints tables in Markdown. Seeds
-are those of `quality_conditions.py`: numbers for documents are from the block `report`, which
-nothing is tuned on.
+Compares planners in regimes and prints tables in Markdown. Seeds are those of
+`quality_conditions.py`: numbers for documents are from the block `report`, which nothing is tuned
+on.
 """
-
-from __future__ import annotations
 
 import argparse
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
-from quality_conditions import wanted
-from search_regimes import KINDS, REGIMES, prepared
+from quality_conditions import NOISES, endless, wanted
 
 from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
-from maasi_sim.experiments.experiment import Case, Experiment
-from maasi_sim.experiments.searches import comparison_of, search_settings
+from maasi_sim.experiments.experiment import Case
+from maasi_sim.experiments.searches import comparison_of, merged, search_settings
 from maasi_sim.experiments.tables import SearchTable
+from maasi_sim.scenario.schema import Scenario
 
-# What differences are to.
-REFERENCE = 'before'
 BEGIN, END = '<!-- table: begin -->', '<!-- table: end -->'
+PAPER = {'objective': 'paper', 'alpha': 0.75, 'beta': 0.75, 'control_weight': 0.0}
+CUBE, PAIR = 'ranging_drone_3d', 'ranging_pair_3d'
+NEAR_3D, NEAR_FLOOR = {'ring': 6, 'distance': 30.0}, {'ring': 8, 'distance': 0.3}
 
 
-def comparison(regime: str, kinds: Sequence[str]) -> Experiment:
-    """Return the comparison of a regime; the reference stands first."""
+class Regime(NamedTuple):
+    """A kind of search; a run that does not find all counts with `limit` [s].
+
+    `neighbours` are candidates of planners that measure at waypoints only. `change` is merged over
+    the scenario, its robots like the first one of the scenario.
+    """
+
+    scenario: str
+    limit: float
+    neighbours: dict[str, Any]
+    change: dict[str, Any] = MappingProxyType({})
+
+
+class Kind(NamedTuple):
+    """A planner as it is compared: its settings, and most seeds, fewer where runs take long.
+
+    `stops`: robots stop at every waypoint; `neighbours`: it chooses among a regime's; `maker` makes
+    the planner, as of `search`, in place of the scenario's.
+    """
+
+    change: dict[str, Any]
+    runs: int = 64
+    stops: bool = False
+    neighbours: bool = False
+    maker: str | None = None
+
+
+def drones(*starts, **change):
+    """Return the change of a scenario to drones that start at these places."""
+    return {'robots': {f'drone{n}': {'start': [*at], **change} for n, at in enumerate(starts, 1)}}
+
+
+REGIMES = {
+    'one drone': Regime(CUBE, 400.0, NEAR_3D),
+    'two drones': Regime(PAIR, 250.0, NEAR_3D),
+    'mambo': Regime('mambo', 150.0, NEAR_FLOOR),
+    'demo': Regime('mambo_turtlebot', 200.0, NEAR_FLOOR),
+    '1000 m, three drones': Regime(
+        PAIR,
+        900.0,
+        {'ring': 8, 'distance': 50.0},
+        {
+            'environment': {'bounds': [[0.0, 1000.0]] * 2},
+            **drones(
+                (1.0, 1.0, 30.0),
+                (999.0, 1.0, 30.0),
+                (1.0, 999.0, 30.0),
+                candidates={'grid': [10, 10], 'spacing': 100.0, 'corner': [50.0, 50.0]},
+                sensor={'detection': {'size': [25.0, 25.0]}},
+            ),
+        },
+    ),
+    'ten robots': Regime(
+        PAIR,
+        100.0,
+        NEAR_3D,
+        drones(*[(10.0 + 25.0 * i, 130.0 + 120.0 * (-1) ** i, 1.0) for i in range(10)]),
+    ),
+    'two clusters': Regime(
+        CUBE,
+        400.0,
+        NEAR_3D,
+        {'targets': {'distribution': 'clustered', 'clusters': 2, 'separation': 5.0}},
+    ),
+    'radians': Regime(
+        CUBE,
+        600.0,
+        NEAR_3D,
+        {'robots': {'drone': {'sensor': {'noise': NOISES['radians'].model_dump(by_alias=True)}}}},
+    ),
+}
+# What is compared; differences are to the first one.
+KINDS = {
+    'before': Kind({'name': 'maasi'}, stops=True),
+    'lawnmower': Kind({'name': 'lawnmower'}, runs=16, stops=True),
+    'nearest_widest': Kind({'name': 'nearest_widest'}, runs=32, stops=True),
+    'mutual_information': Kind({'name': 'mutual_information'}, 16, stops=True, neighbours=True),
+    'paper': Kind({'name': 'maasi', **PAPER}, stops=True),
+    'maasi': Kind({'name': 'maasi'}),
+    'clairvoyant': Kind({'name': 'maasi'}, runs=32, maker='clairvoyant:clairvoyant'),
+}
+
+
+def prepared(regime, kind):
+    """Return the scenario of a regime with a planner."""
+    what, how = REGIMES[regime], KINDS[kind]
+    content = endless(what.scenario)
+    robots = what.change.get('robots', {})
+    if len(robots) > 1:
+        content['robots'] = dict.fromkeys(robots, next(iter(content['robots'].values())))
+    limits = {'limits': {'time': what.limit}, 'filter': {'threads': 1}}
+    content = merged(content, what.change, limits, {'planner': how.change})
+    for robot in content['robots'].values():
+        if how.neighbours:
+            robot['candidates'] = what.neighbours
+        if how.stops:
+            robot['motion'] = merged(robot['motion'], {'arrival_radius': 0.0})
+    return Scenario.model_validate(content)
+
+
+def comparison(regime, kinds):
+    """Return the comparison of a regime."""
     cases = []
-    for kind in sorted(kinds, key=lambda name: name != REFERENCE):
-        how = KINDS[kind]
-        settings = search_settings(prepared(regime, kind), how.maker)
-        cases.append(Case(kind, settings, runs=how.runs))
+    for kind, how in KINDS.items():
+        if kind in kinds:
+            settings = search_settings(prepared(regime, kind), how.maker)
+            cases.append(Case(kind, settings, runs=how.runs))
     return comparison_of(regime, cases)
 
 
-def write(path: Path, text: str) -> None:
-    before, rest = path.read_text(encoding='utf-8').split(BEGIN)
-    after = rest.split(END)[1]
-    path.write_text(f'{before}{BEGIN}\n{text}{END}{after}', encoding='utf-8')
-
-
-def main() -> int:
+def main():
     parser = argparse.ArgumentParser(prog='search_quality', description=__doc__)
     parser.add_argument('--planner', nargs='*', choices=tuple(KINDS), default=list(KINDS))
     parser.add_argument(
@@ -59,14 +153,15 @@ def main() -> int:
         for regime in regimes
     ]
     problems = carry_out_all(plans, max(options.jobs, 1))
-    text = '\n'.join(
-        f'**{name}** (limit {REGIMES[name].limit:g} s)\n\n{SearchTable(work.results()).markdown()}'
-        for name, work in zip(regimes, plans)
-    )
-    head = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer for slow planners).\n'
-    print(f'{head}\n{text}')
+    text = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer for slow planners).\n'
+    for name, work in zip(regimes, plans):
+        table = SearchTable(work.results()).markdown()
+        text += f'\n**{name}** (limit {REGIMES[name].limit:g} s)\n\n{table}'
+    print(text)
     if options.document is not None:
-        write(options.document, f'{head}\n{text}')
+        before, rest = options.document.read_text(encoding='utf-8').split(BEGIN)
+        page = f'{before}{BEGIN}\n{text}{END}{rest.split(END)[1]}'
+        options.document.write_text(page, encoding='utf-8')
     return 1 if problems else 0
 
 

@@ -8,12 +8,8 @@ and clusters with a mass above 1/2; those of the JPDA tracker are its tracks, fr
 detection on. It is told pi at each track, as a constant would delete tracks out of view.
 """
 
-from __future__ import annotations
-
 import datetime
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 from unittest.mock import patch
 
@@ -37,14 +33,13 @@ from stonesoup.types.state import GaussianState
 from stonesoup.types.update import GaussianStateUpdate
 from stonesoup.updater.kalman import ExtendedKalmanUpdater
 
-from maasi_filter import AgentMeasurement, Pose, Sensor, make_filter
-from maasi_filter.arrays import FloatArray
+from maasi_filter import make_filter
 from maasi_filter.metrics import gospa
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_sim.experiments.statistics import mean_interval
-from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
 
+HEAD = 'condition', 'runs', '', 'mean GOSPA [m]', 'at the end [m]', 'step [ms]'
 CUTOFF = 10.0
 START = datetime.datetime(2026, 1, 1)
 # Of what Stone Soup is told: the least clutter in a scan, as of `pmb`.
@@ -55,42 +50,32 @@ MOST_MISSES = 3.0
 LEAST_WALK = 1e-6
 
 
-@dataclass
-class View:
-    """The sensor and its pose at the scan that is processed."""
-
-    sensor: Sensor
-    pose: Pose
-
-    def probability(self, state: Any) -> float:
-        place = np.asarray(state.mean, float).reshape(1, 3)
-        return min(float(self.sensor.detection.probability(place, self.pose)[0]), 0.999)
+def probability(scan, state):
+    """Return pi at a track, by the sensor and its pose at the scan that is processed."""
+    place = np.asarray(state.mean, float).reshape(1, 3)
+    return min(float(scan[0].sensor.detection.probability(place, scan[0].pose)[0]), 0.999)
 
 
 class ViewedHypothesiser(PDAHypothesiser):
     """Probabilistic data association that is told pi at each track."""
 
-    view: View = Property(doc='Sensor and pose')
+    scan: Any = Property(doc='The scan that is processed')
 
-    def hypothesise(self, track: Any, detections: Any, timestamp: Any, **kwargs: Any) -> Any:
-        self.prob_detect = Probability(max(self.view.probability(track.state), 1e-6))
+    def hypothesise(self, track, detections, timestamp, **kwargs):
+        self.prob_detect = Probability(max(probability(self.scan, track.state), 1e-6))
         return super().hypothesise(track, detections, timestamp, **kwargs)
 
 
 class MissedDeleter(Deleter):
     """Deletes a track whose detections were expected, and did not come."""
 
-    view: View = Property(doc='Sensor and pose')
+    scan: Any = Property(doc='The scan that is processed')
 
-    def check_for_deletion(self, track: Any, **kwargs: Any) -> bool:
+    def check_for_deletion(self, track, **kwargs):
         """Count the expected detections that were missed."""
-        missed = track.metadata.get('missed', 0.0)
-        if isinstance(track.state, GaussianStateUpdate):
-            missed = 0.0
-        else:
-            missed += self.view.probability(track.state)
-        track.metadata['missed'] = missed
-        return bool(missed > MOST_MISSES)
+        missed = track.metadata.get('missed', 0.0) + probability(self.scan, track.state)
+        track.metadata['missed'] = 0.0 if isinstance(track.state, GaussianStateUpdate) else missed
+        return track.metadata['missed'] > MOST_MISSES
 
 
 class StoneSoup:
@@ -100,35 +85,35 @@ class StoneSoup:
     the targets' walk [m/sqrt(s)].
     """
 
-    def __init__(self, scan: AgentMeasurement, bounds: FloatArray, walk: float) -> None:
-        self.view = View(scan.sensor, scan.pose)
-        space = scan.sensor.measurement_space(bounds)
+    def __init__(self, scan, bounds, walk):
+        # One place that all read.
+        self.scan = [scan]
         walks = [RandomWalk(max(walk**2, LEAST_WALK))] * 3
         predictor = ExtendedKalmanPredictor(CombinedLinearGaussianTransitionModel(walks))
         updater = ExtendedKalmanUpdater(None)
+        least = LEAST_CLUTTER / scan.sensor.measurement_space(bounds)
         hypothesiser = ViewedHypothesiser(
             predictor=predictor,
             updater=updater,
-            clutter_spatial_density=max(scan.sensor.clutter, LEAST_CLUTTER / space),
+            clutter_spatial_density=max(scan.sensor.clutter, least),
             prob_gate=Probability(0.9999),
-            view=self.view,
+            scan=self.scan,
         )
-        deleter = MissedDeleter(view=self.view)
+        deleter = MissedDeleter(scan=self.scan)
+        distance = DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=4)
         # A detection says where a target is on each axis: the prior is not used.
         initiator = MultiMeasurementInitiator(
             prior_state=GaussianState(np.zeros((3, 1)), np.eye(3)),
             deleter=deleter,
-            data_associator=GNNWith2DAssignment(
-                DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=4)
-            ),
+            data_associator=GNNWith2DAssignment(distance),
             updater=updater,
             min_points=2,
         )
         associator = JPDA(hypothesiser=hypothesiser)
         self.tracker = MultiTargetMixtureTracker(initiator, deleter, None, associator, updater)
 
-    def step(self, scan: AgentMeasurement, seconds: float) -> None:
-        self.view.sensor, self.view.pose = scan.sensor, scan.pose
+    def step(self, scan, seconds):
+        self.scan[0] = scan
         now = START + datetime.timedelta(seconds=seconds)
         # Stone Soup's order is elevation, bearing, range.
         order = [2, 1, 0]
@@ -145,29 +130,15 @@ class StoneSoup:
         self.tracker.detector_iter = iter([(now, detections)])
         next(self.tracker)
 
-    def estimates(self) -> FloatArray:
-        """Return the positions of the tracks, (n, 3), metres."""
-        rows = [np.asarray(track.state.mean, float).ravel() for track in self.tracker.tracks]
-        return np.array(rows).reshape(-1, 3)
+    def estimates(self):
+        return [np.asarray(track.state.mean, float).ravel() for track in self.tracker.tracks]
 
 
-def recorded(scenario: Scenario, seed: int) -> list[tuple[list[AgentMeasurement], int, float]]:
-    """Return what a search with `pmb` measured: measurements, steps gone and time of each batch."""
-    batches: list[tuple[list[AgentMeasurement], int, float]] = []
-    true_step = PmbFilter.step
-
-    def step(self: Any, measurements: Sequence[AgentMeasurement], gone: int, now: float) -> Any:
-        batches.append((list(measurements), gone, now))
-        return true_step(self, measurements, gone, now)
-
-    with patch.object(PmbFilter, 'step', step):
-        search(scenario, seed)
-    return batches
-
-
-def compare(scenario: Scenario, seed: int) -> FloatArray:
+def compare(scenario, seed):
     """Return mean GOSPA, GOSPA at the end and time of a step [s], of both filters, (2, 3)."""
-    batches = recorded(scenario, seed)
+    with patch.object(PmbFilter, 'step', autospec=True, side_effect=PmbFilter.step) as step:
+        search(scenario, seed)
+    batches = [call.args[1:] for call in step.call_args_list]
     bounds, world = scenario.environment.array(), scenario.world(seed)
     ours = make_filter(scenario.filter, bounds, np.random.default_rng(seed))
     theirs = StoneSoup(batches[0][0][0], bounds, scenario.filter.pmb.walk or 0.0)
@@ -182,26 +153,16 @@ def compare(scenario: Scenario, seed: int) -> FloatArray:
         positions = [target.position for target in ours.found_targets]
         positions += [cluster.position for cluster in ours.clusters if cluster.mass > 0.5]
         truth = world.targets_at(round(now / scenario.step))
-        for row, estimate in enumerate((np.array(positions).reshape(-1, 3), theirs.estimates())):
-            scores[row, k] = gospa(estimate, truth, CUTOFF).total
+        for row, estimate in enumerate((positions, theirs.estimates())):
+            scores[row, k] = gospa(np.array(estimate).reshape(-1, 3), truth, CUTOFF).total
     return np.stack([scores.mean(axis=1), scores[:, -1], np.median(times, axis=1)], axis=1)
 
 
-def print_table(
-    conditions: Sequence[str],
-    seeds: Sequence[int],
-    prepare: Callable[[str, str, int], Scenario],
-) -> None:
-    """Print a table of both on the same detections; means with 95 % half widths."""
-    print('| condition | runs | | mean GOSPA [m] | at the end [m] | step [ms] |')
-    print('|---|---|---|---|---|---|')
+def rows(conditions, seeds, prepare):
+    """Yield rows of both filters on the same detections; means with 95 % half widths."""
     for name in conditions:
-        every = [compare(prepare(name, 'pmb', seed), seed) for seed in seeds]
-        for row, method in enumerate(('pmb', 'Stone Soup JPDA')):
-            cells = [mean_interval([both[row, column] for both in every]) for column in range(3)]
-            spans = [f'{cell.mean:.2f} ± {cell.half_width:.2f}' for cell in cells[:2]]
-            print(
-                f'| {name} | {len(seeds)} | {method} | {spans[0]} | {spans[1]} | '
-                f'{1e3 * cells[2].mean:.1f} |',
-                flush=True,
-            )
+        every = np.array([compare(prepare(name, 'pmb', seed), seed) for seed in seeds])
+        for method, runs in zip(('pmb', 'Stone Soup JPDA'), every.transpose(1, 2, 0)):
+            mean, end, step = map(mean_interval, runs)
+            spans = [f'{cell.mean:.2f} ± {cell.half_width:.2f}' for cell in (mean, end)]
+            yield name, str(len(seeds)), method, *spans, f'{1e3 * step.mean:.1f}'
