@@ -9,7 +9,7 @@ import inspect
 import re
 import sys
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.machinery import PathFinder
@@ -39,6 +39,13 @@ class PluginError(ValueError):
 def is_reference(text: Any) -> bool:
     """Return whether a value is of the form `module:Class`."""
     return isinstance(text, str) and _REFERENCE.fullmatch(text) is not None
+
+
+def unknown(read: Any, known: Sequence[str], what: str) -> str:
+    """Return the complaint about an unknown name, with the closest known one first."""
+    close = difflib.get_close_matches(str(read), known, n=1, cutoff=0.6)
+    hint = f" (did you mean '{close[0]}'?)" if close else ''
+    return f'unknown {what} {read!r:.60}{hint}, known are {", ".join(known)}'
 
 
 def add_folders(folders: Iterable[str | Path]) -> list[str]:
@@ -124,12 +131,7 @@ class PluginGroup:
         return {item.name: item for item in _entry_points(tuple(sys.path)).select(group=self.group)}
 
     def _unknown(self, name: str, known: list[str]) -> str:
-        close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-        hint = f" (did you mean '{close[0]}'?)" if close else ''
-        return (
-            f"unknown {self.what} '{name}'{hint}, known are {', '.join(known)}, and module:Class "
-            'of your own'
-        )
+        return f'{unknown(name, known, self.what)}, and module:Class of your own'
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from scipy.stats import binomtest, chi2
 from maasi_filter import warm_up
 from maasi_filter.vector_math import squared_distance
 from maasi_sim.experiments.campaign import make_workers, run_command
-from maasi_sim.experiments.searches import merged
 from maasi_sim.experiments.statistics import mean_interval, paired_difference
 from maasi_sim.experiments.tables import markdown_table
+from maasi_sim.scenario.layering import merged
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
 from maasi_sim.simulation.sensors import RangingSensor

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from maasi_filter import NoiseSettings
-from maasi_sim.experiments.searches import merged
+from maasi_sim.scenario.layering import merged
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.simulation.world import noise_stream
 

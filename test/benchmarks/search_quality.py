@@ -16,8 +16,9 @@ from quality_conditions import NOISES, endless, wanted
 
 from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
 from maasi_sim.experiments.experiment import Case
-from maasi_sim.experiments.searches import comparison_of, merged, search_settings
+from maasi_sim.experiments.searches import comparison_of, search_settings
 from maasi_sim.experiments.tables import SearchTable
+from maasi_sim.scenario.layering import merged
 from maasi_sim.scenario.schema import Scenario
 
 BEGIN, END = '<!-- table: begin -->', '<!-- table: end -->'

@@ -104,7 +104,7 @@ WRONG = [
     ([('robots.mambo.link', 'serial')], 'robots.mambo.link', ['topics']),
     ([('step', 'fast')], 'step', ["read 'fast'", 'a valid number']),
     ([('step', True)], 'step', ['read true', 'a valid number']),
-    ([('step', float('nan'))], 'step', ['.nan', 'finite']),
+    ([('step', float('nan'))], 'step', ['NaN', 'finite']),
     ([('step', -0.1)], 'step', ['read -0.1', 'greater than 0']),
     ([('version', 2)], 'version', ['unknown value 2', '1']),
     ([('version', None)], 'version', ['is missing']),
@@ -112,7 +112,7 @@ WRONG = [
     ([('robots', {})], 'robots', ['at least 1 item, not 0']),
     ([('robots', [1])], 'robots', ['a mapping']),
     ([('robots.mambo', 3)], 'robots.mambo', ['a mapping']),
-    ([('robots.mambo.type', None)], 'robots.mambo.type', ['is missing']),
+    ([('robots.mambo.type', None)], 'robots.mambo.type', ['None', 'turtlebot3_burger']),
     ([('robots.mambo.start', [0.5, 0.5])], 'robots.mambo.start', ['at least 3 items, not 2']),
     ([('robots.mambo.start.1', 'x')], 'robots.mambo.start[1]', ["read 'x'", 'a valid number']),
     ([('robots.mambo.start', [0.5, 2.5, 1.0])], 'robots.mambo.start', ['environment.bounds']),
@@ -171,13 +171,13 @@ DOCS = Path(__file__).parents[2] / 'docs'
 LINKED = {'link': 'mavlink', 'mavlink': {'arm': True, 'url': 'udpin:127.0.0.1:14550'}}
 WRONG_LINKS = [
     ('drone', {'mavlink': None}, 'drone.mavlink', 'is missing'),
-    ('drone', {'mavlink': {'arm': False}}, 'drone.mavlink.arm', 'nothing would ever fly'),
+    ('drone', {'mavlink': {'arm': False}}, 'drone.mavlink.arm', 'never take off'),
     ('drone', {'mavlink': {'arm': True, 'url': 'tcp:a:1'}}, 'drone.mavlink.url', 'udpin'),
     ('drone', {'mavlink': {'arm': True, 'map_yaw': 0.1}}, 'drone.mavlink.map_yaw', 'is 0'),
     ('drone', {'autopilot': {'firmware': 'ardusub'}}, 'drone.mavlink.vehicle', "'ardusub'"),
     ('drone', {'start': [1.0, 1.0, 0.0]}, 'drone.start', 'above mavlink.ground'),
     ('rov', {'start': [1.0, 1.0, 1.0]}, 'rov.start', 'below mavlink.ground'),
-    ('drone', {'guard': True}, 'drone.guard', 'its autopilot stops it'),
+    ('drone', {'guard': True}, 'drone.guard', 'time limit of its own'),
     ('rov', {'mavlink': {'arm': True, 'url': 'udpin:127.0.0.1:14550'}}, 'rov.mavlink.url', 'drone'),
     ('drone', {'driver': 'ranging_driver'}, 'drone.link', 'does not have it'),
     ('mambo', {'mambo': {'arm': False}}, 'mambo.mambo.arm', 'read false, allowed is true'),
@@ -248,8 +248,8 @@ def test_the_line_is_that_of_the_key(load):
 @pytest.mark.parametrize(
     ('name', 'words'),
     [
-        ('missing.yaml', 'there is no such file'),
-        ('.', 'is a folder'),
+        ('missing.yaml', 'No such file'),
+        ('.', 'Is a directory'),
         ('binary.yaml', 'not text'),
         ('mamb', "did you mean 'mambo'"),
     ],
@@ -268,7 +268,7 @@ BOMB = 'a0: &a0 [x, x, x, x, x, x, x, x, x]\n' + ''.join(
 @pytest.mark.parametrize(
     'text, words',
     [
-        ('', 'is empty'),
+        ('', 'read null, a mapping of keys'),
         ('- a\n- b\n', 'a mapping of keys is needed'),
         ('version: 1\nstep: [0.05\n', 'is not YAML'),
         ('version: 1\nversion: 1\n', 'version: stands there twice'),

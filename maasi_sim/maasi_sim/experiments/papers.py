@@ -25,7 +25,8 @@ from maasi_sim.experiments.experiment import (
     Published,
     WrongInput,
 )
-from maasi_sim.experiments.searches import merged, search_case
+from maasi_sim.experiments.searches import search_case
+from maasi_sim.scenario.layering import merged
 
 QUANTITIES = {item.name: item for item in (*searches.QUANTITIES, *buildings.QUANTITIES)}
 RUNS = {

@@ -22,12 +22,11 @@ from maasi_sim.experiments.figures import draw_comparison
 from maasi_sim.experiments.tables import SearchTable
 from maasi_sim.machine import code_digest
 from maasi_sim.run.buildings.scenario import is_cuboid_scenario
-from maasi_sim.scenario.layering import Key, ScenarioError
+from maasi_sim.scenario.layering import Key, ScenarioError, merged
 from maasi_sim.scenario.loading import (
     find_scenario,
     load_scenario,
     read_scenario,
-    scenario_from_content,
     scenario_from_values,
 )
 from maasi_sim.scenario.schema import Scenario
@@ -60,17 +59,6 @@ MAP_NODES = 1024
 DEVIATION = 150.0
 
 
-def merged(*layers: Mapping[str, Any]) -> dict[str, Any]:
-    """Return mappings merged key by key, later ones on top."""
-    result: dict[str, Any] = {}
-    for layer in layers:
-        for key, value in layer.items():
-            below = result.get(key)
-            both = isinstance(below, Mapping) and isinstance(value, Mapping)
-            result[key] = merged(below, value) if both else deepcopy(value)  # type: ignore[arg-type]
-    return result
-
-
 def search_case(
     name: str,
     values: Mapping[str, Any],
@@ -96,7 +84,7 @@ def search_case(
 
 def run_search(settings: dict[str, Any], seed: int) -> Outcome:
     """Run a search of a case and return its results."""
-    scenario = scenario_from_content(settings['scenario'], 'settings')
+    scenario = scenario_from_values(settings['scenario'], 'settings')
     result = search(scenario, seed, settings['most_measurements'])
     return outcome_of(result, settings['most_measurements'], scenario.limits.time)
 
@@ -151,7 +139,7 @@ def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
     Column 'explored' is after each measurement batch, that of the summary at the end.
     """
     outcome = run_search(settings, seed)
-    scenario = scenario_from_content(settings['scenario'], 'settings')
+    scenario = scenario_from_values(settings['scenario'], 'settings')
     bounds = scenario.environment.array()
     exploration = UnexploredMap(bounds, float((bounds[:, 1] - bounds[:, 0]).max()) / 26.0)
     columns = outcome.columns
@@ -299,7 +287,7 @@ def code_of(scenario: Scenario) -> str:
 
 def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
     """Run a search of a case; RuntimeError if the code differs from that of the settings."""
-    scenario = scenario_from_content(settings['scenario'], 'settings')
+    scenario = scenario_from_values(settings['scenario'], 'settings')
     if settings['code'] != code_of(scenario):
         raise RuntimeError('this worker has another version of the code')
     limit = scenario.limits.time

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
-import math
+import json
 import re
 import typing
-import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +14,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from maasi_filter.plugins import own_settings
+from maasi_filter.plugins import own_settings, unknown
 from maasi_filter.ros.parameters import choices
 
 Key = tuple[str | int, ...]
@@ -44,21 +43,6 @@ def to_yaml(content: Any) -> str:
 
 # Far more than any scenario has.
 _MOST_ENTRIES = 100_000
-_STRANGE = yaml.reader.Reader.NON_PRINTABLE
-
-
-class _Loader(yaml.SafeLoader):
-    """A safe loader that also takes `1e-3` for a number, as YAML 1.2 and ROS do."""
-
-
-_Loader.yaml_implicit_resolvers = {
-    first: list(pairs) for first, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:float',
-    re.compile(r'^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$'),
-    list('-+.0123456789'),
-)
 
 
 @dataclass
@@ -77,181 +61,145 @@ class Layer:
                 return self.origins[key[:length]]
         return ''
 
+    def located(self, problem: str) -> str:
+        """Return a problem, `key: text`, with the place of its key before it."""
+        parts = re.findall(r'[^.[\]]+', problem.partition(': ')[0])
+        key = tuple(int(part) if part.isdigit() else part for part in parts)
+        return f'{self.origin(key)}: {problem}'
 
-def read_layer(path: Path) -> Layer:
-    """Read a YAML file whose top is a mapping."""
+
+class _Loader(yaml.SafeLoader):
+    """A safe loader that also takes `1e-3` for a number, as YAML 1.2 and ROS do.
+
+    Refused are keys that are not text or stand twice, and aliases that hold themselves or stand
+    for more than anyone would write.
+    """
+
+    def __init__(self, text: str, path: Path) -> None:
+        super().__init__(text)
+        self.path = path
+        self.origins: dict[Key, str] = {}
+
+    def place(self, node: yaml.Node) -> str:
+        """Return `file:line` of a node."""
+        return f'{self.path}:{node.start_mark.line + 1}'
+
+    def values(self, node: yaml.Node, key: Key, above: tuple[yaml.Node, ...] = ()) -> Any:
+        """Return the values of a node, and note where each key stands."""
+        if node in above:
+            raise ScenarioError(f'{self.place(node)}: an alias stands inside its own anchor')
+        if len(self.origins) >= _MOST_ENTRIES:
+            raise ScenarioError(
+                f'{self.place(node)}: read more than {_MOST_ENTRIES} entries, aliases counted as '
+                'often as they stand there'
+            )
+        self.origins.setdefault(key, self.place(node))
+        above = (*above, node)
+        if isinstance(node, yaml.SequenceNode):
+            return [
+                self.values(item, (*key, index), above) for index, item in enumerate(node.value)
+            ]
+        if not isinstance(node, yaml.MappingNode):
+            return self.construct_object(node, deep=True)
+        mapping: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            name = self.construct_object(key_node, deep=True)
+            inner, place = (*key, name), self.place(key_node)
+            if not isinstance(name, str):
+                raise ScenarioError(
+                    f'{place}: {dotted(key)}: read {_show(name)} as a key, allowed is text'
+                )
+            if name in mapping:
+                raise ScenarioError(f'{place}: {dotted(inner)}: stands there twice')
+            self.origins[inner] = place
+            mapping[name] = self.values(value_node, inner, above)
+        return mapping
+
+
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float',
+    re.compile(r'^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$'),
+    list('-+.0123456789'),
+)
+
+
+def read_layer(path: Path, key: Key = ()) -> Layer:
+    """Read a YAML file whose top is a mapping, as the values under a key."""
     try:
         text = path.read_text(encoding='utf-8')
-    except FileNotFoundError:
-        raise ScenarioError(f'{path}: there is no such file') from None
-    except IsADirectoryError:
-        raise ScenarioError(f'{path}: is a folder, a YAML file is needed') from None
-    except UnicodeDecodeError:
-        raise ScenarioError(f'{path}: is not text in UTF-8') from None
+        loader = _Loader(text, path)
+        node = loader.get_single_node()
+        data = None if node is None else loader.values(node, key)
     except OSError as error:
         raise ScenarioError(f'{path}: cannot be read: {error.strerror}') from None
-    strange = _STRANGE.search(text)
-    if strange:
-        number = text.count('\n', 0, strange.start()) + 1
+    except UnicodeDecodeError:
+        raise ScenarioError(f'{path}: is not text in UTF-8') from None
+    except yaml.reader.ReaderError as error:
+        line = text.count('\n', 0, error.position) + 1
         raise ScenarioError(
-            f'{path}:{number}: is not YAML: read character {ord(strange.group()):#x}, allowed is '
-            'text without control characters'
-        )
-    loader = _Loader(text)
-    layer = Layer(None, folder=path.parent)
-    try:
-        node = loader.get_single_node()
-        if node is None:
-            raise ScenarioError(f'{path}: is empty, a mapping of keys is needed')
-        layer.data = _build(loader, node, (), layer.origins, path)
+            f'{path}:{line}: is not YAML: read character {error.character:#x}, allowed is text '
+            'without control characters'
+        ) from None
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        place = f'{path}:{mark.line + 1}' if mark else path
+        place = f'{path}:{error.problem_mark.line + 1}' if error.problem_mark else path
         raise ScenarioError(f'{place}: is not YAML: {error.problem}') from None
-    except yaml.YAMLError as error:
-        raise ScenarioError(f'{path}: is not YAML: {" ".join(str(error).split()):.200}') from None
     except RecursionError:
         raise ScenarioError(f'{path}: is nested too deeply') from None
-    finally:
-        loader.dispose()
-    if not isinstance(layer.data, dict):
-        raise ScenarioError(
-            f'{path}: read {_show(layer.data)}, a mapping of keys is needed at the top'
-        )
-    return layer
+    if not isinstance(data, dict):
+        raise ScenarioError(f'{path}: read {_show(data)}, a mapping of keys is needed at the top')
+    return under(key, data, loader.origins, path.parent)
 
 
-def _build(
-    loader: _Loader,
-    node: yaml.Node,
-    key: Key,
-    origins: dict[Key, str],
-    path: Path,
-    above: tuple[yaml.Node, ...] = (),
-) -> Any:
-    """Return the values of a node, and note where each key stands.
-
-    Refused are aliases that hold themselves, or that stand for more than anyone would write.
-    """
-    place = f'{path}:{node.start_mark.line + 1}'
-    if node in above:
-        raise ScenarioError(f'{place}: an alias stands inside its own anchor')
-    if len(origins) >= _MOST_ENTRIES:
-        raise ScenarioError(
-            f'{place}: read more than {_MOST_ENTRIES} entries, aliases counted as often as they '
-            'stand there'
-        )
-    origins[key] = place
-    above = (*above, node)
-    if isinstance(node, yaml.SequenceNode):
-        return [
-            _build(loader, item, (*key, index), origins, path, above)
-            for index, item in enumerate(node.value)
-        ]
-    if not isinstance(node, yaml.MappingNode):
-        return loader.construct_object(node, deep=True)
-    mapping: dict[str, Any] = {}
-    for key_node, value_node in node.value:
-        name = loader.construct_object(key_node, deep=True)
-        place = f'{path}:{key_node.start_mark.line + 1}'
-        if not isinstance(name, str):
-            raise ScenarioError(
-                f'{place}: {dotted(key) or "the whole"}: read {_show(name)} as a key, allowed is '
-                'text'
-            )
-        inner = (*key, name)
-        if name in mapping:
-            raise ScenarioError(f'{place}: {dotted(inner)}: stands there twice')
-        mapping[name] = _build(loader, value_node, inner, origins, path, above)
-        origins[inner] = place
-    return mapping
-
-
-def under(key: Key, layer: Layer) -> Layer:
-    """Return a layer in which the tree of another stands under a key."""
-    data = layer.data
+def under(key: Key, data: Any, origins: dict[Key, str], folder: Path | None = None) -> Layer:
+    """Return a layer of a value under a key."""
     for step in reversed(key):
         data = {step: data}
-    return Layer(data, {(*key, *path): origin for path, origin in layer.origins.items() if path})
+    return Layer(data, origins, folder)
 
 
 def merge(*layers: Layer) -> Layer:
     """Merge layers: mappings key by key, anything else is replaced by the later one."""
-    result = Layer({}, folder=layers[-1].folder)
+    origins = {key: origin for layer in layers for key, origin in layer.origins.items()}
+    return Layer(merged(*(layer.data for layer in layers)), origins, layers[-1].folder)
+
+
+def merged(*layers: Mapping[str, Any]) -> dict[str, Any]:
+    """Return mappings merged key by key, later ones on top; anything else is replaced."""
+    result: dict[str, Any] = {}
     for layer in layers:
-        result.data = _merge(result.data, layer.data)
-        result.origins.update(layer.origins)
+        for key, value in layer.items():
+            below = result.get(key)
+            both = isinstance(below, Mapping) and isinstance(value, Mapping)
+            result[key] = merged(below, value) if both else value  # type: ignore[arg-type]
     return result
 
 
-def _merge(below: Any, above: Any) -> Any:
-    if not (isinstance(below, dict) and isinstance(above, dict)):
-        return above
-    both = {name: _merge(below[name], above[name]) for name in below.keys() & above.keys()}
-    return below | above | both
-
-
-def override(layer: Layer, key: Key, value: Any, origin: str) -> None:
-    """Put a value under a key, making the mappings above it; `origin` stands for its place."""
-    data = layer.data
-    for step in key[:-1]:
-        if not isinstance(data.get(step), dict):
-            data[step] = {}
-        data = data[step]
-    data[key[-1]] = value
-    layer.origins[key] = origin
-
-
 def validate(model: type[Model], layer: Layer) -> Model:
-    """Return the settings of a tree, strictly by type; an error has one line for each wrong key."""
+    """Return the settings of a tree, strictly by type; an error has a line for each problem."""
     try:
         return model.model_validate(layer.data, strict=True)
     except ValidationError as error:
         errors = error.errors(include_url=False)
-    problems: dict[Key, list[Any]] = {}
+    problems = []
     for item in errors:
-        problems.setdefault(_resolve(item['loc'], layer.data, item['type']), []).append(item)
-    lines = []
-    for key, items in problems.items():
-        texts = list(dict.fromkeys(_explain(item, key, model, layer.data) for item in items))
-        read = f'read {_show(items[0]["input"])}, '
-        texts[1:] = [text.removeprefix(read) for text in texts[1:]]
-        origin = layer.origin(key)
-        lines.append(f'{origin}: {dotted(key) or "the whole"}: ' + '; or '.join(texts))
-    raise ScenarioError('\n'.join(lines))
+        key = _key(item, layer.data)
+        text = _explain(item, key, model, layer.data)
+        problems.append(f'{layer.origin(key)}: {dotted(key)}: {text}')
+    raise ScenarioError('\n'.join(dict.fromkeys(problems)))
 
 
-def refuse(layer: Layer, problems: Iterable[tuple[Key, str]]) -> None:
-    """Raise a ScenarioError with one line for each problem between keys, if there is one."""
-    lines = [f'{layer.origin(key)}: {dotted(key)}: {text}' for key, text in problems]
-    if lines:
-        raise ScenarioError('\n'.join(lines))
-
-
-def doubt(layer: Layer, problems: Iterable[tuple[Key, str]]) -> None:
-    """Issue a ScenarioWarning for each problem."""
-    for key, text in problems:
-        warnings.warn(f'{layer.origin(key)}: {dotted(key)}: {text}', ScenarioWarning, stacklevel=3)
-
-
-def _resolve(loc: Sequence[str | int], data: Any, kind: str) -> Key:
-    """Return the keys of a pydantic location; tags of unions are left out."""
-    key: list[str | int] = []
-    for index, step in enumerate(loc):
-        known = isinstance(data, dict) and step in data
-        if isinstance(data, list) and isinstance(step, int):
-            known = step < len(data)
-        if known:
+def _key(item: Any, data: Any) -> Key:
+    """Return the key of an error of pydantic, whose location also has tags of unions."""
+    key = []
+    for step in item['loc']:
+        with suppress(KeyError, IndexError, TypeError):
             data = data[step]
-        elif not (kind == 'missing' and index == len(loc) - 1):
-            continue
-        key.append(step)
-    return tuple(key)
+            key.append(step)
+    return (*key, item['loc'][-1]) if item['type'] == 'missing' else tuple(key)
 
 
 def _explain(item: Any, key: Key, model: type[BaseModel], data: Any) -> str:
     kind, context = item['type'], item.get('ctx', {})
-    read = f'read {_show(item["input"])}, '
     if kind == 'extra_forbidden':
         return unknown(str(key[-1]), _known_keys(model, key[:-1], data), 'key')
     if kind == 'missing':
@@ -263,62 +211,30 @@ def _explain(item: Any, key: Key, model: type[BaseModel], data: Any) -> str:
         return str(context['error'])
     text = item['msg'].replace('Input should be', 'allowed is').replace(' after validation', '')
     text = re.sub(r'a valid dictionary( or .*)?', 'a mapping of keys', text)
-    return f'{read}{text[0].lower()}{text[1:]}'
+    return f'read {_show(item["input"])}, {text[0].lower()}{text[1:]}'
 
 
-def unknown(read: Any, known: Sequence[str], what: str) -> str:
-    """Return the complaint about an unknown name, with the closest known ones first."""
-    close = difflib.get_close_matches(str(read), known, n=1, cutoff=0.6)
-    hint = f" (did you mean '{close[0]}'?)" if close else ''
-    return f'unknown {what} {_show(read)}{hint}, known are {", ".join(known)}'
+def _known_keys(model: Any, key: Key, data: Any) -> list[str]:
+    """Return the keys of the settings that stand under a key."""
+    for step in key:
+        if hasattr(model, 'model_fields'):
+            fields = {info.alias or name: info for name, info in model.model_fields.items()}
+            model = own_settings(fields[str(step)], data) or fields[str(step)].annotation
+        else:
+            model = typing.get_args(model)[-1]
+        model = next(item for item in choices(model) if item is not type(None))
+        data = data[step]
+    return [info.alias or name for name, info in model.model_fields.items()]
 
 
 def dotted(key: Key) -> str:
     """Return a key as text: `robots.mambo.start[2]`."""
-    text = ''
-    for step in key:
-        text += f'[{step}]' if isinstance(step, int) else f'.{step}' if text else step
-    return text
-
-
-def _known_keys(model: type[BaseModel], key: Key, data: Any) -> list[str]:
-    annotations: list[Any] = [model]
-    for step in key:
-        annotations = [
-            inner
-            for annotation in annotations
-            for candidate in choices(annotation)
-            for inner in _inside(candidate, step, data)
-        ]
-        data = data[step]
-    return [
-        info.alias or name
-        for annotation in annotations
-        for candidate in choices(annotation)
-        if isinstance(candidate, type) and issubclass(candidate, BaseModel)
-        for name, info in candidate.model_fields.items()
-    ]
-
-
-def _inside(annotation: Any, step: str | int, data: Any) -> list[Any]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        for name, info in annotation.model_fields.items():
-            if step in (name, info.alias):
-                return [own_settings(info, data) or info.annotation]
-        return []
-    if typing.get_origin(annotation) in (list, dict):
-        return [typing.get_args(annotation)[-1]]
-    return []
+    text = ''.join(f'[{step}]' if isinstance(step, int) else f'.{step}' for step in key)
+    return text.removeprefix('.') or 'the whole'
 
 
 def _show(value: Any) -> str:
-    if isinstance(value, str):
-        return f"'{value}'" if len(value) <= 60 else f"'{value[:57]}...'"
-    if isinstance(value, float) and not math.isfinite(value):
-        return {math.inf: '.inf', -math.inf: '-.inf'}.get(value, '.nan')
-    if value is None:
-        return 'nothing'
     if isinstance(value, Mapping):
         return 'a mapping of keys'
-    text = str(value).lower() if isinstance(value, bool) else str(value)
-    return text if len(text) <= 60 else text[:57] + '...'
+    text = repr(value) if isinstance(value, str) else json.dumps(value, default=str)
+    return text if len(text) <= 60 else f'{text[:57]}...'

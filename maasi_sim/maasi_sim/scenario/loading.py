@@ -5,28 +5,23 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from copy import deepcopy
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, TypeVar
 
-from maasi_filter.plugins import is_reference
-from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.scenario.base import BaseScenario
+from maasi_filter.plugins import is_reference, unknown
+from maasi_sim.scenario.base import BaseScenario, ScenarioEnvironment
 from maasi_sim.scenario.checks import Problems, doubts_about, problems_of
 from maasi_sim.scenario.layering import (
     Key,
     Layer,
     ScenarioError,
     ScenarioWarning,
-    dotted,
-    doubt,
     merge,
-    override,
     read_layer,
-    refuse,
     under,
-    unknown,
     validate,
 )
 from maasi_sim.scenario.schema import RobotSettings, Scenario
@@ -38,18 +33,14 @@ AnyScenario = TypeVar('AnyScenario', bound=BaseScenario)
 def config_folder() -> Path:
     """Return the folder of `robots/` and `scenarios/`: of ROS, of pip, or of this repository."""
     places = []
-    try:
+    with suppress(ImportError, LookupError, OSError):
         from ament_index_python.packages import get_package_share_directory
 
         places.append(Path(get_package_share_directory('maasi_config')))
-    except (ImportError, LookupError, OSError):
-        pass
-    try:
-        files = distribution('maasi_config').files or []
-    except PackageNotFoundError:
-        files = []
-    manifests = [file for file in files if file.match('share/maasi_config/package.xml')]
-    places += [Path(os.path.normpath(file.locate())).parent for file in manifests]
+    with suppress(PackageNotFoundError):
+        for item in distribution('maasi_config').files or []:
+            if item.match('share/maasi_config/package.xml'):
+                places.append(Path(os.path.normpath(item.locate())).parent)
     places.append(Path(__file__).resolve().parents[3] / 'config')
     for folder in places:
         # Of links to the files of a repository, messages name those.
@@ -91,23 +82,20 @@ def load_scenario(
 def read_scenario(path: str | Path) -> Layer:
     """Return the values of a scenario file with its layers, not checked yet."""
     path = find_scenario(path)
-    layer = _with_types(read_layer(path), path)
-    _name_folders(layer)
-    return layer
+    return _with_folders(_with_types(read_layer(path), path))
 
 
-def _name_folders(layer: Layer) -> None:
-    """Name the folders of modules in `plugin_path`, where a plugin is given as module:Class."""
-    folder = layer.folder or Path.cwd()
+def _with_folders(layer: Layer) -> Layer:
+    """Return a layer that names folders of modules, where a plugin is given as module:Class."""
+    key, folder = ('plugin_path',), layer.folder or Path.cwd()
     given = layer.data.get('plugin_path', [])
     if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
-        return
+        return layer
     folders = [folder / item for item in given]
     if _names_module(layer.data):
         folders += [folder, Path.cwd()]
-    if folders:
-        absolute = dict.fromkeys(str(item.absolute()) for item in folders)
-        override(layer, ('plugin_path',), list(absolute), layer.origin(('plugin_path',)))
+    absolute = list(dict.fromkeys(str(item.absolute()) for item in folders))
+    return merge(layer, under(key, absolute, {key: layer.origin(key)}, layer.folder))
 
 
 def _names_module(data: Any) -> bool:
@@ -117,30 +105,20 @@ def _names_module(data: Any) -> bool:
 
 
 def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
-    """Return the scenario of values as a scenario file has them: types come from config/robots.
+    """Return the scenario of values as a scenario file has them, or of `Scenario.content`.
 
-    What a program made gets no warnings.
+    Types come from config/robots. What a program made gets no warnings.
     """
     layer = Layer(deepcopy(values), {(): origin})
-    return _without_warnings(_with_types(layer, config_folder() / 'scenarios' / origin))
-
-
-def scenario_from_content(content: dict[str, Any], origin: str) -> Scenario:
-    """Return the scenario of values with all layers merged, as from `Scenario.content`."""
-    return _without_warnings(Layer(content, {(): origin}))
-
-
-def _without_warnings(layer: Layer) -> Scenario:
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore', ScenarioWarning)
-        return check_scenario(layer)
+    return check_scenario(_with_types(layer, config_folder() / 'scenarios' / origin))
 
 
 def check_scenario(
     layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None = None
 ) -> Scenario:
     """Return the scenario of a tree of values with all layers merged."""
-    return checked(Scenario, _with_candidates(layer), overrides, problems_of)
+    _give_candidates(layer)
+    return checked(Scenario, layer, overrides, problems_of)
 
 
 def checked(
@@ -153,81 +131,66 @@ def checked(
     if overrides:
         # What wins over the file hides none of its errors.
         validate(model, layer)
-        layer = deepcopy(layer)
         for origin, (key, value) in overrides.items():
-            if key == ('planner', 'name') and isinstance(layer.data.get('planner'), dict):
+            if key == ('planner', 'name'):
                 # Of the planner that this one replaces.
-                layer.data['planner'].pop('settings', None)
-            override(layer, key, value, origin)
-        _name_folders(layer)
+                layer.data.get('planner', {}).pop('settings', None)
+            layer = merge(layer, under(key, value, {key: origin}, layer.folder))
+        layer = _with_folders(layer)
     scenario = validate(model, layer)
-    refuse(layer, problems(scenario))
-    doubt(layer, doubts_about(scenario))
+    lines = [layer.located(problem) for problem in problems(scenario)]
+    if lines:
+        raise ScenarioError('\n'.join(lines))
+    for doubt in doubts_about(scenario) if layer.folder else ():
+        warnings.warn(layer.located(doubt), ScenarioWarning, stacklevel=2)
     return scenario
 
 
-def _with_candidates(layer: Layer) -> Layer:
-    """Return a tree in which robots without candidates have a grid that sees everything."""
-    robots = layer.data.get('robots')
-    if not isinstance(robots, dict):
-        return layer
-    result = deepcopy(layer)
-    for name, values in robots.items():
-        if isinstance(values, dict) and values.get('candidates') is None:
-            candidates: dict[str, Any] = {'ring': 4, 'distance': 1.0}
-            try:
-                robot = RobotSettings.model_validate({**values, 'candidates': candidates})
-                environment = EnvironmentSettings.model_validate(layer.data.get('environment'))
-                candidates = covering_grid(name, robot, environment)
-            except ValueError:
-                # The error is reported when all is validated.
-                pass
-            key: Key = ('robots', name, 'candidates')
-            override(result, key, candidates, layer.origin(key))
-    return result
+def _give_candidates(layer: Layer) -> None:
+    """Give robots without candidates a grid that sees everything."""
+    for name, values in _robots(layer).items():
+        if values.get('candidates') is None:
+            values['candidates'] = {'ring': 4, 'distance': 1.0}
+            # Errors are reported when all is validated.
+            with suppress(ValueError):
+                robot = RobotSettings.model_validate(values)
+                environment = ScenarioEnvironment.model_validate(layer.data.get('environment'))
+                values['candidates'] = covering_grid(name, robot, environment)
 
 
 def _with_types(layer: Layer, path: Path) -> Layer:
-    """Return a layer over those of the types of its robots."""
-    robots = layer.data.get('robots')
-    if not isinstance(robots, dict):
-        return layer
+    """Return the layer of a scenario file over those of the types of its robots."""
+    folders = [path.parent / 'robots', path.parent.parent / 'robots', config_folder() / 'robots']
+    files = {file.stem: file for folder in reversed(folders) for file in folder.glob('*.yaml')}
+    known = sorted(files.keys() - {'all'})
+    robots = _robots(layer)
     # In the order of the file.
     types = [Layer({'robots': {name: {} for name in robots}})]
     for name, own in robots.items():
-        if isinstance(own, dict):
-            key: Key = ('robots', name)
-            types += [under(key, item) for item in _type_layers(own, path, layer, key)]
+        if own.keys() >= RobotSettings.model_fields.keys():
+            # Of a run: with all layers merged, where the files of types may be missing.
+            continue
+        kind = own.get('type')
+        if kind not in known:
+            problem = unknown(kind, known, 'robot type')
+            raise ScenarioError(layer.located(f'robots.{name}.type: {problem}'))
+        key: Key = ('robots', name)
+        types += [read_layer(files[item], key) for item in ('all', kind) if item in files]
     return merge(*types, layer)
 
 
-def _type_layers(own: dict[str, Any], path: Path, layer: Layer, key: Key) -> list[Layer]:
-    """Return the layers of a robot's type, for a scenario file."""
-    folders = [path.parent / 'robots', path.parent.parent / 'robots', config_folder() / 'robots']
-    files: dict[str, Path] = {}
-    for folder in folders:
-        for file in sorted(folder.glob('*.yaml')):
-            files.setdefault(file.stem, file)
-    kind, known = own.get('type'), sorted(files.keys() - {'all'})
-    if kind not in known and own.keys() >= RobotSettings.model_fields.keys():
-        # Of a run: with all layers merged, where the files of types may be missing.
-        return []
-    if kind is None or (isinstance(kind, str) and kind not in known):
-        key = (*key, 'type')
-        problem = f'is missing, known are {", ".join(known)}'
-        text = problem if kind is None else unknown(kind, known, 'robot type')
-        raise ScenarioError(f'{layer.origin(key)}: {dotted(key)}: {text}')
-    return [read_layer(files[name]) for name in ('all', str(kind)) if name in files]
+def _robots(layer: Layer) -> dict[str, dict[str, Any]]:
+    """Return the settings of the robots that have any, which may be wrong."""
+    robots = layer.data.get('robots')
+    if not isinstance(robots, dict):
+        return {}
+    return {name: own for name, own in robots.items() if isinstance(own, dict)}
 
 
 def robot_type(name: str) -> RobotSettings:
     """Return a robot of a type in `config/robots`, on its own."""
-    content = {
-        'type': name,
-        'start': [0.0, 0.0, 0.0],
-        'candidates': {'ring': 4, 'distance': 1.0},
-    }
-    origin = f'robot type {name}'
-    layer = Layer({}, {(): origin})
-    layers = _type_layers(content, config_folder() / 'scenarios' / name, layer, ())
-    return validate(RobotSettings, merge(*layers, Layer(content, {(): origin})))
+    candidates = {'ring': 4, 'distance': 1.0}
+    content = {'type': name, 'start': [0.0, 0.0, 0.0], 'candidates': candidates}
+    layer = Layer({'robots': {name: content}}, {(): f'robot type {name}'})
+    layer = _with_types(layer, config_folder() / 'scenarios' / name)
+    return validate(RobotSettings, Layer(layer.data['robots'][name], layer.origins))

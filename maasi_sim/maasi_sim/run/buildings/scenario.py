@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -14,7 +13,7 @@ from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
 from maasi_planner.buildings.settings import CuboidSettings, DynamicsSettings, SearcherSettings
 from maasi_sim.run.buildings.mission import CuboidMission
 from maasi_sim.scenario.base import BaseScenario, ScenarioEnvironment
-from maasi_sim.scenario.checks import check_names, event_problems
+from maasi_sim.scenario.checks import Problems, event_problems, name_problems
 from maasi_sim.scenario.layering import Key, Layer, ScenarioError
 from maasi_sim.scenario.loading import checked, read_scenario
 from maasi_sim.simulation.odometry import OdometrySettings
@@ -95,40 +94,32 @@ def load_cuboid_scenario(
     return check_cuboid_scenario(layer, overrides)
 
 
-def _problems(scenario: CuboidScenario) -> Iterator[tuple[Key, str]]:
-    """Yield what is wrong between the keys: key and text."""
+def _problems(scenario: CuboidScenario) -> Problems:
+    """Yield what is wrong between the keys."""
     if scenario.dimension != 3:
         yield (
-            ('environment', 'bounds'),
-            f'read {scenario.dimension} axes, allowed are three: buildings are searched in 3D',
+            f'environment.bounds: read {scenario.dimension} axes, allowed are three: buildings are '
+            'searched in 3D'
         )
         return
     if scenario.environment.obstacles:
         yield (
-            ('environment', 'obstacles'),
-            'read some, allowed is none: those of this planner are boxes, planner.obstacles',
+            'environment.obstacles: read some, allowed is none: those of this planner are boxes, '
+            'planner.obstacles'
         )
-    for name in scenario.names():
-        for text in check_names(name):
-            yield ('robots', name), text
-    yield from event_problems(scenario.events, scenario.names())
+    yield from name_problems(scenario)
+    yield from event_problems(scenario)
     try:
         mission = scenario.mission()
     except ValueError as error:
-        yield _split(('planner',), str(error))
+        yield f'planner.{error}'
         return
     for name, robot in scenario.robots.items():
         try:
             SearchAgent(name, scenario.planner, mission, robot, scenario.step)
         except ValueError as error:
-            yield _split(('robots',), str(error).replace(': ', '.', 1))
-
-
-def _split(head: Key, text: str) -> tuple[Key, str]:
-    """Return the key that a message begins with, and what is left of it."""
-    key, _, rest = text.partition(': ')
-    parts = tuple(int(part) if part.isdigit() else part for part in re.findall(r'\w+', key))
-    return ((*head, *parts), rest) if rest else (head, text)
+            # It begins with `name: key: `.
+            yield f'robots.{str(error).replace(": ", ".", 1)}'
 
 
 def mission_of(scenario: CuboidScenario) -> CuboidMission:
