@@ -73,10 +73,13 @@ class RangingDriver(AgentDriver):
 
 
 class TurtlebotDriver(AgentDriver):
-    """A ground robot with a camera; see `TurtlebotLink` and `CameraInput`."""
+    """A ground robot with a camera; see `TurtlebotLink`, `Nav2Link` and `CameraInput`."""
 
     def __init__(self, **options: Any) -> None:
-        link = partial(_link, 'turtlebot_link:TurtlebotLink')
+        def link(driver: RobotNode) -> RobotLink:
+            kind = 'Nav2Link' if driver.settings.navigation == 'nav2' else 'TurtlebotLink'
+            return _link(f'turtlebot_link:{kind}', driver)
+
         super().__init__({'topics': link}, CameraInput, **options)
 
 

@@ -107,7 +107,9 @@ class TopicLink(RobotLink):
             # In the plane the bounds of the environment have no heights.
             height, flight = settings.start[2], FlightSettings()
             self.fence = make_fence(driver.bounds, settings.radius, height, flight)
-        self._publisher: CommandPublisher | None = None
+        self._commands = CommandPublisher(
+            driver, 'cmd_vel', settings.command_type, settings.lockstep
+        )
         self._polls = 0
         # Whether it has a guard, and whether it had one.
         self._guarded = self._was_guarded = False
@@ -115,20 +117,16 @@ class TopicLink(RobotLink):
         self._command.header.frame_id = f'{driver.robot}/base_link'
 
     def connect(self) -> None:
-        """Subscribe, and publish commands."""
-        driver, settings = self.driver, self.driver.settings
-        commands = CommandPublisher(driver, 'cmd_vel', settings.command_type, settings.lockstep)
-        self._publisher = commands
-        if settings.poses == 'odometry':
+        """Subscribe, and expect that the robot does."""
+        driver = self.driver
+        if driver.settings.poses == 'odometry':
             OdometryTopic(driver)
         self._battery = BatteryTopic(driver)
-        driver.expect_subscribers(lambda: commands.publisher)
+        driver.expect_subscribers(lambda: self._commands.publisher)
 
     def close(self) -> None:
         """Destroy the publisher."""
-        if self._publisher is not None:
-            self._publisher.destroy()
-            self._publisher = None
+        self._commands.destroy()
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
         """Publish a command, with the stamp of the pose."""
@@ -141,18 +139,14 @@ class TopicLink(RobotLink):
 
     def stop(self) -> None:
         """Publish zeros, and wait until they have arrived."""
-        if self._publisher is None:
-            return
         for _ in range(_STOP_COMMANDS):
             self._publish(_ZERO)
-        if self._publisher.publisher is not None:
-            self._publisher.publisher.wait_for_all_acked(_STOP_TIME)
+        if self._commands.publisher is not None:
+            self._commands.publisher.wait_for_all_acked(_STOP_TIME)
 
     def poll(self) -> None:
         """Follow the type that the robot subscribes to; warn where nothing does."""
-        if self._publisher is None:
-            return
-        if problem := self._publisher.refresh():
+        if problem := self._commands.refresh():
             self.driver.warn_throttled('cmd_vel', problem)
         if self._polls % _GUARD_POLLS == 0:
             readers = self.driver.get_subscriptions_info_by_topic('state')
@@ -179,11 +173,9 @@ class TopicLink(RobotLink):
 
     def repeat(self) -> None:
         """Publish the last command again."""
-        if self._publisher is not None:
-            self._publisher.publish(self._command)
+        self._commands.publish(self._command)
 
     def _publish(self, command: Sequence[float]) -> None:
         twist = self._command.twist
         twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z = command
-        if self._publisher is not None:
-            self._publisher.publish(self._command)
+        self._commands.publish(self._command)

@@ -1,8 +1,8 @@
-"""A ground robot with topics, and where it has them a laser scan and Nav2."""
+"""Ground robots with topics: by the driver's own commands, with a laser scan, or by Nav2."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,120 +18,9 @@ from maasi_drivers.links.topic_link import TopicLink
 from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.clocks import Silence
 from maasi_filter.ros.conversions import point_to_ros, stamp_to_ros
-from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
+from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_planner.motion import MotionModel, RobotState
 from maasi_planner.obstacles import Obstacles
-
-
-class Nav2Navigation:
-    """Hands waypoints to Nav2's `navigate_to_pose` (nav2_msgs/NavigateToPose); timeout in s."""
-
-    def __init__(
-        self,
-        node: LockstepLifecycleNode[Any],
-        frame: str,
-        timeout: float,
-        on_end: Callable[[Goal, bool, str], None],
-    ) -> None:
-        try:
-            from nav2_msgs.action import NavigateToPose
-        except ImportError as error:
-            raise SettingsError(
-                "parameter navigation: read 'nav2', but the package nav2_msgs is not installed "
-                "(sudo apt install ros-$ROS_DISTRO-nav2-msgs); allowed without it is 'own'"
-            ) from error
-        self._type = NavigateToPose
-        self._frame = frame
-        self._timeout = timeout
-        self._on_end = on_end
-        self._silence = Silence(node)
-        self._client = node.permanent(
-            'navigate_to_pose', lambda: ActionClient(node, NavigateToPose, 'navigate_to_pose')
-        )
-        #: The goal that it drives to.
-        self.goal: Goal | None = None
-        self._handle: Any = None
-        # Handle of the replaced goal, until Nav2 has accepted the present one.
-        self._replaced: Any = None
-
-    @property
-    def available(self) -> bool:
-        """Whether its action server is there; DDS notices a killed one only after some 20 s."""
-        return bool(self._client.server_is_ready())
-
-    def problem(self) -> str:
-        """Return what is wrong with Nav2 while it drives, or nothing."""
-        silence = self._silence.length
-        if self.goal is None:
-            return ''
-        if not self.available:
-            return 'Nav2 is gone'
-        late = silence > self._timeout
-        return f'no answer or feedback of Nav2 for {silence:.1f} s' if late else ''
-
-    def go(self, goal: Goal, heading: float) -> None:
-        """Send the robot to a waypoint, to face `heading` there [rad].
-
-        Nav2 replaces the goal before, without a stop.
-        """
-        self._replaced = self._handle or self._replaced
-        self.goal, self._handle = goal, None
-        self._silence.end()
-        pose = PoseStamped()
-        pose.header.frame_id = self._frame
-        pose.pose.position = point_to_ros([goal.waypoint[0], goal.waypoint[1], 0.0])
-        pose.pose.orientation.z = float(np.sin(0.5 * heading))
-        pose.pose.orientation.w = float(np.cos(0.5 * heading))
-        request = self._type.Goal(pose=pose)
-        future = self._client.send_goal_async(request, lambda _: self._silence.end())
-        future.add_done_callback(lambda answer: self._answered(goal, answer.result()))
-
-    def _answered(self, goal: Goal, handle: Any) -> None:
-        self._silence.end()
-        if handle is None or not handle.accepted:
-            if goal is self.goal:
-                self._stop_replaced()
-            self._ended(goal, False, 'Nav2 refuses the waypoint')
-            return
-        if goal is self.goal:
-            self._handle, self._replaced = handle, None
-        elif self.goal is None:
-            # Given up before Nav2 had answered.
-            handle.cancel_goal_async()
-            return
-        elif self._handle is None:
-            self._replaced = handle
-        result = handle.get_result_async()
-        result.add_done_callback(lambda answer: self._finished(goal, answer.result()))
-
-    def _finished(self, goal: Goal, answer: Any) -> None:
-        reached = answer.status == ActionStatus.STATUS_SUCCEEDED
-        ended = 'cancelled it' if answer.status == ActionStatus.STATUS_CANCELED else 'gave it up'
-        # Humble's result is empty, newer ones have code and text.
-        code = getattr(answer.result, 'error_code', 0)
-        text = getattr(answer.result, 'error_msg', '')
-        reason = f'Nav2 {ended}{f", error {code}" if code else ""}{f": {text}" if text else ""}'
-        self._ended(goal, reached, '' if reached else reason)
-
-    def _ended(self, goal: Goal, reached: bool, reason: str) -> None:
-        if goal is self.goal:
-            self.goal = self._handle = None
-            self._on_end(goal, reached, reason)
-
-    def give_up(self, goal: Goal) -> None:
-        """Have Nav2 stop, if it is on the way to this goal."""
-        if goal is not self.goal:
-            return
-        handle, self.goal, self._handle = self._handle, None, None
-        self._stop_replaced()
-        if handle is not None:
-            handle.cancel_goal_async()
-
-    def _stop_replaced(self) -> None:
-        """Cancel the goal before, where Nav2 has not taken another one instead."""
-        handle, self._replaced = self._replaced, None
-        if handle is not None:
-            handle.cancel_goal_async()
 
 
 class TurtlebotLink(TopicLink):
@@ -144,25 +33,11 @@ class TurtlebotLink(TopicLink):
     Subscribes
     ----------
     `scan` (sensor_msgs/LaserScan), with the parameters `scan.*`: a dynamic window keeps clear of it
-
-    Actions
-    -------
-    client of `navigate_to_pose` (nav2_msgs/NavigateToPose), with `navigation: nav2`; `cmd_vel` is
-    then Nav2's while the robot is on its way
     """
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
         self._scan: ScanInput | None = None
-        self._nav2: Nav2Navigation | None = None
-
-    def prepare(self) -> None:
-        """Make the client of Nav2."""
-        settings = self.driver.settings
-        if settings.navigation == 'nav2':
-            self._nav2 = Nav2Navigation(
-                self.driver, settings.frame, settings.nav2_timeout, self._on_nav2_end
-            )
 
     def make_motion(self) -> MotionModel:
         """Return the controller, which uses the scan where there is one."""
@@ -175,15 +50,10 @@ class TurtlebotLink(TopicLink):
         return motion
 
     def connect(self) -> None:
-        """Subscribe, and publish commands."""
+        """Subscribe."""
         super().connect()
         if self._scan is not None:
             self._scan.set_up()
-
-    def close(self) -> None:
-        """Destroy the publisher, and drop the client of Nav2."""
-        super().close()
-        self._nav2 = None
 
     def reset(self) -> None:
         """Discard the scan of another time."""
@@ -205,51 +75,129 @@ class TurtlebotLink(TopicLink):
             command = np.zeros(4)
         return command, reached
 
+
+class Nav2Link(TurtlebotLink):
+    """A ground robot that Nav2 drives to its waypoints; see `TurtlebotLink`.
+
+    Actions
+    -------
+    client of `navigate_to_pose` (nav2_msgs/NavigateToPose); `cmd_vel` is Nav2's while the robot is
+    on its way
+    """
+
+    def __init__(self, driver: RobotNode) -> None:
+        super().__init__(driver)
+        try:
+            from nav2_msgs.action import NavigateToPose
+        except ImportError as error:
+            raise SettingsError(
+                "parameter navigation: read 'nav2', but the package nav2_msgs is not installed "
+                "(sudo apt install ros-$ROS_DISTRO-nav2-msgs); allowed without it is 'own'"
+            ) from error
+        self._type = NavigateToPose
+        # Since the last answer or feedback.
+        self._silence = Silence(driver)
+        self._client = driver.permanent(
+            'navigate_to_pose', lambda: ActionClient(driver, NavigateToPose, 'navigate_to_pose')
+        )
+        # The goal that Nav2 drives to, and its handle.
+        self._goal: Goal | None = None
+        self._handle: Any = None
+        # Handle of the replaced goal, until Nav2 has accepted the present one.
+        self._replaced: Any = None
+
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
-        """Return whether it moves: where Nav2 drives, by the velocity of the odometry."""
-        if self._nav2 is None:
-            return super().is_moving(placed, command)
+        """Return whether it moves, by the velocity of the odometry."""
         velocity = np.array([*placed.velocity, placed.angular_velocity[2]])
         return super().is_moving(placed, velocity)
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
-        """Publish a command; with Nav2 zeros, and nothing while it drives."""
-        if self._nav2 is None:
-            super().send(placed, command)
-            return
+        """Publish zeros, and nothing while Nav2 drives."""
         self._command.header.stamp = stamp_to_ros(placed.stamp)
-        if self._nav2.goal is None:
+        if self._goal is None:
             self.hold()
 
     def poll(self) -> None:
-        """Check the link, and Nav2."""
+        """Check the link; stop a robot whose Nav2 is gone or silent."""
         super().poll()
-        if self._nav2 is not None and (problem := self._nav2.problem()):
-            self.driver.end_goal(GoalStatus.ABORTED, problem)
-            self.hold()
+        silence = self._silence.length
+        # DDS notices a killed server only after some 20 s.
+        gone = not self._client.server_is_ready()
+        if self._goal is None or not (gone or silence > self.driver.settings.nav2_timeout):
+            return
+        silent = f'no answer or feedback of Nav2 for {silence:.1f} s'
+        self.driver.end_goal(GoalStatus.ABORTED, 'Nav2 is gone' if gone else silent)
+        self.hold()
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
-        """Refuse goals without Nav2, where Nav2 is to drive."""
-        if self._nav2 is None:
-            return super().goal_problem(position)
-        return None if self._nav2.available else 'navigate_to_pose: Nav2 is not there'
+        """Refuse goals without Nav2."""
+        there = self._client.server_is_ready()
+        return None if there else 'navigate_to_pose: Nav2 is not there'
 
     def goal_taken(self, goal: Goal) -> None:
-        """Send the goal to Nav2."""
-        if self._nav2 is None:
-            return
+        """Send the goal to Nav2, which replaces the one before without a stop."""
         latest, heading = self.driver.history.latest, self.driver.settings.yaw
         if latest is not None:
             ahead = goal.waypoint - latest.pose.position
             heading = float(np.arctan2(ahead[1], ahead[0]))
-        self._nav2.go(goal, heading)
+        self._replaced = self._handle or self._replaced
+        self._goal, self._handle = goal, None
+        self._silence.end()
+        pose = PoseStamped()
+        pose.header.frame_id = self.driver.settings.frame
+        pose.pose.position = point_to_ros([goal.waypoint[0], goal.waypoint[1], 0.0])
+        pose.pose.orientation.z = float(np.sin(0.5 * heading))
+        pose.pose.orientation.w = float(np.cos(0.5 * heading))
+        request = self._type.Goal(pose=pose)
+        future = self._client.send_goal_async(request, lambda _: self._silence.end())
+        future.add_done_callback(lambda answer: self._answered(goal, answer.result()))
 
     def goal_ended(self, goal: Goal) -> None:
-        """Cancel the goal of Nav2."""
-        if self._nav2 is not None:
-            self._nav2.give_up(goal)
+        """Have Nav2 stop, if it is on the way to this goal."""
+        if goal is not self._goal:
+            return
+        handle, self._goal, self._handle = self._handle, None, None
+        self._stop_replaced()
+        if handle is not None:
+            handle.cancel_goal_async()
 
-    def _on_nav2_end(self, goal: Goal, reached: bool, reason: str) -> None:
-        if goal is self.driver.follower.current:
-            status = GoalStatus.REACHED if reached else GoalStatus.ABORTED
-            self.driver.end_goal(status, reason)
+    def _answered(self, goal: Goal, handle: Any) -> None:
+        self._silence.end()
+        if handle is None or not handle.accepted:
+            if goal is self._goal:
+                self._stop_replaced()
+            self._end(goal, GoalStatus.ABORTED, 'Nav2 refuses the waypoint')
+            return
+        if goal is self._goal:
+            self._handle, self._replaced = handle, None
+        elif self._goal is None:
+            # Given up before Nav2 had answered.
+            handle.cancel_goal_async()
+            return
+        elif self._handle is None:
+            self._replaced = handle
+        result = handle.get_result_async()
+        result.add_done_callback(lambda answer: self._finished(goal, answer.result()))
+
+    def _finished(self, goal: Goal, answer: Any) -> None:
+        if answer.status == ActionStatus.STATUS_SUCCEEDED:
+            self._end(goal, GoalStatus.REACHED, '')
+            return
+        ended = 'cancelled it' if answer.status == ActionStatus.STATUS_CANCELED else 'gave it up'
+        # Humble's result is empty, newer ones have code and text.
+        code = getattr(answer.result, 'error_code', 0)
+        text = getattr(answer.result, 'error_msg', '')
+        reason = f'Nav2 {ended}{f", error {code}" if code else ""}{f": {text}" if text else ""}'
+        self._end(goal, GoalStatus.ABORTED, reason)
+
+    def _end(self, goal: Goal, status: GoalStatus, reason: str) -> None:
+        if goal is self._goal:
+            self._goal = self._handle = None
+            if goal is self.driver.follower.current:
+                self.driver.end_goal(status, reason)
+
+    def _stop_replaced(self) -> None:
+        """Cancel the goal before, where Nav2 has not taken another one instead."""
+        handle, self._replaced = self._replaced, None
+        if handle is not None:
+            handle.cancel_goal_async()
