@@ -19,7 +19,7 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.node_parameters import check
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import parameter_fields
-from maasi_sim.run.launch_arguments import ARGUMENTS
+from maasi_sim.run.run_options import launch_arguments
 from maasi_sim.scenario.layering import merge, to_yaml
 from maasi_sim.scenario.loading import find_scenario, load_scenario, read_layer
 from maasi_sim.scenario.schema import RobotSettings, Scenario
@@ -180,7 +180,7 @@ def check_command(program, *rest):
         else:
             launch = (ROOT / package / 'launch' / name).read_text()
             given = {argument.partition(':=')[0] for argument in arguments}
-            assert all(item in ARGUMENTS or f"'{item}'" in launch for item in given)
+            assert all(item in launch_arguments() or f"'{item}'" in launch for item in given)
     elif program.startswith('python') and rest[0] == '-m' and rest[1].startswith('maasi'):
         check_module(rest[1], rest[2:])
     elif program.startswith('python') and rest[0].endswith('.py'):

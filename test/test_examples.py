@@ -21,7 +21,7 @@ from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.node_plan import RunSettings
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario import load_scenario
 from maasi_sim.search import search
@@ -156,10 +156,9 @@ OF_THE_FIELD = {
 def test_the_parameters_of_the_field_are_those_of_its_simulation():
     folder = EXAMPLES / 'field_team'
     file = folder / 'search.yaml'
-    run = RunSettings(1, False, None, False, file)
     plans = {
         '_'.join(filter(None, (plan.namespace, plan.name))): plan
-        for plan in TargetMission('search', load_scenario(file)).plan_nodes(run)
+        for plan in TargetMission('search', load_scenario(file)).plan_nodes(Options(), file)
     }
     for node, (_, model, allowed) in OF_THE_FIELD.items():
         parameters = yaml.safe_load((folder / f'{node}.yaml').read_text())['/**']['ros__parameters']

@@ -15,7 +15,7 @@ from maasi_filter.ros.parameters import flatten, parameter_fields, unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
 from maasi_planner.settings import PLANNERS, PlannerSettings
-from maasi_sim.run.node_plan import RunSettings
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario import ScenarioError, load_scenario
 from maasi_sim.search import search
@@ -361,14 +361,14 @@ def test_driver_of_ones_own_is_tried_before_anything_starts(folder):
     (folder / 'mine.py').write_text('import nowhere_too\n')
     changes = {'driver': (('robots', 'rover', 'driver'), 'mine:Driver')}
     scenario = load_scenario(folder / 'search.yaml', changes)
-    run = RunSettings(1, True, None, False, folder / 'search.yaml')
+    run = Options(lockstep=True), folder / 'search.yaml'
     mission = TargetMission('search', scenario)
     with pytest.raises(ScenarioError, match=r"robots\.rover\.driver: .*'nowhere_too'"):
-        mission.plan_nodes(run)
+        mission.plan_nodes(*run)
     (folder / 'mine.py').write_text(
         'from maasi_drivers.drivers import RangingDriver\nclass Driver(RangingDriver):\n    pass\n'
     )
-    (plan,) = [plan for plan in mission.plan_nodes(run) if plan.drives]
+    (plan,) = [plan for plan in mission.plan_nodes(*run) if plan.drives]
     assert plan.command(Path('x'), Path('y'))[:3] == ['x', 'mine:Driver', str(folder)]
     with pytest.raises(ScenarioError, match=r"unknown driver 'mambo_drive' .*mean 'mambo_d"):
         load_scenario(folder / 'search.yaml', {'d': (('robots', 'rover', 'driver'), 'mambo_drive')})

@@ -20,7 +20,7 @@ from pydantic_core import PydanticUndefined
 
 from maasi_filter.ros.parameters import ParameterField, choices, parameters_of
 from maasi_sim.run.buildings.scenario import CuboidScenario
-from maasi_sim.run.launch_arguments import ending
+from maasi_sim.run.ending import EXIT_CODES
 from maasi_sim.scenario.schema import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -239,11 +239,11 @@ def messages_page() -> str:
 
 def commands_page() -> str:
     os.environ['COLUMNS'] = '100'
-    codes = [(str(number), ending(number).partition(': ')[2]) for number in (1, 2, 3, 4, 130)]
+    codes = [(str(code), meaning) for code, meaning in EXIT_CODES.items()]
     text = [
         '# Commands and exit codes\n',
         'Of `run_scenario`:\n',
-        table(('exit code', 'meaning'), [('0', 'ended as intended'), *codes]),
+        table(('exit code', 'meaning'), codes),
     ]
     for module in PARSERS:
         parser = importlib.import_module(module).build_parser()

@@ -12,7 +12,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.substitutions import ExecutableInPackage
 
-from maasi_sim.run.launch_arguments import ARGUMENTS, ending, is_true, scenario_options
+from maasi_sim.run.ending import EXIT_CODES
+from maasi_sim.run.run_options import is_true, launch_arguments, scenario_options
 
 # Wall time for stopping the robots and writing the results before it is terminated or killed [s].
 PATIENCE = '60'
@@ -21,7 +22,8 @@ PATIENCE = '60'
 def end_launch(event: ProcessExited, context: LaunchContext) -> EmitEvent:
     """End the launch; an exception makes its exit status 1."""
     if event.returncode:
-        raise RuntimeError(ending(event.returncode))
+        meaning = EXIT_CODES.get(event.returncode, 'unknown')
+        raise RuntimeError(f'run_scenario exited with {event.returncode}: {meaning}')
     return EmitEvent(event=Shutdown(reason='the run has ended'))
 
 
@@ -45,7 +47,7 @@ def show(scenario: str, team: str) -> Node:
 
 def start_run(context: LaunchContext) -> list:
     """Return the actions that start the run, and RViz if asked for."""
-    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    given = {name: LaunchConfiguration(name).perform(context) for name in launch_arguments()}
     # First, so that nothing starts where it is not installed.
     actions = (
         [show(given['scenario'].strip(), given['namespace'].strip(' /'))]
@@ -68,7 +70,7 @@ def generate_launch_description() -> LaunchDescription:
         [
             *(
                 DeclareLaunchArgument(name, default_value=default, description=description)
-                for name, (default, description) in ARGUMENTS.items()
+                for name, (default, description) in launch_arguments().items()
             ),
             OpaqueFunction(function=start_run),
         ]

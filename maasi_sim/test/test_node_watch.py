@@ -1,73 +1,105 @@
 """Who hangs: silent nodes, but not those that start or wait for a processor."""
 
 import os
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from maasi_sim.run.supervisor import NodeWatch, waited_for_processor
+from maasi_sim.run import processes, supervisor
+from maasi_sim.run.node_plan import NodePlan
+from maasi_sim.run.processes import NodeProcess, waited_for_processor
+from maasi_sim.run.progress import ProgressDisplay
+from maasi_sim.run.supervisor import Supervisor
+from maasi_sim.scenario.loading import load_scenario
 
 FILTER, PLANNER = '/filter_node', '/planner_node'
 
 
+class Run:
+    """Two nodes whose heartbeats, clock and waits for a processor are played."""
+
+    def __init__(self, monkeypatch):
+        self.now = 0.0
+        self.beats, self.queued, self.stopped = {}, {}, []
+        clock = SimpleNamespace(monotonic=lambda: self.now)
+        monkeypatch.setattr(supervisor, 'time', clock)
+        monkeypatch.setattr(processes, 'waited_for_processor', lambda pid: self.queued.get(pid, 0))
+        plans = {name: NodePlan('maasi', 'node', name[1:]) for name in (FILTER, PLANNER)}
+        self.nodes = {name: NodeProcess(name, [], Path()) for name in plans}
+        for pid, node in enumerate(self.nodes.values(), start=1):
+            node._process = SimpleNamespace(pid=pid, exitcode=None)
+        recorder = SimpleNamespace(elapsed=0.0, relative=str, take_heartbeats=self.take)
+        scenario = load_scenario('mambo')
+        self.supervisor = Supervisor(
+            plans, self.nodes, scenario, False, recorder, ProgressDisplay()
+        )
+        self.supervisor.running = True
+
+    def take(self):
+        beats, self.beats = self.beats, {}
+        return beats
+
+    def beat(self, *names, at):
+        self.now = at
+        self.beats |= dict.fromkeys(names, at)
+        return self.supervisor.check()
+
+    def until(self, end):
+        """Look ten times a second; return the time and the words of the first ending."""
+        while self.now < end - 0.05:
+            self.now += 0.1
+            if ending := self.supervisor.check():
+                return self.now, ending.text
+        return None
+
+
 @pytest.fixture
-def watch():
-    # Time that processes have waited for a processor, by their numbers.
-    queued = {}
-    made = NodeWatch(4.5, 180.0, lambda pid: queued.get(pid, 0.0))
-    made.queued = queued
-    made.begin(FILTER, 1, 0.0)
-    made.begin(PLANNER, 2, 0.0)
-    return made
+def run(monkeypatch):
+    return Run(monkeypatch)
 
 
-def look(watch, begin, end):
-    """Look ten times a second, and return the first finding."""
-    for tick in range(round(10 * begin), round(10 * end)):
-        if hung := watch.hung(0.1 * tick):
-            return 0.1 * tick, hung
-    return None
-
-
-def test_a_silent_node_is_named_within_five_seconds_and_no_pause_of_three(watch):
-    for name in (FILTER, PLANNER):
-        watch.beat(name, 26.0)
-    assert look(watch, 26.1, 30.0) is None
-    watch.beat(FILTER, 30.0)
+def test_a_silent_node_is_named_within_five_seconds_and_no_pause_of_three(run):
+    run.beat(FILTER, PLANNER, at=26.0)
+    assert run.until(30.0) is None
+    run.beat(FILTER, at=30.0)
     for second in range(30, 34):
-        watch.beat(PLANNER, float(second))
-        assert look(watch, second, second + 1) is None
-    watch.beat(PLANNER, 34.0)
-    when, hung = look(watch, 34, 36)
-    assert list(hung) == [FILTER]
+        run.beat(PLANNER, at=float(second))
+        assert run.until(second + 1) is None
+    run.beat(PLANNER, at=34.0)
+    when, words = run.until(36.0)
+    assert words.startswith(f'{FILTER} hangs: no heartbeat for')
     assert when < 35.0
 
 
-def test_a_node_that_starts_has_as_long_as_the_limit_says(watch):
-    assert look(watch, 0, 179) is None
-    assert watch.late(179.0) == []
-    watch.beat(PLANNER, 179.5)
-    assert watch.starting() == [FILTER]
-    assert watch.late(181.0) == [FILTER]
+def test_a_node_that_starts_has_as_long_as_the_limit_says(run):
+    assert run.until(179.0) is None
+    run.beat(PLANNER, at=179.5)
+    when, words = run.until(181.0)
+    assert words == f'{FILTER} not ready 180 s after the start' and when < 180.5
     # The last heartbeat of the process before does not count.
-    watch.begin(PLANNER, 3, 190.0)
-    watch.beat(PLANNER, 190.2)
-    assert set(watch.starting()) == {FILTER, PLANNER}
+    node = run.nodes[PLANNER]
+    node.started, node.beaten, node.restarts = 190.0, None, 1
+    node.beat(190.2)
+    assert run.supervisor.restarting
+    node.beat(190.6)
+    assert not run.supervisor.restarting
 
 
-def test_time_in_the_queue_for_a_processor_does_not_count(watch):
-    watch.queued[1] = 2.0
-    watch.beat(FILTER, 1.0)
-    watch.queued[1] = 5.0
-    assert look(watch, 1.1, 8.4) is None
-    assert look(watch, 8.4, 9.0) is not None
+def test_time_in_the_queue_for_a_processor_does_not_count(run):
+    run.queued[1] = 2.0
+    run.beat(FILTER, at=1.0)
+    run.queued[1] = 5.0
+    assert run.until(8.4) is None
+    assert run.until(9.0) is not None
 
 
-def test_the_run_itself_may_have_stood_still(watch):
-    watch.beat(FILTER, 1.0)
-    watch.hung(1.1)
-    assert not watch.hung(61.1)
-    assert look(watch, 61.2, 65.0) is None
-    assert look(watch, 65.0, 66.5) is not None
+def test_the_run_itself_may_have_stood_still(run):
+    run.beat(FILTER, at=1.0)
+    run.until(1.2)
+    run.now = 61.2
+    assert run.until(65.0) is None
+    assert run.until(66.5) is not None
 
 
 def test_the_wait_for_a_processor_is_read_from_the_system():

@@ -15,8 +15,8 @@ from maasi_sim.run.buildings.building_mission import BuildingMission
 from maasi_sim.run.buildings.observer import CuboidRecord
 from maasi_sim.run.buildings.scenario import check_cuboid_scenario, load_cuboid_scenario
 from maasi_sim.run.buildings.simulation import CuboidSimulation
-from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.run.report_files import write_report
+from maasi_sim.run.run_options import Options
 from maasi_sim.scenario.layering import Layer
 from maasi_sim.scenario.schema import ScenarioError
 
@@ -43,8 +43,7 @@ def test_our_scenarios_load_and_are_read_back(name, tmp_path):
 @pytest.mark.parametrize('name', NAMES)
 def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     scenario = load_cuboid_scenario(name)
-    run = RunSettings(seed=4, lockstep=True, rate=None, recorder=True, file=Path('/s.yaml'))
-    plans = BuildingMission(name, scenario).plan_nodes(run)
+    plans = BuildingMission(name, scenario).plan_nodes(Options(lockstep=True), Path('/s.yaml'))
     assert [plan.full_name for plan in plans] == [
         '/sim_node',
         *(f'/{robot}/{node}' for robot in scenario.names() for node in ('cuboid_planner', 'guard')),

@@ -9,7 +9,8 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_sim.run.node_plan import NodePlan, RunSettings, in_team, with_followed_clock
+from maasi_sim.run.node_plan import NodePlan, plan_in_run
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario.loading import config_folder, load_scenario
 from maasi_sim.scenario.schema import ScenarioError
@@ -23,9 +24,9 @@ SCENARIOS = sorted(
 
 
 def plans_of(scenario, **changes):
-    options = {'seed': 4, 'lockstep': True, 'rate': None, 'recorder': True, 'file': Path('/s.yaml')}
-    run = RunSettings(**{**options, **changes})
-    return {plan.full_name: plan for plan in TargetMission('', scenario).plan_nodes(run)}
+    options = Options(**{'lockstep': True, **changes})
+    plans = TargetMission('', scenario).plan_nodes(options, Path('/s.yaml'))
+    return {plan.full_name: plan for plan in plans}
 
 
 def read_back(plan, model):
@@ -37,7 +38,7 @@ def read_back(plan, model):
 
 @pytest.mark.parametrize('name', SCENARIOS)
 def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
-    scenario = load_scenario(name)
+    scenario = load_scenario(name, {'--seed': (('seed',), 4)})
     # A link of a robot's own runs in real time.
     lockstep = all(robot.link == 'topics' for robot in scenario.robots.values())
     plans = plans_of(scenario, lockstep=lockstep)
@@ -66,29 +67,35 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     'lockstep, rate, expected', [(True, None, 0.0), (True, 2.0, 2.0), (False, None, 1.0)]
 )
 def test_the_sim_gets_the_file_how_fast_it_goes_and_whose_clock_it_is(lockstep, rate, expected):
-    plans = plans_of(load_scenario('mambo'), lockstep=lockstep, rate=rate, recorder=False)
+    scenario = load_scenario('mambo', {'--seed': (('seed',), 4)})
+    plans = plans_of(scenario, lockstep=lockstep, rate=rate)
     settings, simulated = read_back(plans['/sim_node'], SimNodeSettings)
     values = (settings.scenario, settings.seed, settings.lockstep, settings.rate, settings.recorder)
-    assert values == ('/s.yaml', 4, lockstep, expected, False)
+    assert values == ('/s.yaml', 4, lockstep, expected, True)
     # The clock is its own.
     assert not simulated
+    follows = Options(follow_clock=True)
     for plan in plans.values():
-        assert (with_followed_clock(plan) == plan) == (not plan.is_clock)
+        assert (plan_in_run(plan, follows, None) == plan) == (not plan.is_clock)
         assert plan.says_ready == (plan.name != 'guard')
-    settings, simulated = read_back(with_followed_clock(plans['/sim_node']), SimNodeSettings)
+    settings, simulated = read_back(plan_in_run(plans['/sim_node'], follows, None), SimNodeSettings)
     assert settings.follow_clock and simulated
 
 
 def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there():
     plans = plans_of(load_scenario('mambo_turtlebot'), lockstep=False)
     for name, plan in plans.items():
-        moved = in_team(plan, 'north/one')
+        moved = plan_in_run(plan, Options(namespace='north/one'), None)
         assert moved.full_name == f'/north/one{name}'
-        assert in_team(plan, '') is plan
+        assert plan_in_run(plan, Options(), None) == plan
     plan = NodePlan('p', 'e', 'driver', 'a', {'a.b': 1.5}, remaps={'/batch': '/a/batch'})
     for moved, space, batch in (
         (plan, '/a', '/batch:=/a/batch'),
-        (in_team(plan, 'team'), '/team/a', '/team/batch:=/team/a/batch'),
+        (
+            plan_in_run(plan, Options(namespace='team'), None),
+            '/team/a',
+            '/team/batch:=/team/a/batch',
+        ),
     ):
         command = moved.command(Path('/lib/e'), Path('/run/p.yaml'))
         assert command[:2] == ['/lib/e', '--ros-args']

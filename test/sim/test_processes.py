@@ -12,8 +12,7 @@ import pytest
 from node_kinds import KINDS
 from waiting import PATIENCE, wait_until
 
-from maasi_sim.run.node_server import ProcessError
-from maasi_sim.run.processes import NodeProcess, find_executable, stop
+from maasi_sim.run.processes import NodeProcess, ProcessError, find_executable, stop
 
 # Ignores the signals that are named.
 DEAF = """

@@ -16,8 +16,8 @@ from report_check import check_report
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs import msg
 from maasi_sim.run.bag import load_types
+from maasi_sim.run.mission import RunEnd
 from maasi_sim.run.report_files import write_report
-from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.targets.observer import TargetObserver
 from maasi_sim.run.targets.report import build_report, target_summary

@@ -14,7 +14,7 @@ import yaml
 from small_field import SMALL_FIELD
 
 from maasi_filter.records import FoundTarget, Label
-from maasi_sim.run.node_plan import RunSettings
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.targets.tables import csv_text, found_rows, geodetic, geojson_text
 from maasi_sim.scenario.base import OriginSettings
@@ -77,8 +77,7 @@ def field(folder, **origin):
 
 def test_nodes_are_not_told_the_origin_and_a_wrong_one_is_refused(tmp_path):
     scenario = field(tmp_path, latitude=46.0, longitude=23.5)
-    run = RunSettings(1, True, None, True, Path('/s.yaml'))
-    plans = TargetMission('field', scenario).plan_nodes(run)
+    plans = TargetMission('field', scenario).plan_nodes(Options(), Path('/s.yaml'))
     assert not any('environment.origin' in name for plan in plans for name in plan.parameters)
     with pytest.raises(ScenarioError, match=r'field.yaml:.*environment.origin.latitude'):
         field(tmp_path, latitude=146.0, longitude=23.5)

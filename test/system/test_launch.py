@@ -13,9 +13,8 @@ import pytest
 from scenario_runs import reserved_domain, started, write_scenario
 
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.launch_arguments import ARGUMENTS, scenario_options
 from maasi_sim.run.processes import find_executable
-from maasi_sim.run.run_options import build_parser
+from maasi_sim.run.run_options import build_parser, launch_arguments, scenario_options
 
 LAUNCH_FILE = Path(__file__).parents[2] / 'maasi_sim' / 'launch' / 'scenario.launch.py'
 HAS_LAUNCH = bool(importlib.util.find_spec('launch') and importlib.util.find_spec('launch_ros'))
@@ -34,7 +33,7 @@ sys.exit(service.run())
 """
 # Longer than the address of a socket may be.
 TEMPORARY = 'temporary' * 12
-DEFAULTS = {name: default for name, (default, _) in ARGUMENTS.items()}
+DEFAULTS = {name: default for name, (default, _) in launch_arguments().items()}
 
 pytestmark = pytest.mark.system
 

@@ -9,6 +9,14 @@ from dataclasses import dataclass
 from types import FrameType
 
 DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, NOT_WRITTEN, INTERRUPTED = 0, 1, 2, 3, 4, 130
+EXIT_CODES = {
+    DONE: 'all targets found (or, with stop: planner_done, ended as meant)',
+    NOT_ALL_FOUND: 'not all targets were found',
+    WRONG_INPUT: 'wrong input',
+    NODE_FAILED: 'a node died or hung',
+    NOT_WRITTEN: 'bag or report not written (disk full) or with gaps',
+    INTERRUPTED: 'interrupted',
+}
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

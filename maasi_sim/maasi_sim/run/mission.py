@@ -1,16 +1,156 @@
-"""The interface between a run and its mission: a search for targets, or of buildings."""
+"""What a run needs of its mission, a search for targets or of buildings: nodes, record, report."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
+import numpy as np
 from rosbags.typesys.store import Typestore
 
-from maasi_sim.run.node_plan import NodePlan, RunSettings
-from maasi_sim.run.run_record import Observer, RunRecord
+from maasi_filter.arrays import FloatArray
+from maasi_sim.run.node_plan import NodePlan
+from maasi_sim.run.run_options import Options
+from maasi_sim.run.topics import STEP, seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+# Goal status of `AgentState`.
+UNAVAILABLE = 5
+
+
+@dataclass(frozen=True)
+class RunEnd:
+    """How a run ended.
+
+    `reason` is a key of `END_REASONS`, `time` simulated, `wall_time` from the first step [s].
+    Events are nodes that died, hung or were restarted.
+    """
+
+    reason: str
+    time: float
+    wall_time: float
+    events: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass
+class RunRecord:
+    """Data of the reports of all kinds of runs.
+
+    Trajectories are time [s], x, y, z [m] by robot, (n, 4). Events are robots lost and back, nodes
+    restarted or dead, in order of time.
+    """
+
+    name: str
+    scenario: Any
+    seed: int
+    trajectories: dict[str, FloatArray] = field(default_factory=dict, kw_only=True)
+    events: list[dict[str, Any]] = field(default_factory=list, kw_only=True)
+    end_reason: str = field(default='', kw_only=True)
+    end_time: float = field(default=0.0, kw_only=True)
+    wall_time: float = field(default=0.0, kw_only=True)
+
+
+class Observer(ABC):
+    """Gathers the data of a report from serialised messages, and detects the end of the run."""
+
+    #: Of the needed `topics`, filter updates: added after the messages they refer to.
+    update_topics: Sequence[str] = ()
+    #: Targets or cuboids there are, and found so far; measurements so far, of all robots.
+    total = found = measurements = 0
+    #: Share of the environment explored.
+    explored = 0.0
+    #: Whether something was found since the caller last reset it.
+    news = False
+    #: Time and step at which all was found, where the scenario stops then.
+    completed: Any = None
+    #: The reason, once all planners report that nothing is left to gain.
+    settled: str | None = None
+    #: Step at which the search ended by itself.
+    end_step: int | None = None
+    #: Time of the first step [s]: a clock that the run follows may start at any time.
+    begin: float | None = None
+    #: That take part, as the simulation says.
+    robots: list[str] | None = None
+
+    def __init__(
+        self, name: str, scenario: Any, seed: int, types: Typestore, topics: Sequence[str]
+    ) -> None:
+        self.name = name
+        self.scenario = scenario
+        self.seed = seed
+        self._types = types
+        self._events: list[dict[str, Any]] = []
+        self._states: dict[str, list[bytes]] = {f'/{name}/state': [] for name in scenario.names()}
+        self.topics = [STEP, *topics, *self._states]
+
+    def add(self, topic: str, data: bytes) -> None:
+        """Add a serialised message; one of another topic is ignored."""
+        if topic in self._states:
+            self._states[topic].append(data)
+        elif topic == STEP and self.completed is None:
+            self._note_step(self.decode(data, 'LockstepStep'))
+
+    def settle(self) -> None:  # noqa: B027 - missions that evaluate at the end need none
+        """Evaluate the messages added since the last call."""
+
+    @abstractmethod
+    def record(self, end: RunEnd) -> Any:
+        """Return the record of the run, up to the step at which all was found."""
+
+    def decode(self, data: bytes, name: str) -> Any:
+        """Return a message of `maasi_msgs`."""
+        return self._types.deserialize_cdr(data, f'maasi_msgs/msg/{name}')
+
+    def time(self, stamp: Any) -> float:
+        """Return the time since the first step [s]."""
+        return seconds(stamp) - (self.begin or 0.0)
+
+    def _note_step(self, step: Any) -> None:
+        """Note the robots that take part."""
+        if self.begin is None:
+            self.begin = seconds(step.stamp)
+        before, self.robots = self.robots, list(step.robots)
+        if before is not None:
+            now, time = set(self.robots), self.time(step.stamp)
+            for word, names in (('lost', set(before) - now), ('joined', now - set(before))):
+                for name in sorted(names):
+                    self._events.append({'time': time, 'agent': name, 'event': word})
+
+    def _until(self, kind: str, messages: Iterable[bytes], end: float) -> Iterator[Any]:
+        """Yield messages up to a time [s]; all at once would take much memory."""
+        for data in messages:
+            item = self.decode(data, kind)
+            if self.time(item.header.stamp) <= end:
+                yield item
+
+    def _complete(self, record: RunRecord, end: RunEnd) -> None:
+        """Add how the run ended, ways and events to a record; the time of its end is set."""
+        record.end_reason, record.wall_time = end.reason, end.wall_time
+        events = [*record.events, *self._events]
+        for name, messages in zip(self.scenario.names(), self._states.values()):
+            way, away = [], False
+            for state in self._until('AgentState', messages, record.end_time):
+                time, place = self.time(state.header.stamp), state.pose.pose.position
+                way.append((time, place.x, place.y, place.z))
+                if self.robots is None and (state.goal_status == UNAVAILABLE) != away:
+                    away = not away
+                    word = 'lost' if away else 'joined'
+                    events.append({'time': time, 'agent': name, 'event': word})
+                    if away and state.reason:
+                        events[-1]['reason'] = state.reason
+            record.trajectories[name] = rows(way, 4)
+        record.events = sorted([*events, *end.events], key=lambda event: float(event['time']))
+
+
+def rows(values: list[Any], width: int) -> FloatArray:
+    """Return rows as an array, (0, width) without any."""
+    return np.array(values, dtype=float).reshape(-1, width)
+
 
 Record = TypeVar('Record', bound=RunRecord, contravariant=True)
 
@@ -28,8 +168,8 @@ class Mission(Protocol[Record]):
         """Assign addresses on this host to simulated robots."""
         return None
 
-    def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
-        """Return the nodes to start."""
+    def plan_nodes(self, options: Options, file: Path) -> list[NodePlan]:
+        """Return the nodes to start; `file` is the scenario with all layers."""
 
     def warning(self) -> str:
         """Return a warning about the scenario, or an empty text; takes a while."""

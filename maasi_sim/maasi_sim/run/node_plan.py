@@ -13,36 +13,13 @@ from maasi_filter.ros.node_settings import LIVELINESS_LEASE
 from maasi_filter.ros.parameters import flatten
 from maasi_sim.run.processes import NodeProcess, find_executable
 from maasi_sim.run.run_folder import write_text
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.topics import within
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import to_yaml
 
 # Time of the simulation.
 SIMULATED = {'use_sim_time': True}
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """How a scenario is run.
-
-    The rate is simulated over wall time; None: as fast as possible in lockstep, else 1. With
-    `recorder` the simulation waits for one. `file` is the scenario with all layers.
-    """
-
-    seed: int
-    lockstep: bool
-    rate: float | None
-    recorder: bool
-    file: Path
-
-    def common(self, scenario: BaseScenario) -> dict[str, Any]:
-        """Return the parameters that all nodes have."""
-        return {
-            'plugin_path': scenario.plugin_path,
-            'step': scenario.step,
-            'seed': self.seed,
-            'lockstep': self.lockstep,
-        }
 
 
 @dataclass(frozen=True)
@@ -83,12 +60,12 @@ class NodePlan:
         """Return its parameter file."""
         return to_yaml({'/**': {'ros__parameters': dict(self.parameters)}})
 
-    def process(self, parameters: Path, logs: Path, log_level: str | None = None) -> NodeProcess:
-        """Write its parameter file into a folder, and return its process, not started yet."""
-        path = parameters / f'{self.file_name}.yaml'
+    def process(self, folder: Path, log_level: str | None = None) -> NodeProcess:
+        """Write its parameter file, and return its process, not started yet, with its log there."""
+        path = folder / 'parameters' / f'{self.file_name}.yaml'
         write_text(path, self.parameter_text())
         command = self.command(find_executable(self.package, self.executable), path, log_level)
-        log = logs / f'{self.file_name}.log'
+        log = folder / f'{self.file_name}.log'
         return NodeProcess(self.full_name, command, log, self.package)
 
     def command(
@@ -106,42 +83,46 @@ class NodePlan:
         return words + level
 
 
-def in_team(plan: NodePlan, team: str) -> NodePlan:
-    """Return the plan of a node in the namespace of a team; the clock is shared."""
-    if not team:
-        return plan
-    return replace(
+def plan_in_run(plan: NodePlan, options: Options, state: Path | None) -> NodePlan:
+    """Return the plan of a node in the namespace of a run; topics of others are not remapped.
+
+    The clock may be that of another run. With a folder for its state, a filter resumes after a
+    restart.
+    """
+    team, parameters = options.namespace, dict(plan.parameters)
+    if options.follow_clock and plan.is_clock:
+        parameters |= SIMULATED | {'follow_clock': True}
+    plan = replace(
         plan,
-        namespace=f'{team}/{plan.namespace}' if plan.namespace else team,
+        namespace='/'.join(filter(None, (team, plan.namespace))),
         remaps={within(team, key): within(team, value) for key, value in plan.remaps.items()},
+        parameters=parameters,
     )
+    if state is not None and plan.executable == 'filter_node':
+        saved = {'save_file': str(state / f'{plan.file_name}.maasi'), 'save_batches': True}
+        plan = replace(plan, parameters=parameters | saved)
+    return plan
 
 
-def with_followed_clock(plan: NodePlan) -> NodePlan:
-    """Return the plan of a node of a run that follows the clock of another run."""
-    if not plan.is_clock:
-        return plan
-    return replace(plan, parameters={**plan.parameters, **SIMULATED, 'follow_clock': True})
+def common_parameters(scenario: BaseScenario, options: Options) -> dict[str, Any]:
+    """Return the parameters that all nodes have."""
+    return {
+        'plugin_path': scenario.plugin_path,
+        'step': scenario.step,
+        'seed': scenario.seed,
+        'lockstep': options.lockstep,
+    }
 
 
-def with_saved_state(plan: NodePlan, folder: Path) -> NodePlan:
-    """Return the plan of a node that resumes from its saved state after a restart."""
-    if plan.executable != 'filter_node':
-        return plan
-    file = str(folder / f'{plan.file_name}.maasi')
-    parameters = {**plan.parameters, 'save_file': file, 'save_batches': True}
-    return replace(plan, parameters=parameters)
-
-
-def sim_plan(executable: str, scenario: BaseScenario, run: RunSettings) -> NodePlan:
+def sim_plan(executable: str, scenario: BaseScenario, options: Options, file: Path) -> NodePlan:
     """Return the simulation node, whose clock is that of the run."""
-    pace = run.rate if run.rate is not None else 0.0 if run.lockstep else 1.0
+    pace = options.rate if options.rate is not None else 0.0 if options.lockstep else 1.0
     parameters: dict[str, Any] = {
-        'scenario': str(run.file),
-        'seed': run.seed,
-        'lockstep': run.lockstep,
+        'scenario': str(file),
+        'seed': scenario.seed,
+        'lockstep': options.lockstep,
         'rate': pace,
-        'recorder': run.recorder,
+        'recorder': True,
         **(SIMULATED if scenario.external_clock else {}),
     }
     return NodePlan(
@@ -157,12 +138,13 @@ def sim_plan(executable: str, scenario: BaseScenario, run: RunSettings) -> NodeP
 def guard_plan(robot: str, common: Mapping[str, Any], period: float) -> NodePlan:
     """Return the guard of a robot whose driver may be busy for `period` seconds."""
     lease = max(LIVELINESS_LEASE, period)
+    settings = GuardSettings.model_validate({**common, 'lease': lease})
     return NodePlan(
         'maasi_drivers',
         'guard_node',
         'guard',
         robot,
-        {**flatten(GuardSettings.model_validate({**common, 'lease': lease})), **SIMULATED},
+        {**flatten(settings), **SIMULATED},
         says_ready=False,
         says_done=False,
     )

@@ -1,20 +1,139 @@
-"""Nodes as processes: found, started, restarted, and stopped in bounded time."""
+"""Nodes as processes: found, forked from a server, watched, and stopped in bounded time.
+
+The fork server of `multiprocessing` has imported the modules and compiled the kernels that nodes
+share: a node starts in a tenth of the time.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import gc
+import importlib
+import multiprocessing
 import os
 import signal
+import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from multiprocessing import forkserver, resource_tracker, util
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from setproctitle import getproctitle, setproctitle
 
-from maasi_sim.run.domain import remove_dead
-from maasi_sim.run.node_server import ProcessError, node_process, start_server
+import maasi_entry
+
+_PR_SET_PDEATHSIG = 1
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_PACKAGES = ('maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
+# In the environment of the server only: the process that started it.
+_STARTED_BY = 'MAASI_NODE_SERVER_OF'
+# One thread for each linear algebra library: there is a process for each node, and a process with
+# several threads must not be forked.
+_ENVIRONMENT = {
+    'PYTHONUNBUFFERED': '1',
+    'OMP_NUM_THREADS': '1',
+    'OPENBLAS_NUM_THREADS': '1',
+    'MKL_NUM_THREADS': '1',
+}
+# Addresses of Unix sockets have at most 107 bytes; multiprocessing adds 32 to the folder.
+_LONGEST_FOLDER = 75
+_context = multiprocessing.get_context('forkserver')
+# A heartbeat this soon after a start is from the previous process [s].
+_LEAST_START = 0.5
+# Signals of a shutdown, and the timeout of each [s].
+ENDING = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5.0))
+
+
+class ProcessError(RuntimeError):
+    """A process cannot be started."""
+
+
+def start_server() -> None:
+    """Start the server, which loads what nodes share in the background."""
+    _context.set_forkserver_preload([__name__])
+    resource_tracker.ensure_running()
+    for key, value in _ENVIRONMENT.items():
+        os.environ.setdefault(key, value)
+    os.environ[_STARTED_BY] = str(os.getpid())
+    # Ctrl-C in the terminal must not reach the server before it has a session of its own.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    folder = tempfile.gettempdir()
+    try:
+        # The server's socket needs a folder whose path is not too long for an address.
+        if len(os.fsencode(folder)) > _LONGEST_FOLDER:
+            tempfile.tempdir = '/tmp'
+        util.get_temp_dir()
+        forkserver.ensure_running()
+    except OSError as error:
+        raise ProcessError(f'the server of the nodes cannot be started: {error}') from error
+    finally:
+        tempfile.tempdir = folder
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        del os.environ[_STARTED_BY]
+
+
+def wait_for_server() -> None:
+    """Return once the server has loaded what nodes share."""
+    process = _context.Process(target=int)
+    try:
+        process.start()
+    except (OSError, EOFError) as error:
+        raise ProcessError('the server of the nodes has ended: its error is above') from error
+    process.join()
+
+
+def _load(started_by: int) -> None:
+    """Load what nodes need; the server ends with the process that started it."""
+    # It finds the place of the title beside an environment that has not changed yet.
+    getproctitle()
+    os.setsid()
+    _die_with(started_by)
+    # Nodes inherit them.
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+    gc.disable()
+    # Not rclpy, which starts threads.
+    importlib.import_module('maasi_sim.run.warm_up').prepare_nodes()
+    # What exists now is never garbage: nodes share its memory.
+    gc.freeze()
+    gc.enable()
+
+
+def _die_with(parent: int) -> None:
+    """Let Linux kill this process when its parent ends for any reason."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _become_node(package: str, command: list[str], log: Path, environment: dict[str, str]) -> None:
+    """Become a node: an independent process that ends with the server, and so with the run."""
+    os.setsid()
+    _die_with(_server)
+    try:
+        output = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except OSError:
+        # The disk is full: the node runs without a log.
+        output = os.open(os.devnull, os.O_WRONLY)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    for source, target in ((nothing, 0), (output, 1), (output, 2)):
+        os.dup2(source, target)
+    os.environ.clear()
+    os.environ.update(environment)
+    script = getattr(maasi_entry, Path(command[0]).name, None)
+    if package not in _PACKAGES or script is None:
+        for number in (signal.SIGPIPE, signal.SIGXFSZ):
+            signal.signal(number, signal.SIG_DFL)
+        os.execv(command[0], command)
+    sys.argv = list(command)
+    setproctitle(' '.join(command))
+    sys.exit(script())
 
 
 def find_executable(package: str, executable: str) -> Path:
@@ -33,8 +152,11 @@ def find_executable(package: str, executable: str) -> Path:
 class NodeProcess:
     """A node that runs as a process and cannot outlive this one.
 
-    Its log is kept over restarts. A node of a package of this suite inherits what the node server
-    has loaded.
+    Its command is the path of its executable and its arguments, also shown by `ps`. Its log is kept
+    over restarts. A node of a package of this suite inherits what the server has loaded.
+
+    Its executor publishes a heartbeat each second. Until the first one it is starting, which may
+    include compilation. Times are of the wall [s].
     """
 
     name: str
@@ -42,6 +164,10 @@ class NodeProcess:
     log: Path
     package: str = ''
     restarts: int = 0
+    started: float = 0.0
+    #: Time of its last heartbeat, and how long it had waited for a processor by then.
+    beaten: float | None = None
+    _waited: float = 0.0
     _process: BaseProcess | None = None
 
     def start(self) -> None:
@@ -49,16 +175,21 @@ class NodeProcess:
         # The node itself opens it.
         with contextlib.suppress(OSError):
             self.log.touch()
-        self._process = node_process(self.package, self.command, self.log)
+        given = self.package, self.command, self.log, dict(os.environ)
+        self._process = _context.Process(target=_become_node, args=given)
         try:
             start_server()
             self._process.start()
         except (OSError, EOFError) as error:
             self._process = None
             raise ProcessError(f'{self.name}: cannot be started: {error}') from error
+        self.started, self.beaten = time.monotonic(), None
 
     def restart(self) -> None:
         """Restart it after it died."""
+        # Deferred: the server is to be started first.
+        from maasi_sim.run.domain import remove_dead
+
         self.restarts += 1
         remove_dead()
         with contextlib.suppress(OSError), self.log.open('ab') as output:
@@ -86,6 +217,18 @@ class NodeProcess:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, number)
 
+    def beat(self, now: float) -> None:
+        """Note a heartbeat."""
+        if self.beaten is not None or now - self.started >= _LEAST_START:
+            self.beaten, self._waited = now, waited_for_processor(self.pid)
+
+    def hangs(self, now: float, limit: float) -> bool:
+        """Return whether there was no heartbeat for a time; waits for a processor do not count."""
+        if self.beaten is None or now - self.beaten <= limit:
+            return False
+        waited = waited_for_processor(self.pid) - self._waited
+        return now - self.beaten - waited > limit
+
     def how_it_ended(self) -> str:
         """Return in words how it ended."""
         code = self.code
@@ -107,8 +250,12 @@ class NodeProcess:
         return '\n'.join(text.splitlines()[-lines:])
 
 
-# Signals of a shutdown, and the timeout of each [s].
-ENDING = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5.0))
+def waited_for_processor(pid: int | None) -> float:
+    """Return how long the main thread of a process was runnable without running [s]."""
+    try:
+        return 1e-9 * int(Path(f'/proc/{pid}/schedstat').read_text().split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0.0
 
 
 def stop(
@@ -133,3 +280,9 @@ def stop(
         while any(process.running for process in rest) and time.monotonic() < deadline:
             time.sleep(0.005)
     return stubborn
+
+
+if _STARTED_BY in os.environ:
+    _load(int(os.environ.pop(_STARTED_BY)))
+#: Of a node, its parent: a node is forked from where this module was loaded before.
+_server = os.getpid()

@@ -29,7 +29,7 @@ from maasi_filter.ros.conversions import stamp_of_step, stamp_to_ros
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, reader_of
 from maasi_msgs.msg import LockstepDone, LockstepStep
 from maasi_sim.run.bag import BagError, BagWriter, topic_qos
-from maasi_sim.run.run_record import Observer
+from maasi_sim.run.mission import Observer
 from maasi_sim.run.topics import CLOCK, STEP, message_class, stamp_of, time_at, within
 from maasi_sim.run.view.messages import is_shown
 
@@ -113,8 +113,8 @@ class Recorder:
         self.first: dict[str, int] = {}
         #: Share of the environment explored, published by planners each second.
         self.explored = 0.0
-        #: Present errors of planners, by the name of the node.
-        self.faults: dict[str, str] = {}
+        # Planners whose present error is among the complaints.
+        self._faulty: set[str] = set()
         #: Time of the last diagnostics of each node [s of wall time].
         self.heartbeats: dict[str, float] = {}
         self._arming: dict[str, Client] = {}
@@ -125,7 +125,7 @@ class Recorder:
         self._asked_with = 0
         self._finished = False
         self._last_step = -1
-        self.complaints: list[str] = []
+        self._complaints: list[str] = []
         #: Called with topic, type and content of each message that a page shows.
         self.listener: Callable[[str, str, bytes], None] | None = None
         self._shown: dict[str, str] = {}
@@ -152,8 +152,8 @@ class Recorder:
         """Return the full name of a topic of the team."""
         return topic if topic in _SHARED else within(self._team, topic)
 
-    def _relative(self, topic: str) -> str | None:
-        """Return the name of a topic within the team; None for a topic of others."""
+    def relative(self, topic: str) -> str | None:
+        """Return the name of a topic or node within the team; None for one of others."""
         if not self._team or topic in _SHARED:
             return topic
         inner = topic.removeprefix(f'/{self._team}')
@@ -162,7 +162,7 @@ class Recorder:
     def discover(self) -> None:
         """Subscribe to the topics that have appeared since the last call."""
         for full, types in self.node.get_topic_names_and_types():
-            topic = self._relative(full)
+            topic = self.relative(full)
             if topic is None or topic in self._subscriptions or topic in self._refused:
                 continue
             shown = self.listener is not None and is_shown(topic, types[0])
@@ -183,7 +183,7 @@ class Recorder:
                     self.bag.add_topic(full, types[0], topic_qos(reliable, latched))
             except (ImportError, AttributeError, BagError) as error:
                 self._refused.add(topic)
-                self.complaints.append(f'topic {full} is not recorded: {error}')
+                self._complaints.append(f'topic {full} is not recorded: {error}')
                 continue
             self._subscriptions[topic] = self._subscribe(topic, kind, qos)
             if shown:
@@ -220,6 +220,16 @@ class Recorder:
             self._ready_subscription = self._subscribe(READY, LockstepDone, LATCHED_ALL)
         self.take_ready()
         return [name for name in nodes if name not in self._answered]
+
+    def take_heartbeats(self) -> dict[str, float]:
+        """Return when nodes have sent diagnostics since the last call [s of wall time]."""
+        beats, self.heartbeats = self.heartbeats, {}
+        return beats
+
+    def take_complaints(self) -> list[str]:
+        """Return what became wrong since the last call: of the recording, and of planners."""
+        complaints, self._complaints = self._complaints, []
+        return complaints
 
     def publish_ready(self) -> None:
         """Report that the recorder is ready."""
@@ -292,9 +302,11 @@ class Recorder:
         """Note what a planner says between its decisions: its error, and the exploration."""
         if not status.name.endswith('/planner_node'):
             return
-        self.faults.pop(status.name, None)
-        if status.level == DiagnosticStatus.ERROR:
-            self.faults[status.name] = status.message
+        if status.level != DiagnosticStatus.ERROR:
+            self._faulty.discard(status.name)
+        elif status.name not in self._faulty:
+            self._faulty.add(status.name)
+            self._complaints.append(f'{status.name}: {status.message}')
         for item in status.values:
             if item.key == 'explored':
                 with contextlib.suppress(ValueError):

@@ -231,7 +231,7 @@ def replay(
             node_facts = recording.facts['nodes'][within(name, f'/{FILTER}')]
             parameters = {**node_facts['parameters'], **REPLAYED}
             kind = node_facts['package'], node_facts['executable']
-            processes.append(NodePlan(*kind, FILTER, name, parameters).process(folder, folder))
+            processes.append(NodePlan(*kind, FILTER, name, parameters).process(folder))
         ends.callback(stop, processes)
         for process in processes:
             process.start()

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from maasi_sim.machine import this_machine
-from maasi_sim.run.mission import Mission
+from maasi_sim.run.mission import Mission, RunRecord
 from maasi_sim.run.run_folder import ResultsError, remove, write_text, write_whole
-from maasi_sim.run.run_record import RunRecord
 
 # Of the format of `report.json`, see `report.schema.json`.
 REPORT_VERSION = 1

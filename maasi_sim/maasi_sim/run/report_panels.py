@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_sim.run.run_record import RunRecord
+from maasi_sim.run.mission import RunRecord
 
 # Palette for colour-blind readers (Okabe and Ito).
 COLOURS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#8C564B')

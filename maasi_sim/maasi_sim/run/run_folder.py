@@ -41,8 +41,9 @@ def make_folder(out: Path | None, suffix: str = '') -> Path:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file of the run."""
+    """Write a file of the run; its folder is made."""
     try:
+        path.parent.mkdir(exist_ok=True)
         write_whole(path, lambda file: file.write_text(text, encoding='utf-8'))
     except OSError as error:
         raise ResultsError(f'{path}: {error.strerror}') from error

@@ -1,15 +1,30 @@
-"""The command line of `run_scenario`."""
+"""The options of a run: on the command line of `run_scenario`, and of `scenario.launch.py`."""
 
 from __future__ import annotations
 
 import argparse
+import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from maasi_sim.arguments import Parser, positive, whole
+from maasi_sim.run.ending import EXIT_CODES
 
 LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
+# Options that are arguments of a launch as well.
+_LAUNCH_OPTIONS = (
+    'out',
+    'seed',
+    'rate',
+    'planner',
+    'time_limit',
+    'namespace',
+    'log_level',
+    'port',
+)
+_LAUNCH_FLAGS = ('lockstep', 'follow_clock', 'view')
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
 
@@ -47,9 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog='run_scenario',
         description='Run a scenario as separate ROS 2 processes, or replay a recording of one.',
-        epilog='Exit codes: 0 all targets found (or, with stop: planner_done, ended as meant), '
-        '1 not all found, 2 wrong input, 3 a node died or hung, 4 bag or report not '
-        'written (disk full) or with gaps, 130 interrupted.',
+        epilog=f'Exit codes: {", ".join(f"{code} {what}" for code, what in EXIT_CODES.items())}.',
     )
     parser.add_argument(
         'scenario', nargs='?', metavar='FILE', help='scenario file, or name of one in config'
@@ -151,3 +164,49 @@ def parse(arguments: list[str] | None) -> Options:
         'view': view if options.view else None,
     }
     return Options(**given)
+
+
+def launch_arguments() -> dict[str, tuple[str, str]]:
+    """Return default and description of each argument of `scenario.launch.py`.
+
+    An empty one leaves an option out.
+    """
+    arguments = {'scenario': ('mambo_turtlebot', 'scenario file, or name of one in maasi_config')}
+    for action in build_parser()._actions:
+        if action.dest in _LAUNCH_OPTIONS:
+            arguments[action.dest] = ('', f'{action.help}; empty: not given')
+        elif action.dest in _LAUNCH_FLAGS:
+            arguments[action.dest] = ('false', f'{action.help}; true or false')
+    return arguments | {
+        'record': ('true', 'whether a bag is recorded; true or false'),
+        'rviz': ('false', 'whether RViz shows the search; true or false'),
+    }
+
+
+def is_true(given: Mapping[str, str], name: str) -> bool:
+    """Return an argument that is true or false."""
+    text = given[name].strip().lower()
+    if text not in ('true', 'false'):
+        raise ValueError(f"{name}: read '{given[name]}', allowed are true and false")
+    return text == 'true'
+
+
+def scenario_options(given: Mapping[str, str]) -> list[str]:
+    """Return the command line of `run_scenario` for the arguments of a launch.
+
+    The nodes are in the ROS domain of the launch, so that other tools see them.
+    """
+    values = {name: text.strip() for name, text in given.items()}
+    flags = {name: is_true(given, name) for name in (*_LAUNCH_FLAGS, 'record', 'rviz')}
+    if not flags['view']:
+        values['port'] = ''
+    # Joined by '=': a value that begins with '-' stays a value.
+    words = [f'{name}={values[name]}' for name in _LAUNCH_OPTIONS if values[name]]
+    words += [name for name in _LAUNCH_FLAGS if flags[name]]
+    words += [] if flags['record'] else ['no_record']
+    words.append(f'domain_id={os.environ.get("ROS_DOMAIN_ID") or 0}')
+    options = [word.partition('=') for word in words]
+    return [
+        values['scenario'],
+        *(f'--{name.replace("_", "-")}{sign}{value}' for name, sign, value in options),
+    ]

@@ -8,7 +8,7 @@ import os
 import sys
 
 from maasi_sim.run.ending import NOT_WRITTEN, WRONG_INPUT, Interruption
-from maasi_sim.run.node_server import ProcessError, start_server
+from maasi_sim.run.processes import ProcessError, start_server
 from maasi_sim.run.run_options import parse
 
 

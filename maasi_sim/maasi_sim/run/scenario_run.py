@@ -23,22 +23,15 @@ from maasi_sim.run.ending import (
     Ending,
     Interruption,
 )
+from maasi_sim.run.mission import RunEnd
 from maasi_sim.run.missions import load_mission
-from maasi_sim.run.node_plan import (
-    NodePlan,
-    RunSettings,
-    in_team,
-    with_followed_clock,
-    with_saved_state,
-)
-from maasi_sim.run.node_server import wait_for_server
-from maasi_sim.run.processes import stop
+from maasi_sim.run.node_plan import NodePlan, plan_in_run
+from maasi_sim.run.processes import stop, wait_for_server
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.report_files import StoredReport, store_report
 from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
 from maasi_sim.run.run_options import Options
-from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
 from maasi_sim.run.view.live_view import RunPage
@@ -77,6 +70,7 @@ class ScenarioRun:
             '--seed': (('seed',), options.seed),
         }
         overrides = {name: item for name, item in given.items() if item[1] is not None}
+        self.display = ProgressDisplay()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter('always', ScenarioWarning)
             self.mission = load_mission(options.scenario, overrides)
@@ -87,39 +81,73 @@ class ScenarioRun:
                 f"--namespace: read '{options.namespace}', allowed is a name that is none of "
                 'a robot of the scenario'
             )
-        self.display = ProgressDisplay()
         self._bag: BagWriter | None = None
         #: Errors of writing.
         self.unwritten: list[str] = []
-        # Planners whose present error was printed.
-        self._told: set[str] = set()
         self._armed_at = 0.0
-        # Wall time of the first step and of the end.
+        # Wall time when all nodes were ready, of the first step, and of the end.
+        self._complete: float | None = None
         self._begun: float | None = None
         self._ended: float | None = None
 
     def execute(self) -> int:
         """Run it and return the exit code."""
         options = self.options
-        with Domain(
-            options.domain_id, team=options.namespace, shared=options.follow_clock
-        ) as domain:
+        number, team, shared = options.domain_id, options.namespace, options.follow_clock
+        with Domain(number, team=team, shared=shared) as domain, contextlib.ExitStack() as ends:
             self.folder = make_folder(options.out)
             os.environ.update(domain.environment())
             self.mission.prepare()
             self._scenario = self.mission.scenario
             self._limits = self._scenario.limits
-            self.supervisor = Supervisor(
-                self._plan(), self.mission.scenario, options, self.folder, self.display
-            )
+            self._plans = {plan.full_name: plan for plan in self._plan()}
+            processes = {
+                name: plan.process(self.folder, options.log_level)
+                for name, plan in self._plans.items()
+            }
             self.display.say(
-                f'{self.mission.name}: seed {self.mission.scenario.seed}, '
-                f'{len(self.supervisor.processes)} nodes in ROS domain {domain.number}, results in '
-                f'{short(self.folder)}'
+                f'{self.mission.name}: seed {self._scenario.seed}, {len(processes)} nodes in ROS '
+                f'domain {domain.number}, results in {short(self.folder)}'
             )
-            for text in self._doubts:
-                self.display.say(f'warning: {text}')
-            return self._execute(domain)
+            self._warn(*self._doubts)
+            ends.callback(self.display.close)
+            page = self._page(domain.number)
+            if page is not None:
+                ends.callback(page.end)
+            types = load_types()
+            self.observer = self.mission.observer(types)
+            if options.record:
+                self._bag = BagWriter(self.folder / 'bag', types, self._scenario.record.images)
+                ends.callback(self._close_bag)
+            step = self._scenario.step
+            self.recorder = Recorder(domain.number, self.observer, step, self._bag, team)
+            ends.callback(self.recorder.close)
+            self.recorder.listener = None if page is None else page.put_message
+            if self._bag is not None:
+                self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
+            self.supervisor = Supervisor(
+                self._plans,
+                processes,
+                self._scenario,
+                options.lockstep,
+                self.recorder,
+                self.display,
+            )
+            ends.callback(stop, list(processes.values()))
+            self._monitor()
+            followed = self._is_followed()
+            if followed:
+                self._close_bag()
+            else:
+                ends.close()
+            code = self._report()
+            if followed:
+                teams = ', '.join(self.recorder.followers())
+                self.display.say(f'the clock goes on for {teams} (Ctrl-C ends it)')
+                while self._is_followed():
+                    self.recorder.wait(_FOLLOWERS_PERIOD)
+                    self.recorder.drain()
+            return code
 
     def _plan(self) -> list[NodePlan]:
         """Write the scenario with all layers, and return its nodes."""
@@ -127,99 +155,9 @@ class ScenarioRun:
         file = self.folder / 'scenario.yaml'
         write_text(file, scenario.text())
         write_text(self.folder / 'view.rviz', view_text(self.mission, options.namespace))
-        run = RunSettings(scenario.seed, options.lockstep, options.rate, recorder=True, file=file)
-        plans = [in_team(plan, options.namespace) for plan in self.mission.plan_nodes(run)]
-        if options.follow_clock:
-            plans = [with_followed_clock(plan) for plan in plans]
-        if scenario.on_exit == 'respawn':
-            plans = [with_saved_state(plan, self.folder / 'state') for plan in plans]
-        return plans
-
-    def _execute(self, domain: Domain) -> int:
-        with contextlib.ExitStack() as ends:
-            ends.callback(self.display.close)
-            page = self._page(domain.number)
-            if page is not None:
-                ends.callback(page.end)
-            types = load_types()
-            self.observer = self.mission.observer(types)
-            if self.options.record:
-                self._bag = BagWriter(self.folder / 'bag', types, self._scenario.record.images)
-                ends.callback(self._close_bag)
-                self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
-            step, team = self._scenario.step, self.options.namespace
-            self.recorder = Recorder(domain.number, self.observer, step, self._bag, team)
-            ends.callback(self.recorder.close)
-            self.recorder.listener = None if page is None else page.put_message
-            ends.callback(stop, list(self.supervisor.processes.values()))
-            # Ctrl-C ends the wait at once; the run reports it.
-            with self.interruption.at_once():
-                wait_for_server()
-            if not self.interruption:
-                self.supervisor.start()
-            self._monitor()
-            if self.is_followed:
-                self._close_bag()
-                code = self._report()
-                self._keep_clock()
-                return code
-        return self._report()
-
-    def _close_bag(self) -> None:
-        try:
-            if self._bag is not None:
-                self._bag.close()
-        except BagError as error:
-            self.unwritten.append(str(error))
-
-    def _monitor(self) -> None:
-        """Monitor the run from the start to the end of its nodes."""
-        ending = self._wait_until_ready()
-        threading.Thread(target=self._warn, daemon=True).start()
-        self.ending = ending or self._follow()
-        self._ended = time.monotonic()
-        self._check_recording()
-        self.recorder.finish()
-        self.supervisor.stop(self.recorder, self.is_followed, _POLL)
-
-    def _let_take_off(self) -> None:
-        """Let simulated robots take off whose drivers do not take part yet."""
-        if time.monotonic() - self._armed_at < _ARMING_PERIOD:
-            return
-        self._armed_at = time.monotonic()
-        ready = set(map(self.supervisor.without_team, self.recorder.ready))
-        names = [name for name, robot in self._scenario.robots.items() if robot.takes_off]
-        self.recorder.arm([name for name in names if f'/{name}/driver' not in ready])
-
-    def _check_recording(self) -> None:
-        """Note which topics with a message at each step lack a recording of their beginning."""
-        recorder, options = self.recorder, self.options
-        if not options.record or self.ending.code not in (DONE, NOT_ALL_FOUND):
-            return
-        follows = options.follow_clock or self._scenario.external_clock
-        for gap in recorder.gaps(follows, _CONNECTION_PATIENCE * (options.rate or 1.0)):
-            self.unwritten.append(gap)
-            self.supervisor.events.append(
-                {'time': recorder.elapsed, 'node': 'recorder', 'event': 'gap', 'reason': gap}
-            )
-
-    @property
-    def is_followed(self) -> bool:
-        """Whether another run follows the clock of this one."""
-        follows = self.options.follow_clock or self._scenario.external_clock
-        if follows or self.options.lockstep or self.interruption:
-            return False
-        supervisor = self.supervisor
-        running = all(supervisor.processes[name].running for name in supervisor.clocks)
-        return running and bool(self.recorder.followers())
-
-    def _keep_clock(self) -> None:
-        """Keep the simulation running until no other run follows its clock."""
-        teams = ', '.join(self.recorder.followers())
-        self.display.say(f'the clock goes on for {teams} (Ctrl-C ends it)')
-        while self.is_followed:
-            self.recorder.wait(_FOLLOWERS_PERIOD)
-            self.recorder.drain()
+        state = self.folder / 'state' if scenario.on_exit == 'respawn' else None
+        plans = self.mission.plan_nodes(options, file)
+        return [plan_in_run(plan, options, state) for plan in plans]
 
     def _facts(self) -> str:
         """Return the data for a replay, as YAML."""
@@ -233,68 +171,95 @@ class ScenarioRun:
             'follow_clock': options.follow_clock,
             'scenario': self._scenario.content(),
             'nodes': {
-                self.supervisor.without_team(plan.full_name): {
+                self.recorder.relative(name): {
                     'package': plan.package,
                     'executable': plan.executable,
                     'parameters': plan.parameters,
                 }
-                for plan in self.supervisor.plans
+                for name, plan in self._plans.items()
             },
         }
         return to_yaml(facts)
 
-    def _warn(self) -> None:
-        warning = self.mission.warning()
-        if warning:
-            self.display.say(f'warning: {warning}')
+    def _page(self, domain: int) -> RunPage | None:
+        """Serve the page of the run, if it is asked for; an error does not end the run."""
+        options = self.options.view
+        if options is None:
+            return None
+        try:
+            scene = scene_of(self.mission.name, self._scenario)
+            page = RunPage(scene, options, domain, self.options.namespace)
+        except OSError as error:
+            self._warn(f'no view: {options.host}: {error.strerror or error}')
+            return None
+        page.announce(self.display.say)
+        return page
+
+    def _warn(self, *texts: str) -> None:
+        for text in filter(None, texts):
+            self.display.say(f'warning: {text}')
+
+    def _monitor(self) -> None:
+        """Monitor the run from the start to the end of its nodes."""
+        # Ctrl-C ends the wait at once; the run reports it.
+        with self.interruption.at_once():
+            wait_for_server()
+        if not self.interruption:
+            self.supervisor.start()
+        self._name_external_robots()
+        self.ending = self._wait_until_ready() or self._follow()
+        self._ended = time.monotonic()
+        self._check_recording()
+        self.recorder.finish()
+        self.supervisor.stop(self._is_followed())
 
     def _wait_until_ready(self) -> Ending | None:
         """Wait until every node is ready, the recorder last; return an ending if one is not."""
-        recorder, supervisor = self.recorder, self.supervisor
-        begin = time.monotonic()
-        patience = _START_PATIENCE
-        self._name_external_robots()
-        expected = [plan.full_name for plan in supervisor.plans if plan.says_ready]
-        complete: float | None = None
-        while True:
-            ending = self._check()
-            if ending is not None:
-                return ending
-            # Nodes report last, so that all topics of one that has reported are discovered.
-            ready = recorder.take_ready()
-            recorder.discover()
-            # Messages of starting nodes are recorded as they arrive.
-            recorder.drain()
-            self._let_take_off()
-            late = [name for name in expected if name not in ready]
-            what = [f'{name} is not ready' for name in late]
-            if not late:
-                complete = complete or time.monotonic()
-                unmatched = recorder.unmatched()
-                what = [f'{topic} has a publisher that is not connected' for topic in unmatched]
-                if not unmatched or time.monotonic() - complete > _CONNECTION_PATIENCE:
-                    late = recorder.unanswered(expected)
-                    if not late:
-                        break
-                    what = [f'{name} does not know the recorder' for name in late]
+        expected = [name for name, plan in self._plans.items() if plan.says_ready]
+        begin, patience = time.monotonic(), _START_PATIENCE
+        while (ending := self._turn()) is None and (lacks := self._lacks(expected)):
+            what = ', '.join(f'{name} {lack}' for name, lack in lacks.items())
             waited = time.monotonic() - begin
             if waited > self._limits.start:
-                supervisor.failed.update(late)
-                text = f'{", ".join(what)} after {self._limits.start:g} s'
+                self.supervisor.failed.update(lacks)
+                text = f'{what} after {self._limits.start:g} s'
                 return Ending('not_ready', NODE_FAILED, text)
             if waited > patience:
-                self.display.say(f'waiting: {", ".join(what)}')
+                self.display.say(f'waiting: {what}')
                 patience += _START_PATIENCE
-            recorder.wait(_POLL)
-        for complaint in recorder.complaints:
-            self.display.say(f'warning: {complaint}')
-        for topic in unmatched:
-            self.display.say(f'warning: {topic} has a publisher that is not recorded')
         # Their executors run, even if no heartbeat has arrived so far.
         for name in expected:
-            supervisor.watch.beat(name, time.monotonic())
-        recorder.publish_ready()
-        return None
+            self.supervisor.processes[name].beat(time.monotonic())
+        if ending is None:
+            loose = self.recorder.unmatched()
+            self._warn(*(f'{topic} has a publisher that is not recorded' for topic in loose))
+            self.recorder.publish_ready()
+            # It takes a while.
+            threading.Thread(target=lambda: self._warn(self.mission.warning()), daemon=True).start()
+        return ending
+
+    def _lacks(self, expected: list[str]) -> dict[str, str]:
+        """Return the nodes, else the topics, else the nodes again that lack something, and what."""
+        recorder = self.recorder
+        # Nodes report last, so that all topics of one that has reported are discovered.
+        ready = set(recorder.take_ready())
+        recorder.discover()
+        if late := [name for name in expected if name not in ready]:
+            return dict.fromkeys(late, 'is not ready')
+        self._complete = self._complete or time.monotonic()
+        unmatched = recorder.unmatched()
+        if unmatched and time.monotonic() - self._complete <= _CONNECTION_PATIENCE:
+            return dict.fromkeys(unmatched, 'has a publisher that is not connected')
+        return dict.fromkeys(recorder.unanswered(expected), 'does not know the recorder')
+
+    def _let_take_off(self) -> None:
+        """Let simulated robots take off whose drivers do not take part yet."""
+        if time.monotonic() - self._armed_at < _ARMING_PERIOD:
+            return
+        self._armed_at = time.monotonic()
+        ready = set(map(self.recorder.relative, self.recorder.ready))
+        names = [name for name, robot in self._scenario.robots.items() if robot.takes_off]
+        self.recorder.arm([name for name in names if f'/{name}/driver' not in ready])
 
     def _name_external_robots(self) -> None:
         team = self.options.namespace
@@ -309,58 +274,44 @@ class ScenarioRun:
 
     def _follow(self) -> Ending:
         """Monitor the run until it ends, and return its ending."""
-        recorder, supervisor = self.recorder, self.supervisor
-        limit = round(self._limits.time * 1e9)
+        recorder, supervisor, silence = self.recorder, self.supervisor, self._limits.silence
         moved = time.monotonic()
         last: tuple[int | None, int] = (None, 0)
-        while True:
-            recorder.wait(_POLL)
-            recorder.drain(limit)
-            self._let_take_off()
-            ending = self._check() or self._goal()
-            if ending is not None:
-                return ending
+        while (ending := self._turn()) is None:
             now = (recorder.step, recorder.time)
             if now != last:
                 last, moved = now, time.monotonic()
                 self._begun = self._begun or moved
                 supervisor.running = True
-                self._finish_step()
+                # The step is done once the disk keeps up.
+                if self._bag is not None:
+                    with contextlib.suppress(BagError):
+                        self._bag.wait(_BACKLOG)
+                if self.options.lockstep and recorder.step is not None:
+                    recorder.publish_done(recorder.step)
             elif supervisor.restarting:
                 # A restarted node may have to compile: `limits.start` applies.
                 moved = time.monotonic()
-            elif time.monotonic() - moved > self._limits.silence:
-                if self.options.follow_clock:
-                    return Ending(
-                        'clock_stopped',
-                        NODE_FAILED,
-                        '/clock, which this run follows, stands still for '
-                        f'{self._limits.silence:g} s',
-                    )
-                return supervisor.standstill(recorder)
-            for name in recorder.faults.keys() - self._told:
-                self.display.say(f'warning: {name}: {recorder.faults[name]}')
-            self._told = set(recorder.faults)
+            elif time.monotonic() - moved > silence:
+                if not self.options.follow_clock:
+                    return supervisor.standstill()
+                text = f'/clock, which this run follows, stands still for {silence:g} s'
+                return Ending('clock_stopped', NODE_FAILED, text)
+            self._warn(*recorder.take_complaints())
             if self.display.due or self.observer.news:
                 self._show()
+        return ending
 
-    def _finish_step(self) -> None:
-        """Report that the recorder is done with a step, once the disk keeps up."""
-        if self._bag is not None:
-            with contextlib.suppress(BagError):
-                self._bag.wait(_BACKLOG)
-        if self.options.lockstep and self.recorder.step is not None:
-            self.recorder.publish_done(self.recorder.step)
-
-    def _check(self) -> Ending | None:
-        """Return an ending if the run was interrupted or a node has failed."""
+    def _turn(self) -> Ending | None:
+        """Take what nodes have sent; return an ending if the run is over, or a node has failed."""
+        recorder, observer, limit = self.recorder, self.observer, self._limits.time
+        recorder.wait(_POLL)
+        recorder.drain(round(limit * 1e9))
+        self._let_take_off()
         if self.interruption:
             return Ending('interrupted', INTERRUPTED)
-        return self.supervisor.check(self.recorder)
-
-    def _goal(self) -> Ending | None:
-        """Return the ending that the scenario defines, if it is reached."""
-        observer = self.observer
+        if failure := self.supervisor.check():
+            return failure
         if observer.completed is not None:
             return Ending('all_found', DONE)
         if self._bag is not None and self._bag.failed:
@@ -368,7 +319,7 @@ class ScenarioRun:
         if observer.settled is not None:
             meant = self._scenario.stop == 'planner_done'
             return Ending('planner_done', DONE if meant else NOT_ALL_FOUND, observer.settled)
-        if self.recorder.elapsed >= self._limits.time:
+        if recorder.elapsed >= limit:
             return Ending('time_limit', NOT_ALL_FOUND)
         return None
 
@@ -386,6 +337,32 @@ class ScenarioRun:
             f'{seconds / wall if wall > 0.0 else 0.0:.1f} x real time',
             observer.found,
         )
+
+    def _check_recording(self) -> None:
+        """Note which topics with a message at each step lack a recording of their beginning."""
+        recorder, options = self.recorder, self.options
+        if not options.record or self.ending.code not in (DONE, NOT_ALL_FOUND):
+            return
+        follows = options.follow_clock or self._scenario.external_clock
+        for gap in recorder.gaps(follows, _CONNECTION_PATIENCE * (options.rate or 1.0)):
+            self.unwritten.append(gap)
+            self.supervisor.events.append(
+                {'time': recorder.elapsed, 'node': 'recorder', 'event': 'gap', 'reason': gap}
+            )
+
+    def _close_bag(self) -> None:
+        try:
+            if self._bag is not None:
+                self._bag.close()
+        except BagError as error:
+            self.unwritten.append(str(error))
+
+    def _is_followed(self) -> bool:
+        """Return whether another run follows the clock of this one."""
+        follows = self.options.follow_clock or self._scenario.external_clock
+        if follows or self.options.lockstep or self.interruption:
+            return False
+        return self.supervisor.has_clock and bool(self.recorder.followers())
 
     def _report(self) -> int:
         """Write the report, print a summary, and return the exit code."""
@@ -417,20 +394,6 @@ class ScenarioRun:
             code = DONE
         return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
-    def _page(self, domain: int) -> RunPage | None:
-        """Serve the page of the run, if it is asked for; an error does not end the run."""
-        options = self.options.view
-        if options is None:
-            return None
-        try:
-            scene = scene_of(self.mission.name, self.mission.scenario)
-            page = RunPage(scene, options, domain, self.options.namespace)
-        except OSError as error:
-            self.display.say(f'warning: no view: {options.host}: {error.strerror or error}')
-            return None
-        page.announce(self.display.say)
-        return page
-
     def _leave_replay(self) -> None:
         """Write the page that shows the run, from its recording."""
         if not self.options.record:
@@ -439,7 +402,7 @@ class ScenarioRun:
         try:
             write_replay(read_events(self.folder, partial(self.display.share, REPLAY)), file)
         except (BagError, ResultsError) as error:
-            self.display.say(f'warning: no {REPLAY}: {error}')
+            self._warn(f'no {REPLAY}: {error}')
         else:
             self.display.say(f'replay: {short(file)}')
 

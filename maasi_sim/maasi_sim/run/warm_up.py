@@ -10,7 +10,7 @@ import maasi_planner
 from maasi_planner.settings import PLANNERS
 from maasi_sim.run.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario
-from maasi_sim.simulation.simulated_world import simulated_robot
+from maasi_sim.simulation.simulated_world import Simulation
 
 # What most nodes exchange; importing messages starts no threads.
 _MESSAGES = (
@@ -28,19 +28,16 @@ _MESSAGES = (
 
 def warm_up() -> None:
     """Compile, or load from the cache, the kernels of simulations."""
-    _play_robots()
+    _simulate()
     mission_of(load_cuboid_scenario('buildings_four')).run(1)
 
 
-def _play_robots() -> None:
-    """Play one step of simulated robots of each kind."""
+def _simulate() -> None:
+    """Simulate one step of robots of each kind."""
     for name in ('mambo_turtlebot_obstacles', 'ranging_pair_3d'):
-        scenario = load_scenario(name)
-        world = scenario.world(scenario.seed)
-        for robot_name in scenario.names():
-            robot = simulated_robot(robot_name, scenario, world, scenario.seed)
-            robot.warm_up()
-            robot.step(1, scenario.step)
+        simulation = Simulation(load_scenario(name), 1)
+        simulation.warm_up()
+        simulation.advance()
 
 
 def prepare_nodes() -> None:
@@ -50,7 +47,7 @@ def prepare_nodes() -> None:
     """
     maasi_filter.warm_up()
     maasi_planner.warm_up()
-    _play_robots()
+    _simulate()
     for package in _MESSAGES:
         importlib.import_module(f'{package}.msg')
     # Messages import it at their first use.

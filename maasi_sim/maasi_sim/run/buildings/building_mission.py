@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.store import Typestore
@@ -12,7 +13,14 @@ from maasi_sim.run.buildings.observer import CuboidObserver, CuboidRecord
 from maasi_sim.run.buildings.report import build_cuboid_report, cuboid_summary
 from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.run.mission import Mission
-from maasi_sim.run.node_plan import SIMULATED, NodePlan, RunSettings, guard_plan, sim_plan
+from maasi_sim.run.node_plan import (
+    SIMULATED,
+    NodePlan,
+    common_parameters,
+    guard_plan,
+    sim_plan,
+)
+from maasi_sim.run.run_options import Options
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,11 +35,11 @@ class BuildingMission(Mission[CuboidRecord]):
         self.name = name
         self.scenario = scenario
 
-    def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
+    def plan_nodes(self, options: Options, file: Path) -> list[NodePlan]:
         """Return the simulation, and for each robot a planner and a guard."""
         scenario = self.scenario
-        common = run.common(scenario)
-        plans = [sim_plan('cuboid_sim_node', scenario, run)]
+        common = common_parameters(scenario, options)
+        plans = [sim_plan('cuboid_sim_node', scenario, options, file)]
         for name in scenario.names():
             plans.append(_planner_plan(name, scenario, common))
             # It plans once per step, and a command is valid for one step.

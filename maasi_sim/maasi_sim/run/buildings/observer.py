@@ -12,7 +12,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings.agent import Activity
 from maasi_planner.buildings.preplanning import CoveragePlan
 from maasi_sim.run.buildings.scenario import CuboidScenario
-from maasi_sim.run.run_record import Observer, RunEnd, RunRecord, rows
+from maasi_sim.run.mission import Observer, RunEnd, RunRecord, rows
 
 
 class Moment(NamedTuple):

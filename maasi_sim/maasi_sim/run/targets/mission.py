@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.store import Typestore
@@ -12,7 +13,14 @@ from maasi_drivers.settings.driver import DRIVERS, DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import unsuitable_lengths, unused_settings
-from maasi_sim.run.node_plan import SIMULATED, NodePlan, RunSettings, guard_plan, sim_plan
+from maasi_sim.run.node_plan import (
+    SIMULATED,
+    NodePlan,
+    common_parameters,
+    guard_plan,
+    sim_plan,
+)
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.observer import TargetObserver
 from maasi_sim.run.targets.report import build_report, target_summary
 from maasi_sim.run.targets.tables import csv_text, found_rows, geojson_text
@@ -43,12 +51,12 @@ class TargetMission:
         """See `Mission.prepare`."""
         self.scenario = with_addresses(self.scenario)
 
-    def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
+    def plan_nodes(self, options: Options, file: Path) -> list[NodePlan]:
         """Return the simulation, drivers and guards, filters and planners."""
         scenario = self.scenario
-        scenario.check_pace(run.lockstep, run.rate)
-        common = run.common(scenario)
-        plans = [sim_plan('sim_node', scenario, run)]
+        scenario.check_pace(options.lockstep, options.rate)
+        common = common_parameters(scenario, options)
+        plans = [sim_plan('sim_node', scenario, options, file)]
         for name in scenario.names():
             plans += _robot_plans(name, scenario.robots[name], scenario, common)
         for namespace, names in scenario.namespaces().items():

@@ -10,7 +10,7 @@ import numpy as np
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.models.pose import Pose
-from maasi_sim.run.run_record import UNAVAILABLE, Observer, RunEnd, rows
+from maasi_sim.run.mission import UNAVAILABLE, Observer, RunEnd, rows
 from maasi_sim.run.targets.tally import Tally, TargetRecord
 from maasi_sim.run.topics import DECISIONS, FOUND, UPDATE, point, within
 from maasi_sim.scenario.schema import Scenario

@@ -12,7 +12,7 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import FoundTarget, Label
-from maasi_sim.run.run_record import Observer, RunRecord
+from maasi_sim.run.mission import Observer, RunRecord
 from maasi_sim.run.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.run.topics import seconds
 from maasi_sim.scenario.schema import Scenario
