@@ -29,7 +29,8 @@ from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.live_view import SearchTrace
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
 from maasi_sim.search_result import SearchResult, SearchState
-from maasi_sim.simulation.simulated_world import simulated_robot, step_of_event
+from maasi_sim.simulation.robots import SimulatedRobot
+from maasi_sim.simulation.simulated_world import step_of_event
 from maasi_sim.simulation.world import World
 
 # From the settings, and a function that returns the true targets that are not found yet.
@@ -271,15 +272,14 @@ class _Robot:
         settings = scenario.robots[name]
         self.name = name
         self.sensor = settings.sensor.build(name, scenario.dimension)
-        self.body = simulated_robot(name, scenario, world, seed)
+        self.body = SimulatedRobot(name, settings, world, scenario.floor, seed)
         obstacles = Obstacles.from_settings(scenario.environment.obstacles)
         self.follower = WaypointFollower(make_motion(settings.motion, obstacles, settings.radius))
         self.odometry = MapOdometry(Pose.from_yaw(settings.start, settings.yaw))
         self.detector = (
             None if settings.camera is None else MarkerDetector(settings.camera, scenario.dimension)
         )
-        period = settings.sensor.period if settings.camera is None else 1.0 / settings.camera.rate
-        self.imaging_steps = steps_of(period, scenario.step) if period > 0.0 else 1
+        self.imaging_steps = steps_of(settings.measuring_period, scenario.step)
         self.pose: StampedPose
         self.state: RobotState
         self.distance = 0.0

@@ -9,9 +9,9 @@ from maasi_filter.settings import SensorSettings
 from maasi_planner.motion import RobotState
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.schema import SimulatedSettings
 from maasi_sim.search import search
 from maasi_sim.simulation.odometry import OdometryModel, OdometrySettings
-from maasi_sim.simulation.robots import SimulatedSettings
 from maasi_sim.simulation.sensors import RangingSensor
 from maasi_sim.simulation.simulated_world import Simulation
 from maasi_sim.simulation.world import World
@@ -90,7 +90,7 @@ def test_a_scenario_plays_it_in_the_simulation_that_nodes_use_and_in_the_search(
     simulation = Simulation(changed, 1)
     believed = changed.robots['drone'].sensor.build('drone', 3)
     body = simulation.robots['drone']
-    assert_allclose(body.equipment.sensor.covariance, 4.0 * believed.covariance)
+    assert_allclose(body.ranging.sensor.covariance, 4.0 * believed.covariance)
     assert np.linalg.norm(body.odometry.pose.position) > 2.5
     assert simulation.world.walk == pytest.approx(0.3 * changed.step**0.5)
     # Targets are counted where they are in the end.

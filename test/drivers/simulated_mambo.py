@@ -12,9 +12,9 @@ from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import make_motion
 from maasi_planner.settings import MotionSettings
+from maasi_sim.scenario.schema import BatterySettings
 from maasi_sim.simulation.emulators.mambo.firmware import FirmwareSettings, MamboFirmware, Piloting
 from maasi_sim.simulation.odometry import OdometrySettings
-from maasi_sim.simulation.robots import BatterySettings
 
 STEP = 0.05
 TILT = 0.1

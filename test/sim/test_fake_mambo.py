@@ -16,6 +16,7 @@ from waiting import PATIENCE, wait_until
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
 from maasi_filter.models.pose import Pose
 from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.schema import BatterySettings
 from maasi_sim.simulation.emulators.linked_robots import linked_robot, with_addresses
 from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port, main
 from maasi_sim.simulation.emulators.mambo.firmware import (
@@ -23,7 +24,6 @@ from maasi_sim.simulation.emulators.mambo.firmware import (
     FlyingState,
     MamboFirmware,
 )
-from maasi_sim.simulation.robots import BatterySettings
 
 START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
 

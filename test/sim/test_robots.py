@@ -12,9 +12,10 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings, SensorSettings
 from maasi_planner.motion import RobotState
 from maasi_planner.settings import MotionSettings
+from maasi_sim.scenario.schema import BatterySettings, RobotSettings
 from maasi_sim.simulation.floor import RenderSettings
 from maasi_sim.simulation.odometry import OdometryModel, OdometrySettings
-from maasi_sim.simulation.robots import BatterySettings, Equipment, SimulatedRobot
+from maasi_sim.simulation.robots import SimulatedRobot
 from maasi_sim.simulation.sensors import LaserSettings
 from maasi_sim.simulation.world import TargetSettings, World
 
@@ -32,17 +33,20 @@ def world(**environment):
 
 
 def robot(model='mambo', start=DRONE, seed=1, name='robot', place=None, **changes):
+    camera = CameraSettings(focal_length=[220.0, 220.0]) if model == 'mambo' else None
     values = {
+        'type': 'any',
+        'driver': 'ranging_driver',
+        'start': start.position.tolist(),
+        'yaw': start.yaw,
+        'candidates': {'ring': 4, 'distance': 1.0},
         'motion': MotionSettings(model=model, speed=0.4),
-        'radius': 0.1,
-        'camera': CameraSettings(focal_length=[220.0, 220.0]) if model == 'mambo' else None,
-        'sensor': None,
-        'laser': None,
+        'sensor': SensorSettings(),
+        'camera': camera,
         'odometry': PERFECT,
-        'battery': BatterySettings(),
     }
-    equipment = Equipment(**(values | changes))
-    return SimulatedRobot(name, equipment, start, place or world(), RenderSettings(), seed)
+    settings = RobotSettings(**(values | changes))
+    return SimulatedRobot(name, settings, place or world(), RenderSettings(), seed)
 
 
 def drive(one, steps, command=(0.3, 0.0, 0.0, 0.2), dt=0.05, first=1):
@@ -142,7 +146,7 @@ def test_an_empty_battery_stops_a_robot_and_brings_a_drone_down():
 def test_a_robot_that_follows_is_where_its_leader_is():
     sensor = SensorSettings(detection={'kind': 'box', 'lower': [-9, -9], 'upper': [9, 9]})
     place = world(obstacles=[{'centre': [1.8, 1.0], 'radius': 0.1}])
-    one = robot('constant_speed', place=place, sensor=sensor.build('robot', 2))
+    one = robot('constant_speed', place=place, sensor=sensor)
     leader = SimpleNamespace(state=RobotState.at_rest([1.0, 1.5, 1.0]))
     one.follow(leader)
     one.command([0.3, 0.0, 0.0, 0.0])

@@ -13,9 +13,8 @@ from maasi_drivers.settings.driver import DRIVERS
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.plugins import unknown
 from maasi_sim.scenario.base import BaseScenario
-from maasi_sim.scenario.schema import RobotSettings, Scenario
+from maasi_sim.scenario.schema import RobotSettings, Scenario, SimulatedSettings
 from maasi_sim.scenario.visibility import robot_candidates
-from maasi_sim.simulation.robots import SimulatedSettings
 
 # Each is `key: text`.
 Problems = Iterator[str]

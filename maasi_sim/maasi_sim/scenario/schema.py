@@ -11,7 +11,16 @@ from pydantic import AfterValidator, Field
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.settings.driver import DRIVERS, BatteryUnit
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
-from maasi_filter.settings import FilterSettings, Finite, SensorSettings, Settings, Vector3
+from maasi_filter.arrays import FloatArray
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.settings import (
+    FilterSettings,
+    Finite,
+    NoiseSettings,
+    SensorSettings,
+    Settings,
+    Vector3,
+)
 from maasi_planner.node_settings import PlannedRobotSettings, PlannerNodeSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 from maasi_sim.scenario.base import BaseScenario
@@ -19,9 +28,66 @@ from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.simulation.floor import RenderSettings
 from maasi_sim.simulation.odometry import OdometrySettings
-from maasi_sim.simulation.robots import BatterySettings, SimulatedSettings
 from maasi_sim.simulation.sensors import LaserSettings
 from maasi_sim.simulation.world import TargetSettings, World
+
+
+class SimulatedSettings(Settings):
+    """True parameters of a robot, where they differ from its other settings.
+
+    The sensor's part is for ranging sensors; a camera has its own true settings.
+    """
+
+    noise: NoiseSettings | None = Field(
+        default=None, description="True noise of its sensor; none: the sensor's"
+    )
+    noise_factor: float = Field(
+        default=1.0, gt=0.0, le=1000.0, description='Factor on the true deviations [1]'
+    )
+    probability_factor: float = Field(
+        default=1.0,
+        ge=0.0,
+        le=100.0,
+        description='Factor on the true probability of detection, which is at most 1 [1]',
+    )
+    clutter_per_scan: float | None = Field(
+        default=None,
+        ge=0.0,
+        le=1e4,
+        description='True mean number of false detections in a scan; none: as in the sensor [1]',
+    )
+    odometry: OdometrySettings | None = Field(
+        default=None,
+        description='True noise, drift and offset of its odometry, while the covariance it reports '
+        'is that of `odometry`; none: they are the same',
+    )
+
+    def sensor(self, believed: SensorSettings, name: str, bounds: FloatArray) -> Sensor:
+        """Return the true ranging sensor; its clutter is within the diagonal of the bounds."""
+        dimension = len(bounds)
+        noise = self.noise or believed.noise
+        probability = min(believed.detection.probability * self.probability_factor, 1.0)
+        detection = believed.detection.model_copy(update={'probability': probability})
+        true = believed.model_copy(update={'noise': noise, 'detection': detection})
+        sensor = true.build(name, dimension)
+        sensor.covariance = sensor.covariance * self.noise_factor**2
+        if self.clutter_per_scan is not None:
+            size = bounds[:, 1] - bounds[:, 0]
+            reach = min(math.sqrt(float((size * size).sum())), sensor.maximum_range)
+            space = reach * 2.0 * math.pi * (math.pi if dimension == 3 else 1.0)
+            sensor.clutter = self.clutter_per_scan / space
+        return sensor
+
+
+class BatterySettings(Settings):
+    """A robot's battery."""
+
+    capacity: float = Field(default=7200.0, gt=0.0, description='Energy of a full battery [J]')
+    charge: float = Field(default=1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
+    idle_power: float = Field(default=2.0, ge=0.0, description='Drain at rest or hovering [W]')
+    motion_power: float = Field(
+        default=4.0, ge=0.0, description='Drain for each metre per second on top of it [W/(m/s)]'
+    )
 
 
 class RobotSettings(Settings):
@@ -90,6 +156,11 @@ class RobotSettings(Settings):
         if self.link == 'mavlink':
             return self.autopilot.external
         return self.body == 'external'
+
+    @property
+    def measuring_period(self) -> float:
+        """Of its camera, or of its ranging sensor [s]."""
+        return self.sensor.period if self.camera is None else 1.0 / self.camera.rate
 
     @property
     def takes_off(self) -> bool:

@@ -2,88 +2,24 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 
 from maasi_drivers.agent.sensor_reading import Sweep
-from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import UNLABELLED
-from maasi_filter.settings import NoiseSettings, SensorSettings, Settings
 from maasi_planner.motion import Body, RobotState, make_motion
 from maasi_planner.motion.base import check_command
-from maasi_planner.settings import MotionSettings
+from maasi_sim.scenario.schema import BatterySettings, RobotSettings
 from maasi_sim.simulation.camera import CameraRenderer
 from maasi_sim.simulation.floor import RenderSettings, scene_of
-from maasi_sim.simulation.odometry import OdometryModel, OdometryReading, OdometrySettings
-from maasi_sim.simulation.sensors import LaserScanner, LaserSettings, RangingSensor
+from maasi_sim.simulation.odometry import OdometryModel, OdometryReading
+from maasi_sim.simulation.sensors import LaserScanner, RangingSensor
 from maasi_sim.simulation.world import World
-
-
-class SimulatedSettings(Settings):
-    """True parameters of a robot, where they differ from its other settings.
-
-    The sensor's part is for ranging sensors; a camera has its own true settings.
-    """
-
-    noise: NoiseSettings | None = Field(
-        default=None, description="True noise of its sensor; none: the sensor's"
-    )
-    noise_factor: float = Field(
-        default=1.0, gt=0.0, le=1000.0, description='Factor on the true deviations [1]'
-    )
-    probability_factor: float = Field(
-        default=1.0,
-        ge=0.0,
-        le=100.0,
-        description='Factor on the true probability of detection, which is at most 1 [1]',
-    )
-    clutter_per_scan: float | None = Field(
-        default=None,
-        ge=0.0,
-        le=1e4,
-        description='True mean number of false detections in a scan; none: as in the sensor [1]',
-    )
-    odometry: OdometrySettings | None = Field(
-        default=None,
-        description='True noise, drift and offset of its odometry, while the covariance it reports '
-        'is that of `odometry`; none: they are the same',
-    )
-
-    def sensor(self, believed: SensorSettings, name: str, bounds: FloatArray) -> Sensor:
-        """Return the true ranging sensor; its clutter is within the diagonal of the bounds."""
-        dimension = len(bounds)
-        noise = self.noise or believed.noise
-        probability = min(believed.detection.probability * self.probability_factor, 1.0)
-        detection = believed.detection.model_copy(update={'probability': probability})
-        true = believed.model_copy(update={'noise': noise, 'detection': detection})
-        sensor = true.build(name, dimension)
-        sensor.covariance = sensor.covariance * self.noise_factor**2
-        if self.clutter_per_scan is not None:
-            size = bounds[:, 1] - bounds[:, 0]
-            reach = min(math.sqrt(float((size * size).sum())), sensor.maximum_range)
-            space = reach * 2.0 * math.pi * (math.pi if dimension == 3 else 1.0)
-            sensor.clutter = self.clutter_per_scan / space
-        return sensor
-
-
-class BatterySettings(Settings):
-    """A robot's battery."""
-
-    capacity: float = Field(default=7200.0, gt=0.0, description='Energy of a full battery [J]')
-    charge: float = Field(default=1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
-    idle_power: float = Field(default=2.0, ge=0.0, description='Drain at rest or hovering [W]')
-    motion_power: float = Field(
-        default=4.0, ge=0.0, description='Drain for each metre per second on top of it [W/(m/s)]'
-    )
 
 
 class Battery:
@@ -104,24 +40,6 @@ class Battery:
         self.charge = max(self.charge - power * dt / self.settings.capacity, 0.0)
 
 
-@dataclass(frozen=True)
-class Equipment:
-    """Body and sensors of a simulated robot.
-
-    `radius` is that of a circle around it that hits obstacles [m]; `odometry` is what its odometry
-    reports of its errors, `true_odometry` what they are, if different.
-    """
-
-    motion: MotionSettings
-    radius: float
-    camera: CameraSettings | None
-    sensor: Sensor | None
-    laser: LaserSettings | None
-    odometry: OdometrySettings
-    battery: BatterySettings
-    true_odometry: OdometrySettings | None = None
-
-
 class Leader(Protocol):
     """Moves a robot instead of its simulated body."""
 
@@ -140,54 +58,47 @@ class SimulatedRobot:
     def __init__(
         self,
         name: str,
-        equipment: Equipment,
-        start: Pose,
+        settings: RobotSettings,
         world: World,
         floor: RenderSettings,
         seed: int,
     ) -> None:
         self.name = name
-        self.equipment = equipment
+        self.settings = settings
         self.world = world
         self.collisions = 0
-        self._motion = make_motion(equipment.motion)
+        start = Pose.from_yaw(settings.start, settings.yaw)
+        self._motion = make_motion(settings.motion)
         self._body: Body = self._motion.body(RobotState(start))
         self.state = self._body.robot_state()
         if self._hits(self.state.pose.position):
             raise ValueError(
                 f'{name}: got start {start.position.tolist()}, allowed is a place at least its '
-                f'radius ({equipment.radius} m) from every obstacle'
+                f'radius ({settings.radius} m) from every obstacle'
             )
         self._command = np.zeros(4)
-        self._flies = equipment.motion.model != 'unicycle' and start.position[2] > 0.0
+        self._flies = settings.motion.model != 'unicycle' and start.position[2] > 0.0
         self._resting = False
-        self.battery = Battery(equipment.battery)
-        self._odometry = OdometryModel(
-            equipment.true_odometry or equipment.odometry, start, seed, name, equipment.odometry
-        )
+        self.battery = Battery(settings.battery)
+        odometry = settings.simulated.odometry or settings.odometry
+        self._odometry = OdometryModel(odometry, start, seed, name, settings.odometry)
         self.odometry: OdometryReading = self._odometry.step(self.state, 0)
         self._leader: Leader | None = None
         self.camera: CameraRenderer | None = None
-        if equipment.camera is not None:
-            self.camera = CameraRenderer(
-                Camera.from_settings(equipment.camera),
-                floor,
-                scene_of(world, floor, seed),
-                seed,
-                name,
-            )
-        self.laser: LaserScanner | None = None
-        if equipment.laser is not None:
-            obstacles = world.obstacles
-            self.laser = LaserScanner(
-                equipment.laser, world.bounds, obstacles.centres, obstacles.radii, seed, name
-            )
         self.ranging: RangingSensor | None = None
-        if equipment.sensor is not None:
+        if settings.camera is not None:
+            camera, shapes = Camera.from_settings(settings.camera), scene_of(world, floor, seed)
+            self.camera = CameraRenderer(camera, floor, shapes, seed, name)
+        else:
+            sensor = settings.simulated.sensor(settings.sensor, name, world.bounds)
             size = world.bounds[:, 1] - world.bounds[:, 0]
             reach = float(np.sqrt((size * size).sum()))
-            self.ranging = RangingSensor(
-                equipment.sensor, world.targets_3d_at(0), seed, name, reach
+            self.ranging = RangingSensor(sensor, world.targets_3d_at(0), seed, name, reach)
+        self.laser: LaserScanner | None = None
+        if settings.laser is not None:
+            obstacles = world.obstacles
+            self.laser = LaserScanner(
+                settings.laser, world.bounds, obstacles.centres, obstacles.radii, seed, name
             )
 
     def command(self, velocity: ArrayLike) -> None:
@@ -278,4 +189,4 @@ class SimulatedRobot:
 
     def _hits(self, position: FloatArray) -> bool:
         distances = self.world.obstacles.distances(position)
-        return bool(len(distances) and distances.min() < self.equipment.radius)
+        return bool(len(distances) and distances.min() < self.settings.radius)

@@ -58,15 +58,14 @@ class RobotTopics:
         def publisher(kind: type, topic: str) -> Publisher:
             return node.create_publisher(kind, f'{name}/{topic}', qos)
 
-        equipment = self.robot.equipment
+        robot = self.robot.settings
         # A linked or external robot reports its own pose.
-        robot = simulation.scenario.robots[name]
         self.linked = robot.link != 'topics' or robot.external
         self._odometry_publisher = None if self.linked else publisher(Odometry, 'odom')
         self._odometry = Odometry(child_frame_id=f'{name}/base_link')
         self._odometry.header.frame_id = f'{name}/odom'
-        linear = max(equipment.odometry.velocity_noise**2, _LEAST_VARIANCE)
-        angular = max(equipment.odometry.heading_noise**2, _LEAST_VARIANCE)
+        linear = max(robot.odometry.velocity_noise**2, _LEAST_VARIANCE)
+        angular = max(robot.odometry.heading_noise**2, _LEAST_VARIANCE)
         self._odometry.twist.covariance[::7] = [linear] * 3 + [angular] * 3
         self._battery_publisher = None if self.linked else publisher(BatteryState, 'battery_state')
         self._battery = BatteryState(
@@ -83,20 +82,22 @@ class RobotTopics:
         self.needed: list[str] = []
         if self._odometry_publisher is not None:
             self.needed.append(self._odometry_publisher.topic_name)
-        if equipment.camera is not None:
+        if self.robot.camera is not None:
+            assert robot.camera is not None
             self._image_publisher = publisher(Image, 'camera/image_raw')
             self._info_publisher = publisher(CameraInfo, 'camera/camera_info')
-            self._image, self._info = camera_messages(equipment.camera, f'{name}/camera_optical')
+            self._image, self._info = camera_messages(robot.camera, f'{name}/camera_optical')
             self.needed.append(self._image_publisher.topic_name)
-        elif equipment.sensor is not None:
+        elif self.robot.ranging is not None:
             self._ranges_publisher = publisher(RangeArray, 'ranges')
             self._ranges = RangeArray(header=Header(frame_id=f'{name}/base_link'))
             self.needed.append(self._ranges_publisher.topic_name)
         # The program that moves an external robot also publishes its scan.
-        self._scans = equipment.laser is not None and robot.body == 'simulated'
-        if equipment.laser is not None and self._scans:
+        laser = self.robot.laser
+        self._scans = laser is not None and robot.body == 'simulated'
+        if laser is not None and self._scans:
             self._scan_publisher = publisher(LaserScan, 'scan')
-            self._scan = scan_message(equipment.laser, f'{name}/base_scan')
+            self._scan = scan_message(laser.settings, f'{name}/base_scan')
 
     def publish(self, stamp: Time) -> bool:
         """Publish what is due; return whether camera or ranging sensor had something."""

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.models.pose import Pose
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.schema import Scenario, steps_of
-from maasi_sim.simulation.robots import Equipment, SimulatedRobot
-from maasi_sim.simulation.world import World
+from maasi_sim.simulation.robots import SimulatedRobot
 
 
 class SimulatedTeam:
@@ -66,13 +64,13 @@ class Simulation(SimulatedTeam):
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self.world = scenario.world(seed)
         robots = {
-            name: simulated_robot(name, scenario, self.world, seed) for name in scenario.names()
+            name: SimulatedRobot(name, scenario.robots[name], self.world, scenario.floor, seed)
+            for name in scenario.names()
         }
-        self._image_steps = {}
-        for name in robots:
-            robot = scenario.robots[name]
-            period = robot.sensor.period if robot.camera is None else 1.0 / robot.camera.rate
-            self._image_steps[name] = steps_of(period, scenario.step)
+        self._image_steps = {
+            name: steps_of(robot.settings.measuring_period, scenario.step)
+            for name, robot in robots.items()
+        }
         super().__init__(scenario, robots)
 
     def warm_up(self) -> None:
@@ -96,17 +94,17 @@ class Simulation(SimulatedTeam):
     def scan(self, name: str) -> NDArray[np.float32]:
         """Return a laser scan (beams,) [m] that shows the other robots at its height as well."""
         robot = self.robots[name]
-        height, radius = robot.state.pose.position[2], robot.equipment.radius
+        height, radius = robot.state.pose.position[2], robot.settings.radius
         others = [
             other
             for key, other in self.robots.items()
             if key != name
-            and abs(other.state.pose.position[2] - height) <= radius + other.equipment.radius
+            and abs(other.state.pose.position[2] - height) <= radius + other.settings.radius
         ]
         return robot.scan(
             self.step,
             [other.state.pose.position[:2] for other in others],
-            [other.equipment.radius for other in others],
+            [other.settings.radius for other in others],
         )
 
 
@@ -114,27 +112,3 @@ def step_of_event(time: float, step: float) -> int:
     """Return the first step at or after a time [s]."""
     # A time as close as this to a step is the step's.
     return math.ceil(time / step - 1e-6)
-
-
-def simulated_robot(name: str, scenario: Scenario, world: World, seed: int) -> SimulatedRobot:
-    """Return a robot of a scenario at its start."""
-    robot = scenario.robots[name]
-    return SimulatedRobot(
-        name,
-        Equipment(
-            motion=robot.motion,
-            radius=robot.radius,
-            camera=robot.camera,
-            sensor=None
-            if robot.camera
-            else robot.simulated.sensor(robot.sensor, name, world.bounds),
-            laser=robot.laser,
-            odometry=robot.odometry,
-            battery=robot.battery,
-            true_odometry=robot.simulated.odometry,
-        ),
-        Pose.from_yaw(robot.start, robot.yaw),
-        world,
-        scenario.floor,
-        seed,
-    )

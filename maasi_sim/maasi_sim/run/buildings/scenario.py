@@ -16,8 +16,8 @@ from maasi_sim.scenario.base import BaseScenario, ScenarioEnvironment
 from maasi_sim.scenario.checks import Problems, event_problems, name_problems
 from maasi_sim.scenario.layering import Key, Layer, ScenarioError
 from maasi_sim.scenario.loading import checked, read_scenario
+from maasi_sim.scenario.schema import BatterySettings
 from maasi_sim.simulation.odometry import OdometrySettings
-from maasi_sim.simulation.robots import BatterySettings
 from maasi_sim.simulation.world import TargetSettings, World
 
 NAME = 'cuboid_mpc'

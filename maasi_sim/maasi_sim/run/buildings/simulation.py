@@ -10,10 +10,9 @@ from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.preplanning import CoveragePlan
 from maasi_planner.motion import RobotState
 from maasi_planner.motion.base import check_command
-from maasi_planner.settings import MotionSettings
 from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.simulation.odometry import OdometryModel, OdometryReading
-from maasi_sim.simulation.robots import Battery, Equipment
+from maasi_sim.simulation.robots import Battery
 from maasi_sim.simulation.simulated_world import SimulatedTeam
 
 
@@ -32,15 +31,7 @@ class SearchingRobot:
         settings = scenario.robots[name]
         self.name = name
         self.collisions = 0
-        self.equipment = Equipment(
-            motion=MotionSettings(),
-            radius=0.0,
-            camera=None,
-            sensor=None,
-            laser=None,
-            odometry=settings.odometry,
-            battery=settings.battery,
-        )
+        self.settings = settings
         self.battery = Battery(settings.battery)
         self._mission = mission
         self._dynamics = Dynamics(settings.dynamics, scenario.step)

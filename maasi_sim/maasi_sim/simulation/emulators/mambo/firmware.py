@@ -35,8 +35,9 @@ import numpy as np
 
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
+from maasi_sim.scenario.schema import BatterySettings
 from maasi_sim.simulation.odometry import OdometryModel, OdometrySettings
-from maasi_sim.simulation.robots import Battery, BatterySettings
+from maasi_sim.simulation.robots import Battery
 
 _GRAVITY = 9.81
 # Deceleration for each m/s while it hovers [1/s].
