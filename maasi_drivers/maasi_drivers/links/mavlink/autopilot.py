@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import struct
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from maasi_drivers.links.mavlink.estimate import Estimate, FlightOrigin, swap_enu_ned, swap_yaw
@@ -47,27 +47,23 @@ class Autopilot:
     """One autopilot, as its messages describe it; times are of the steady clock [s]."""
 
     def __init__(
-        self,
-        settings: MavlinkSettings,
-        sender: Any,
-        log: ReportLog,
-        place: FlightOrigin,
-        on_restart: Callable[[], None],
+        self, settings: MavlinkSettings, start: list[float], sender: Any, memory: Path | None
     ) -> None:
+        self.settings = settings
+        self.log = ReportLog()
+        self.place = FlightOrigin(settings, start, memory, self.log)
         self.firmware: Firmware | None = None
         self.failsafes: FailsafeCheck | None = None
         self.refusal = ''
         self.armed = False
         self.mode = -1
         self.lost = False
-        self.estimate = Estimate(settings, place, on_restart)
+        self.estimate = Estimate(settings, self.place, self.on_restart)
         #: Commands that were not answered yet.
         self.commands: deque[_Command] = deque()
         #: Numbers of those that were accepted in this phase of the flight.
         self.accepted: set[int] = set()
-        self._settings = settings
         self._sender = sender
-        self._log = log
         self._received_at = self._heartbeat_at = self._setpoint_at = -math.inf
         #: Time of the last request for messages.
         self.requested_at = -math.inf
@@ -77,9 +73,12 @@ class Autopilot:
         """Whether it is in the mode in which it takes set-points."""
         return self.firmware is not None and self.mode == self.firmware.external
 
+    def on_restart(self) -> None:
+        """Take note that the autopilot was restarted."""
+
     # ---- what comes in -----------------------------------------------------------------------
 
-    def handle(self, message: Any, now: float) -> tuple[bool, int] | None:
+    def take(self, message: Any, now: float) -> tuple[bool, int] | None:
         """Take a message; after a heartbeat return whether it was armed before, and the mode then.
 
         Of other systems only messages with the driver's own id count.
@@ -89,7 +88,7 @@ class Autopilot:
             if self.failsafes is not None:
                 self.failsafes.hear_own_id(now)
             return None
-        if source != (self._settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1):
+        if source != (self.settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1):
             return None
         self._received_at = now
         if kind == 'HEARTBEAT':
@@ -100,7 +99,7 @@ class Autopilot:
             self.mode = int(message.custom_mode)
             return before
         if kind == 'STATUSTEXT':
-            self._log.add_text(int(message.severity), message.text.rstrip('\0').strip(), now)
+            self.log.add_text(int(message.severity), message.text.rstrip('\0').strip(), now)
         elif kind == 'PARAM_VALUE':
             self._take_parameter(message)
         elif kind == 'COMMAND_ACK':
@@ -119,7 +118,7 @@ class Autopilot:
         The driver does not receive its own messages. Behind a router that keeps programs apart,
         the answers to the other one's commands are all that comes.
         """
-        own = self._settings.own_system
+        own = self.settings.own_system
         if message.get_srcSystem() == own:
             return True
         return (
@@ -131,17 +130,17 @@ class Autopilot:
     def _recognise(self, message: Any) -> bool:
         try:
             firmware = identify(int(message.autopilot), int(message.type))
-            if firmware.kind != self._settings.vehicle:
+            if firmware.kind != self.settings.vehicle:
                 raise ValueError(
-                    f'HEARTBEAT: read a {firmware.kind}, allowed is a {self._settings.vehicle}'
+                    f'HEARTBEAT: read a {firmware.kind}, allowed is a {self.settings.vehicle}'
                 )
         except ValueError as error:
             self.refusal = str(error)
-            self._log.add(ERROR, self.refusal)
+            self.log.add(ERROR, self.refusal)
             return False
         self.firmware = firmware
         self.read_failsafes()
-        self._log.add(INFO, f'{firmware.name} is there as system {self._settings.system}')
+        self.log.add(INFO, f'{firmware.name} is there as system {self.settings.system}')
         return True
 
     def _take_parameter(self, message: Any) -> None:
@@ -166,16 +165,16 @@ class Autopilot:
     def check_link(self, now: float) -> bool:
         """Update `lost`; return whether it changed."""
         silence, before = now - self._received_at, self.lost
-        self.lost = silence > self._settings.link_timeout
+        self.lost = silence > self.settings.link_timeout
         if self.lost != before:
             text = f'nothing heard for {silence:.1f} s' if self.lost else 'it is back'
-            self._log.add(WARNING, f'link: {text}')
+            self.log.add(WARNING, f'link: {text}')
         return self.lost != before
 
     def read_failsafes(self) -> None:
         """Read the failsafe parameters from the beginning."""
         assert self.firmware is not None
-        self.failsafes = FailsafeCheck(self.firmware, self._settings, self._sender, self._log)
+        self.failsafes = FailsafeCheck(self.firmware, self.settings, self._sender, self.log)
 
     def request_data(self, now: float) -> None:
         """Request parameters and messages that are missing."""
@@ -188,7 +187,7 @@ class Autopilot:
         self.requested_at = now
         for name, rate in _MESSAGES.items():
             number = getattr(mavlink, f'MAVLINK_MSG_ID_{name}')
-            interval = 1e6 / (rate or self._settings.position_rate)
+            interval = 1e6 / (rate or self.settings.position_rate)
             self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (number, interval))
 
     def request_mode(self, mode: int) -> None:
@@ -213,9 +212,9 @@ class Autopilot:
         why = 'not answered' if result is None else why
         if command.number == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             name = mavlink.mavlink_map[int(command.parameters[0])].msgname
-            self._log.add(DEBUG, f'{name} at another rate: {why}')
+            self.log.add(DEBUG, f'{name} at another rate: {why}')
         else:
-            self._log.add(WARNING, f'{mavlink.enums["MAV_CMD"][command.number].name}: {why}')
+            self.log.add(WARNING, f'{mavlink.enums["MAV_CMD"][command.number].name}: {why}')
 
     def send_commands(self, now: float) -> None:
         """Send what is due."""
@@ -229,7 +228,7 @@ class Autopilot:
             return
         parameters = [*command.parameters, *[0.0] * (7 - len(command.parameters))]
         self._sender.command_long_send(
-            self._settings.system,
+            self.settings.system,
             mavlink.MAV_COMP_ID_AUTOPILOT1,
             command.number,
             command.tries,
@@ -240,12 +239,12 @@ class Autopilot:
 
     def send_setpoint(self, position: FloatArray, yaw: float | None, now: float) -> None:
         """Send where it is to be, (3,) [m], if that is due; without a yaw it keeps its own."""
-        if now - self._setpoint_at < 1.0 / self._settings.setpoint_rate - 1e-6:
+        if now - self._setpoint_at < 1.0 / self.settings.setpoint_rate - 1e-6:
             return
         self._setpoint_at = now
         self._sender.set_position_target_local_ned_send(
             int(now * 1000.0) & 0xFFFFFFFF,
-            self._settings.system,
+            self.settings.system,
             mavlink.MAV_COMP_ID_AUTOPILOT1,
             mavlink.MAV_FRAME_LOCAL_NED,
             _POSITION_AND_YAW | (_NO_YAW if yaw is None else 0),

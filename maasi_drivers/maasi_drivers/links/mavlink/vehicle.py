@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission
 from maasi_drivers.links.mavlink.autopilot import Autopilot
-from maasi_drivers.links.mavlink.estimate import FlightOrigin
 from maasi_drivers.links.mavlink.firmware import Firmware
-from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, ReportLog, mavlink
+from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, mavlink
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 from maasi_filter.arrays import FloatArray
 
@@ -64,7 +63,7 @@ _UNABLE = (
 )
 
 
-class Vehicle:
+class Vehicle(Autopilot):
     """One vehicle, from the first heartbeat to the end; times are of the steady clock [s]."""
 
     def __init__(
@@ -74,15 +73,11 @@ class Vehicle:
         sender: Any,
         memory: Path | None = None,
     ) -> None:
-        self.settings = settings
+        super().__init__(settings, start, sender, memory)
         # Over its origin; a copter's is on the ground [m].
         self.height = start[2] - settings.ground
         self.phase = VehiclePhase.CONNECTING
         self.active = False
-        self.log = ReportLog()
-        self._place = FlightOrigin(settings, start, memory, self.log)
-        self._autopilot = Autopilot(settings, sender, self.log, self._place, self._on_restart)
-        self.estimate = self._autopilot.estimate
         self._permission = ArmPermission(settings.arm_timeout)
         # Where it is to be, and its yaw there; none: it keeps its own.
         self._target: FloatArray | None = None
@@ -103,34 +98,34 @@ class Vehicle:
     @property
     def flying(self) -> bool:
         """Whether it follows set-points, with a link that works."""
-        return self.phase is VehiclePhase.FLYING and not self._autopilot.lost
+        return self.phase is VehiclePhase.FLYING and not self.lost
 
     @property
     def in_air(self) -> bool:
         """Whether it is armed, and not on the ground."""
         landed = self.estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND
-        return self._autopilot.armed and not landed
+        return self.armed and not landed
 
     @property
     def parameters(self) -> Mapping[str, float | None]:
         """Of the failsafes, as read; None where the autopilot does not have it."""
-        failsafes = self._autopilot.failsafes
+        failsafes = self.failsafes
         return {} if failsafes is None else failsafes.values
 
     @property
     def at_rest(self) -> bool:
         """Whether nothing is left to command when the driver ends."""
-        if self.phase not in COMMANDED or not self._autopilot.armed:
+        if self.phase not in COMMANDED or not self.armed:
             return True
-        return self.phase is VehiclePhase.ENDING and _MODE in self._autopilot.accepted
+        return self.phase is VehiclePhase.ENDING and _MODE in self.accepted
 
     @property
     def fault(self) -> str:
         """Why it cannot go anywhere; empty where it can."""
-        if self._autopilot.lost:
+        if self.lost:
             return f'link: nothing heard from system {self.settings.system}'
-        if self._place.problem:
-            return f'vehicle: {self._place.problem}'
+        if self.place.problem:
+            return f'vehicle: {self.place.problem}'
         flying = self.phase is VehiclePhase.FLYING
         problem = self.estimate.problem(self._fix_needed) if flying else ''
         what = problem or ': '.join(part for part in (self.phase.value, self._detail) if part)
@@ -138,8 +133,8 @@ class Vehicle:
 
     @property
     def _firmware(self) -> Firmware:
-        assert self._autopilot.firmware is not None
-        return self._autopilot.firmware
+        assert self.firmware is not None
+        return self.firmware
 
     @property
     def _ending_mode(self) -> int:
@@ -177,7 +172,7 @@ class Vehicle:
         """End the permission: arming is given up, a flight continues."""
         self._permission.end()
         if self.phase in (VehiclePhase.STARTING, VehiclePhase.ARMING):
-            self._autopilot.commands.clear()
+            self.commands.clear()
             self._enter(VehiclePhase.WAITING)
 
     def stop(self) -> None:
@@ -188,19 +183,18 @@ class Vehicle:
 
     def _objection(self, now: float) -> str:
         """Return why it must not be armed, or taken over."""
-        autopilot = self._autopilot
         if self.phase in (VehiclePhase.RISING, VehiclePhase.FLYING):
             return 'it is in the air already'
         if self._displaced:
             return 'the autopilot has restarted: start the driver again'
-        if autopilot.lost or self._place.problem or self.phase in _UNABLE:
+        if self.lost or self.place.problem or self.phase in _UNABLE:
             return self.fault
-        if autopilot.armed and autopilot.firmware is not None and not autopilot.in_external_mode:
-            return f'it is flown in {autopilot.firmware.mode_name(autopilot.mode)}'
-        if not (self.settings.arm or autopilot.armed):
+        if self.armed and self.firmware is not None and not self.in_external_mode:
+            return f'it is flown in {self.firmware.mode_name(self.mode)}'
+        if not (self.settings.arm or self.armed):
             return 'mavlink.arm is false'
-        if self.phase is VehiclePhase.WAITING and autopilot.failsafes is not None:
-            return autopilot.failsafes.problem(now)
+        if self.phase is VehiclePhase.WAITING and self.failsafes is not None:
+            return self.failsafes.problem(now)
         return ''
 
     def finish(self, ending: Ending, reason: str = '') -> None:
@@ -211,10 +205,10 @@ class Vehicle:
         self._permission.end()
         if self.phase is VehiclePhase.ENDING and self._ending == ending:
             return
-        if self._autopilot.armed and self.phase in COMMANDED:
+        if self.armed and self.phase in COMMANDED:
             self._ending = ending
             self._reason = f', {reason}' if reason else ''
-            self._autopilot.commands.clear()
+            self.commands.clear()
             what = 'it lands' if ending == 'land' else 'it holds its position'
             self._enter(VehiclePhase.ENDING, what + self._reason)
         self.forbid()
@@ -223,15 +217,15 @@ class Vehicle:
 
     def handle(self, message: Any, now: float) -> None:
         """Take a message."""
-        before = self._autopilot.handle(message, now)
+        before = self.take(message, now)
         if before is not None:
             self._judge_mode(*before, now)
-        elif self._autopilot.refusal and self.phase is not VehiclePhase.REFUSED:
-            self._enter(VehiclePhase.REFUSED, self._autopilot.refusal)
+        elif self.refusal and self.phase is not VehiclePhase.REFUSED:
+            self._enter(VehiclePhase.REFUSED, self.refusal)
 
     def _judge_mode(self, was_armed: bool, before: int, now: float) -> None:
         """Give the vehicle up where the pilot, a failsafe or a disarming has taken it."""
-        firmware, mode, armed = self._firmware, self._autopilot.mode, self._autopilot.armed
+        firmware, mode, armed = self._firmware, self.mode, self.armed
         if self.phase is VehiclePhase.CONNECTING:
             self._enter(VehiclePhase.PREPARING)
         elif was_armed and not armed:
@@ -240,15 +234,15 @@ class Vehicle:
             name = firmware.mode_name(mode)
             text = f'the pilot or a failsafe has taken over: mode {name}; the driver lets go'
             self.log.add(WARNING, text)
-            self._autopilot.commands.clear()
+            self.commands.clear()
             self._permission.end()
             self._target = None
             self._enter(VehiclePhase.RELEASED, f'mode {name}')
         elif self.phase is VehiclePhase.ENDING:
-            self._autopilot.accepted.discard(_MODE)
+            self.accepted.discard(_MODE)
             if mode == self._ending_mode:
-                self._autopilot.accepted.add(_MODE)
-                self._autopilot.commands.clear()
+                self.accepted.add(_MODE)
+                self.commands.clear()
         elif self.phase is VehiclePhase.RELEASED:
             name = firmware.mode_name(mode)
             if mode == firmware.external and armed and not firmware.px4:
@@ -269,10 +263,10 @@ class Vehicle:
             return {before, external}
         if self.phase is VehiclePhase.ENDING:
             return {before, external, self._ending_mode}
-        return {self._autopilot.mode}
+        return {self.mode}
 
     def _on_disarmed(self, now: float) -> None:
-        self._autopilot.commands.clear()
+        self.commands.clear()
         self._permission.end()
         if self.phase is VehiclePhase.ENDING:
             self._enter(VehiclePhase.STOPPED, f'it has landed{self._reason}, {UNTIL_ARM}')
@@ -282,16 +276,16 @@ class Vehicle:
             self.log.add(WARNING, f'it has been disarmed {why}')
             self._enter(VehiclePhase.STOPPED, f'{why}, {UNTIL_ARM}')
 
-    def _on_restart(self) -> None:
+    def on_restart(self) -> None:
         """Begin anew with an autopilot that was restarted: its local frame is another one."""
         text = 'the autopilot has restarted'
         self.log.add(WARNING, text)
-        self._autopilot.commands.clear()
+        self.commands.clear()
         # It has reset the rates of its messages.
-        self._autopilot.requested_at = -math.inf
+        self.requested_at = -math.inf
         self._permission.end()
         if self.phase in (VehiclePhase.CONNECTING, VehiclePhase.PREPARING, VehiclePhase.WAITING):
-            self._autopilot.read_failsafes()
+            self.read_failsafes()
             self._enter(VehiclePhase.PREPARING)
         else:
             self._displaced = True
@@ -301,20 +295,19 @@ class Vehicle:
 
     def tick(self, now: float) -> None:
         """Send what is due; at least 50 times a second."""
-        autopilot = self._autopilot
-        autopilot.send_heartbeat(now)
-        if autopilot.firmware is None:
+        self.send_heartbeat(now)
+        if self.firmware is None:
             return
-        if autopilot.check_link(now):
-            if autopilot.lost:
+        if self.check_link(now):
+            if self.lost:
                 self.forbid()
             elif self.phase is VehiclePhase.FLYING:
                 self._begin_flying()
-        autopilot.request_data(now)
+        self.request_data(now)
         self._continue(now)
-        autopilot.send_commands(now)
+        self.send_commands(now)
         if self._target is not None and self._streams_setpoints:
-            autopilot.send_setpoint(self._target, self._yaw, now)
+            self.send_setpoint(self._target, self._yaw, now)
 
     @property
     def _streams_setpoints(self) -> bool:
@@ -348,43 +341,42 @@ class Vehicle:
 
     def _is_due(self, now: float, period: float) -> bool:
         """Return whether a request may be sent again, and note that it is."""
-        if now - self._tried_at < period or self._autopilot.commands:
+        if now - self._tried_at < period or self.commands:
             return False
         self._tried_at = now
         return True
 
     def _prepare(self, now: float) -> None:
         self._detail = self.log.recent_text(now)
-        assert self._autopilot.failsafes is not None
+        assert self.failsafes is not None
         estimate = self.estimate
         ready = estimate.telemetry is not None and not estimate.problem(fix_needed=False)
-        if self._autopilot.failsafes.complete and ready:
+        if self.failsafes.complete and ready:
             self._enter(VehiclePhase.WAITING)
             self._wait(now)
 
     def _wait(self, now: float) -> None:
-        autopilot = self._autopilot
-        assert autopilot.failsafes is not None
-        name = self._firmware.mode_name(autopilot.mode)
+        assert self.failsafes is not None
+        name = self._firmware.mode_name(self.mode)
         permitted = self.active and self._permission.holds(now)
-        if autopilot.armed and not autopilot.in_external_mode:
+        if self.armed and not self.in_external_mode:
             self._permission.end()
             self._detail = f'it is flown in {name}'
-        elif autopilot.armed and permitted:
+        elif self.armed and permitted:
             self.log.add(INFO, f'it is armed, in {name}: taken over')
             self._permission.end()
             if self.in_air:
                 self._begin_flying()
             else:
                 self._begin_rising(now)
-        elif autopilot.armed:
+        elif self.armed:
             self._detail = f'it is armed in {name}, not by this driver, {UNTIL_ARM}'
         elif not self.settings.arm:
             self._detail = 'arm is false'
         elif not self.active:
             self._detail = 'the driver is not active'
         else:
-            problem = autopilot.failsafes.problem(now)
+            problem = self.failsafes.problem(now)
             if problem:
                 self._permission.end()
             elif permitted:
@@ -396,27 +388,27 @@ class Vehicle:
     def _take_mode(self, now: float) -> None:
         if self._firmware.px4 and now - self._phase_at < _STREAM_AHEAD:
             return
-        if self._autopilot.in_external_mode:
+        if self.in_external_mode:
             self._enter(VehiclePhase.ARMING)
         elif self._is_due(now, _ARMING_PERIOD):
-            self._autopilot.request_mode(self._firmware.external)
+            self.request_mode(self._firmware.external)
 
     def _arm(self, now: float) -> None:
-        if self._autopilot.armed:
+        if self.armed:
             self._permission.end()
             self._begin_rising(now)
         elif self._is_due(now, _ARMING_PERIOD):
             self._detail = self.log.recent_text(now)
-            self._autopilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
+            self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 
     def _begin_rising(self, now: float) -> None:
         # A request to arm without an answer would arm it again after a pilot disarmed it.
-        self._autopilot.commands.clear()
+        self.commands.clear()
         self._target = self._position()
         if self._firmware.kind == 'copter':
             # On the ground; the barometer may have drifted since the estimator started.
             self.estimate.origin[2] = self._target[2]
-            self._place.keep(self.estimate.origin, self.estimate.booted)
+            self.place.keep(self.estimate.origin, self.estimate.booted)
         self._least_left, self._nearer_at = math.inf, now
         self._enter(VehiclePhase.RISING)
 
@@ -439,9 +431,9 @@ class Vehicle:
             self.finish('land', reason)
         elif not by_command:
             self._target[2] = top
-        elif _TAKE_OFF not in self._autopilot.accepted and self._is_due(now, _ARMING_PERIOD):
+        elif _TAKE_OFF not in self.accepted and self._is_due(now, _ARMING_PERIOD):
             take_off = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.height)
-            self._autopilot.command(_TAKE_OFF, take_off)
+            self.command(_TAKE_OFF, take_off)
 
     def _begin_flying(self) -> None:
         position = self._position()
@@ -450,15 +442,15 @@ class Vehicle:
         self._target, self._yaw = position, None
         if self.phase is not VehiclePhase.FLYING:
             self._fix_needed = self.estimate.has_fix
-        self._autopilot.commands.clear()
+        self.commands.clear()
         self._enter(VehiclePhase.FLYING)
 
     def _end(self, now: float) -> None:
         # Not again once accepted: a pilot may have taken another mode since the last heartbeat.
-        if _MODE not in self._autopilot.accepted and self._is_due(now, _ENDING_PERIOD):
-            self._autopilot.request_mode(self._ending_mode)
+        if _MODE not in self.accepted and self._is_due(now, _ENDING_PERIOD):
+            self.request_mode(self._ending_mode)
 
     def _enter(self, phase: VehiclePhase, detail: str = '') -> None:
-        self._autopilot.accepted.clear()
+        self.accepted.clear()
         self.phase, self._detail = phase, detail
         self._phase_at = self._tried_at = -math.inf
