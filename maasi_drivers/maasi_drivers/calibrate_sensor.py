@@ -227,16 +227,10 @@ class RecordedRobot:
         for topic, message in self._messages(*map(self._topic, _IMAGES)):
             placed = history.at(_stamp(message) + offset)
             try:
-                image = (
-                    decode_image(message.data, message.format)
-                    if topic.endswith('/compressed')
-                    else image_to_array(
-                        message.height, message.width, message.encoding, message.step, message.data
-                    )
-                )
                 if placed is None:
                     raise ValueError
-                seen = detector.detect(image, placed.pose)
+                decode = decode_image if topic.endswith('/compressed') else image_to_array
+                seen = detector.detect(decode(message), placed.pose)
             except ValueError:
                 self.left_out += 1
                 continue

@@ -2,6 +2,7 @@
 
 from array import array
 from functools import partial
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,6 +16,10 @@ ROWS, COLUMNS = np.mgrid[:24, :32]
 SMOOTH = np.stack([40 + 4 * ROWS, 200 - 3 * COLUMNS, 60 + 2 * ROWS + 2 * COLUMNS], axis=2).astype(
     np.uint8
 )
+
+
+def message(encoding, height, width, step, data):
+    return SimpleNamespace(encoding=encoding, height=height, width=width, step=step, data=data)
 
 
 def encoded(encoding):
@@ -42,7 +47,8 @@ def encoded(encoding):
 def test_what_cameras_send_is_decoded_without_the_padding(encoding, padding):
     rows = np.pad(encoded(encoding), ((0, 0), (0, padding)), constant_values=255)
     for container in (bytes, memoryview, partial(array, 'B')):
-        image = image_to_array(24, 32, encoding, rows.shape[1], container(rows.tobytes()))
+        data = container(rows.tobytes())
+        image = image_to_array(message(encoding, 24, 32, rows.shape[1], data))
         assert image.shape == SMOOTH.shape and image.dtype == np.uint8
         inner = np.s_[2:-2, 2:-2]
         error = np.abs(image[inner].astype(int) - SMOOTH[inner]).max()
@@ -66,4 +72,4 @@ def test_what_cameras_send_is_decoded_without_the_padding(encoding, padding):
 )
 def test_what_does_not_fit_is_refused(encoding, height, width, step, size, text):
     with pytest.raises(ValueError, match=f'image {text}'):
-        image_to_array(height, width, encoding, step, bytes(size))
+        image_to_array(message(encoding, height, width, step, bytes(size)))

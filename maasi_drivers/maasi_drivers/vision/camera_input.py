@@ -222,9 +222,7 @@ class CameraInput(SensorInput[Picture]):
 
     def _on_image(self, message: Image) -> None:
         try:
-            image = image_to_array(
-                message.height, message.width, message.encoding, message.step, message.data
-            )
+            image = image_to_array(message)
             self._detector.check_size(image)
         except ValueError as error:
             self.driver.drop('image', f'camera/image_raw: {error}')
@@ -240,7 +238,7 @@ class CameraInput(SensorInput[Picture]):
         self.driver.take_frame(
             'camera/image_raw/compressed',
             stamp_from_ros(message.header.stamp),
-            lambda: decode_image(message.data, message.format),
+            lambda: decode_image(message),
             repeated=self._is_repeated(message.data),
         )
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from array import array
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -38,17 +38,9 @@ COLOUR_ENCODINGS = tuple(_ENCODINGS)
 _MAXIMUM_SIDE = 16384
 
 
-def image_to_array(
-    height: int,
-    width: int,
-    encoding: str,
-    step: int,
-    data: bytes | bytearray | memoryview | array | ImageArray,
-) -> ImageArray:
-    """Turn the fields of a ``sensor_msgs/Image`` into an RGB array.
-
-    Units: height, width [px]; step [bytes].
-    """
+def image_to_array(message: Any) -> ImageArray:
+    """Return the RGB array of a ``sensor_msgs/Image``, also of a recorded one."""
+    height, width, step, encoding = message.height, message.width, message.step, message.encoding
     for name, value in (('height', height), ('width', width)):
         if not 0 < value <= _MAXIMUM_SIDE:
             raise ValueError(f'image {name}: got {value}, allowed 1 to {_MAXIMUM_SIDE} px')
@@ -69,7 +61,7 @@ def image_to_array(
             f'image step: got {step} bytes, allowed at least {width * size} '
             f'({width} px of {encoding})'
         )
-    flat = np.frombuffer(data, dtype=np.uint8)
+    flat = np.frombuffer(message.data, dtype=np.uint8)
     rows = height * 3 // 2 if halved else height
     if flat.size != step * rows:
         raise ValueError(
@@ -82,13 +74,13 @@ def image_to_array(
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)
 
 
-def decode_image(data: bytes | bytearray | array | ImageArray, kind: str) -> ImageArray:
-    """Decode the data of a ``sensor_msgs/CompressedImage``."""
-    flat = np.frombuffer(data, np.uint8)
+def decode_image(message: Any) -> ImageArray:
+    """Return the RGB array of a ``sensor_msgs/CompressedImage``, also of a recorded one."""
+    flat = np.frombuffer(message.data, np.uint8)
     image = cv2.imdecode(flat, cv2.IMREAD_COLOR) if flat.size else None
     if image is None:
         raise ValueError(
-            f"image: got {flat.size} bytes of '{kind}', allowed is what OpenCV decodes"
+            f"image: got {flat.size} bytes of '{message.format}', allowed is what OpenCV decodes"
         )
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
