@@ -36,16 +36,16 @@ MakeSensor = Callable[[RobotNode], SensorInput]
 class AgentDriver(RobotNode):
     """The driver of a robot, in the robot's namespace.
 
-    It is composed of a link to the robot, a sensor, and parts with one concern each: `GoalServer`
-    (action `go_to`), `MeasurementResponder`, `StatePublisher`, `Watchdog`, `RobotFrames`; their
-    documentation lists topics and actions.
+    It is composed of a link to the robot, a sensor, and parts with one concern each: `GoalServer`,
+    `MeasurementResponder`, `StatePublisher`, `Watchdog`, `RobotFrames`.
 
     Subscribes
     ----------
-    `/measurement_batch` (maasi_msgs/MeasurementBatch) of the team; what link and sensor need:
-    `odom` (nav_msgs/Odometry), `battery_state` (sensor_msgs/BatteryState), `camera/image_raw`,
-    `camera/camera_info` or `ranges` (maasi_msgs/RangeArray); `pose` or `tf` where the parameter
-    `pose_source` says so
+    `/measurement_batch` (maasi_msgs/MeasurementBatch), `/tf` and `/tf_static` (tf2_msgs/TFMessage)
+    of the team; what link and sensor need: `odom` (nav_msgs/Odometry), `battery_state`
+    (sensor_msgs/BatteryState), `camera/image_raw`, `camera/camera_info`, `scan`
+    (sensor_msgs/LaserScan) or `ranges` (maasi_msgs/RangeArray); `pose`
+    (geometry_msgs/PoseStamped, in the map) where the parameter `pose_source` says so
 
     Publishes
     ---------

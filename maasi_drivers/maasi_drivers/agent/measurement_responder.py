@@ -106,16 +106,7 @@ _AHEAD = 2_000_000_000
 
 
 class MeasurementResponder:
-    """Answers each batch that the robot is in by the detections of one image or sweep.
-
-    Subscribes
-    ----------
-    `measurement_batch` of the team (maasi_msgs/MeasurementBatch)
-
-    Publishes
-    ---------
-    `detections` (maasi_msgs/DetectionArray)
-    """
+    """Answers each batch that the robot is in by the detections of one image or sweep."""
 
     def __init__(self, driver: RobotNode, sensor: SensorInput, watchdog: Watchdog) -> None:
         self._driver = driver

@@ -81,15 +81,9 @@ def robot_description(robot: str, settings: DriverSettings) -> str:
 
 
 class RobotFrames:
-    """The frames of one robot.
+    """The frames of one robot, on the team's `tf` and `tf_static`.
 
-    Publishes
-    ---------
-    `tf`, `tf_static` of the team (tf2_msgs/TFMessage); `robot_description` (std_msgs/String)
-
-    Subscribes
-    ----------
-    `tf`, `tf_static` of the team, not in lockstep: there only the robot's own frames are known
+    In lockstep these are not read: only the robot's own frames are known.
     """
 
     def __init__(

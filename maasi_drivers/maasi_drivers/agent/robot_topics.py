@@ -20,12 +20,7 @@ from maasi_filter.ros.qos import sensor_reader
 
 
 class OdometryTopic:
-    """Hands poses to `driver.take_pose`.
-
-    Subscribes
-    ----------
-    `odom` (nav_msgs/Odometry)
-    """
+    """Hands poses on `odom` to `driver.take_pose`."""
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
@@ -81,12 +76,7 @@ class OdometryTopic:
 
 
 class PoseTopic:
-    """Where a robot is by motion capture, SLAM or another localiser.
-
-    Subscribes
-    ----------
-    `pose` (geometry_msgs/PoseStamped), in the map
-    """
+    """Where a robot is by motion capture, SLAM or another localiser: `pose`, in the map."""
 
     def __init__(
         self, node: LockstepLifecycleNode[DriverSettings], on_pose: Callable[[int, Pose], None]
@@ -119,12 +109,7 @@ def charge_of(percentage: float, unit: BatteryUnit) -> float:
 
 
 class BatteryTopic:
-    """Hands charges to `driver.take_charge`.
-
-    Subscribes
-    ----------
-    `battery_state` (sensor_msgs/BatteryState)
-    """
+    """Hands charges on `battery_state` to `driver.take_charge`."""
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver

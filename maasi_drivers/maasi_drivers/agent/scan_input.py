@@ -178,13 +178,7 @@ _PROGRESS = 0.02
 
 
 class ScanInput:
-    """
-    Hands scans to the controller, and finds out whether they are silent or the robot is blocked.
-
-    Subscribes
-    ----------
-    `scan` (sensor_msgs/LaserScan)
-    """
+    """Hands scans to the controller; finds out whether they are silent or the robot is blocked."""
 
     def __init__(self, driver: RobotNode, settings: ScanSettings, motion: ScanUnicycle) -> None:
         self._driver = driver

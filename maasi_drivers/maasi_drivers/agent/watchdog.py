@@ -14,12 +14,7 @@ from maasi_msgs.msg import AgentState
 
 
 class StatePublisher:
-    """Publishes pose, goal and faults of a robot.
-
-    Publishes
-    ---------
-    `state` (maasi_msgs/AgentState), with each pose; its liveliness is asserted by the executor
-    """
+    """Publishes `state` with each pose; the executor asserts its liveliness."""
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
