@@ -24,10 +24,13 @@ from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.parameters import parameter_fields, unflatten
 
-_IMAGES = ('camera/image_raw', 'camera/image_raw/compressed')
-_DETECTIONS = 'detections'
+# Topics of a robot that show its target.
+_USED = {
+    'images': ('/camera/image_raw', '/camera/image_raw/compressed'),
+    'detections': ('/detections',),
+}
 # The driver's own poses come first: its detections are relative to them.
-_POSES = ('state', 'odom')
+_POSES = ('/state', '/odom')
 _POSE_TYPES = ('AgentState', 'Odometry', 'PoseStamped')
 # Mean errors above this multiple of their standard deviation are significant.
 _CLEAR = 4.0
@@ -138,16 +141,13 @@ class RecordedRobot:
         self.left_out = 0
         self._bag = bag
         with BagReader(bag) as reader:
-            self._types = reader.types
-            self.recovered = reader.recovered
-        wanted = {'images': _IMAGES, 'detections': (_DETECTIONS,)}
-        kinds = (use,) if use else ('images', 'detections')
+            self._types, self.recovered = reader.types, reader.recovered
+        kinds = (use,) if use else (*_USED,)
         for kind in kinds:
-            ends = tuple(f'/{end}' for end in wanted[kind])
             robots = {
                 topic[: -len(end)].strip('/')
                 for topic in self._types
-                for end in ends
+                for end in _USED[kind]
                 if topic.endswith(end)
             }
             if robot is not None:
@@ -161,22 +161,17 @@ class RecordedRobot:
                 f'{" or ".join(kinds)}, allowed is one (--robot, --use); recorded are {there}'
             )
         self.robot, self.use = robots.pop(), kind
-        own = [self._topic(name) for name in _POSES if self._topic(name) in self._types]
-        if poses is None and not own:
+        state, odometry = map(self._topic, _POSES)
+        self.poses = poses or (state if state in self._types else odometry)
+        known = self._types.get(self.poses, 'not recorded')
+        self._pose_type = known.rpartition('/')[2]
+        if self._pose_type not in _POSE_TYPES:
             raise ValueError(
-                f'{bag}: poses: found neither {self._topic("state")} nor {self._topic("odom")}'
-            )
-        self.poses = poses or own[0]
-        if self.poses not in self._types:
-            raise ValueError(f'{bag}: poses: {self.poses} is not recorded')
-        if self._types[self.poses].rpartition('/')[2] not in _POSE_TYPES:
-            raise ValueError(
-                f'{bag}: poses: {self.poses} is {self._types[self.poses]}, allowed are '
-                + ', '.join(_POSE_TYPES)
+                f'{bag}: poses: {self.poses} is {known}, allowed are {", ".join(_POSE_TYPES)}'
             )
 
     def _topic(self, name: str) -> str:
-        return f'/{self.robot}/{name}' if self.robot else f'/{name}'
+        return f'/{self.robot}{name}' if self.robot else name
 
     def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
         with BagReader(self._bag) as reader:
@@ -199,7 +194,7 @@ class RecordedRobot:
 
     def _published(self) -> Iterator[Observation]:
         dimension = self.settings.environment.dimension
-        for _, message in self._messages(self._topic(_DETECTIONS)):
+        for _, message in self._messages(*map(self._topic, _USED['detections'])):
             values = [[item.range, item.bearing, item.elevation] for item in message.detections]
             array = np.reshape(np.array(values, dtype=float), (-1, 3))[:, :dimension]
             pose = _pose(message.pose.pose)
@@ -211,7 +206,7 @@ class RecordedRobot:
     def _segmented(self) -> Iterator[Observation]:
         assert self.settings.camera is not None
         camera = self.settings.camera
-        for _, message in self._messages(self._topic('camera/camera_info')):
+        for _, message in self._messages(self._topic('/camera/camera_info')):
             if message.k[0] != 0.0:
                 camera = camera.with_calibration(
                     message.width,
@@ -224,7 +219,7 @@ class RecordedRobot:
         detector = MarkerDetector(camera, self.settings.environment.dimension)
         history = self._history()
         offset = round(camera.stamp_offset * 1e9)
-        for topic, message in self._messages(*map(self._topic, _IMAGES)):
+        for topic, message in self._messages(*map(self._topic, _USED['images'])):
             placed = history.at(_stamp(message) + offset)
             try:
                 if placed is None:
@@ -237,9 +232,8 @@ class RecordedRobot:
             yield Observation(placed.pose, seen.values)
 
     def _history(self) -> PoseHistory:
-        settings = self.settings
+        settings, kind = self.settings, self._pose_type
         history = PoseHistory(sys.maxsize)
-        kind = self._types[self.poses].rpartition('/')[2]
         odometry: MapOdometry | None = None
         start = Pose.from_yaw(settings.start, settings.yaw)
         for _, message in self._messages(self.poses):
