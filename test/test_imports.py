@@ -25,7 +25,6 @@ ROS_FILES = (
     'robot_topics.py',
     'robot_command.py',
     'robot_frames.py',
-    'scan_input.py',
     'sensor_input.py',
     'watchdog.py',
     # Of the simulation.

@@ -9,18 +9,25 @@ import numpy as np
 from action_msgs.msg import GoalStatus as ActionStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.action.client import ActionClient
+from sensor_msgs.msg import LaserScan
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
-from maasi_drivers.agent.scan_input import ScanInput, ScanUnicycle
+from maasi_drivers.agent.scan_motion import ScanUnicycle, scan_points
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
 from maasi_drivers.links.topic_link import TopicLink
 from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.clocks import Silence
-from maasi_filter.ros.conversions import point_to_ros, stamp_to_ros
+from maasi_filter.ros.conversions import point_to_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import SettingsError
+from maasi_filter.ros.qos import sensor_reader
 from maasi_planner.motion import MotionModel, RobotState
 from maasi_planner.obstacles import Obstacles
+
+# Kind of fault.
+_SCAN = 'scan'
+# A distance to the waypoint that is smaller by this is progress [m].
+_PROGRESS = 0.02
 
 
 class TurtlebotLink(TopicLink):
@@ -37,7 +44,9 @@ class TurtlebotLink(TopicLink):
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
-        self._scan: ScanInput | None = None
+        # Its controller, where it uses the scan.
+        self._motion: ScanUnicycle | None = None
+        self.reset()
 
     def make_motion(self) -> MotionModel:
         """Return the controller, which uses the scan where there is one."""
@@ -45,35 +54,101 @@ class TurtlebotLink(TopicLink):
         if settings.scan is None:
             return super().make_motion()
         obstacles = Obstacles.from_settings(settings.environment.obstacles)
-        motion = ScanUnicycle(settings.motion, obstacles, settings.radius, settings.scan)
-        self._scan = ScanInput(self.driver, settings.scan, motion)
-        return motion
+        self._motion = ScanUnicycle(settings.motion, obstacles, settings.radius, settings.scan)
+        return self._motion
 
     def connect(self) -> None:
-        """Subscribe."""
+        """Compile and subscribe."""
         super().connect()
-        if self._scan is not None:
-            self._scan.set_up()
+        motion, (x, y, z) = self._motion, self.driver.settings.start
+        if motion is None:
+            return
+        motion.see([[x + 0.4, y], [x + 9.0, y]])
+        motion.command(RobotState.at_rest([x, y, z]), [x + 1.0, y, z])
+        motion.see(np.zeros((0, 2)))
+        self.driver.create_subscription(LaserScan, 'scan', self._on_scan, sensor_reader(False))
 
     def reset(self) -> None:
         """Discard the scan of another time."""
-        if self._scan is not None:
-            self._scan.reset()
+        self._scan: LaserScan | None = None
+        self._scanned_at: int | None = None
+        # The present goal, the least distance that was left to it [m], and its stamp [ns].
+        self._nearest: tuple[Goal, float, int] | None = None
 
     def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
-        """Return command and goal reached; a blocked robot gives its goal up."""
-        scan, settings, latest = self._scan, self.driver.settings.scan, self.driver.history.latest
-        if scan is None or settings is None or latest is None:
+        """Return command and goal reached; without scans it is stopped, blocked it gives up."""
+        driver, settings, latest = (
+            self.driver,
+            self.driver.settings.scan,
+            self.driver.history.latest,
+        )
+        if settings is None or latest is None:
             return super().steer(robot, step)
-        scan.update(latest)
+        self._place_scan()
+        if self._scanned_at is None:
+            self._scanned_at = latest.stamp
+        age = 1e-9 * (latest.stamp - self._scanned_at)
+        if age > settings.timeout:
+            driver.health.begin(_SCAN, f'no scan for {age:.1f} s')
         command, reached = super().steer(robot, step)
-        if scan.is_blocked(latest):
-            self.driver.end_goal(
+        if self._without_progress(latest) > settings.blocked_timeout:
+            driver.end_goal(
                 GoalStatus.ABORTED,
                 f'blocked: no nearer to the waypoint for {settings.blocked_timeout:g} s',
             )
             command = np.zeros(4)
         return command, reached
+
+    def _without_progress(self, placed: StampedPose) -> float:
+        """Return for how long it has come no nearer to its waypoint [s]."""
+        follower = self.driver.follower
+        goal = follower.goal
+        if goal is None or goal.status != GoalStatus.MOVING:
+            self._nearest = None
+            return 0.0
+        left, before = follower.distance(placed.pose.position, goal), self._nearest
+        if before is None or before[0] is not goal or left < before[1] - _PROGRESS:
+            self._nearest = before = goal, left, placed.stamp
+        return 1e-9 * (placed.stamp - before[2])
+
+    def _on_scan(self, message: LaserScan) -> None:
+        if self.driver.active:
+            self._scan = message
+            self._place_scan()
+
+    def _place_scan(self) -> None:
+        """Place the scan in the map once the odometry covers its stamp."""
+        driver, message, settings = self.driver, self._scan, self.driver.settings.scan
+        latest = driver.history.latest
+        if message is None or latest is None or settings is None or self._motion is None:
+            return
+        stamp = stamp_from_ros(message.header.stamp)
+        if stamp > latest.stamp:
+            return
+        self._scan = None
+        placed = driver.history.at(stamp)
+        if placed is None:
+            driver.drop(
+                'scan',
+                f'scan.header.stamp: read {stamp} ns, allowed is what the odometry covers, up to '
+                f'{latest.stamp} ns',
+            )
+            return
+        try:
+            points = scan_points(
+                message.ranges,
+                (message.angle_min, message.angle_increment),
+                (message.range_min, message.range_max),
+                message.time_increment,
+                placed,
+                [*settings.position, settings.yaw],
+            )
+        except ValueError as error:
+            driver.drop('scan', f'scan.{error}')
+            return
+        self._motion.see(points)
+        self._scanned_at = latest.stamp
+        driver.health.end(_SCAN, 'scan: received again')
 
 
 class Nav2Link(TurtlebotLink):
