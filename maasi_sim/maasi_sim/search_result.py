@@ -7,6 +7,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
 from maasi_planner.team import Decision
@@ -104,6 +106,19 @@ class SearchResult:
         """Whether all targets are found, and nothing else."""
         return self.missed == 0 and self.false_found == 0
 
+    def columns(self) -> dict[str, Any]:
+        """Return the progress by columns, with places of robots and whether they measured."""
+        progress = self.progress
+        kinds = ('step', 'time', 'measurements', 'found', 'true_found', 'rmse')
+        columns: dict[str, Any] = {
+            kind: [getattr(item, kind) for item in progress] for kind in kinds
+        }
+        for name in sorted(self.measurements):
+            places = np.array([item.positions[name] for item in progress]).reshape(-1, 3)
+            columns |= {f'{name}_{axis}': values for axis, values in zip('xyz', places.T)}
+            columns[f'{name}_measures'] = [name in item.members for item in progress]
+        return columns
+
     def save_replay(self, path: str | Path) -> None:
         """Write a page that shows the search, one HTML file.
 
@@ -145,11 +160,4 @@ class SearchResult:
             rows = found_rows(self.found_targets, self.truth, self.pairs, origin)
             frame = pandas.DataFrame(rows, columns=columns(self.truth.shape[1], origin))
             return frame.astype({'target': 'Int64', 'error': float})
-        rows = []
-        for item in self.progress:
-            counts = ('time', 'step', 'measurements', 'found', 'true_found', 'rmse')
-            row = {name: getattr(item, name) for name in counts}
-            for name, place in item.positions.items():
-                row |= {f'{name}_{axis}': float(value) for axis, value in zip('xyz', place)}
-            rows.append(row | {f'{name}_measures': name in item.members for name in item.positions})
-        return pandas.DataFrame(rows)
+        return pandas.DataFrame(self.columns())

@@ -96,14 +96,6 @@ def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: 
         (item for item in progress if len(result.truth) and item.true_found == len(result.truth)),
         None,
     )
-    names = sorted(result.measurements)
-    kinds = ('step', 'time', 'measurements', 'found', 'true_found', 'rmse')
-    columns: dict[str, Any] = {kind: [getattr(item, kind) for item in progress] for kind in kinds}
-    for name in names:
-        places = np.array([item.positions[name] for item in progress]).reshape(-1, 3)
-        for axis, values in zip('xyz', places.T):
-            columns[f'{name}_{axis}'] = values
-        columns[f'{name}_measures'] = [name in item.members for item in progress]
     filter_time, planning_time = sum(result.filter_times), sum(result.planning_times)
     return Outcome(
         summary={
@@ -120,7 +112,7 @@ def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: 
             'decisions': len(result.decisions),
             'distance': sum(result.distance.values()),
         },
-        columns=columns,
+        columns=result.columns(),
         details={
             'truth': result.truth.tolist(),
             'found': [target.position.tolist() for target in result.found_targets],
