@@ -1,6 +1,7 @@
 """Scenario files: layers, and messages for what is wrong in them."""
 
 import re
+import warnings
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,12 @@ import yaml
 
 from maasi_sim.run.missions import load_mission
 from maasi_sim.scenario.layering import ScenarioWarning
-from maasi_sim.scenario.loading import config_folder, find_scenario, load_scenario
+from maasi_sim.scenario.loading import (
+    config_folder,
+    find_scenario,
+    load_scenario,
+    scenario_from_values,
+)
 from maasi_sim.scenario.schema import ScenarioError
 from maasi_sim.scenario.visibility import never_seen, robot_candidates
 
@@ -216,8 +222,12 @@ def test_a_robot_may_be_moved_by_another_program(load):
     assert load(scenario.content()).robots['drone'].external
     assert load_scenario(DOCS / 'drone_sitl.yaml').robots['drone'].external
     content['events'] = [{'at': 5.0, 'robot': 'drone', 'do': 'leave'}]
-    with pytest.raises(ScenarioError, match=r"events\[0\]\.robot: read 'drone', which is external"):
+    content['robots']['drone']['simulated'] = {'noise_factor': 2.0}
+    with pytest.raises(
+        ScenarioError, match=r"events\[0\]\.robot: read 'drone', which is external"
+    ) as caught:
         load(content)
+    assert 'robots.drone.simulated: is given for a robot that is external' in str(caught.value)
     scenario = load(changed(('robots.mambo.body', 'external')))
     mambo = scenario.robots['mambo']
     assert mambo.external and not mambo.takes_off and scenario.external_clock
@@ -239,9 +249,14 @@ def test_a_drone_with_a_camera_may_be_linked_by_mavlink(load):
 
 
 def test_the_line_is_that_of_the_key(load):
-    text = yaml.safe_dump(changed(('stepp', 3)), sort_keys=False)
-    line = text.splitlines().index('stepp: 3') + 1
+    text = yaml.safe_dump(changed(('stepp', {'a': 3})), sort_keys=False)
+    line = text.splitlines().index('stepp:') + 1
     with pytest.raises(ScenarioError, match=f'my_scenario.yaml:{line}: stepp'):
+        load(text)
+    # Of an item of a list, where settings do not fit together.
+    text = yaml.safe_dump(changed(('events', [LEAVES, LEAVES | {'do': 'leave'}])))
+    line = len(text.splitlines()) - text.splitlines()[::-1].index('  do: leave')
+    with pytest.raises(ScenarioError, match=rf'my_scenario.yaml:{line}: events\[1\]\.do'):
         load(text)
 
 
@@ -301,6 +316,7 @@ def test_what_is_no_scenario_is_refused_in_one_short_line(load, text, words):
 )
 def test_a_robot_without_candidates_gets_a_grid_that_sees_everything(load, robot):
     content = changed(('robots', {'one': robot | {'start': [0.5, 0.5, 1.0]}}))
+    content['environment']['origin'] = {'latitude': 46.0, 'longitude': 23.5}
     scenario = load(content)
     assert never_seen(scenario) == ''
     numbers = scenario.robots['one'].candidates.grid
@@ -377,3 +393,7 @@ def test_what_is_hardly_meant_is_taken_with_a_warning(load, changes, words):
     load(changed(('robots.mambo.yaw', -3.0)))
     with pytest.warns(ScenarioWarning, match=rf'my_scenario.yaml:\d+: {words}'):
         load(changed(*changes), {'--time-limit': (('limits', 'time'), 5.0)})
+    # What a program made gets none.
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        scenario_from_values(changed(('limits.time', 5.0), *changes), 'a program')
