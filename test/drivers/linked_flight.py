@@ -1,5 +1,6 @@
 """A flying robot behind a link, its driver in this process or its own, and the team around it."""
 
+import signal
 import subprocess
 from functools import partial
 
@@ -102,6 +103,15 @@ class LinkedFlight:
         _, result = self.until_it_flies().team.send_accepted(goal)
         self.until(result.done)
         assert result.result().result.reached
+
+    def is_sent(self, number, result):
+        """Send a signal to the driver's process, and wait for its end."""
+        self.driver.send_signal(number)
+        self.until(lambda: self.driver.poll() is not None)
+        if number == signal.SIGINT:
+            assert self.driver.returncode == 0
+            self.until(result.done)
+            assert result.result().result.reason == 'the driver stops'
 
     def gives_up(self, result, reason):
         """Check that the goal ends, that the planner hears why, and that it is not sent on."""

@@ -100,6 +100,21 @@ class Play:
             before()
             self.turn()
 
+    def unheard(self, seconds):
+        """Return itself, after a time in which the driver hears nothing."""
+        self.to_driver.cut = True
+        self.run(seconds)
+        self.to_driver.cut = False
+        return self
+
+    def without_driver(self, seconds, place=None):
+        """Let the driver hang for a time; then the vehicle may be carried elsewhere."""
+        self.driver_lives = False
+        self.run(seconds)
+        if place is not None:
+            self.body.position[:2] = place
+        self.driver_lives = True
+
     def until(self, condition, limit=60.0):
         end = self.now + limit
         while not condition():

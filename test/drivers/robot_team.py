@@ -17,7 +17,7 @@ from waiting import wait_until
 from maasi_drivers.drivers import MamboDriver, RangingDriver, TurtlebotDriver
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.models.pose import Pose, compose, inverse
-from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
+from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_to_ros
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
 from maasi_msgs.action import GoToWaypoint
@@ -248,6 +248,13 @@ class Team(Node):
     def answer(self, number=1):
         self.until(lambda: len(self.detections) >= number, 'no detections')
         return self.detections[number - 1]
+
+    def seen_at(self):
+        """Return the place on the floor of the one detection of the first answer."""
+        (seen,) = self.answer().detections
+        pose = pose_from_ros(self.answer().pose.pose)
+        way = seen.range * np.array([math.cos(seen.bearing), math.sin(seen.bearing)])
+        return pose.position[:2] + way
 
 
 def numbers(message):

@@ -97,6 +97,12 @@ class Flight:
         yaw = math.radians(round(math.degrees(estimate.yaw)))
         self.position = PositionEvent(position, yaw, self.time)
 
+    def is_silent(self, steps):
+        """Lose what it sends for some steps."""
+        self.cut_down = True
+        self.step(steps)
+        self.cut_down = False
+
     def until(self, condition, limit=30.0):
         end = self.time + limit
         while not condition():

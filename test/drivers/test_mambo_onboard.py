@@ -17,15 +17,6 @@ from maasi_drivers.drivers import MamboOnboardDriver
 from maasi_drivers.links.mambo.onboard_link import OrderKind
 from maasi_drivers.links.mambo.onboard_link import encode as encode_order
 from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.detector import Blobs
-from maasi_drivers.vision.measurement_feed import (
-    FeedError,
-    FeedPacket,
-    FeedPose,
-    FeedState,
-    decode,
-    encode,
-)
 from maasi_filter.models.pose import Pose, compose
 from maasi_sim.simulation.emulators.mambo.fake_mambo import free_address, free_port
 
@@ -41,17 +32,10 @@ class Flight(LinkedFlight):
         port = free_port()
         self.drone = OnboardProgram(free_address(), ('127.0.0.1', port))
         link = {'arm': True, 'address': self.drone.address, 'order_port': self.drone.port}
-        settings = {
-            'start': START,
-            'yaw': YAW,
-            'link': 'mambo_feed',
-            'image_source': 'feed',
-            'feed_port': port,
-            'battery_minimum': 0.0,
-            'odometry_timeout': 0.5,
-            'mambo': link | {'ground': GROUND_HEIGHT, 'land_after': 1.0} | mambo,
-        }
-        super().__init__(context, MAMBO | settings)
+        link |= {'ground': GROUND_HEIGHT, 'land_after': 1.0} | mambo
+        own = {'start': START, 'yaw': YAW, 'link': 'mambo_feed', 'mambo': link}
+        own |= {'image_source': 'feed', 'feed_port': port}
+        super().__init__(context, MAMBO | own | {'battery_minimum': 0.0, 'odometry_timeout': 0.5})
 
     @property
     def where(self):
@@ -100,10 +84,7 @@ def test_it_takes_off_goes_where_it_is_sent_measures_and_lands(fly):
     drone.blobs = struct.pack('<8fI', *pixel, 0.0, 0.0, 0.0, 70.0, 9.4, 9.4, 0)
     drone.count = 1
     team.ask(team.get_clock().now().nanoseconds + 200_000_000)
-    (seen,) = team.answer().detections
-    pose = team.answer().pose.pose.position
-    place = [pose.x + seen.range * np.cos(seen.bearing), pose.y + seen.range * np.sin(seen.bearing)]
-    assert_allclose(place, target, atol=0.06)
+    assert_allclose(team.seen_at(), target, atol=0.06)
     flight.driver.trigger_deactivate()
     flight.until(lambda: drone.state == GROUND)
     assert drone.take_offs == 1
@@ -162,40 +143,6 @@ def test_a_driver_that_hangs_is_a_drone_that_hovers_then_lands(fly):
     wait_until(lambda: np.linalg.norm(flight.drone.model.velocity) < 0.01)
     assert flight.drone.state == AIR
     wait_until(lambda: flight.drone.state == GROUND)
-
-
-# ---- the datagrams ---------------------------------------------------------------------------
-
-
-def packet(**pose):
-    blobs = Blobs(
-        np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros(0, bool), np.zeros((0, 2, 2))
-    )
-    numbers = {'position': np.array([0.5, -0.25, 1.0]), 'yaw': 0.5, 'battery': 0.75} | pose
-    return FeedPacket(7, 0.0, 160, 120, blobs, FeedPose(state=FeedState.AIR, **numbers))
-
-
-def test_a_pose_is_read_as_it_is_written():
-    data = encode(packet())
-    assert data[5] == 1 and len(data) == 20 + 32 + 4
-    assert struct.unpack_from('<7fI', data, 20) == (0.5, -0.25, 1.0, 0.0, 0.0, 0.5, 0.75, 1)
-    pose = decode(data).pose
-    assert pose.state is FeedState.AIR and pose.yaw == 0.5
-    assert_allclose(pose.position, [0.5, -0.25, 1.0])
-
-
-@pytest.mark.parametrize(
-    ('pose', 'text'),
-    [
-        ({'yaw': math.nan}, 'finite'),
-        ({'position': np.array([2000.0, 0.0, 0.0])}, 'within 1000 m'),
-        ({'roll': 1.6}, 'roll and pitch'),
-        ({'battery': 1.1}, 'charge'),
-    ],
-)
-def test_a_pose_that_cannot_be_is_refused(pose, text):
-    with pytest.raises(FeedError, match=text):
-        encode(packet(**pose))
 
 
 def test_an_order_is_finite():

@@ -22,24 +22,24 @@ AT_MOST = 1.5
 @pytest.mark.parametrize('share', [0.6, 1.0, 1.6])
 def test_events_correct_a_speed_that_was_measured_wrong(share):
     flight = Flight(full_speed=share * full_speed(0.5)).up()
-    errors, tilts, doubts = [], [], []
+    errors, tilts, variances = [], [], []
     for goal in ([2.0, 0.3, 1.0], [0.1, 0.2, 1.0]):
         flight.goal = np.array(goal)
         for _ in range(300):
             flight.step()
-            state, true = flight.pilot.state, flight.firmware.state
-            errors.append(np.linalg.norm(state.pose.position - true.pose.position))
-            tilts.append(np.linalg.norm((state.pose.rotation() - true.pose.rotation())[:, 2]))
-            covariance = flight.pilot.reckoning.covariance()
-            assert 1e-4 <= covariance[0, 0] <= 0.05**2
-            doubts.append(covariance[3, 3])
+            pose, true = flight.pilot.state.pose, flight.firmware.state.pose
+            errors.append(np.linalg.norm(pose.position - true.position))
+            tilts.append(np.linalg.norm((pose.rotation() - true.rotation())[:, 2]))
+            variances.append(np.diag(flight.pilot.reckoning.covariance()))
         assert flight.left < 0.05
     right = share == 1.0
     assert np.sqrt(np.mean(np.square(errors))) < (0.02 if right else 0.05)
     assert max(errors) < (0.04 if right else 0.12)
     assert np.sqrt(np.mean(np.square(tilts))) < 0.01 and max(tilts) < 0.05
+    x, tilt = np.array(variances)[:, [0, 3]].T
+    assert x.min() >= 1e-4 and x.max() <= 0.05**2
     # Which of two tilts it has is not known while a command is on its way.
-    assert max(doubts) > 1.2 * min(doubts) > 0.0
+    assert tilt.max() > 1.2 * tilt.min() > 0.0
 
 
 def test_an_event_corrects_the_time_that_it_is_of():
@@ -48,17 +48,15 @@ def test_an_event_corrects_the_time_that_it_is_of():
     reckoning.correct(PositionEvent(np.array([0.0, 0.0, 1.0]), 0.0, 0.0), flying=False)
     shares = np.array([0.4, 0.0, 0.0, 0.0])
     reckoning.command(0.0, shares)
-    truth = Course(np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0)
-    places = {}
+    truth = [Course(np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0)]
     for step in range(1, 61):
-        truth = model.advance(truth, shares, STEP)
-        places[step] = truth.position
+        truth.append(model.advance(truth[-1], shares, STEP))
         reckoning.go_on(step * STEP, flying=True)
         if step % 10 == 0:
             # Four steps late.
-            event = PositionEvent(places[step - 4], 0.0, step * STEP)
+            event = PositionEvent(truth[step - 4].position, 0.0, step * STEP)
             reckoning.correct(event, flying=True)
-    assert_allclose(reckoning.state.pose.position, places[60], atol=0.02)
+    assert_allclose(reckoning.state.pose.position, truth[-1].position, atol=0.02)
 
 
 # Drag [1/s] and delay [s]; test/drivers/mambo_table.py prints more.
@@ -92,21 +90,17 @@ def test_a_velocity_that_cannot_be_stopped_before_the_geofence_is_not_flown(end,
 def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
     flight = Flight(drag=drag, delay=0.2, pose=pose)
     flight.sent = 'true' if pose == 'events' else 'none'
-
-    def step():
+    flight.goal = np.array([1.5, 0.3, 1.0])
+    distances = []
+    while flight.time < 35.0:
         if flight.where[2] > 0.05:
             # Wind.
             flight.firmware.body.velocity[0] += 0.2 * STEP
         if pose == 'pose':
             flight.pilot.take_pose(flight.time, flight.firmware.state)
         flight.step()
-        return flight.left
-
-    flight.goal = np.array([1.5, 0.3, 1.0])
-    while flight.time < 30.0:
-        step()
-    assert flight.pilot.phase is MamboPhase.FLYING
-    assert max(step() for _ in range(100)) < 0.03
+        distances.append(flight.left)
+    assert flight.pilot.phase is MamboPhase.FLYING and max(distances[-100:]) < 0.03
     # Without a pose it hovers.
     flight.sent, began = 'none', flight.time
     flight.until(lambda: flight.pilot.problem.startswith('no position'))
@@ -172,10 +166,8 @@ def test_each_call_of_the_service_is_for_one_take_off():
 def test_what_is_lost_stops_it_then_lands_it(fault, reason):
     flight = Flight().flown()
     # A short loss is forgiven.
-    flight.cut_down = True
-    flight.step(40)
+    flight.is_silent(40)
     assert flight.pilot.problem.startswith('link lost')
-    flight.cut_down = False
     flight.until(lambda: not flight.pilot.problem)
     assert flight.pilot.phase is MamboPhase.FLYING
     flight.goal = HOME.position
@@ -197,10 +189,6 @@ def test_what_is_lost_stops_it_then_lands_it(fault, reason):
     assert flight.firmware.take_offs == 1
 
 
-def drain(flight):
-    flight.firmware.charge.charge = 0.08
-
-
 def drift(flight):
     flight.firmware.body.position[0] += 0.05
 
@@ -209,7 +197,10 @@ def drift(flight):
     ('fault', 'text'),
     [
         (lambda flight: flight.pilot.end('the end'), f'landed: the end, {UNTIL_ARM}'),
-        (drain, f'battery at 0.08, below 0.10, {UNTIL_ARM}'),
+        (
+            lambda flight: setattr(flight.firmware.charge, 'charge', 0.08),
+            f'battery at 0.08, below 0.10, {UNTIL_ARM}',
+        ),
         (drift, f'outside the geofence, -0.4 to 2.5 m, {UNTIL_ARM}'),
         (lambda flight: flight.firmware.land(), f'by itself, {UNTIL_ARM}'),
         (lambda flight: flight.firmware.emergency(), 'emergency'),
@@ -230,35 +221,35 @@ def test_what_else_lands_it_and_keeps_it_down(fault, text):
 
 def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     flight = Flight().flown()
+    pilot, firmware = flight.pilot, flight.firmware
     flight.goal = None
     # No number is no command: it hovers as after a cancelled goal.
     with pytest.raises(ValueError, match='finite'):
-        flight.pilot.fly(np.array([0.1, math.nan, 0.0, 0.0]))
+        pilot.fly(np.array([0.1, math.nan, 0.0, 0.0]))
     assert flight.until_it_is(FlyingState.HOVERING) <= AT_MOST
     # A new goal soon after a cancelled one keeps it up.
-    flight.pilot.goal_cancelled(flight.time)
+    pilot.goal_cancelled(flight.time)
     flight.step(20)
-    flight.pilot.goal_taken()
+    pilot.goal_taken()
     flight.step(200)
-    assert flight.pilot.phase is MamboPhase.FLYING
+    assert pilot.phase is MamboPhase.FLYING
     flight.flown().goal = None
-    flight.pilot.goal_cancelled(flight.time)
+    pilot.goal_cancelled(flight.time)
     hovers = flight.until_it_is(FlyingState.HOVERING)
     assert hovers <= AT_MOST
-    assert hovers + flight.until_it_is(FlyingState.LANDED) >= flight.pilot.settings.cancel_landing
+    assert hovers + flight.until_it_is(FlyingState.LANDED) >= pilot.settings.cancel_landing
     flight.step(50)
-    flight.pilot.goal_taken()
+    pilot.goal_taken()
     flight.step(50)
-    assert flight.pilot.problem == f'on the ground, {UNTIL_ARM}'
-    assert flight.firmware.take_offs == 1
-    assert flight.pilot.permit(flight.time) == ''
+    assert pilot.problem == f'on the ground, {UNTIL_ARM}' and firmware.take_offs == 1
     # On the ground it ends the permission.
-    flight.pilot.goal_cancelled(flight.time)
+    assert pilot.permit(flight.time) == ''
+    pilot.goal_cancelled(flight.time)
     flight.step(50)
-    assert flight.firmware.take_offs == 1
-    assert flight.pilot.permit(flight.time) == ''
+    assert firmware.take_offs == 1
+    assert pilot.permit(flight.time) == ''
     flight.up()
-    assert flight.firmware.take_offs == 2
+    assert firmware.take_offs == 2
 
 
 @pytest.mark.parametrize('phase', [MamboPhase.TAKING_OFF, MamboPhase.CLIMBING])
@@ -278,19 +269,14 @@ def test_a_permission_ends_with_the_link():
     # No pose yet: it stands.
     flight.step(20)
     assert flight.pilot.phase is MamboPhase.GROUND
-    flight.cut_down = True
-    flight.step(60)
-    flight.cut_down = False
-    flight.step(20)
-    state = flight.firmware.state
+    flight.is_silent(60)
     for _ in range(100):
-        flight.pilot.take_pose(flight.time, state)
+        flight.pilot.take_pose(flight.time, flight.firmware.state)
         flight.step()
     assert flight.pilot.phase is MamboPhase.GROUND and UNTIL_ARM in flight.pilot.problem
     assert flight.firmware.take_offs == 0
     # Nor is there one while it is not heard.
-    flight.cut_down = True
-    flight.step(60)
+    flight.is_silent(60)
     assert 'link lost' in flight.pilot.permit(flight.time)
     flight.connected = False
     other = MamboPilot(flight, flight.motion, flight.pilot.settings, HOME, FENCE)

@@ -22,7 +22,9 @@ from maasi_drivers.vision.images import ImageSourceError, VideoSource
 from maasi_drivers.vision.measurement_feed import (
     FeedError,
     FeedPacket,
+    FeedPose,
     FeedReceiver,
+    FeedState,
     decode,
     encode,
 )
@@ -40,8 +42,14 @@ def blobs(number, seed=1):
     )
 
 
-def packet(number=3, sequence=7, age=0.012):
-    return FeedPacket(sequence, age, 160, 120, blobs(number))
+def packet(number=3, sequence=7, age=0.012, pose=None):
+    return FeedPacket(sequence, age, 160, 120, blobs(number), pose)
+
+
+def posed(**changes):
+    """Return a packet with the pose of a drone, without blobs."""
+    values = {'position': np.array([0.5, -0.25, 1.0]), 'yaw': 0.5, 'battery': 0.75} | changes
+    return packet(0, pose=FeedPose(state=FeedState.AIR, **values))
 
 
 def sealed(data):
@@ -71,6 +79,15 @@ def test_the_bytes_are_those_of_the_document():
     numbers = struct.pack('<8f', 80.5, 59.25, 0.25, 0.125, 0.5, 33.0, 7.0, 6.0)
     start = bytes.fromhex('4d534d4601000100a00078000403020188130000')
     assert data == sealed(start + numbers + b'\1\0\0\0' + bytes(4))
+
+
+def test_a_pose_is_read_as_it_is_written():
+    data = encode(posed())
+    assert data[5] == 1 and len(data) == 20 + 32 + 4
+    assert struct.unpack_from('<7fI', data, 20) == (0.5, -0.25, 1.0, 0.0, 0.0, 0.5, 0.75, 1)
+    pose = decode(data).pose
+    assert pose.state is FeedState.AIR and pose.yaw == 0.5
+    assert_allclose(pose.position, [0.5, -0.25, 1.0])
 
 
 def test_no_damage_goes_unnoticed():
@@ -117,13 +134,27 @@ def test_a_field_that_cannot_be_is_named(offset, layout, value, said):
         decode(sealed(bytes(data)))
 
 
-def test_what_cannot_be_sent_is_refused():
+@pytest.mark.parametrize(
+    ('sent', 'text'),
+    [
+        (packet(257), 'at most 256'),
+        (packet(age=float('nan')), 'age'),
+        (posed(yaw=float('nan')), 'finite'),
+        (posed(position=np.array([2000.0, 0.0, 0.0])), 'within 1000 m'),
+        (posed(roll=1.6), 'roll and pitch'),
+        (posed(battery=1.1), 'charge'),
+    ],
+)
+def test_what_cannot_be_sent_is_refused(sent, text):
+    with pytest.raises(FeedError, match=text):
+        encode(sent)
+
+
+def test_a_blob_without_a_place_is_not_sent():
     bad = packet(1)
     bad.blobs.centroids[0, 0] = np.nan
-    wrong = {'at most 256': packet(257), 'age': packet(age=float('nan')), 'finite': bad}
-    for text, sent in wrong.items():
-        with pytest.raises(FeedError, match=text):
-            encode(sent)
+    with pytest.raises(FeedError, match='finite'):
+        encode(bad)
 
 
 def received(receiver, number):

@@ -4,7 +4,6 @@ What it measures is compared with the truth in test_mambo_pilot.py.
 """
 
 import math
-import os
 import signal
 import subprocess
 import sys
@@ -66,35 +65,38 @@ def test_what_says_too_little_or_does_not_fit_is_refused(places, text):
 
 
 @pytest.fixture
-def drone():
+def measure():
+    """Return a fake, and a function that starts the command for it."""
     fake = FakeMambo(MamboFirmware(Pose.from_yaw([0.0, 0.0, 0.0], 0.0)), free_address())
-    yield fake
+    line = [sys.executable, '-m', 'maasi_drivers.measure_mambo', '--address', fake.address]
+    line += ['--port', str(free_port()), '--fly']
+
+    def start(*options):
+        return subprocess.Popen([*line, *options], stdout=subprocess.PIPE, text=True)
+
+    yield fake.firmware, start
     fake.close()
 
 
-def command(fake, *options):
-    line = [sys.executable, '-m', 'maasi_drivers.measure_mambo', '--address', fake.address]
-    line += ['--port', str(free_port()), *options]
-    return subprocess.Popen(line, stdout=subprocess.PIPE, text=True, env=os.environ)
-
-
-def test_the_command_measures_through_pyparrot_and_lands(drone):
-    process = command(drone, '--fly', '--legs', '2')
+def test_the_command_measures_through_pyparrot_and_lands(measure):
+    firmware, start = measure
+    process = start('--legs', '2')
     output, _ = process.communicate(timeout=LIMIT)
     assert process.returncode == 0, output
     lines = dict(line.split(': ') for line in output.splitlines() if line.startswith('mambo.'))
-    drag = drone.firmware.settings.drag
-    assert_allclose(float(lines['mambo.full_speed'].split()[0]), full_speed(drag), rtol=0.3)
-    assert drone.firmware.flying_state == FlyingState.LANDED and drone.firmware.take_offs == 1
+    measured = float(lines['mambo.full_speed'].split()[0])
+    assert_allclose(measured, full_speed(firmware.settings.drag), rtol=0.3)
+    assert firmware.flying_state == FlyingState.LANDED and firmware.take_offs == 1
 
 
-def test_the_command_lands_when_it_is_interrupted(drone):
-    process = command(drone, '--fly')
-    wait_until(lambda: drone.firmware.flying_state == FlyingState.HOVERING)
+def test_the_command_lands_when_it_is_interrupted(measure):
+    firmware, start = measure
+    process = start()
+    wait_until(lambda: firmware.flying_state == FlyingState.HOVERING)
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=LIMIT)
     assert process.returncode == 1
-    assert drone.firmware.flying_state == FlyingState.LANDED
+    assert firmware.flying_state == FlyingState.LANDED
 
 
 def test_the_command_says_what_it_would_do_and_what_cannot_be(capsys):
