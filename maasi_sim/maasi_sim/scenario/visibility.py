@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from maasi_filter.models.pose import Pose
-from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import EnvironmentSettings
-from maasi_planner.candidates import CandidateSet, Viewer, unseen_parts
+from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_parts
 from maasi_planner.settings import CandidateSettings
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
@@ -48,14 +46,14 @@ def covering_grid(
 ) -> dict[str, Any]:
     """Return a grid of candidates over the bounds from which a robot sees everything.
 
-    Its spacing is at most the side of a square, or cube, as large as what the sensor sees well;
-    where that takes too many waypoints, it is a coarser grid, and `never_seen` warns.
+    Its spacing is at most the width of what the sensor sees; where that takes too many waypoints,
+    it is a coarser grid, and `never_seen` warns.
     """
     bounds = environment.array()
     sides = bounds[:, 1] - bounds[:, 0]
     sensor = robot.sensor.build(name, environment.dimension)
     start = np.array(robot.start)
-    width = _view_width(sensor, float(sides.max()))
+    width = min(2.0 * half_view(sensor), float(sides.max()))
     while np.ceil(sides / width).prod() > _MOST_CANDIDATES:
         width *= 1.1
     first: dict[str, Any] = {}
@@ -76,24 +74,6 @@ def covering_grid(
             return grid
         first = first or grid
         width *= 0.8
-
-
-def _view_width(sensor: Sensor, size: float) -> float:
-    """Return the side of a square or cube as large as where at least half of pi is reached."""
-    dimension = sensor.dimension
-    axis = np.linspace(-1.0, 1.0, 41 if dimension == 2 else 21)
-    lattice = np.stack(np.meshgrid(*[axis] * dimension, indexing='ij'), axis=-1)
-    lattice = lattice.reshape(-1, dimension)
-    pose = Pose.from_yaw(np.zeros(3), 0.0)
-    share = 0.0
-    # From the whole environment to what the sensor resolves.
-    for _ in range(20):
-        values = sensor.detection.probability(size * lattice, pose)
-        share = float((values >= 0.5 * values.max()).mean()) if values.max() > 0.0 else 0.0
-        if share > 0.1:
-            break
-        size *= 0.7
-    return 2.0 * size * max(share, 1e-3) ** (1.0 / dimension)
 
 
 def _viewer(scenario: Scenario, name: str, spacing: float) -> Viewer:
