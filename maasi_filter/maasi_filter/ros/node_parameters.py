@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from functools import reduce
 from typing import Any, Generic, TypeVar
@@ -26,7 +25,6 @@ from maasi_filter.ros.parameters import (
     choices,
     flatten,
     parameter_fields,
-    parameter_name,
     unflatten,
 )
 
@@ -53,17 +51,14 @@ class NodeParameters(Generic[SettingsT]):
         self._settings: SettingsT | None = None
         self._own_change = False
         # Parameters of rclpy, such as use_sim_time and start_type_description_service.
-        self._foreign = set(node.list_parameters([], 0).names)
-        given = {
-            name: item.value
-            for name, item in node._parameter_overrides.items()
-            if not self._is_foreign(name) and item.value is not None
-        }
+        self._foreign = ('qos_overrides.', *node.list_parameters([], 0).names)
+        #: Values of the parameters that were set, by a file or at run time.
+        self._given: dict[str, Any] = {}
+        given = self._with(self._own(node._parameter_overrides.values()))
         add_folders(given.get('plugin_path') or [])
         known = {item.name for item in parameter_fields(model, given)}
-        #: Names of parameters that were set, by a file or at run time.
-        self._given = set(given) & known
-        self._declare(given)
+        self._given = {name: value for name, value in given.items() if name in known}
+        self._complete()
         for name in sorted(set(given) - known):
             close = get_close_matches(name, sorted(known), 1)
             hint = f'; did you mean {close[0]}?' if close else ''
@@ -73,10 +68,10 @@ class NodeParameters(Generic[SettingsT]):
 
     def read(self) -> SettingsT:
         """Return the settings, and lock them until `release`."""
-        settings, problems = check(self._model, self._values())
+        settings, problems = check(self._model, self._given)
         if settings is None:
             raise SettingsError('\n'.join(problems.values()))
-        self._show(settings)
+        self._complete(settings.resolved())
         self._settings = settings
         return settings
 
@@ -84,85 +79,66 @@ class NodeParameters(Generic[SettingsT]):
         """Unlock all parameters."""
         self._settings = None
 
-    def _values(self) -> dict[str, Any]:
-        """Return the parameters that were set."""
-        return {name: self._node.get_parameter(name).value for name in sorted(self._given)}
-
-    def _show(self, settings: SettingsT) -> None:
-        """Set the other parameters to their resolved values."""
-        changes = [
-            Parameter(name, value=value)
-            for name, value in flatten(settings.resolved()).items()
-            if name not in self._given
-            and self._node.get_parameter_or(name, Parameter(name)).value != value
-        ]
-        if changes:
-            with self._changing():
-                self._node.set_parameters_atomically(changes)
-
-    @contextmanager
-    def _changing(self) -> Iterator[None]:
+    def _complete(self, resolved: SettingsT | None = None) -> None:
+        """Declare what is missing, such as parameters of a new robot; show resolved settings."""
+        _, problems = check(self._model, self._given)
         self._own_change = True
-        try:
-            yield
-        finally:
-            self._own_change = False
+        for item in parameter_fields(self._model, self._given):
+            present = self._node.has_parameter(item.name)
+            if not present and (item.default is not None or item.name in self._given):
+                # With a range, rclpy would refuse the value before this class can report the error.
+                ranged = item.name not in problems
+                self._node.declare_parameter(item.name, item.default, _descriptor(item, ranged))
+        if resolved is not None:
+            flat = {k: v for k, v in flatten(resolved).items() if k not in self._given}
+            self._node.set_parameters_atomically([Parameter(k, value=v) for k, v in flat.items()])
+        self._own_change = False
 
-    def _is_foreign(self, name: str) -> bool:
-        return name in self._foreign or name.startswith('qos_overrides.')
+    def _own(self, parameters: Iterable[Parameter]) -> list[Parameter]:
+        return [item for item in parameters if not item.name.startswith(self._foreign)]
 
     def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
         """Return whether parameters may be set, and if not, why."""
-        own = [item for item in parameters if not self._is_foreign(item.name)]
-        reason = '' if self._own_change else self._objection(own)
+        objections = self._objections(self._own(parameters))
+        reason = '' if self._own_change else next(objections, '')
         return SetParametersResult(successful=not reason, reason=reason)
 
-    def _objection(self, own: Sequence[Parameter]) -> str:
-        values = self._values() | {item.name: item.value for item in own}
-        values = {name: value for name, value in values.items() if value is not None}
+    def _objections(self, own: Sequence[Parameter]) -> Iterator[str]:
+        values = self._with(own)
         known = {item.name for item in parameter_fields(self._model, values)}
-        known |= {item.name for item in own if self._node.has_parameter(item.name)}
         _, problems = check(self._model, values)
         for item in own:
-            if item.name not in known:
-                return f'parameter {item.name}: is not known'
-            if self._settings is not None and item.name not in self._model.live:
-                return (
+            if item.name not in known and not self._node.has_parameter(item.name):
+                yield f'parameter {item.name}: is not known'
+            elif self._settings is not None and item.name not in self._model.live:
+                yield (
                     f'parameter {item.name}: is read in configure; set it while the node is '
                     'unconfigured (deactivate and cleanup before)'
                 )
-            # Errors of other parameters, or of several together, may still be corrected.
-            wrong = [item.name] if self._settings is None else list(problems)
-            found = [problems[name] for name in wrong if name in problems]
-            if found and item.value is not None:
-                return found[0]
-        return ''
+            elif item.value is not None:
+                # Errors of other parameters, or of several together, may still be corrected.
+                wrong = [item.name] if self._settings is None else list(problems)
+                yield from (problems[name] for name in wrong if name in problems)
 
     def _note(self, parameters: list[Parameter]) -> None:
-        """Apply what was set, and declare dependent parameters, such as those of a new robot."""
+        """Apply what was set."""
         if self._own_change:
             return
-        own = [item for item in parameters if not self._is_foreign(item.name)]
-        self._given -= {item.name for item in own}
-        self._given |= {item.name for item in own if item.value is not None}
+        own = self._own(parameters)
+        self._given = self._with(own)
         if self._settings is None:
-            with self._changing():
-                self._declare(self._values())
+            self._complete()
             return
         # Change settings in use in place.
-        changed, _ = check(self._model, self._values())
+        changed, _ = check(self._model, self._given)
         for *path, last in (item.name.split('.') for item in own):
             target, source = (reduce(getattr, path, item) for item in (self._settings, changed))
             setattr(target, last, getattr(source, last))
 
-    def _declare(self, given: Mapping[str, Any]) -> None:
-        _, problems = check(self._model, given)
-        for item in parameter_fields(self._model, given):
-            present = self._node.has_parameter(item.name)
-            if not present and (item.default is not None or item.name in given):
-                # With a range, rclpy would refuse the value before this class can report the error.
-                ranged = item.name not in problems
-                self._node.declare_parameter(item.name, item.default, _descriptor(item, ranged))
+    def _with(self, own: Sequence[Parameter]) -> dict[str, Any]:
+        """Return the values that were set, and these."""
+        values = self._given | {item.name: item.value for item in own}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 def check(
@@ -175,10 +151,14 @@ def check(
         items = error.errors()
     except ValueError as error:
         return None, {str(error).partition(':')[0]: f'parameter {error}'}
+    fields = list(parameter_fields(model, values))
     problems: dict[str, str] = {}
     missing = []
     for item in items:
-        name = parameter_name(model, item['loc'], values)
+        keys = [str(key) for key in item['loc']]
+        # The parameter that the error is in, or one of those that it is about.
+        field = next(field for field in fields if all(map(str.__eq__, field.keys, keys)))
+        name = '.'.join(field.name.split('.')[: len(keys)])
         if item['type'] == 'missing' or not values:
             missing.append(name)
         else:
@@ -200,15 +180,13 @@ def _descriptor(item: ParameterField, ranged: bool) -> ParameterDescriptor:
         dynamic_typing=True,
     )
     low, high = item.bound('ge', 'gt'), item.bound('le', 'lt')
-    kinds = [kind for kind in choices(item.info.annotation) if kind is not type(None)]
-    if not ranged or low is high is None or kinds not in ([int], [float]):
-        return descriptor
-    most = sys.float_info.max
-    if kinds == [float]:
-        ends = -most if low is None else float(low), most if high is None else float(high)
-        span = FloatingPointRange(from_value=ends[0], to_value=ends[1])
-        descriptor.floating_point_range = [span]
-    else:
-        ends = -(2**63) if low is None else int(low), 2**63 - 1 if high is None else int(high)
-        descriptor.integer_range = [IntegerRange(from_value=ends[0], to_value=ends[1])]
+    kind, *others = (kind for kind in choices(item.info.annotation) if kind is not type(None))
+    if ranged and kind in (int, float) and not others and not low is high is None:
+        most = 2**63 - 1 if kind is int else sys.float_info.max
+        first, last = kind(-most if low is None else low), kind(most if high is None else high)
+        if kind is int:
+            descriptor.integer_range = [IntegerRange(from_value=first, to_value=last)]
+        else:
+            span = FloatingPointRange(from_value=first, to_value=last)
+            descriptor.floating_point_range = [span]
     return descriptor
