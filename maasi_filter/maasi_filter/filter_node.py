@@ -90,7 +90,6 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         # Until when batches wait for the targets that the planner keeps for a restarted filter.
         # Only the first message is used: later ones contain what this filter found itself.
         self._kept_until, self._kept_taken = math.inf, False
-        self._restored = b''
         if settings.save_file and Path(settings.save_file).exists():
             self._restore(Path(settings.save_file))
 
@@ -102,9 +101,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         warning = unsuitable_lengths(settings.filter, settings.environment.array())
         if warning:
             self.get_logger().warning(warning)
-        self._batches = BatchAssembly(self, self._sensors)
-        self._last_step: int | None = None
-        self._settled_by: dict[int, int] = {}
+        self._continue_from(Progress())
+        self._restored = False
         self._found_published = False
         self._shared.reset()
         self._board = MarkerBoard()
@@ -112,6 +110,10 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._latency = 0.0
         self._no_faults = {FOUND: 0, REPEATED: 0}
         self._misfits: dict[str, str] = {}
+
+    def _continue_from(self, progress: Progress) -> None:
+        self._progress = progress
+        self._batches = BatchAssembly(self, self._sensors, progress)
 
     def _restore(self, file: Path) -> None:
         """Resume the saved search, or after the last batch of a process that died.
@@ -143,10 +145,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         if progress is None or not settings.save_batches:
             self.get_logger().info(f'state loaded from {file}: {found}')
             return
-        self._batches.last, self._batches.last_stamp = progress.batch, progress.stamp
-        self._last_step = progress.step
-        self._settled_by, self._batches.heard = progress.settled_by, progress.heard
-        self._restored = progress.update.tobytes()
+        self._continue_from(progress)
+        self._restored = True
         self.get_logger().warning(
             f'restarted after batch {progress.batch} with {found}, from {file}'
         )
@@ -185,9 +185,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._kept_until = min(self._kept_until, time.monotonic() + _KEPT_PATIENCE)
         if not self._restored:
             return
-        update = deserialize_message(self._restored, FilterUpdate)
-        self._restored = b''
-        self._publish_found(update.header, self._batches.last)
+        self._restored = False
+        update = deserialize_message(self._progress.update.tobytes(), FilterUpdate)
+        self._publish_found(update.header, self._progress.batch)
         # The process may have died before it sent this update; receivers ignore a duplicate.
         self._update_publisher.publish(update)
 
@@ -196,7 +196,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         if self.active and not self.settings.save_batches:
             self._save()
 
-    def _save(self, progress: Progress | None = None) -> None:
+    def _save(self) -> None:
         settings = self.settings
         if not settings.save_file:
             return
@@ -206,6 +206,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 file.parent.mkdir(parents=True, exist_ok=True)
             # After each batch it need not survive a power failure, only the death of the process.
             durable = not settings.save_batches
+            progress = self._progress if settings.save_batches else None
             write_state(file, {**self.filter.state(), 'progress': progress}, durable=durable)
         except OSError as error:
             # A search must not fail because its copy cannot be written.
@@ -220,7 +221,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     def status(self) -> dict[str, Any]:
         """Return the state of the search."""
         return {
-            'batches': self._batches.last,
+            'batches': self._progress.batch,
             'waiting batches': len(self._batches.pending),
             'particles': len(self.filter.weights),
             'expected number': f'{self.filter.expected_number:.3f}',
@@ -247,7 +248,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             return
         late = self._batches.take(name, message)
         if late is not None:
-            late.step = max(late.step, self._last_step or 0)
+            late.step = max(late.step, self._progress.step or 0)
             self._process(late)
         self._process_complete()
 
@@ -268,9 +269,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def _process(self, batch: PendingBatch) -> None:
         begin, settings = time.perf_counter(), self.settings
-        last = self._last_step
+        last = self._progress.step
         steps = 1 if last is None else min(max(batch.step - last, 0), _MOST_STEPS)
-        self._last_step = batch.step
+        self._progress.step = batch.step
         members = [item for item in batch.members if item.robot in batch.measurements]
         now = batch.stamp * 1e-9
         changed = self._shared.merge_into(self.filter, batch.stamp)
@@ -295,7 +296,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._misfits = result.misfits
         header = Header(stamp=stamp_to_ros(batch.stamp), frame_id=settings.frame)
         for target in result.newly_found:
-            self._settled_by[target.id] = batch.id
+            self._progress.settled_by[target.id] = batch.id
         clusters = [cluster_to_ros(cluster) for cluster in result.clusters]
         update = FilterUpdate(
             header=header,
@@ -310,17 +311,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         )
         if settings.save_batches:
             # Save before publishing, so that no published result is lost with this process.
-            heard, data = self._batches.heard, serialize_message(update)
-            self._save(
-                Progress(
-                    self._batches.last,
-                    self._batches.last_stamp,
-                    batch.step,
-                    self._settled_by,
-                    heard,
-                    np.frombuffer(data, np.uint8),
-                )
-            )
+            self._progress.update = np.frombuffer(serialize_message(update), np.uint8)
+            self._save()
         # Found targets first, so that subscribers have them when the update arrives.
         if changed or result.found_changed or not self._found_published:
             self._publish_found(header, batch.id)
@@ -360,7 +352,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 header=header,
                 batch_id=batch,
                 targets=[
-                    found_target_to_ros(target, self._settled_by.get(target.id, 0))
+                    found_target_to_ros(target, self._progress.settled_by.get(target.id, 0))
                     for target in self.filter.found_targets
                 ],
             )
@@ -385,7 +377,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         if new:
             known = {item.id: int(item.batch_id) for item in message.targets}
             for target in new:
-                self._settled_by[target.id] = known.get(target.id, 0)
+                self._progress.settled_by[target.id] = known.get(target.id, 0)
             self.get_logger().warning(
                 f'restarted without the state of the search: {len(new)} found targets taken from '
                 'found_targets/kept; what was believed of others is lost'

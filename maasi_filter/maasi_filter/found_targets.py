@@ -17,7 +17,14 @@ SAME_TARGET = 16.0
 
 def distance(position: FloatArray, covariance: FloatArray, target: FoundTarget) -> float:
     """Return the squared normalised distance between an estimate and a found target."""
-    return float(squared_distance(position - target.position, covariance + target.covariance))
+    return squared_distance(position - target.position, covariance + target.covariance)
+
+
+def nearest(target: FoundTarget, estimates: Sequence[tuple[FloatArray, FloatArray]]) -> int:
+    """Return the index of the nearest estimate, position and covariance, within the gate, or -1."""
+    apart = [distance(*estimate, target) for estimate in estimates]
+    best = int(np.argmin(apart)) if apart else -1
+    return best if apart and apart[best] < SAME_TARGET else -1
 
 
 @dataclass
@@ -37,7 +44,8 @@ class FoundTargets:
         added, changed = [], []
         for target in targets:
             known = [(item.robot, item.origin) == (robot, target.id) for item in self.targets]
-            f = known.index(True) if any(known) else self._nearest(target)
+            estimates = [(item.position, item.covariance) for item in self.targets]
+            f = known.index(True) if any(known) else nearest(target, estimates)
             old = self.targets[f] if f >= 0 else None
             if old is not None and not any(known) and (old.time, old.robot) <= (target.time, robot):
                 # Another one found it first.
@@ -72,9 +80,3 @@ class FoundTargets:
             self.targets.append(added)
             new.append(added)
         return new
-
-    def _nearest(self, target: FoundTarget) -> int:
-        """Return the index of the nearest found target within the gate, or -1."""
-        apart = [distance(target.position, target.covariance, known) for known in self.targets]
-        best = int(np.argmin(apart)) if apart else -1
-        return best if apart and apart[best] < SAME_TARGET else -1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -51,12 +51,15 @@ def make_filter(
 class Progress:
     """Progress of a run after a batch."""
 
-    batch: int  # Id of the last batch
-    stamp: int  # Of the last batch [ns]
-    step: int  # Of the last batch
-    settled_by: dict[int, int]  # Id of the batch that completed each found target, by its id
-    heard: dict[str, tuple[int, int, int]]  # Batch, measurement, stamp [ns] last heard, by robot
-    update: ByteArray  # The last update, serialised; it may not have been sent yet
+    batch: int = 0  # Id of the last batch
+    stamp: int = -1  # Of the last batch [ns]
+    step: int | None = None  # Of the last batch, or of a later measurement of its own
+    #: Id of the batch that completed each found target, by its id.
+    settled_by: dict[int, int] = field(default_factory=dict)
+    #: Batch, measurement, stamp [ns] last heard, by robot.
+    heard: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+    #: The last update, serialised; it may not have been sent yet.
+    update: ByteArray = field(default_factory=lambda: np.empty(0, np.uint8))
 
 
 def load_filter(path: str | os.PathLike[str]) -> SearchFilter:

@@ -22,7 +22,6 @@ from maasi_filter.models.detection import (
     ExponentialDetection,
     GaussianDetection,
 )
-from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.plugins import OwnSettings, PluginGroup
 
@@ -184,14 +183,9 @@ class SensorSettings(Settings):
         """Return the sensor of robot `name` for a problem of `dimension` 2 or 3."""
         if dimension not in (2, 3):
             raise ValueError(f'dimension: got {dimension}, allowed are 2 and 3')
-        return Sensor(
-            name=name,
-            detection=self.detection.build(dimension),
-            measurement=RangeBearing() if dimension == 2 else RangeBearingElevation(),
-            covariance=self.noise.covariance(dimension),
-            clutter=self.clutter,
-            period=self.period,
-            resolution=self.resolution,
+        detection, covariance = self.detection.build(dimension), self.noise.covariance(dimension)
+        return Sensor.ranging(
+            name, detection, covariance, self.clutter, self.period, self.resolution
         )
 
 

@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
+from maasi_filter.arrays import FloatArray
+
 # exp(x) = 2^k exp(r): adding MAGIC to x / log(2) leaves k in the low bits of the sum.
 MAGIC = 6755399441055744.0
 LOG2_E = 1.4426950408889634
@@ -102,12 +104,13 @@ def exponential(x: float) -> float:
 
 
 @njit(cache=True, error_model='numpy')
-def squared_distance(offset, covariance):  # type: ignore[no-untyped-def]
-    """Return the squared normalised distance x' C^-1 x, by the Cholesky factor of C (d, d)."""
+def normalised(offset, covariance):  # type: ignore[no-untyped-def]
+    """Return x' C^-1 x and the log of the root of det C, by the Cholesky factor of C (d, d)."""
     d = len(offset)
     root = np.zeros((d, d))
     scaled = np.empty(d)
     total = 0.0
+    log_root = 0.0
     for i in range(d):
         rest = offset[i]
         for j in range(i + 1):
@@ -121,4 +124,10 @@ def squared_distance(offset, covariance):  # type: ignore[no-untyped-def]
                 rest -= root[i, j] * scaled[j]
         scaled[i] = rest / root[i, i]
         total += scaled[i] * scaled[i]
-    return total
+        log_root += math.log(root[i, i])
+    return total, log_root
+
+
+def squared_distance(offset: FloatArray, covariance: FloatArray) -> float:
+    """Return the squared normalised distance x' C^-1 x, with the covariance C (d, d)."""
+    return float(normalised(offset, covariance)[0])

@@ -147,7 +147,7 @@ def test_a_ramp_falls_linearly_across_the_edge():
     positions = [[0.17, 0.0], [0.19, 0.0], [0.2, 0.0], [0.21, 0.0], [0.23, 0.0]]
     values = box.probability(positions, Pose([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(values, [0.9, 0.675, 0.45, 0.225, 0.0], atol=1e-12)
-    assert box.softened(0.01) is box
+    assert box.softened(0.01).edge == 0.02
 
 
 @pytest.mark.parametrize(

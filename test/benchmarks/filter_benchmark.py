@@ -19,7 +19,7 @@ from maasi_filter import (
     SensorSettings,
     warm_up,
 )
-from maasi_filter.ic_phd.corrector import make_scan, phd_correct
+from maasi_filter.ic_phd.corrector import phd_correct, phd_scan
 
 BOUNDS = np.array([[0.0, 260.0]] * 3)
 TARGETS, DETECTED = 12, 3
@@ -76,7 +76,7 @@ def phd_update_time():
     particles, weights, (member,) = middle_of_search(10_000, 1)
 
     def update():
-        scan = make_scan(member.values, member.sensor, member.pose)
+        scan = phd_scan(member.values, member.sensor, member.pose)
         return weights * phd_correct(particles, weights, scan, np.full(DETECTED, 1e-6))[0]
 
     update()

@@ -15,7 +15,7 @@ from maasi_filter.ic_phd.births import (
     uniform_births,
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
-from maasi_filter.ic_phd.corrector import make_scan, phd_correct
+from maasi_filter.ic_phd.corrector import phd_correct, phd_scan
 from maasi_filter.ic_phd.filter import kept_measurements
 from maasi_filter.records import FoundTarget
 
@@ -94,7 +94,7 @@ def test_the_corrector_is_equation_13(dimension, detections):
     weights = generator.random(5000) * 0.01
     values = sensor.measurement.measure(positions[:detections], pose) + 0.05
     background = np.geomspace(1e-6, 1.0, detections)
-    scan = make_scan(values, sensor, pose)
+    scan = phd_scan(values, sensor, pose)
     factor, normaliser = phd_correct(positions, weights, scan, background)
     probability = detection.probability(positions, pose)
     psi = probability * np.exp(log_density(sensor, values, positions, pose))

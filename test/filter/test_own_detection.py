@@ -113,12 +113,12 @@ def test_a_saved_filter_goes_on_in_another_process(method, monkeypatch, tmp_path
     search.save(tmp_path / 'state')
     wanted = step(search, sensor, 3).clusters
     # As in another process, where the function is elsewhere.
-    before = sensor.detection.kernel()[1][detection.ADDRESS]
-    monkeypatch.setattr(detection, '_blocks', {})
+    before = sensor.detection.kernel()[1][detection.VALUES]
+    monkeypatch.setattr(detection, '_known', {})
     if method == 'pmb':
         with pytest.raises(StateFileError, match='make the sensors'):
             load_filter(tmp_path / 'state')
     again = Sensor.ranging('a', Compiled(Width(width=4.0), 0.9, 2), np.diag([0.01, 0.01]))
-    assert again.detection.kernel()[1][detection.ADDRESS] != before
+    assert again.detection.kernel()[1][detection.VALUES] != before
     found = step(load_filter(tmp_path / 'state'), again, 3).clusters
     assert [item.mass for item in found] == [item.mass for item in wanted]

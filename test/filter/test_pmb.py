@@ -22,6 +22,9 @@ TARGET = np.array([[60.0, 45.0]])
 PLACES = [(30.0, 30.0), (50.0, 70.0), (80.0, 20.0), (40.0, 50.0)]
 # Enough for one target not to be taken for another.
 PRECISE = plane_sensor(range_noise=0.5, bearing=0.01)
+MANY_DRAWS = FilterSettings(
+    method='pmb', expected_targets=3.0, pmb={'particles': 20_000}
+).resolved()
 
 
 def observe(generator, sensor, targets, position):
@@ -93,9 +96,8 @@ def test_unseen_targets_are_thinned_as_the_exploration_function_says():
     value = sensor.measurement.measure(np.array([[50.0, 30.0]]), Pose(np.array(PLACES[0])))
     probability, likelihood = densities(sensor, PLACES[0], value)
     expected = 3.0 / SIDE**2 * (search.exploration.at(cells()) * probability * likelihood[0]).sum()
-    settings = FilterSettings(method='pmb').resolved()
-    (member,) = check_measurements([measured(sensor, PLACES[0], value)], 1, 0.0, settings, 2)
-    scan = make_scan(member, 1.0, search.exploration, 3.0, 20_000, np.random.default_rng(0))
+    (member,) = check_measurements([measured(sensor, PLACES[0], value)], 1, 0.0, MANY_DRAWS, 2)
+    scan = make_scan(member, 1.0, search.exploration, MANY_DRAWS, np.random.default_rng(0))
     assert scan.intensity[0] == pytest.approx(expected, rel=0.02)
 
 
@@ -290,7 +292,7 @@ def test_noise_of_a_camera_is_cartesian_next_to_the_robot():
     covariances = 0.005**2 * jacobian @ jacobian.swapaxes(1, 2)
     values = sensor.measurement.measure(place, pose)
     member = AgentMeasurement('robot', pose, sensor, values, covariances)
-    (checked,) = check_measurements([member], 1, 0.0, search._numbers, 2)
-    scan = make_scan(checked, 1.0, search.exploration, 3.0, 20_000, np.random.default_rng(0))
+    (checked,) = check_measurements([member], 1, 0.0, MANY_DRAWS, 2)
+    scan = make_scan(checked, 1.0, search.exploration, MANY_DRAWS, np.random.default_rng(0))
     np.testing.assert_allclose(scan.means, place, atol=2e-4)
     np.testing.assert_allclose(scan.covariances[0], 0.005**2 * np.eye(2), atol=2e-6)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.detection import DetectionModel
@@ -96,24 +95,13 @@ def noise_in_space(values: FloatArray, sensor: Sensor, pose: Pose) -> FloatArray
     return np.asarray((inverse @ sensor.covariance @ inverse.transpose(0, 2, 1)).mean(axis=0))
 
 
-@njit(cache=True, error_model='numpy')
-def _select(cumulative, points, index):  # type: ignore[no-untyped-def]
-    """Fill the first index whose cumulative weight is above each of the increasing points."""
-    i = 0
-    for k in range(len(points)):
-        while i < len(cumulative) - 1 and cumulative[i] <= points[k]:
-            i += 1
-        index[k] = i
-
-
 def resample(weights: FloatArray, number: int, generator: np.random.Generator) -> IntArray:
     """Return indices (number,) of particles, drawn with replacement by weight; they increase."""
     # Uniform points in order, from exponential gaps.
     gaps = np.cumsum(generator.standard_exponential(number + 1))
     cumulative = np.cumsum(weights)
-    index = np.empty(number, np.int64)
-    _select(cumulative, gaps[:-1] * (cumulative[-1] / gaps[-1]), index)
-    return index
+    index = np.searchsorted(cumulative, gaps[:-1] * (cumulative[-1] / gaps[-1]), 'right')
+    return np.minimum(index, len(weights) - 1)
 
 
 def jittered(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,15 +23,13 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.vector_math import arctan2, exponential, use_wide_vectors
 
 CHUNK = 2048
-# Detections that are worked on at a time: bounds the memory of psi.
-BLOCK = 16
 # Sums may be added in vector lanes; all numbers are finite.
 SUMS = {'reassoc', 'nsz', 'nnan'}
 # Rows of a chunk's working array.
 X, Y, Z, RANGE, BEARING, ELEVATION, ROWS = range(7)
 
 
-class Scan(NamedTuple):
+class PhdScan(NamedTuple):
     """Detections of one robot, and how its sensor saw them.
 
     values (m, d) in m and rad; information (d, d) the inverse of R; log_norm the logarithm of the
@@ -48,11 +47,11 @@ class Scan(NamedTuple):
     sine: float
 
 
-def make_scan(values: FloatArray, sensor: Sensor, pose: Pose) -> Scan:
+def phd_scan(values: FloatArray, sensor: Sensor, pose: Pose) -> PhdScan:
     """Return detections (m, d) as the corrector takes them."""
     kind, parameters = sensor.detection.kernel()
     _, log_determinant = np.linalg.slogdet(2.0 * math.pi * sensor.covariance)
-    return Scan(
+    return PhdScan(
         np.ascontiguousarray(values),
         np.asarray(np.linalg.inv(sensor.covariance), float),
         -0.5 * float(log_determinant),
@@ -112,7 +111,7 @@ def _fill_psi(z, scan, rows, weights, psi):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _explain_chunks(first, last, particles, weights, scan, probability, psi, sums):  # type: ignore[no-untyped-def]
+def _explain_chunks(particles, weights, scan, probability, psi, sums, first, last):  # type: ignore[no-untyped-def]
     """Fill pi (n,), psi (m, n), and the weighted sums (chunks, m) of psi in chunks."""
     rows = np.empty((ROWS, CHUNK))
     for chunk in range(first, last):
@@ -139,7 +138,7 @@ def _explain_chunks(first, last, particles, weights, scan, probability, psi, sum
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _add_chunks(first, last, psi, normaliser, factor):  # type: ignore[no-untyped-def]
+def _add_chunks(psi, normaliser, factor, first, last):  # type: ignore[no-untyped-def]
     """Add psi_z / C(z) of each detection to the factor (n,) of chunks."""
     for chunk in range(first, last):
         begin = chunk * CHUNK
@@ -167,7 +166,7 @@ def run_chunks(
 def phd_correct(
     particles: FloatArray,
     weights: FloatArray,
-    scan: Scan,
+    scan: PhdScan,
     background: FloatArray,
     pool: ThreadPoolExecutor | None = None,
 ) -> tuple[FloatArray, FloatArray]:
@@ -177,20 +176,11 @@ def phd_correct(
     `background` (m,) are the intensities of clutter and of births at each detection, above 0.
     """
     number, count = len(weights), len(scan.values)
-    chunks = max(1, -(-number // CHUNK))
+    psi, sums = np.empty((count, number)), np.empty((max(1, -(-number // CHUNK)), count))
     probability = np.empty(number)
-    factor = np.empty(number)
-    normaliser = np.array(background)
-    for first in range(0, max(count, 1), BLOCK):
-        block = scan._replace(values=scan.values[first : first + BLOCK])
-        psi = np.empty((len(block.values), number))
-        sums = np.empty((chunks, len(block.values)))
-        explain = (particles, weights, block, probability, psi, sums)
-        run_chunks(lambda c, e, work=explain: _explain_chunks(c, e, *work), number, pool)  # type: ignore[misc]
-        if first == 0:
-            np.subtract(1.0, probability, out=factor)
-        here = normaliser[first : first + BLOCK]
-        here += sums.cumsum(axis=0)[-1]
-        add = (psi, here, factor)
-        run_chunks(lambda c, e, work=add: _add_chunks(c, e, *work), number, pool)  # type: ignore[misc]
+    explain = partial(_explain_chunks, particles, weights, scan, probability, psi, sums)
+    run_chunks(explain, number, pool)
+    factor = 1.0 - probability
+    normaliser = background + sums.cumsum(axis=0)[-1]
+    run_chunks(partial(_add_chunks, psi, normaliser, factor), number, pool)
     return factor, normaliser

@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from operator import itemgetter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,7 +23,7 @@ from maasi_filter.ic_phd.births import (
     uniform_births,
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
-from maasi_filter.ic_phd.corrector import make_scan, phd_correct
+from maasi_filter.ic_phd.corrector import phd_correct, phd_scan
 from maasi_filter.measurement_check import (
     FOUND,
     CheckedMeasurement,
@@ -120,7 +121,7 @@ class IcPhdFilter(SearchFilter):
         births, intensity = self._births(member, before)
         space = member.sensor.measurement_space(self.bounds)
         clutter = max(member.sensor.clutter, LEAST_PER_SCAN / space)
-        scan = make_scan(member.values, member.sensor, member.pose)
+        scan = phd_scan(member.values, member.sensor, member.pose)
         factor, normaliser = phd_correct(
             self.particles, self.weights, scan, clutter + intensity.sum(axis=1), self._threads()
         )
@@ -218,16 +219,9 @@ class IcPhdFilter(SearchFilter):
             known = [distance(position, covariance, target) for target in self.found_targets]
             if min(known, default=math.inf) < SAME_TARGET:
                 continue
-            credit = _nearest_member(position, members)
-            target = FoundTarget(
-                self._found.next_id(),
-                position,
-                covariance,
-                credit.robot,
-                credit.index,
-                time,
-                label=_nearest_label(position, members, numbers.removal_distance),
-            )
+            credit, label_of = _nearest(position, members, numbers.removal_distance)
+            number, robot, index = self._found.next_id(), credit.robot, credit.index
+            target = FoundTarget(number, position, covariance, robot, index, time, label=label_of)
             self._found.targets.append(target)
             newly_found.append(target)
         alive = ~np.isin(label, list(narrow))
@@ -272,18 +266,21 @@ class IcPhdFilter(SearchFilter):
             self.particles, self.weights = self.particles[keep], self.weights[keep]
 
 
-def _distances(position: FloatArray, member: CheckedMeasurement) -> FloatArray:
-    """Return how far from a position each detection points (m,), metres."""
-    centres = member.sensor.measurement.inverse(member.values, member.pose)
-    return np.sqrt(np.square(centres - position).sum(axis=1))
+def _nearest(
+    position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
+) -> tuple[CheckedMeasurement, Label]:
+    """Return the robot with the detection nearest to a position, and the nearest label.
 
-
-def _nearest_member(
-    position: FloatArray, members: Sequence[CheckedMeasurement]
-) -> CheckedMeasurement:
-    """Return the robot with the detection nearest to a position; the last one if there is none."""
-    apart = [_distances(position, member).min(initial=math.inf) for member in members]
-    return members[int(np.argmin(apart)) if math.isfinite(min(apart)) else -1]
+    The robot is the last one if there is no detection; the label is within T_z = `limit` metres, as
+    the PHD filter does not associate detections with targets.
+    """
+    apart, labelled = [(math.inf, members[-1])], [(limit, UNLABELLED)]
+    for member in members:
+        centres = member.sensor.measurement.inverse(member.values, member.pose)
+        distances = np.sqrt(np.square(centres - position).sum(axis=1)).tolist()
+        apart += [(distance, member) for distance in distances]
+        labelled += zip(distances, member.labels)
+    return min(apart, key=itemgetter(0))[1], min(labelled, key=itemgetter(0))[1]
 
 
 def kept_measurements(
@@ -303,19 +300,3 @@ def kept_measurements(
         elif near.any():
             keep[int(np.argmin(np.where(near, apart, np.inf)))] = False
     return keep
-
-
-def _nearest_label(
-    position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
-) -> Label:
-    """Return the label of the detection nearest to a position, within T_z = `limit` metres.
-
-    The PHD filter does not associate detections with targets.
-    """
-    seen = [
-        (apart, label)
-        for member in members
-        for apart, label in zip(_distances(position, member).tolist(), member.labels)
-    ]
-    apart, label = min(seen, key=lambda item: item[0], default=(math.inf, UNLABELLED))
-    return label if apart <= limit else UNLABELLED

@@ -21,39 +21,39 @@ from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic
 from numpy.typing import ArrayLike
 
-from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.vector_math import exponential
 
 EXPONENTIAL, GAUSSIAN, BOX, CUSTOM = 0, 1, 2, 3
 PARAMETERS = 9
-# Entries of the parameters; those before are as of the radial models.
-REACH, NUMBER, ADDRESS = 4, 5, 6
+# Entries of the parameters of CUSTOM; those before are as of the radial models: number and address
+# of the function, address of its values, and how many there are.
+REACH, NUMBER, FUNCTION, VALUES, LENGTH = 4, 5, 6, 7, 8
 
-# Functions with the addresses of function and values, and the number of these; what kernels may
-# still call, by its address, must not be freed.
-_blocks: dict[int, tuple[Callable[..., float], IntArray]] = {}
-_alive: list[Any] = []
+# Functions, and their entries from NUMBER on, by number; values that kernels may still read.
+_known: dict[int, tuple[Callable[..., float], FloatArray]] = {}
+_alive: list[FloatArray] = []
 
 
 @intrinsic
-def _call(typing_context, address, forward, left, up):  # type: ignore[no-untyped-def]
-    """Return the function of a block at an offset."""
+def _call(typing_context, function, values, length, forward, left, up):  # type: ignore[no-untyped-def]
+    """Return what the function at an address, with the values at another, gives at an offset."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         integer, number = (context.get_value_type(kind) for kind in (types.int64, types.float64))
-        block = builder.inttoptr(arguments[0], integer.as_pointer())
-        entries = [builder.load(builder.gep(block, [integer(index)])) for index in range(3)]
-        values = builder.inttoptr(entries[1], number.as_pointer())
-        kind = cgutils.ir.FunctionType(number, [number] * 3 + [number.as_pointer(), integer])
-        function = builder.inttoptr(entries[0], kind.as_pointer())
-        return builder.call(function, [*arguments[1:], values, entries[2]])
+        several = number.as_pointer()
+        kind = cgutils.ir.FunctionType(number, [number] * 3 + [several, integer])
+        called = builder.inttoptr(arguments[0], kind.as_pointer())
+        return builder.call(
+            called, [*arguments[3:], builder.inttoptr(arguments[1], several), arguments[2]]
+        )
 
-    return types.float64(types.int64, types.float64, types.float64, types.float64), generate
+    return types.float64(*[types.int64] * 3, *[types.float64] * 3), generate
 
 
-def register(function: Callable[..., float], values: FloatArray) -> tuple[int, int]:
-    """Return number and address of a function (forward, left, up, values) with its values.
+def register(function: Callable[..., float], values: FloatArray) -> FloatArray:
+    """Return the entries from NUMBER on of a function (forward, left, up, values) and its values.
 
     The number is the same in every process for the same name of the function and values.
     """
@@ -61,33 +61,29 @@ def register(function: Callable[..., float], values: FloatArray) -> tuple[int, i
     digest = hashlib.sha256(name.encode() + b'\0' + values.tobytes()).digest()
     # Floats are exact up to 2^53.
     number = int.from_bytes(digest[:6], 'little')
-    known = _blocks.get(number)
     # A notebook may define it again.
-    if known is None or known[0] is not function:
-        compiled, own = _compiled(function), np.array(values, dtype=float)
-        entries = np.array([compiled.address, own.ctypes.data, len(own)], np.int64)
-        _alive.extend([compiled, own, entries])
-        known = _blocks[number] = (function, entries)
-    return number, known[1].ctypes.data
+    if number not in _known or _known[number][0] is not function:
+        own = np.array(values, dtype=float)
+        _alive.append(own)
+        entries = np.array([number, _compiled(function).address, own.ctypes.data, len(own)], float)
+        _known[number] = (function, entries)
+    return _known[number][1]
 
 
 def renew_addresses(kinds: FloatArray, parameters: FloatArray) -> None:
     """Put the addresses of this process into saved parameters (n, PARAMETERS), in place."""
     for row in np.flatnonzero(kinds == CUSTOM).tolist():
-        block = _blocks.get(int(parameters[row, NUMBER]))
-        if block is None:
+        if parameters[row, NUMBER] not in _known:
             raise ValueError(
                 'it was saved with a detection model of your own, which no sensor of this process '
                 'has: make the sensors, with the same settings, before it is loaded'
             )
-        parameters[row, ADDRESS] = block[1].ctypes.data
+        parameters[row, NUMBER:] = _known[parameters[row, NUMBER]][1]
 
 
 @cache
 def _compiled(function: Callable[..., float]) -> Any:
-    inner = function
-    if not isinstance(function, Dispatcher):
-        inner = njit(error_model='numpy')(function)
+    inner = function if isinstance(function, Dispatcher) else njit(error_model='numpy')(function)
     number = types.float64
 
     @cfunc(number(number, number, number, types.CPointer(number), types.int64))
@@ -119,7 +115,9 @@ def detection_probability_at(
     if kind == CUSTOM:
         if dx * dx + dy * dy + dz * dz > parameters[REACH] * parameters[REACH]:
             return 0.0
-        value = parameters[0] * _call(np.int64(parameters[ADDRESS]), x, y, dz)  # type: ignore[call-arg]
+        address, values = np.int64(parameters[FUNCTION]), np.int64(parameters[VALUES])
+        length = np.int64(parameters[LENGTH])
+        value: float = parameters[0] * _call(address, values, length, x, y, dz)  # type: ignore[call-arg]
         # What is not a number is not above 0 either.
         return min(value, 1.0) if value > 0.0 else 0.0
     if kind == BOX:
@@ -155,12 +153,6 @@ def fill_probabilities(  # type: ignore[no-untyped-def]
         out[i] = gain * exponential(-0.5 * (square if gaussian else math.sqrt(square)))
 
 
-def _check_probability(probability: float) -> float:
-    if not (math.isfinite(probability) and 0.0 <= probability <= 1.0):
-        raise ValueError(f'probability: got {probability}, allowed are numbers in [0, 1]')
-    return float(probability)
-
-
 class DetectionModel:
     """Probability of detection of a target at x by a sensor at pose q.
 
@@ -169,6 +161,13 @@ class DetectionModel:
 
     _kind: int
     _parameters: FloatArray
+
+    def __init__(self, probability: float) -> None:
+        if not (math.isfinite(probability) and 0.0 <= probability <= 1.0):
+            raise ValueError(f'probability: got {probability}, allowed are numbers in [0, 1]')
+        self.gain = float(probability)
+        self._parameters = np.zeros(PARAMETERS)
+        self._parameters[0] = self.gain
 
     def kernel(self) -> tuple[int, FloatArray]:
         """Return (kind, parameters) for `detection_probability_at`."""
@@ -196,10 +195,8 @@ class _RadialDetection(DetectionModel):
         values = np.array(size, dtype=float)
         if values.shape not in ((2,), (3,)) or not (values > 0.0).all():
             raise ValueError(f'size: got {list(size)}, allowed are 2 or 3 positive numbers')
-        self.gain = _check_probability(probability)
+        super().__init__(probability)
         self.size = values
-        self._parameters = np.zeros(PARAMETERS)
-        self._parameters[0] = self.gain
         self._parameters[1 : 1 + len(values)] = 1.0 / values
 
 
@@ -260,22 +257,17 @@ class BoxDetection(DetectionModel):
             raise ValueError(f"frame: got {frame!r}, allowed are 'robot' and 'world'")
         if not (math.isfinite(edge) and edge >= 0.0):
             raise ValueError(f'edge: got {edge}, allowed are finite numbers from 0')
-        self.gain = _check_probability(probability)
+        super().__init__(probability)
         self.lower = low
         self.upper = high
         self.frame = frame
         self.edge = float(edge)
-        self._parameters = np.empty(PARAMETERS)
-        self._parameters[0] = self.gain
-        self._parameters[1:4] = -np.inf
-        self._parameters[4:7] = np.inf
-        self._parameters[1 : 1 + len(low)] = low
-        self._parameters[4 : 4 + len(high)] = high
-        self._parameters[7] = self.edge
-        self._parameters[8] = 1.0 if frame == 'robot' else 0.0
+        everywhere = [math.inf] * (3 - len(low))
+        self._parameters[1:4] = [*low, *np.negative(everywhere)]
+        self._parameters[4:7] = [*high, *everywhere]
+        self._parameters[7:] = self.edge, frame == 'robot'
 
     def softened(self, edge: float) -> BoxDetection:
         """Return the same box with a ramp of at least `edge` metres."""
-        if edge <= self.edge:
-            return self
+        edge = max(edge, self.edge)
         return BoxDetection(self.lower.tolist(), self.upper.tolist(), self.gain, self.frame, edge)

@@ -11,15 +11,7 @@ from numba import njit
 from pydantic import BaseModel
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.detection import (
-    ADDRESS,
-    CUSTOM,
-    NUMBER,
-    PARAMETERS,
-    REACH,
-    DetectionModel,
-    register,
-)
+from maasi_filter.models.detection import CUSTOM, NUMBER, REACH, DetectionModel, register
 from maasi_filter.plugins import PluginError
 from maasi_filter.unexplored_map import interpolate_at
 
@@ -36,10 +28,7 @@ class OwnDetection(DetectionModel):
     multiplied with `probability` of the settings, and 0 beyond the reach. In two dimensions `up`
     is 0.
 
-    `compiled` is called for every place, and is about as fast as a model of the suite. `evaluate`
-    is called once, for the nodes of a grid up to the reach (in 2D 513 on each axis, in 3D 97);
-    between them pi is interpolated, so that a step becomes a ramp of a 256th (3D: a 48th) of the
-    reach.
+    Both ways are compared in docs/plugins.md.
 
     Parameters
     ----------
@@ -71,30 +60,28 @@ class OwnDetection(DetectionModel):
     _kind = CUSTOM
 
     def __init__(self, settings: Any = None, probability: float = 1.0, dimension: int = 3) -> None:
+        super().__init__(probability)
         if settings is None and self.Settings is not None:
             settings = self.Settings()
         self.own = settings
-        self.gain = float(probability)
         self.dimension = dimension
-        reach = float(self._numbers(self.reach(), 'reach', ()))
+        reach = float(self._numbers('reach', self.reach(), ()))
         if not 0.0 < reach < math.inf:
             self._refuse(f'reach: got {reach}, allowed are finite numbers above 0')
         function = type(self).compiled
         if function is None:
             function, values = _interpolated, self._table(reach)
         else:
-            values = self._numbers(self.values(), 'values')
+            values = self._numbers('values', self.values())
             # At some places, where an exception would still be seen.
             places = np.random.default_rng(1).uniform(-reach, reach, (_TRIALS, 3))
             places[:, dimension:] = places[0] = 0.0
             results = [function(*place, values) for place in places.tolist()]
-            self._probabilities(results, (_TRIALS,), 'compiled')
-        self._parameters = np.zeros(PARAMETERS)
-        self._parameters[0] = self.gain
+            self._numbers('compiled', results, (_TRIALS,), probabilities=True)
         # As of the radial models: the inverse of half the width of the view.
         self._parameters[1 : 1 + dimension] = 2.0 / reach
         self._parameters[REACH] = reach
-        self._parameters[NUMBER], self._parameters[ADDRESS] = register(function, values)
+        self._parameters[NUMBER:] = register(function, values)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Build it anew in another process: the function is elsewhere there."""
@@ -102,7 +89,7 @@ class OwnDetection(DetectionModel):
 
     def reach(self) -> float:
         """Return the distance beyond which nothing is detected, metres."""
-        raise NotImplementedError(f'{self._name()} lacks reach')
+        self._refuse('lacks reach')
 
     def values(self) -> Sequence[float]:
         """Return what the compiled function needs to know."""
@@ -110,16 +97,19 @@ class OwnDetection(DetectionModel):
 
     def evaluate(self, forward: FloatArray, left: FloatArray, up: FloatArray) -> FloatArray:
         """Return pi, (n,), of targets at offsets (n,) each in the robot's axes, metres."""
-        raise NotImplementedError(f'{self._name()} lacks compiled or evaluate')
-
-    @classmethod
-    def _name(cls) -> str:
-        return f'{cls.__module__}:{cls.__qualname__}'
+        self._refuse('lacks compiled or evaluate')
 
     def _refuse(self, problem: str) -> NoReturn:
-        raise PluginError(f'{self._name()}: {problem}')
+        raise PluginError(f'{type(self).__module__}:{type(self).__qualname__}: {problem}')
 
-    def _numbers(self, value: Any, what: str, shape: tuple[int, ...] | None = None) -> FloatArray:
+    def _numbers(
+        self,
+        what: str,
+        value: Any,
+        shape: tuple[int, ...] | None = None,
+        *,
+        probabilities: bool = False,
+    ) -> FloatArray:
         """Return what a method gave as numbers of a shape; without one: (n,)."""
         try:
             found = np.asarray(value)
@@ -127,17 +117,14 @@ class OwnDetection(DetectionModel):
             found = np.asarray(None)
         if found.dtype.kind not in 'biuf':
             self._refuse(f'{what}: got {value!r:.80}, allowed are numbers')
-        allowed = '(n,)' if shape is None else shape
         if found.ndim != 1 if shape is None else found.shape != shape:
-            self._refuse(f'{what}: got shape {found.shape}, allowed is {allowed}')
-        return found.astype(float)
-
-    def _probabilities(self, value: Any, shape: tuple[int, ...], what: str) -> FloatArray:
-        found = self._numbers(value, what, shape)
+            self._refuse(
+                f'{what}: got shape {found.shape}, allowed is {"(n,)" if shape is None else shape}'
+            )
         wrong = found[~((found >= 0.0) & (found <= 1.0))]
-        if wrong.size:
+        if probabilities and wrong.size:
             self._refuse(f'{what}: got a probability of {wrong[0]}, allowed are numbers in [0, 1]')
-        return found
+        return found.astype(float)
 
     def _table(self, reach: float) -> FloatArray:
         """Return the numbers of `_interpolated`: corner, step and shape of a grid, and pi on it."""
@@ -145,7 +132,8 @@ class OwnDetection(DetectionModel):
         axis = np.linspace(-reach, reach, 2 * cells + 1)
         height = axis if self.dimension == 3 else np.zeros(1)
         grids = [grid.ravel() for grid in np.meshgrid(axis, axis, height, indexing='ij')]
-        table = self._probabilities(self.evaluate(*grids), grids[0].shape, 'evaluate')
+        given = self.evaluate(*grids)
+        table = self._numbers('evaluate', given, grids[0].shape, probabilities=True)
         return np.concatenate([[-reach] * 3, [reach / cells] * 3, [len(axis), len(height)], table])
 
 

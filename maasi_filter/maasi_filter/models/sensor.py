@@ -118,8 +118,9 @@ class Sensor:
         covariance: FloatArray,
         clutter: float = 0.0,
         period: float = 0.0,
+        resolution: float = 1.0,
     ) -> Sensor:
         """Return a sensor of range and angles whose dimension is that of `covariance`."""
         dimension = len(np.atleast_2d(covariance))
         model: MeasurementModel = RangeBearing() if dimension == 2 else RangeBearingElevation()
-        return cls(name, detection, model, covariance, clutter, period)
+        return cls(name, detection, model, covariance, clutter, period, resolution=resolution)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from maasi_filter.make_filter import Progress
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import AgentMeasurement
 from maasi_filter.ros.clocks import Silence, batch_id_limit
@@ -41,36 +42,35 @@ class BatchAssembly:
     """Matches batches and detections; what is refused is dropped and counted by the node."""
 
     def __init__(
-        self, node: LockstepLifecycleNode[FilterNodeSettings], sensors: Mapping[str, Sensor]
+        self,
+        node: LockstepLifecycleNode[FilterNodeSettings],
+        sensors: Mapping[str, Sensor],
+        progress: Progress,
     ) -> None:
         self._node = node
         self._sensors = sensors
+        self._progress = progress
         #: Batches that have not been taken, by id.
         self.pending: dict[int, PendingBatch] = {}
-        #: Id and stamp [ns] of the last batch taken.
-        self.last, self.last_stamp = 0, -1
-        #: Batch, measurement and stamp [ns] of the last detections, by robot.
-        self.heard: dict[str, tuple[int, int, int]] = {}
         self._early: dict[tuple[int, str], DetectionArray] = {}
 
     def add(self, batch: MeasurementBatch) -> None:
         """Take a batch, and the detections that arrived before it."""
-        node = self._node
+        node, last = self._node, self._progress.batch
         number = int(batch.id)
         stamp = stamp_from_ros(batch.stamp)
         known = {key: item.stamp for key, item in self.pending.items()}
-        known[self.last] = self.last_stamp
+        known[last] = self._progress.stamp
         if known.get(number) == stamp:
             # Duplicate batch: the planner republishes batches that may have been missed.
             return
-        if number <= self.last or (number in self.pending and not node.settings.lockstep):
+        if number <= last or (number in self.pending and not node.settings.lockstep):
             node.drop('old batch', f'measurement_batch.id: read {number}, allowed is a new one')
             return
-        if number > batch_id_limit(self.last):
+        if number > batch_id_limit(last):
             node.drop(
                 'bad batch',
-                f'measurement_batch.id: read {number}, allowed is up to '
-                f'{batch_id_limit(self.last)}',
+                f'measurement_batch.id: read {number}, allowed is up to {batch_id_limit(last)}',
             )
             return
         for item in batch.members:
@@ -110,13 +110,13 @@ class BatchAssembly:
                 expected.failed.add(name)
             return None
         key = (number, int(message.measurement), stamp_from_ros(message.header.stamp))
-        if self.heard.get(name) == key:
+        if self._progress.heard.get(name) == key:
             # Duplicate: drivers also republish.
             return None
-        self.heard[name] = key
+        self._progress.heard[name] = key
         if expected is not None:
             self._take(expected, message)
-        elif number > self.last and pending is None:
+        elif number > self._progress.batch and pending is None:
             # Its batch has not arrived yet.
             self._early[(number, name)] = message
             if len(self._early) > _MOST_EARLY:
@@ -133,7 +133,7 @@ class BatchAssembly:
         if first is None or not first.failed.issuperset(first.missing):
             return None
         del self.pending[first.id]
-        self.last, self.last_stamp = first.id, first.stamp
+        self._progress.batch, self._progress.stamp = first.id, first.stamp
         for key in [key for key in self._early if key[0] <= first.id]:
             del self._early[key]
         return first
@@ -169,17 +169,17 @@ class BatchAssembly:
         if message.measurement > batch_id_limit(0):
             return f'measurement: read {message.measurement}, allowed is up to {batch_id_limit(0)}'
         stamp = stamp_from_ros(message.header.stamp)
-        last = self.heard[name][2] if name in self.heard else 0
+        last = self._progress.heard[name][2] if name in self._progress.heard else 0
         if expected is not None:
             # After one stamp from the future, later messages with valid stamps are not late.
             earliest, latest = min(last, expected.stamp), expected.stamp + _STAMP_AHEAD
-        elif message.batch_id > self.last:
+        elif message.batch_id > self._progress.batch:
             # Its batch may still arrive.
             return None
         else:
             # The first one, where no planner sends batches, may have any stamp up to now.
             now = self._node.get_clock().now().nanoseconds
-            earliest, latest = last, max(self.last_stamp, last, now) + _STAMP_AHEAD
+            earliest, latest = last, max(self._progress.stamp, last, now) + _STAMP_AHEAD
         if earliest <= stamp <= latest:
             return None
         return (
@@ -189,14 +189,15 @@ class BatchAssembly:
 
     def _measurement(self, message: DetectionArray) -> AgentMeasurement | None:
         name = message.robot
-        try:
-            measurement, left_out = measurement_from_ros(message, self._sensors[name])
-        except ValueError as error:
-            self._node.drop('bad detections', f'{name}/detections.pose.{error}')
-            return None
-        for reason, text, number in left_out:
+
+        def drop(reason: str, text: str, number: int = 1) -> None:
             self._node.drop(reason, f'{name}/detections.{text}', number)
-        return measurement
+
+        try:
+            return measurement_from_ros(message, self._sensors[name], drop)
+        except ValueError as error:
+            drop('bad detections', f'pose.{error}')
+            return None
 
     def _take(self, pending: PendingBatch, message: DetectionArray) -> None:
         measurement = self._measurement(message)

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_filter.found_targets import SAME_TARGET, distance
+from maasi_filter.found_targets import SAME_TARGET
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
 from maasi_filter.pmb.labels import LabelTally
@@ -45,14 +45,14 @@ def add_look(answers, detected, missed):  # type: ignore[no-untyped-def]  # prag
         answers[k] += (1.0 - missed) * math.log(RATES[k])
 
 
-def rate_of_targets(answers: Sequence[FloatArray], existence: Sequence[float]) -> FloatArray:
+def rate_of_targets(components: Sequence[Component]) -> FloatArray:
     """Return the probabilities of COMMON, from the answers of all places that may be targets."""
-    if not len(answers):
+    if not components:
         return PRIOR
-    logs = np.array(answers)
+    logs = np.array([item.answers for item in components])
     peaks = logs.max(axis=1, keepdims=True)
     fits = np.log(np.exp(logs - peaks) @ (_TARGET + _REFLECTION).T)
-    sums = np.array(existence) @ fits + np.log(PRIOR)
+    sums = np.array([item.existence for item in components]) @ fits + np.log(PRIOR)
     weights = np.exp(sums - sums.max())
     return np.asarray(weights / weights.sum())
 
@@ -237,7 +237,7 @@ def views(components: Sequence[Component], scan: Scan) -> list[View]:
 def gap(one: Component, other: Component) -> float:
     """Return the squared normalised distance of two components."""
     offset = one.density.mean - other.density.mean
-    return float(squared_distance(offset, one.density.covariance + other.density.covariance))
+    return squared_distance(offset, one.density.covariance + other.density.covariance)
 
 
 def merge(components: list[Component]) -> list[Component]:
@@ -281,14 +281,3 @@ def is_known(i: int, components: Sequence[Component], caused: FloatArray) -> boo
         and gap(item, other) < SAME_TARGET
         for f, other in enumerate(components)
     )
-
-
-def nearest(target: FoundTarget, components: Sequence[Component]) -> Component | None:
-    """Return the nearest component that is not found within the gate of a target, or None."""
-    gaps = [
-        (distance(item.density.mean, item.density.covariance, target), i)
-        for i, item in enumerate(components)
-        if item.target is None
-    ]
-    least, best = min(gaps, default=(math.inf, 0))
-    return components[best] if least < SAME_TARGET else None

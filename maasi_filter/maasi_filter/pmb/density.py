@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
-from maasi_filter.arrays import FloatArray
+from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.detection import renew_addresses
 from maasi_filter.pmb.factors import (
     CARTESIAN,
@@ -69,18 +69,10 @@ def _exponent(weights, logs, most, least_effective, out):  # type: ignore[no-unt
     return min(max(low, LEAST_STEP), most)
 
 
-@njit(cache=True, error_model='numpy')
-def _systematic(weights, number, start):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _systematic(weights: FloatArray, number: int, start: float) -> IntArray:
     """Return indices of a systematic resampling; `start` is uniform in [0, 1)."""
-    index = np.empty(number, np.int64)
-    cumulative = weights[0]
-    i = 0
-    for k in range(number):
-        while cumulative < (k + start) / number and i < len(weights) - 1:
-            i += 1
-            cumulative += weights[i]
-        index[k] = i
-    return index
+    points = (np.arange(number) + start) / number
+    return np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
 
 
 @njit(cache=True, error_model='numpy')

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.found_targets import FoundTargets
+from maasi_filter.found_targets import FoundTargets, nearest
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
     check_measurements,
@@ -32,7 +32,6 @@ from maasi_filter.pmb.component import (
     Component,
     is_known,
     merge,
-    nearest,
     rate_of_targets,
     reflects,
     views,
@@ -100,22 +99,25 @@ class PmbFilter(SearchFilter):
         return sorted(found, key=lambda target: target.id)
 
     @property
+    def potential(self) -> list[Component]:
+        """Components that are not found."""
+        return [item for item in self.components if item.target is None]
+
+    @property
     def expected_number(self) -> float:
         """Expected number of detected but not found targets: the sum of their r."""
-        return math.fsum(item.existence for item in self.components if item.target is None)
+        return math.fsum(item.existence for item in self.potential)
 
     @property
     def particles(self) -> FloatArray:
         """Particles of the components that are not found, (n, d), metres."""
-        parts = [item.density.particles for item in self.components if item.target is None]
+        parts = [item.density.particles for item in self.potential]
         return np.concatenate([np.empty((0, self.dimension)), *parts])
 
     @property
     def weights(self) -> FloatArray:
         """Their weights, (n,); they sum to the expected number."""
-        parts = [
-            item.existence * item.density.weights for item in self.components if item.target is None
-        ]
+        parts = [item.existence * item.density.weights for item in self.potential]
         return np.concatenate([np.empty(0), *parts])
 
     def step(
@@ -126,26 +128,16 @@ class PmbFilter(SearchFilter):
         result = FilterResult()
         before = self.found_targets
         self._predict(time)
-        real = [item for item in self.components if item.existence >= LEAST_CLUSTER_MASS]
-        self._rates = rate_of_targets(
-            [item.answers for item in real], [item.existence for item in real]
-        )
         for member in members:
             self._correct(member, time, result)
-        # Estimate the found targets whose densities have changed.
-        for item in self.components:
-            if item.target is not None and item.stale and not item.foreign:
-                item.target = self._estimate(item.target, item)
-            item.stale = False
-        found = [item for item in self.components if item.target is not None]
-        others = [item for item in self.components if item.target is None]
-        self.components = found + merge([i for i in others if i.existence >= LEAST_EXISTENCE])
-        self._cluster()
+        self._estimate_changed()
+        merged = merge([item for item in self.potential if item.existence >= LEAST_EXISTENCE])
+        self.components = [item for item in self.components if item.target is not None] + merged
+        self.clusters = self._clusters_of(merged)
         result.clusters = list(self.clusters)
         # A target that has changed is another record.
-        result.found_changed = bool(result.newly_found) or [*map(id, before)] != [
-            *map(id, self.found_targets)
-        ]
+        changed = [*map(id, before)] != [*map(id, self.found_targets)]
+        result.found_changed = bool(result.newly_found) or changed
         result.expected_number = self.expected_number
         misfits = {robot: learnt.misfit(robot) for robot, learnt in sorted(self._learnt.items())}
         result.misfits = {robot: text for robot, text in misfits.items() if text}
@@ -154,51 +146,42 @@ class PmbFilter(SearchFilter):
     def _correct(self, member: CheckedMeasurement, time: float, result: FilterResult) -> None:
         """Correct with one robot's scan (docs/filter.md, Williams 2015, TOMB/P)."""
         member = without_repeats(within_range(member, result.dropped), result.dropped)
-        learnt = self._learnt.setdefault(member.robot, Learnt())
+        components, learnt = self.components, self._learnt.setdefault(member.robot, Learnt())
         # kappa: clutter per unit of measurement space; N0 / V.
         space = member.sensor.measurement_space(self.bounds)
         kappa = learnt.clutter_per_scan(member.sensor.clutter * space) / space
         unseen = self._numbers.expected_targets / self.exploration.volume
         # Errors of the robot's position, those that last and those that the scan tells.
-        if self._offsets.active:
-            member = self._offsets.localise(member, self.components, kappa, unseen)
-        error = learnt.learn_error(member, self.components, kappa, unseen)
+        member = self._offsets.localise(member, components, kappa, unseen)
+        error = learnt.learn_error(member, components, kappa, unseen)
         blurred = replace(member, pose_error=math.hypot(member.pose_error, error))
         # lambda_j = (N0 / V) int e pi g_j dx, by importance sampling from the detections.
         scan = make_scan(
-            blurred,
-            learnt.noise_factor(),
-            self.exploration,
-            self._numbers.expected_targets,
-            self._numbers.pmb.particles,
-            self.generator,
+            blurred, learnt.noise_factor(), self.exploration, self._numbers, self.generator
         )
         self._scans += 1
         # p_D = int f pi dx, L_j = int f pi g_j dx.
-        seen = views(self.components, scan)
+        seen = views(components, scan)
         # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
         odds = np.zeros((len(seen), len(scan.terms)))
-        for i, (item, view) in enumerate(zip(self.components, seen)):
+        for i, (item, view) in enumerate(zip(components, seen)):
             r = item.existence
             odds[i, view.gated] = r * view.likelihood / (1.0 - r * view.detected)
         other = kappa + scan.intensity
-        tallies = [item.labels for item in self.components]
+        tallies = [item.labels for item in components]
         named = associate_by_identity(member.labels, tallies, odds, other)
         missed, caused, new = associate(odds, other)
         learn_labels(member.labels, tallies, caused)
-        learnt.count_found(member, self.components, caused, error > 0.0)
+        learnt.count_found(member, components, caused, error > 0.0)
         alone = (scan.intensity <= 0.0) & ~(odds > 0.0).any(axis=0)
         count_unexplained(scan.centres[alone], self.bounds, result.dropped)
         # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
         radius = self._found_radius(blurred)
-        detected = (caused.sum(axis=1) > 0.5).tolist()
-        for i, (item, view) in enumerate(zip(self.components, seen)):
+        for i, (item, view) in enumerate(zip(components, seen)):
             moved = item.update(view, missed[i], caused[i], scan, self.generator)
-            if detected[i] and not item.foreign:
+            if caused[i].sum() > 0.5 and not item.foreign:
                 item.pose_error, item.found_radius = blurred.pose_error, radius
-            if item.target is not None:
-                self._keep_or_withdraw(item)
-            elif moved and self._can_be_found(item) and not is_known(i, self.components, caused):
+            if self._is_found(item, moved) and not is_known(i, components, caused):
                 result.newly_found.append(self._find(item, member, time))
         # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
         real = np.where(named, 0.0, scan.intensity / (kappa + scan.intensity))
@@ -221,46 +204,53 @@ class PmbFilter(SearchFilter):
                     item.labels.identity = ''
             self.components.append(item)
 
-    def _can_be_found(self, item: Component) -> bool:
-        """Return whether a component almost surely exists, at a precisely known position."""
-        return (
-            item.existence > self._numbers.pmb.found_probability
-            and item.hits >= LEAST_HITS
-            and item.density.radius <= item.found_radius
-            and reflects(item.answers, self._rates) < MOST_REFLECTING
-        )
+    def _is_found(self, item: Component, moved: bool) -> bool:
+        """Return whether a component becomes found; withdraw a found one that hardly exists.
+
+        It almost surely exists, at a precisely known position.
+        """
+        numbers, reflecting = self._numbers.pmb, reflects(item.answers, self._rates)
+        if item.foreign:
+            item.existence = CERTAIN
+        elif item.target is not None:
+            if item.existence < numbers.withdrawn_probability or reflecting > SURELY_REFLECTING:
+                item.target = None
+        else:
+            return (
+                moved
+                and item.existence > numbers.found_probability
+                and item.hits >= LEAST_HITS
+                and item.density.radius <= item.found_radius
+                and bool(reflecting < MOST_REFLECTING)
+            )
+        return False
 
     def _find(self, item: Component, member: CheckedMeasurement, time: float) -> FoundTarget:
         """Mark a component as found."""
         self._last_id += 1
-        if self._offsets.active:
-            self._offsets.find(member.robot, self._last_id)
+        self._offsets.find(member.robot, self._last_id)
         mean, covariance, by = item.density.mean, item.density.covariance, member.robot
         target = FoundTarget(self._last_id, mean, covariance, by, member.index, time)
         item.target = self._estimate(target, item)
         return item.target
 
-    def _keep_or_withdraw(self, item: Component) -> None:
-        """Withdraw a found component that hardly exists."""
-        if item.foreign:
-            item.existence = CERTAIN
-        elif (
-            item.existence < self._numbers.pmb.withdrawn_probability
-            or reflects(item.answers, self._rates) > SURELY_REFLECTING
-        ):
-            item.target = None
+    def _estimate_changed(self) -> None:
+        """Estimate the found targets whose densities have changed."""
+        for item in self.components:
+            if item.target is not None and item.stale and not item.foreign:
+                item.target = self._estimate(item.target, item)
+            item.stale = False
 
     def _estimate(self, target: FoundTarget, item: Component) -> FoundTarget:
         """Return a target with the moments of its particles and the position error of the robot."""
         covariance = item.density.covariance.copy()
         covariance.flat[:: self.dimension + 1] += item.pose_error**2
-        if self._offsets.active:
-            covariance += self._offsets.covariance_of(target.id)
+        covariance += self._offsets.covariance_of(target.id)
         mean, label = item.density.mean.copy(), item.labels.label
         return replace(target, position=mean, covariance=covariance, label=label)
 
     def _predict(self, time: float) -> None:
-        """Predict the random walk since the last step."""
+        """Predict the random walk since the last step; learn how often targets answer."""
         last = time if self._last_time is None else self._last_time
         self._last_time = max(time, last)
         variance = self._numbers.pmb.walk**2 * max(time - last, 0.0)
@@ -270,19 +260,20 @@ class PmbFilter(SearchFilter):
                 if not item.foreign:
                     item.density.diffuse(variance, self.generator)
                     item.stale = True
+        self._rates = rate_of_targets(
+            [item for item in self.components if item.existence >= LEAST_CLUSTER_MASS]
+        )
 
-    def _cluster(self) -> None:
-        """Publish what may be a target that is not found; a place that reflects weighs less."""
+    def _clusters_of(self, components: Sequence[Component]) -> list[Cluster]:
+        """Return what may be a target; a place that reflects weighs less."""
         clusters = []
-        for item in self.components:
-            if item.target is not None or item.existence < LEAST_CLUSTER_MASS:
-                continue
+        for item in components:
             mass = item.existence * (1.0 - reflects(item.answers, self._rates))
             if mass >= LEAST_CLUSTER_MASS:
                 density = item.density
                 mean, covariance = density.mean.copy(), density.covariance.copy()
                 clusters.append(Cluster(mean, covariance, density.radius, mass))
-        self.clusters = sorted(clusters, key=lambda cluster: -cluster.mass)
+        return sorted(clusters, key=lambda cluster: -cluster.mass)
 
     def _found_radius(self, member: CheckedMeasurement) -> float:
         """Return T_r [m]."""
@@ -300,7 +291,10 @@ class PmbFilter(SearchFilter):
         self._last_id = found.last_id
         for target in changed:
             same = [item for item in self.components if item.target and item.target.id == target.id]
-            item = same[0] if same else nearest(target, self.components)
+            others = self.potential
+            moments = [(item.density.mean, item.density.covariance) for item in others]
+            best = nearest(target, moments)
+            item = same[0] if same else others[best] if best >= 0 else None
             density = Density.normal(
                 target.position,
                 target.covariance,

@@ -15,6 +15,7 @@ from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.pmb.association import propagate
 from maasi_filter.pmb.component import Component, moments
 from maasi_filter.pmb.factors import MOST_PROBABLE
+from maasi_filter.vector_math import normalised
 
 # Weight of the prior of the clutter, in scans.
 PRIOR_SCANS = 10.0
@@ -52,28 +53,14 @@ def _log_sums(errors, jacobians, covariances, noise, variances, odds, out):  # t
     n, m, d = errors.shape
     psi = np.empty((n, m))
     missed, caused, new = np.empty(n), np.empty((n, m)), np.empty(m)
-    root = np.empty((d, d))
-    solved = np.empty(d)
     for k in range(len(variances)):
         for i in range(n):
-            spread = covariances[i].copy()
-            for a in range(d):
-                spread[a, a] += variances[k]
+            spread = covariances[i] + variances[k] * np.eye(d)
             expected = jacobians[i] @ spread @ jacobians[i].T
             for j in range(m):
-                exponent = 0.0
-                for a in range(d):
-                    for b in range(a + 1):
-                        value = expected[a, b] + noise[j, a, b]
-                        for c in range(b):
-                            value -= root[a, c] * root[b, c]
-                        root[a, b] = math.sqrt(max(value, 1e-30)) if a == b else value / root[b, b]
-                    value = errors[i, j, a]
-                    for c in range(a):
-                        value -= root[a, c] * solved[c]
-                    solved[a] = value / root[a, a]
-                    exponent -= 0.5 * solved[a] ** 2 + math.log(root[a, a])
-                psi[i, j] = odds[i, j] * math.exp(exponent) / (2.0 * math.pi) ** (0.5 * d)
+                square, log_root = normalised(errors[i, j], expected + noise[j])
+                density = math.exp(-0.5 * square - log_root) / (2.0 * math.pi) ** (0.5 * d)
+                psi[i, j] = odds[i, j] * density
         out[k] = propagate(psi, missed, caused, new)
 
 

@@ -56,11 +56,13 @@ class Offsets:
         clutter: float,
         unseen: float,
     ) -> CheckedMeasurement:
-        """Return a robot's scan at its estimated pose; the components are moved.
+        """Return a robot's scan at its estimated pose, if errors last; the components are moved.
 
         `clutter` is kappa, per unit of measurement space; `unseen` N0 / V, per m^d: the largest
         intensity of undetected targets.
         """
+        if not self.active:
+            return member
         found = {item.target.id for item in components if item.target is not None}
         self._keep([key for key in self.keys if isinstance(key, str) or key in found])
         robot = member.robot
@@ -92,6 +94,8 @@ class Offsets:
 
     def find(self, robot: str, target: int) -> None:
         """Let a target that a robot has just found inherit the robot's error."""
+        if not self.active:
+            return
         part = self._part(robot)
         self._append(target, self.mean[part], self.covariance[part], self.covariance[part, part])
 
@@ -129,7 +133,8 @@ class Offsets:
         """Kalman update with the detections that found targets most probably caused."""
         d = self.dimension
         items = likely(components)
-        rows = [self._difference(member.robot, item) for item in items]
+        found = [item.target.id if item.target is not None else '' for item in items]
+        rows = [self._rows(member.robot, target) for target in found]
         apart = [row @ self.covariance @ row.T for row in rows]
         most = max(map(np.trace, apart), default=0.0)
         if not len(member.values) or most < LEAST_DIFFERENCE**2:
@@ -154,17 +159,12 @@ class Offsets:
         covariance = self.covariance - gain @ design @ self.covariance
         self.covariance = 0.5 * (covariance + covariance.T)
 
-    def _difference(self, robot: str, item: Component) -> FloatArray:
-        """Return what takes the error of a component from that of a robot; 0 if it has none."""
-        if item.target is None or item.target.id not in self.keys:
-            return np.zeros((self.dimension, len(self.mean)))
-        return self._rows(robot, item.target.id)
-
     def _rows(self, one: str | int, other: str | int) -> FloatArray:
-        """Return the (d, n d) matrix of one error minus another one."""
+        """Return the (d, n d) matrix of one error minus another one; 0 if that is not known."""
         rows = np.zeros((self.dimension, len(self.mean)))
-        rows[:, self._part(one)] += np.eye(self.dimension)
-        rows[:, self._part(other)] -= np.eye(self.dimension)
+        if other in self.keys:
+            rows[:, self._part(one)] += np.eye(self.dimension)
+            rows[:, self._part(other)] -= np.eye(self.dimension)
         return rows
 
     def _part(self, key: str | int) -> slice:

@@ -28,6 +28,7 @@ from maasi_filter.pmb.factors import (
     TERMS,
     gaussian_terms,
 )
+from maasi_filter.settings import FilterSettings
 from maasi_filter.unexplored_map import UnexploredMap
 
 # Fewest effective draws that stand for a density.
@@ -87,18 +88,17 @@ def make_scan(
     member: CheckedMeasurement,
     factor: float,
     exploration: UnexploredMap,
-    expected_targets: float,
-    number: int,
+    settings: FilterSettings,
     generator: np.random.Generator,
 ) -> Scan:
-    """Return a scan with `number` draws of each detection, before e is updated with it.
+    """Return a scan with draws of each detection, before e is updated with it.
 
     `factor` is that of the variances. The position error of the robot is added to the noise.
     Covariances that a camera reports come from Cartesian ones: next to the robot, where the bearing
     is unknown, they are used as such.
     """
     values, pose, detection = member.values, member.pose, member.sensor.detection
-    count, d = values.shape
+    (count, d), number = values.shape, settings.pmb.particles
     if isinstance(detection, BoxDetection):
         # The position error of the robot blurs the edge of a box-shaped field of view.
         detection = detection.softened(2.0 * member.pose_error)
@@ -156,7 +156,7 @@ def make_scan(
         weights,
         means,
         spreads,
-        expected_targets / exploration.volume * weights.mean(axis=1),
+        settings.expected_targets / exploration.volume * weights.mean(axis=1),
     )
 
 

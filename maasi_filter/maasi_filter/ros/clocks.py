@@ -22,8 +22,6 @@ LAST_STAMP = 2**31 - 1
 _FIRST_IDS = 2**62
 _IDS_AHEAD = 10**6
 
-# Time without /clock before a warning [s].
-_PATIENCE = 3.0
 # With several publishers of /clock: a jump counts if time stays back this long [s].
 _CONFIRMATION = 1.0
 _LEAST_BACKWARD, _LEAST_FORWARD = 1_000_000, 200_000_000
@@ -143,8 +141,6 @@ class ClockWatch:
         self._on_restart = on_restart
         # Unconfirmed jump: time before it [ns], and steady time at which it happened [s].
         self._pending: tuple[int, float] | None = None
-        self._silent_since: float | None = None
-        self._patience = _PATIENCE
         # rclpy only borrows the pointer: without this reference a jump segfaults.
         self._handle: Any = node.get_clock().create_jump_callback(
             JumpThreshold(
@@ -182,25 +178,12 @@ class ClockWatch:
             self._pending = (now - delta, time.monotonic())
 
     def look(self) -> None:
-        """Confirm pending jumps and check for silence; call about once per second."""
-        now, time_now = time.monotonic(), self._node.get_clock().now().nanoseconds
-        if self._pending is not None and now - self._pending[1] >= _CONFIRMATION:
+        """Confirm pending jumps; call about once per second."""
+        if self._pending is not None and time.monotonic() - self._pending[1] >= _CONFIRMATION:
             before, self._pending = self._pending[0], None
-            if time_now < before:
-                self._on_restart(1e-9 * (before - time_now))
-        simulated = self._node.get_parameter('use_sim_time').value
-        if not simulated or time_now or self._node.count_publishers('/clock'):
-            self._silent_since, self._patience = None, _PATIENCE
-            return
-        if self._silent_since is None:
-            self._silent_since = now
-        waited = now - self._silent_since
-        if waited >= self._patience:
-            # Exponential back-off.
-            self._patience = 2.0 * waited
-            self._node.get_logger().warning(
-                f'no publisher of /clock for {waited:.0f} s (use_sim_time is true): waiting'
-            )
+            gap = before - self._node.get_clock().now().nanoseconds
+            if gap > 0:
+                self._on_restart(1e-9 * gap)
 
     def stop(self) -> None:
         """Remove the callback from the clock."""

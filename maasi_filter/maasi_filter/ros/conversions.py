@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import array
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -90,10 +90,8 @@ def pose_from_ros(message: PoseMessage) -> Pose:
 
 def covariance_to_ros(covariance: FloatArray) -> list[float]:
     """Return a covariance of two or three coordinates as nine numbers, row-major."""
-    full = np.zeros((3, 3))
-    d = len(covariance)
-    full[:d, :d] = covariance
-    return [float(value) for value in full.ravel()]
+    values: list[float] = np.pad(covariance, (0, 3 - len(covariance))).ravel().tolist()
+    return values
 
 
 def covariance_from_ros(values: Sequence[float], dimension: int) -> FloatArray:
@@ -194,14 +192,13 @@ def label_problem(message: Detection | RangeMeasurement) -> str | None:
 
 def detection_problem(detection: Detection, dimension: int) -> str | None:
     """Return the error of a detection: field, what was read, what is allowed."""
-    if not (math.isfinite(detection.range) and detection.range >= 0.0):
+    if not 0.0 <= detection.range < math.inf:
         return f'range: read {detection.range}, allowed are finite numbers from 0 [m]'
     for name, limit in (('bearing', math.pi), ('elevation', 0.5 * math.pi)):
         value = getattr(detection, name)
-        if not (math.isfinite(value) and abs(value) <= limit + 1e-6):
+        if not abs(value) <= limit + 1e-6:
             return f'{name}: read {value}, allowed is {-limit:.4f} to {limit:.4f} [rad]'
-    problem = label_problem(detection)
-    if problem is not None:
+    if problem := label_problem(detection):
         return problem
     size = len(detection.covariance)
     if size not in (0, dimension * dimension):
@@ -215,11 +212,12 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
 
 
 def measurement_from_ros(
-    message: DetectionArray, sensor: Sensor
-) -> tuple[AgentMeasurement, list[tuple[str, str, int]]]:
-    """Return the measurement of a robot, and what was left out: reason, text and number.
+    message: DetectionArray, sensor: Sensor, drop: Callable[[str, str, int], None]
+) -> AgentMeasurement:
+    """Return the measurement of a robot.
 
-    Invalid detections, equal ones, and those beyond `MOST_DETECTIONS` are left out.
+    Invalid detections, equal ones, and those beyond `MOST_DETECTIONS` are left out: `drop` is
+    called with reason, text and number.
     """
     pose = pose_from_ros(message.pose.pose)
     errors = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
@@ -227,19 +225,18 @@ def measurement_from_ros(
         raise ValueError(f'pose.covariance: read {errors.tolist()}, allowed is finite')
     d, total = sensor.dimension, len(message.detections)
     kept: list[Detection] = []
-    left_out: list[tuple[str, str, int]] = []
     seen: set[tuple[float, ...]] = set()
     for index, item in enumerate(message.detections):
         if len(kept) == MOST_DETECTIONS:
             text = f'detections: read {total}, allowed are {MOST_DETECTIONS} that can be used'
-            left_out.append(('too many detections', text, total - index))
+            drop('too many detections', text, total - index)
             break
         key = (item.range, item.bearing, item.elevation)
         if problem := detection_problem(item, d):
-            left_out.append(('bad detection', f'detections[{index}].{problem}', 1))
+            drop('bad detection', f'detections[{index}].{problem}', 1)
         elif key in seen:
             text = f'detections[{index}]: read {key}, allowed is each one once'
-            left_out.append(('equal detection', text, 1))
+            drop('equal detection', text, 1)
         else:
             seen.add(key)
             kept.append(item)
@@ -248,7 +245,7 @@ def measurement_from_ros(
     if any(len(item.covariance) for item in kept):
         given = [item.covariance if len(item.covariance) else sensor.covariance for item in kept]
         covariances = np.array([np.reshape(item, (d, d)) for item in given])
-    measurement = AgentMeasurement(
+    return AgentMeasurement(
         robot=message.robot,
         pose=pose,
         sensor=sensor,
@@ -259,7 +256,6 @@ def measurement_from_ros(
         position_covariance=errors if np.diagonal(errors).min() >= 0.0 else None,
         labels=labels_of(kept),
     )
-    return measurement, left_out
 
 
 def particles_to_ros(positions: FloatArray, weights: FloatArray, header: Header) -> PointCloud2:

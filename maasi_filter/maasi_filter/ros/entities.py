@@ -91,49 +91,14 @@ def survive_bad_requests(node: Node, drop: Callable[[str, str], None]) -> None:
             service.callback = partial(answer, service.srv_name, errors, service.callback)
 
 
-# Longest time from the discovery of a subscription to its connection [s].
+# Longest time from the discovery of an endpoint to its connection [s].
 _CONNECTION_PATIENCE = 5.0
 _OBSERVERS = ('recorder', 'guard', 'rosbag2_recorder')
-_EVERYWHERE = ('/parameter_events', '/clock', '/diagnostics')
+_EVERYWHERE = ('/parameter_events', '/diagnostics')
 
 
-def subscribers_connected(
-    node: Node,
-    publisher: Callable[[], Publisher | None] | Publisher,
-    number: int,
-    names: Collection[str],
-) -> Callable[[], bool]:
-    """Return a function that tells whether a message would reach all expected subscribers.
-
-    Arguments as of `LockstepLifecycleNode.expect_subscribers`.
-    """
-    get = publisher if callable(publisher) else lambda: publisher
-    known_since: list[float] = []
-
-    def connected() -> bool:
-        present = get()
-        if present is None:
-            return False
-        kind: Any = present.msg_type
-        known = [
-            info.node_name
-            for info in node.get_subscriptions_info_by_topic(present.topic_name)
-            if info.topic_type == f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'
-        ]
-        peers = [name for name in known if name not in _OBSERVERS and not name.startswith('_')]
-        if not set(names) <= set(known) or len(peers) < number:
-            return False
-        known_since.append(time.monotonic())
-        # An observer with an incompatible quality of service never connects.
-        late = known_since[-1] - known_since[0] > _CONNECTION_PATIENCE
-        del known_since[1:]
-        return late or present.get_subscription_count() >= len(known)
-
-    return connected
-
-
-class Unconnected:
-    """Topics with an endpoint that is known but never connects.
+class Endpoints:
+    """Endpoints of a node's topics: to whom a message would get, and what never connects.
 
     In place of the event callbacks of rclpy, which publishers and subscriptions that are destroyed
     while their node spins must not have (`NodeEntities`).
@@ -143,10 +108,13 @@ class Unconnected:
         self._node = node
         # Since when an endpoint has been known, but not connected [s of wall time].
         self._since: dict[str, float] = {}
-        self._said: set[str] = set()
+        self._lasting: set[str] = set()
 
     def look(self) -> list[str]:
-        """Return a warning for each such topic, logged once; call about once per second."""
+        """Return a warning for each topic with an endpoint that is known but never connects.
+
+        It is logged once. Call about once per second.
+        """
         node, now = self._node, time.monotonic()
         unconnected = {
             f'{item.topic_name}: a publisher does not connect'
@@ -158,20 +126,31 @@ class Unconnected:
             if item.get_subscription_count() < node.count_subscribers(item.topic_name)
         }
         self._since = {text: self._since.get(text, now) for text in unconnected}
-        lasting = [
-            f'{text}: its quality of service or type differs'
-            for text, since in sorted(self._since.items())
-            if now - since > _CONNECTION_PATIENCE
-        ]
-        for text in set(lasting) - self._said:
-            node.get_logger().warning(text)
-        self._said = set(lasting)
-        return lasting
+        lasting = {
+            text for text, since in self._since.items() if now - since > _CONNECTION_PATIENCE
+        }
+        warnings = [f'{text}: its quality of service or type differs' for text in sorted(lasting)]
+        for text, warning in zip(sorted(lasting), warnings):
+            if text not in self._lasting:
+                node.get_logger().warning(warning)
+        self._lasting = lasting
+        return warnings
 
+    def reach(self, publisher: Publisher, number: int, names: Collection[str]) -> bool:
+        """Return whether a message would reach all expected subscribers.
 
-def unpublished_topics(node: Node) -> list[str]:
-    """Return the topics that a node subscribes to and nobody publishes."""
-    topics = {item.topic_name for item in node.subscriptions}
-    return sorted(
-        topic for topic in topics if topic not in _EVERYWHERE and not node.count_publishers(topic)
-    )
+        Arguments as of `LockstepLifecycleNode.expect_subscribers`.
+        """
+        topic = publisher.topic_name
+        known = [info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)]
+        peers = [name for name in known if name not in _OBSERVERS and not name.startswith('_')]
+        if not set(names) <= set(known) or len(peers) < number:
+            return False
+        # An observer with an incompatible quality of service never connects.
+        late = f'{topic}: a subscription does not connect' in self._lasting
+        return late or publisher.get_subscription_count() >= len(known)
+
+    def unpublished(self) -> list[str]:
+        """Return the topics that the node subscribes to and nobody publishes."""
+        topics = {item.topic_name for item in self._node.subscriptions}.difference(_EVERYWHERE)
+        return sorted(topic for topic in topics if not self._node.count_publishers(topic))

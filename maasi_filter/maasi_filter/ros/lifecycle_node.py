@@ -22,13 +22,7 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from maasi_filter.ros.clocks import ClockWatch, stamp_problem
-from maasi_filter.ros.entities import (
-    NodeEntities,
-    Unconnected,
-    subscribers_connected,
-    survive_bad_requests,
-    unpublished_topics,
-)
+from maasi_filter.ros.entities import Endpoints, NodeEntities, survive_bad_requests
 from maasi_filter.ros.loopback import loopback_fault
 from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.ros.qos import LATCHED, RELIABLE
@@ -99,7 +93,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._unconnected = Unconnected(self)
+        self._endpoints = Endpoints(self)
         self._clock_watch = ClockWatch(self, self.warn_throttled, self._on_restart)
         self.create_wall_timer(_DIAGNOSTICS_PERIOD, self._publish_diagnostics)
         survive_bad_requests(self, self.drop)
@@ -267,7 +261,12 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         `publisher` may be a function that returns the present one; `number` does not count mere
         observers; nodes of these `names`, without namespace, have to be among the subscribers.
         """
-        self.expect(subscribers_connected(self, publisher, number, frozenset(names)))
+
+        def reached() -> bool:
+            present = publisher() if callable(publisher) else publisher
+            return present is not None and self._endpoints.reach(present, number, names)
+
+        self.expect(reached)
 
     def expect_publisher(self, topic: str) -> None:
         """Be ready only with a publisher of a topic."""
@@ -285,7 +284,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         if time.monotonic() < self._notice_at:
             return
         self._notice_at = math.inf
-        missing = unpublished_topics(self)
+        missing = self._endpoints.unpublished()
         if missing:
             self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')
         if missing and (fault := loopback_fault()):
@@ -349,7 +348,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     # ---- messages ----------------------------------------------------------------------------
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
-        """Return a publisher without the event callbacks of rclpy; see `Unconnected`."""
+        """Return a publisher without the event callbacks of rclpy; see `Endpoints`."""
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         return super().create_publisher(
             msg_type, topic, qos_profile, **{'event_callbacks': quiet, **options}
@@ -361,7 +360,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         """Return a subscription that drops messages with an invalid stamp, and far too large ones.
 
         It is never called after its destruction; the executor may already have queued a message.
-        It has no event callbacks of rclpy; see `Unconnected`.
+        It has no event callbacks of rclpy; see `Endpoints`.
         """
         options.setdefault(
             'event_callbacks', SubscriptionEventCallbacks(use_default_callbacks=False)
@@ -435,7 +434,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._clock_watch.look()
         self._say_what_is_missing()
         fault = self.fault() if self.active else ''
-        warnings = [*(self.warnings() if self.active else []), *self._unconnected.look()]
+        warnings = [*(self.warnings() if self.active else []), *self._endpoints.look()]
         if sum(self.dropped.values()):
             counts = (f'{reason} {number}' for reason, number in sorted(self.dropped.items()))
             warnings = [*warnings, f'dropped: {", ".join(counts)}']
