@@ -10,6 +10,9 @@ from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotS
 from maasi_sim.simulation.emulators.mavlink.fake_autopilot import FakeAutopilot
 
 PERIOD = 0.02
+TAKE_OFF = mavlink.MAV_CMD_NAV_TAKEOFF
+# What a vehicle may take until it has stopped [s].
+AT_MOST = 1.5
 HEIGHTS = {'arducopter': 2.0, 'px4': 2.0, 'ardusub': -1.5}
 
 

@@ -187,6 +187,8 @@ def test_what_is_lost_stops_it_then_lands_it(fault, reason):
     flight.step(100)
     assert flight.pilot.problem.startswith(f'landed: {reason}')
     assert flight.firmware.take_offs == 1
+    assert flight.pilot.permit(flight.time) == ''
+    flight.up()
 
 
 def drift(flight):

@@ -153,9 +153,7 @@ def test_a_camera_in_a_map_that_is_turned_against_north(fly):
     flight.team.ask(stamp)
     image = rendered(flight.team, [target.tolist()], pose)
     flight.team.images.publish(stamped(image, stamp))
-    (seen,) = flight.team.answer().detections
-    angles = math.cos(seen.bearing), math.sin(seen.bearing)
-    assert_allclose(pose.position[:2] + seen.range * np.array(angles), target, atol=0.03)
+    assert_allclose(flight.team.seen_at(), target, atol=0.03)
 
 
 def test_a_localiser_says_where_the_frame_of_the_autopilot_is(fly):
@@ -300,11 +298,7 @@ def test_a_driver_that_ends_or_is_killed(fly, number):
     flight = fly({'parameters': {'FS_GCS_TIMEOUT': 3}}, own_process=True)
     result = flight.fly().under_way()
     before = flight.where
-    flight.driver.send_signal(number)
-    assert flight.driver.wait(timeout=30.0) == (0 if number == signal.SIGINT else -signal.SIGKILL)
-    if number == signal.SIGINT:
-        assert flight.doing == 'LAND'
-        flight.until(result.done)
-        assert result.result().result.reason == 'the driver stops'
+    flight.is_sent(number, result)
+    assert number != signal.SIGINT or flight.doing == 'LAND'
     flight.until_stopped(before)
     flight.until(lambda: flight.doing == 'LAND')
