@@ -11,6 +11,7 @@ from planner_helpers import random_team
 
 from maasi_filter.models.detection import BoxDetection
 from maasi_planner import PlannerSettings, make_planner
+from maasi_planner.objective.joint_search import search, total_value
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import all_apart, free_of_robots, waiting_places
 from maasi_planner.team import UsableCandidates
@@ -27,6 +28,12 @@ def built(team, settings):
             view.candidates, way, free & way.reached & (way.lengths > 0)
         )
     return TeamObjective(team, settings, options), options
+
+
+def best_of(team, settings):
+    """Return the best joint choice of a team, its value, whether it is exact, and the work done."""
+    objective, _ = built(team, settings)
+    return search(objective.table, objective.alone[:, 2], settings)
 
 
 def choices(options):
@@ -78,7 +85,7 @@ def test_terms_are_those_of_the_plain_objective(case, kind, change):
                 ours = objective.given(i, chosen)[choice[name]]
                 assert ours == pytest.approx(terms[name], rel=1e-9, abs=1e-10)
             total = sum(values[2] for values in terms.values())
-            assert objective.value(chosen) == pytest.approx(total, rel=1e-9, abs=1e-10)
+            assert total_value(objective.table, chosen) == pytest.approx(total, rel=1e-9, abs=1e-10)
 
 
 @pytest.mark.parametrize('kind', ['paper', 'information'])
@@ -87,25 +94,26 @@ def test_search_is_enumeration(case, kind):
     for seed in range(4):
         rng = np.random.default_rng(1000 + seed)
         team = random_team(rng, candidates=6, radius=0.05, **case)
-        objective, options = built(team, PlannerSettings(objective=kind))
+        settings = PlannerSettings(objective=kind)
+        objective, options = built(team, settings)
         best = max(
             (
-                objective.value(chosen)
+                total_value(objective.table, chosen)
                 for choice, chosen in choices(options)
                 if all(options[name].allowed[w] for name, w in choice.items())
                 and all_apart(team, {name: options[name].points[w] for name, w in choice.items()})
             ),
         )
-        chosen, value, exact, _ = objective.search()
+        chosen, value, exact, _ = best_of(team, settings)
         assert exact
         assert value == pytest.approx(best, rel=1e-12)
-        assert objective.value(chosen) == value
+        assert total_value(objective.table, chosen) == value
 
 
 def test_bound_prunes():
     rng = np.random.default_rng(5)
     team = random_team(rng, dimension=2, planning=2, waiting=0, candidates=40)
-    _, _, exact, evaluated = built(team, PlannerSettings(objective='paper'))[0].search()
+    _, _, exact, evaluated = best_of(team, PlannerSettings(objective='paper'))
     assert exact
     assert evaluated < 1600 / 2
 
@@ -117,8 +125,8 @@ def test_choice_in_turn_is_within_two_percent_of_the_optimum(kind):
     for seed in range(25):
         rng = np.random.default_rng(3000 + seed)
         team = random_team(rng, dimension=2, planning=3, waiting=0, candidates=8)
-        best = built(team, settings)[0].search()[1]
-        _, value, exact, _ = built(team, few)[0].search()
+        best = best_of(team, settings)[1]
+        _, value, exact, _ = best_of(team, few)
         assert not exact
         assert best - 0.02 * abs(best) <= value <= best + 1e-12 * abs(best)
 
@@ -139,8 +147,8 @@ def test_blocks_keep_what_is_unseen():
     """Coarser nodes leave the expected new targets about the same where pi is smooth."""
     rng = np.random.default_rng(12)
     team = random_team(rng, dimension=3, planning=1, waiting=0, candidates=5, spacing=10.0)
-    fine = built(team, PlannerSettings(exploration_nodes=1_000_000))[0].alone()[:, 1]
-    coarse = built(team, PlannerSettings(exploration_nodes=3000))[0].alone()[:, 1]
+    fine = built(team, PlannerSettings(exploration_nodes=1_000_000))[0].alone[:, 1]
+    coarse = built(team, PlannerSettings(exploration_nodes=3000))[0].alone[:, 1]
     assert coarse == pytest.approx(fine, rel=0.02)
 
 

@@ -37,28 +37,29 @@ def lower_factor(covariance: FloatArray) -> FloatArray:
 
 @njit(cache=True)
 def _add_information(
-    jacobian: FloatArray,
+    rows: FloatArray,
     lower: FloatArray,
     chance: FloatArray,
     owner: IntArray,
     cluster: IntArray,
     out: FloatArray,
 ) -> None:
-    """Add pi H' R^-1 H of measurements (n,) to the rows of out of candidates and clusters."""
+    """Add pi H' R^-1 H of measurements to out of their candidates and clusters.
+
+    rows (n, d, d): H; in place they become H in units of the noise, by forward substitution.
+    """
     d = lower.shape[0]
-    rows = np.zeros((d, d))
     for i in range(chance.shape[0]):
         for a in range(d):
             for b in range(d):
-                rows[a, b] = jacobian[i, a, b]
                 for k in range(a):
-                    rows[a, b] -= lower[a, k] * rows[k, b]
-                rows[a, b] /= lower[a, a]
+                    rows[i, a, b] -= lower[a, k] * rows[i, k, b]
+                rows[i, a, b] /= lower[a, a]
         for a in range(d):
             for b in range(d):
                 total = 0.0
                 for k in range(d):
-                    total += rows[k, a] * rows[k, b]
+                    total += rows[i, k, a] * rows[i, k, b]
                 out[owner[i], cluster[i], a, b] += chance[i] * total
 
 
@@ -69,32 +70,15 @@ def _information(
     out = np.zeros((len(measured.own), len(centres), d, d))
     chance = chances(measured, first, centres)
     for robot, view in enumerate(views):
-        sensor = view.sensor
-        owner, index, cluster = np.nonzero(
-            (chance > 0.0) & (measured.robot == robot)[:, None, None]
-        )
-        if not len(owner):
-            continue
+        lower = lower_factor(view.sensor.covariance)
+        owner, index, cluster = np.nonzero(chance * (measured.robot == robot)[:, None, None])
         offsets = (centres[cluster] - measured.places[owner, index])[:, :d]
         # Nearer than the noise of the range the linear model would promise too much.
-        least = math.sqrt(float(sensor.covariance[0, 0]))
         distance = np.sqrt((offsets * offsets).sum(axis=1))
-        offsets = offsets * np.maximum(1.0, least / np.maximum(distance, 1e-12))[:, None]
-        jacobian = sensor.measurement.jacobian(offsets, Pose(np.zeros(3)))
+        offsets *= np.maximum(1.0, lower[0, 0] / np.maximum(distance, 1e-12))[:, None]
+        jacobian = view.sensor.measurement.jacobian(offsets, Pose(np.zeros(3)))
         seen = chance[owner, index, cluster]
-        _add_information(jacobian, lower_factor(sensor.covariance), seen, owner, cluster, out)
-    return out
-
-
-@njit(cache=True)
-def _block_sums(values: FloatArray, stride: int) -> FloatArray:
-    """Return sums over blocks of `stride` nodes on each axis."""
-    x, y, z = values.shape
-    out = np.zeros((-(-x // stride), -(-y // stride), -(-z // stride)))
-    for i in range(x):
-        for j in range(y):
-            for k in range(z):
-                out[i // stride, j // stride, k // stride] += values[i, j, k]
+        _add_information(jacobian, lower, seen, owner, cluster, out)
     return out
 
 
@@ -107,12 +91,14 @@ def _unseen(
     most, stride = settings.exploration_nodes, 1
     while not every_node and np.prod([-(-size // stride) for size in values.shape]) > most:
         stride += 1
-    left = _block_sums(values * volumes, stride)
+    # Nodes of each axis by the block that they are in.
+    x, y, z = np.ix_(*(np.arange(size) // stride for size in values.shape))
+    shape = [int(blocks.max()) + 1 for blocks in (x, y, z)]
+    block = (x * shape[1] + y) * shape[2] + z
+    left = np.bincount(block.ravel(), (values * volumes).ravel())
     start = lower + 0.5 * (stride - 1) * step
-    places = start[:, None] + (stride * step)[:, None] * np.indices(left.shape).reshape(3, -1)
-    if team.dimension == 2:
-        places[2] = 0.0
-    return places, left.ravel() * (settings.expected_targets / float(volumes.sum()))
+    places = start[:, None] + (stride * step)[:, None] * np.indices(shape).reshape(3, -1)
+    return places, left * (settings.expected_targets / float(volumes.sum()))
 
 
 @njit(cache=True)

@@ -32,8 +32,8 @@ class Measurements(NamedTuple):
 
     Trajectory g is of robot[g] and has number[g] of them: the first own[g] are planned, the others
     only expected by other robots. times (G, n) [steps from now], places (G, n, 3) [m], in 2D with
-    z = 0, turns (G, n, 2): cosine and sine of the heading. Of each robot the kernel of pi, kind
-    (R,) and parameters (R, PARAMETERS), and its reach (R,), beyond which pi is 0 [m].
+    z = 0, yaws (G, n) [rad]. Of each robot the kernel of pi, kind (R,) and parameters
+    (R, PARAMETERS), and its reach (R,), beyond which pi is 0 [m].
     """
 
     robot: IntArray
@@ -41,7 +41,7 @@ class Measurements(NamedTuple):
     own: IntArray
     times: IntArray
     places: FloatArray
-    turns: FloatArray
+    yaws: FloatArray
     kind: IntArray
     parameters: FloatArray
     reach: FloatArray
@@ -62,57 +62,15 @@ class Ways(NamedTuple):
 
 
 def remaining_way(view: RobotView) -> Ways:
-    """Return the trajectory of a robot that does not plan."""
+    """Return the trajectory of a robot that does not plan; one that plans measures where it is."""
     path, yaws = view.remaining_path, view.remaining_yaws
-    if path is None or len(path) == 0:
+    if view.planning or path is None or len(path) == 0:
         path, yaws = np.array(view.state.pose.position)[None, :], None
     if yaws is None:
         yaws = np.full(len(path), view.state.pose.yaw)
-    positions, yaws = np.ascontiguousarray(path, float), np.ascontiguousarray(yaws, float)
     # Where its path ends the robot measures in any case: it plans there.
-    lengths, arrival = np.array([len(path) - 1]), len(path) > 1
-    return Ways(view, positions[None], yaws[None], lengths, max(0, view.phase), arrival)
-
-
-def present_place(view: RobotView) -> Ways:
-    """Return the way of a robot that measures where it is, once."""
-    pose = view.state.pose
-    place, yaw = np.array(pose.position)[None, None], np.full((1, 1), pose.yaw)
-    return Ways(view, place, yaw, np.zeros(1, np.int64), 0, True)
-
-
-@njit(cache=True)
-def _fill(
-    positions: FloatArray,
-    yaws: FloatArray,
-    lengths: IntArray,
-    timing: tuple[int, int, int, bool],
-    out: Measurements,
-) -> None:
-    """Fill the rows of a robot; timing: phase, period, horizon, arrival."""
-    phase, period, horizon, arrival = timing
-    for w in range(lengths.shape[0]):
-        number, t = 0, phase
-        while t < lengths[w]:
-            out.times[w, number] = t
-            number += 1
-            t += period
-        if arrival:
-            out.times[w, number] = lengths[w]
-            number += 1
-            if t == lengths[w]:
-                t += period
-        out.own[w] = number
-        while t <= horizon:
-            out.times[w, number] = t
-            number += 1
-            t += period
-        out.number[w] = number
-        for i in range(number):
-            k = min(out.times[w, i], lengths[w])
-            for axis in range(3):
-                out.places[w, i, axis] = positions[w, k, axis]
-            out.turns[w, i, 0], out.turns[w, i, 1] = math.cos(yaws[w, k]), math.sin(yaws[w, k])
+    lengths, arrival = np.array([len(path) - 1]), view.planning or len(path) > 1
+    return Ways(view, path[None], yaws[None], lengths, max(0, view.phase), arrival)
 
 
 def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurements:
@@ -125,28 +83,50 @@ def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurement
     total, most = sum(counts), 1
     for ways in robots:
         longest = max(horizon, int(ways.lengths.max(initial=0)))
-        most = max(most, max(0, longest - ways.phase) // ways.view.period_steps + 3)
+        most = max(most, max(0, longest - ways.phase) // ways.view.period_steps + 2)
+    number, own = np.empty((2, total), np.int64)
+    times, yaws = np.empty((total, most), np.int64), np.empty((total, most))
+    places = np.empty((total, most, 3))
+    end = 0
+    for ways, count in zip(robots, counts):
+        rows = slice(end, end := end + count)
+        lengths = ways.lengths[:, None]
+        when = np.full((count, most), NEVER)
+        when[:, 1:] = ways.phase + ways.view.period_steps * np.arange(most - 1)
+        last = lengths - 1
+        if ways.arrival:
+            when[when == lengths] = NEVER
+            when[:, :1] = last = lengths
+        when.sort(axis=1)
+        own[rows] = (when <= last).sum(axis=1)
+        number[rows] = (when <= (np.maximum(last, horizon) if extend else last)).sum(axis=1)
+        at = np.arange(count)[:, None], np.minimum(when, lengths)
+        times[rows], places[rows], yaws[rows] = when, ways.positions[at], ways.yaws[at]
+        if ways.view.sensor.dimension == 2:
+            places[rows, :, 2] = 0.0
     detections = [ways.view.sensor.detection for ways in robots]
-    out = Measurements(
-        robot=np.repeat(np.arange(len(robots)), counts),
-        number=np.zeros(total, np.int64),
-        own=np.zeros(total, np.int64),
-        times=np.empty((total, most), np.int64),
-        places=np.empty((total, most, 3)),
-        turns=np.empty((total, most, 2)),
+    return Measurements(
+        np.repeat(np.arange(len(robots)), counts),
+        number,
+        own,
+        times,
+        places,
+        yaws,
         kind=np.array([item.kernel()[0] for item in detections], np.int64),
         parameters=np.array([item.kernel()[1] for item in detections]).reshape(-1, PARAMETERS),
         reach=np.array([reach_of(item) for item in detections], float),
     )
-    end = 0
-    for ways, count in zip(robots, counts):
-        begin, end = end, end + count
-        rows = Measurements._make([*(column[begin:end] for column in out[:6]), *out[6:]])
-        timing = ways.phase, ways.view.period_steps, horizon if extend else -1, ways.arrival
-        _fill(ways.positions, ways.yaws, ways.lengths, timing, rows)
-        if ways.view.sensor.dimension == 2:
-            rows.places[..., 2] = 0.0
-    return out
+
+
+def reach_of(detection: DetectionModel) -> float:
+    """Return the horizontal distance beyond which pi is 0, metres; inf if there is none."""
+    kind, parameters = detection.kernel()
+    if kind == CUSTOM:
+        return float(parameters[REACH])
+    if kind != BOX:
+        return math.inf
+    x, y, z = np.maximum(np.abs(parameters[1:4]), np.abs(parameters[4:7])).tolist()
+    return max(math.hypot(x, y), z if math.isfinite(z) else 0.0) + 2.0 * float(parameters[7])
 
 
 @njit(cache=True)
@@ -163,23 +143,9 @@ def chances(measured: Measurements, first: int, points: FloatArray) -> FloatArra
                 x[c] = points[c, 0] - measured.places[g, e, 0]
                 y[c] = points[c, 1] - measured.places[g, e, 1]
                 z[c] = points[c, 2] - measured.places[g, e, 2]
-            cosine, sine = measured.turns[g, e]
+            cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
             fill_probabilities(kind, parameters, x, y, z, number, cosine, sine, out[g, e])
     return out
-
-
-def reach_of(detection: DetectionModel) -> float:
-    """Return the horizontal distance beyond which pi is 0, metres; inf if there is none."""
-    kind, parameters = detection.kernel()
-    if kind == CUSTOM:
-        return float(parameters[REACH])
-    if kind != BOX:
-        return math.inf
-    offsets = np.abs(parameters[[1, 2, 4, 5]])
-    extra = np.abs(parameters[[3, 6]])
-    extra = extra[np.isfinite(extra)]
-    reach = math.hypot(float(offsets[[0, 2]].max()), float(offsets[[1, 3]].max()))
-    return max([reach, *extra.tolist()]) + 2.0 * float(parameters[7])
 
 
 @njit(cache=True)
@@ -200,16 +166,18 @@ def apply_misses(
     robot = measured.robot[g]
     kind, parameters = measured.kind[robot], measured.parameters[robot]
     reach = measured.reach[robot]
-    number = left.shape[0]
+    number, begin = left.shape[0], 0
     room = np.empty((4, number))
-    begin = 0
+    # Only for boxes and own models the heading counts.
+    cosine, sine = 1.0, 0.0
     for e in range(first, last):
         while begin < number and until[begin] < measured.times[g, e]:
             begin += 1
         if begin == number:
             return
         x0, y0, z0 = measured.places[g, e]
-        cosine, sine = measured.turns[g, e]
+        if kind >= BOX:
+            cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
         if reach < np.inf:
             for i in range(begin, number):
                 dx, dy = places[0][i] - x0, places[1][i] - y0

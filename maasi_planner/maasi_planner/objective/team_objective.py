@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.objective.information import information_terms
-from maasi_planner.objective.joint_search import CandidateTable, search, total_value, values_given
+from maasi_planner.objective.joint_search import CandidateTable, values_given
 from maasi_planner.objective.paper import paper_terms
-from maasi_planner.objective.predicted_measurements import (
-    Ways,
-    predicted,
-    present_place,
-    remaining_way,
-)
+from maasi_planner.objective.predicted_measurements import Ways, predicted, remaining_way
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import TeamView, UsableCandidates
 
@@ -25,52 +19,36 @@ from maasi_planner.team import TeamView, UsableCandidates
 REPORT_LIMIT = 600
 
 
-def _all(parts: Sequence[NDArray], dtype: type) -> NDArray:
-    """Return arrays (W,) of several robots as one."""
-    return np.concatenate([np.zeros(0, dtype), *parts])
-
-
 class TeamObjective:
     """Objective of all joint candidates at one step.
 
     team: the team; robots that do not plan count with the rest of their trajectories; settings:
     weights; options: candidates of the planning robots that have some; names: these, in order;
-    start (R + 1,): where the candidates of each begin among all; table: all candidates;
-    measurements (G,): M of each candidate.
+    start (R + 1,): where the candidates of each begin among all; table: all candidates; alone
+    (G, 3): T, E and J of each candidate without the other planning robots.
     """
 
     def __init__(
-        self,
-        team: TeamView,
-        settings: PlannerSettings,
-        options: Mapping[str, UsableCandidates],
+        self, team: TeamView, settings: PlannerSettings, options: Mapping[str, UsableCandidates]
     ) -> None:
-        self.settings = settings
-        self.weights = weights = settings.weights()
-        self.names = names = [name for name in team.planning() if name in options]
-        ways = [options[name].prediction for name in names]
-        counts = [len(options[name].points) for name in names]
-        self.start = np.array([0, *counts]).cumsum()
-        lengths = _all([way.lengths for way in ways], np.int64)
-        horizon = int(lengths.max(initial=0))
-        views = [team.robots[name] for name in names]
-        others = [team.robots[name] for name in team.names() if name not in names]
-        rest = [remaining_way(view) for view in others]
-        arrival, extend = weights.arrival, weights.extend
+        weights = settings.weights()
+        self.names = [name for name in team.planning() if name in options]
+        choices = [options[name] for name in self.names]
+        self.start = np.array([0, *(len(option.points) for option in choices)]).cumsum()
+        views = [team.robots[name] for name in self.names]
+        ways = [
+            Ways(view, way.positions, way.yaws, way.lengths, 0, weights.arrival)
+            for view, way in zip(views, (option.prediction for option in choices))
+        ]
+        rest = [remaining_way(team.robots[name]) for name in team.names() if name not in self.names]
         # The first measurement that counts: the present one does not depend on the choice.
         first = 0 if weights.present else 1
         if first and weights.information:
-            rest += map(present_place, views)
-        planned = predicted(
-            [
-                Ways(view, way.positions, way.yaws, way.lengths, 0, arrival)
-                for view, way in zip(views, ways)
-            ],
-            horizon,
-            extend,
-        )
-        settled = predicted(rest, horizon, extend)
-        self.measurements = planned.own
+            rest += map(remaining_way, views)
+        lengths = np.concatenate([way.lengths for way in ways])
+        cost = np.concatenate([option.prediction.control_cost for option in choices])
+        planned = predicted(ways, int(lengths.max()), weights.extend)
+        settled = predicted(rest, int(lengths.max()), weights.extend)
         centres = np.zeros((len(team.clusters), 3))
         for centre, cluster in zip(centres, team.clusters):
             centre[: team.dimension] = cluster.position[: team.dimension]
@@ -82,30 +60,21 @@ class TeamObjective:
             terms = paper_terms(planned, settled, first, weights.own, centres, grid)
         norm = lengths.astype(float)
         if weights.per_distance:
-            norm = _all([way.distances() for way in ways], float)
+            norm = np.concatenate([option.prediction.distances() for option in choices])
         self.table = CandidateTable(
-            start=self.start,
-            robot=planned.robot,
-            allowed=_all([options[name].allowed for name in names], bool),
-            waypoints=np.concatenate([np.zeros((0, 3)), *(options[name].points for name in names)]),
+            allowed=np.concatenate([option.allowed for option in choices]),
+            waypoints=np.concatenate([option.points for option in choices]),
             radii=np.array([view.radius for view in views], float),
-            control=_all([way.control_cost for way in ways], float),
+            cost=weights.control * cost,
             norm=np.maximum(norm, 1e-9),
             alpha=float(weights.alpha),
             beta=float(weights.beta),
-            control_weight=float(weights.control),
             shared=weights.information,
             planned=planned,
             terms=terms,
         )
-        self._alone: FloatArray | None = None
-
-    def alone(self) -> FloatArray:
-        """Return T, E and J of each candidate without the other planning robots, (G, 3)."""
-        if self._alone is None:
-            nobody = np.full(len(self.names), -1, np.int64)
-            self._alone = values_given(self.table, 0, len(self.table.robot), nobody)
-        return self._alone
+        nobody = np.full(len(self.names), -1, np.int64)
+        self.alone = values_given(self.table, 0, len(norm), nobody)
 
     def given(self, robot: int, chosen: IntArray) -> FloatArray:
         """Return T, E and J of each candidate of one robot, given the others' choices, (W, 3).
@@ -113,21 +82,10 @@ class TeamObjective:
         In teams too large for that, all but the chosen one without the other planning robots.
         """
         others, g = len(self.names) - 1, int(chosen[robot])
-        first, last = int(self.start[robot]), int(self.start[robot + 1])
-        if others and len(self.table.robot) * others <= REPORT_LIMIT:
+        first, last = self.start[robot : robot + 2].tolist()
+        if 0 < len(self.alone) * others <= REPORT_LIMIT:
             return values_given(self.table, first, last, chosen)
-        rows = self.alone()[first:last].copy()
+        rows = self.alone[first:last].copy()
         if others and g >= 0:
             rows[g - first] = values_given(self.table, g, g + 1, chosen)[0]
         return rows
-
-    def value(self, chosen: IntArray) -> float:
-        """Return the sum of J of a joint choice (26); indices into all candidates."""
-        return float(total_value(self.table, chosen))
-
-    def search(self) -> tuple[IntArray, float, bool, int]:
-        """Return the best joint choice, its value, whether it is exact, and the work done.
-
-        The choice (R,) has indices into all candidates, -1 for a robot with none admissible.
-        """
-        return search(self.table, self.alone()[:, 2], self.settings)

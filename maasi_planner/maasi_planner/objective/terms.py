@@ -63,26 +63,18 @@ def exploration_given(terms: Terms, planned: Measurements, g: int, others: IntAr
     """Return E of candidate g, given others that count before it."""
     left = terms.value[g, : terms.filled[g]].copy()
     for other in others:
-        factor = left_by(terms, planned, g, other)
-        for i in range(left.shape[0]):
-            left[i] *= factor[i]
-    total = 0.0
-    for i in range(left.shape[0]):
-        total += left[i]
-    return total
+        left *= left_by(terms, planned, g, other)
+    return left.sum()
 
 
 @njit(cache=True)
 def _log_det(matrix: FloatArray) -> float:
-    """Return log det of a (2, 2) or (3, 3) matrix with determinant of at least 1."""
-    if matrix.shape[0] == 2:
-        det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-    else:
-        det = (
-            matrix[0, 0] * (matrix[1, 1] * matrix[2, 2] - matrix[1, 2] * matrix[2, 1])
-            - matrix[0, 1] * (matrix[1, 0] * matrix[2, 2] - matrix[1, 2] * matrix[2, 0])
-            + matrix[0, 2] * (matrix[1, 0] * matrix[2, 1] - matrix[1, 1] * matrix[2, 0])
-        )
+    """Return log det of a (3, 3) matrix with determinant of at least 1."""
+    det = (
+        matrix[0, 0] * (matrix[1, 1] * matrix[2, 2] - matrix[1, 2] * matrix[2, 1])
+        - matrix[0, 1] * (matrix[1, 0] * matrix[2, 2] - matrix[1, 2] * matrix[2, 0])
+        + matrix[0, 2] * (matrix[1, 0] * matrix[2, 1] - matrix[1, 1] * matrix[2, 0])
+    )
     return math.log(max(det, 1.0))
 
 
@@ -91,14 +83,10 @@ def refinement_given(terms: Terms, g: int, others: IntArray) -> float:
     """Return T of candidate g, given the candidates `others` that count before it."""
     total = terms.refinement[g]
     clusters, d, _ = terms.covariance.shape
-    if clusters == 0:
-        return total
-    known, before, after = np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
+    # In 2D the third row and column stay those of the identity.
+    known, before, after = np.empty((d, d)), np.eye(3), np.eye(3)
     for c in range(clusters):
-        helps = False
-        for a in range(d):
-            helps |= terms.gain[g, c, a, a] > 0.0
-        if not helps:
+        if not np.any(terms.gain[g, c]):
             continue
         known[:] = terms.base[c]
         for other in others:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from maasi_filter.arrays import FloatArray
+from maasi_planner.objective.joint_search import search
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import Planner, centres_of, explain, usable_options
 from maasi_planner.settings import PlannerSettings
@@ -25,12 +26,12 @@ class Intermittent(Planner):
         """See `Planner.decide`."""
         decision = Decision(step=team.step)
         options = usable_options(team, decision, lambda name: self._centres(team, name))
-        objective = TeamObjective(team, self.settings, options)
-        chosen, value, exact, work = objective.search()
-        decision.objective = value if len(chosen) else 0.0
-        decision.exact = exact
-        decision.evaluated = work
-        weights = objective.weights
+        if not options:
+            return explain(decision)
+        objective, weights = TeamObjective(team, self.settings, options), self.settings.weights()
+        chosen, decision.objective, decision.exact, decision.evaluated = search(
+            objective.table, objective.alone[:, 2], self.settings
+        )
         for index, name in enumerate(objective.names):
             option, terms = options[name], objective.given(index, chosen)
             if weights.information:
@@ -49,7 +50,7 @@ class Intermittent(Planner):
             )
             result = single_choice(option.points, option.prediction, best, reason)
             result.target_refinement, result.exploration, result.objective = terms.T
-            result.measurements = objective.measurements[first:last]
+            result.measurements = objective.table.planned.own[first:last]
             decision.robots[name] = result
         return explain(decision)
 
