@@ -18,6 +18,14 @@ from maasi_planner.objective.predicted_measurements import reach_of
 from maasi_planner.settings import CandidateSettings
 
 
+def in_bounds(points: FloatArray, bounds: FloatArray) -> BoolArray:
+    """Return which points (n, d or more) are finite and within bounds (d, 2), a little slack."""
+    low, high = (bounds + 1e-9 * (1.0 + np.abs(bounds)) * [-1.0, 1.0]).T
+    places = points[:, : len(bounds)]
+    inside = (places >= low) & (places <= high)
+    return np.asarray(inside.all(axis=1) & np.isfinite(points).all(axis=1))
+
+
 class CandidateSet:
     """Candidate waypoints of one robot.
 
@@ -80,15 +88,11 @@ class CandidateSet:
                 f'points: got shape {points.shape}, allowed in {self.dimension}D are '
                 f'(n, {self.dimension})'
             )
-        inside = points[:, : self.dimension]
-        slack = 1e-9 * (1.0 + np.abs(self.bounds))
-        low, high = (self.bounds + slack * [-1.0, 1.0]).T
-        outside = (inside < low) | (inside > high)
-        if outside.any():
-            first = points[outside.any(axis=1)][0]
+        outside = points[~in_bounds(points, self.bounds)]
+        if len(outside):
             raise ValueError(
-                f'candidates: got a waypoint at {first.tolist()}, allowed are waypoints inside '
-                f'{self.bounds.tolist()}'
+                f'candidates: got a waypoint at {outside[0].tolist()}, allowed are waypoints '
+                f'inside {self.bounds.tolist()}'
             )
         complete = np.full((len(points), 3), self.height)
         complete[:, : points.shape[1]] = points
@@ -104,9 +108,7 @@ class CandidateSet:
         points = np.asarray(position, dtype=float)[None, :] + self._ring
         if self.dimension == 2:
             points[:, 2] = self.height
-        inside = points[:, : self.dimension]
-        keep = ((inside >= self.bounds[:, 0]) & (inside <= self.bounds[:, 1])).all(axis=1)
-        return points[keep]
+        return points[in_bounds(points, self.bounds)]
 
 
 @dataclass

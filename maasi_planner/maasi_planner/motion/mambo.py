@@ -37,49 +37,29 @@ PERIOD = 0.005
 
 
 @njit(cache=True)
-def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: float) -> FloatArray:
-    """Return the gain of a discrete LQR with one input, by iterating the Riccati equation.
+def _product(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a b in plain sums, which do not depend on a linear algebra library."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            for k in range(a.shape[1]):
+                out[i, j] += a[i, k] * b[k, j]
+    return out
 
-    Plain loops in a fixed order, so that the gain does not depend on a linear algebra library.
-    """
-    n = a.shape[0]
-    p = np.zeros((n, n))
-    for i in range(n):
-        p[i, i] = q[i]
-    gain = np.zeros(n)
-    pa = np.zeros((n, n))
-    pb = np.zeros(n)
+
+@njit(cache=True)
+def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: float) -> FloatArray:
+    """Return the gain of a discrete LQR with one input, by iterating the Riccati equation."""
+    p, gain, column = np.diag(q), np.zeros(len(q)), b.reshape(-1, 1)
     for _ in range(200_000):
-        for i in range(n):
-            pb[i] = 0.0
-            for k in range(n):
-                pb[i] += p[i, k] * b[k]
-            for j in range(n):
-                pa[i, j] = 0.0
-                for k in range(n):
-                    pa[i, j] += p[i, k] * a[k, j]
-        size = r
-        for i in range(n):
-            size += b[i] * pb[i]
-        change = 0.0
-        for j in range(n):
-            value = 0.0
-            for k in range(n):
-                value += b[k] * pa[k, j]
-            value /= size
-            change = max(change, abs(value - gain[j]) / (abs(value) + 1e-300))
-            gain[j] = value
-        for i in range(n):
-            for j in range(i + 1):
-                value = 0.0
-                for k in range(n):
-                    value += a[k, i] * pa[k, j]
-                value -= gain[j] * gain[i] * size
-                if i == j:
-                    value += q[i]
-                p[i, j] = value
-                p[j, i] = value
-        if change < 1e-13:
+        pa, pb, size = _product(p, a), _product(p, column), r
+        for i in range(len(q)):
+            size += b[i] * pb[i, 0]
+        before, gain = gain, _product(b.reshape(1, -1), pa)[0] / size
+        p = _product(a.T.copy(), pa) - np.outer(gain, gain) * size + np.diag(q)
+        # Rounding must not make it asymmetric.
+        p = np.tril(p) + np.tril(p, -1).T
+        if (np.abs(gain - before) / (np.abs(gain) + 1e-300)).max() < 1e-13:
             break
     return gain
 
@@ -157,6 +137,8 @@ def _response_size(a: FloatArray, b: FloatArray, gain: FloatArray) -> tuple[Floa
 # Entries of the parameter array of `mambo_step`.
 K_VX, K_PITCH, K_Q, K_VY, K_ROLL, K_P, K_VZ, K_R = range(8)
 TILT, LIFT, SPEED, YAW_RATE, COUNT_FORCE = range(8, 13)
+# Speed per distance left of the position loop [1/s].
+RATE = 13
 
 
 _PARAMETERS: dict[str, FloatArray] = {}
@@ -168,7 +150,7 @@ def mambo_parameters(settings: MotionSettings) -> FloatArray:
     if key in _PARAMETERS:
         return _PARAMETERS[key].copy()
     gains = lqr_gains(settings)
-    out = np.zeros(13)
+    out = np.zeros(14)
     out[K_VX], out[K_PITCH], out[K_Q] = gains['pitch'][1:]
     # Roll to the right is positive, left is positive: the sign of the velocity gain turns.
     out[K_VY], out[K_ROLL], out[K_P] = gains['roll'][1:]
@@ -188,6 +170,7 @@ def mambo_parameters(settings: MotionSettings) -> FloatArray:
     out[SPEED] = settings.speed / (1.015 * overshoot)
     out[YAW_RATE] = settings.yaw_rate
     out[COUNT_FORCE] = 1.0 if settings.control_inputs == 'all' else 0.0
+    out[RATE] = min(gains[chain][0] / gains[chain][1] for chain in ('pitch', 'roll', 'height'))
     _PARAMETERS[key] = out
     return out.copy()
 
@@ -319,7 +302,7 @@ def _lateral(
     )
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def mambo_step(
     state: FloatArray,
     command: Command,

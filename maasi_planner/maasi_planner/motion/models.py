@@ -37,13 +37,15 @@ APPROACH_RATE = 5.0
 class Kernel(NamedTuple):
     """What the compiled functions of a model need for steps of `periods` times `h` seconds.
 
-    States are arrays that begin with the position [m, map] and the heading [rad]. parameters: of a
-    flying robot's body; table: what `periods` do at once (Mambo); tolerance: distance at which a
-    waypoint is reached [m].
+    States are arrays that begin with the position [m, map] and the heading [rad]. obstructed:
+    whether there are obstacles, which it gets around, or in place of that the obstacle term acts;
+    parameters: of a flying robot's body; table: what `periods` do at once (Mambo); tolerance:
+    distance at which a waypoint is reached [m].
     """
 
     kind: int
     steering: Steering
+    obstructed: bool
     around: Surroundings
     term: ObstacleTerm
     parameters: FloatArray
@@ -79,72 +81,35 @@ def _point_step(state: FloatArray, command: Command, steering: Steering, dt: flo
     state[3] += dt * state[7]
 
 
-# Arrays are arguments only of what needs them: counting references to them costs more than a step.
 @njit(cache=True, forceinline=True)
-def _freely(kind: int, steering: Steering, state: FloatArray, goal: Vector) -> Command:
-    if kind == UNICYCLE:
-        return drive_freely(state, goal, steering)
-    return fly_freely((state[0], state[1], state[2]), state[3], goal, steering)
-
-
-@njit(cache=True)
-def _among(
-    kind: int,
-    steering: Steering,
-    around: Surroundings,
-    state: FloatArray,
-    goal: Vector,
-    to_goal: FloatArray,
-) -> Command:
-    if kind == UNICYCLE:
-        return drive_among(state, goal, to_goal, steering, around)
-    return fly_among((state[0], state[1], state[2]), state[3], goal, to_goal, steering, around)
-
-
-@njit(cache=True, forceinline=True)
-def _move(kind: int, steering: Steering, state: FloatArray, command: Command, dt: float) -> float:
-    if kind == UNICYCLE:
-        unicycle_step(state, command, steering, dt)
-    else:
-        _point_step(state, command, steering, dt)
-    return command[0] ** 2 + command[1] ** 2 + command[2] ** 2 + command[3] ** 2
-
-
-@njit(cache=True)
-def _fly(
-    kind: int,
-    parameters: FloatArray,
-    table: FloatArray,
-    periods: int,
-    h: float,
-    state: FloatArray,
-    command: Command,
-) -> float:
-    if kind == MAMBO:
-        return mambo_step(state, command, parameters, table, periods, h)
-    return quadrotor_step(state, command, parameters, periods, h)
-
-
-@njit(cache=True)
 def steer(kernel: Kernel, state: FloatArray, goal: Vector, to_goal: FloatArray) -> Command:
     """Return the command of a robot's controller towards a waypoint."""
-    if kernel.around.circles.shape[0]:
-        command = _among(kernel.kind, kernel.steering, kernel.around, state, goal, to_goal)
-    else:
-        command = _freely(kernel.kind, kernel.steering, state, goal)
-    if kernel.term.kind:
-        position = (state[0], state[1], state[2])
-        return with_obstacle_term(position, state[3], command, kernel.term, kernel.parameters)
+    position, yaw, steering = (state[0], state[1], state[2]), state[3], kernel.steering
+    if kernel.kind == UNICYCLE:
+        if kernel.obstructed:
+            return drive_among(state, goal, to_goal, steering, kernel.around)
+        return drive_freely(state, goal, steering)
+    if kernel.obstructed and not kernel.term.kind:
+        return fly_among(position, yaw, goal, to_goal, steering, kernel.around)
+    command = fly_freely(position, yaw, goal, steering)
+    if kernel.obstructed:
+        return with_obstacle_term(position, yaw, command, kernel.term, kernel.parameters)
     return command
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def advance(kernel: Kernel, state: FloatArray, command: Command) -> float:
     """Move a body for a step under a command, in place; return the sum of its squared inputs."""
-    if kernel.kind >= MAMBO:
-        h, parameters, table = kernel.h, kernel.parameters, kernel.table
-        return _fly(kernel.kind, parameters, table, kernel.periods, h, state, command)
-    return _move(kernel.kind, kernel.steering, state, command, kernel.h)
+    periods, h = kernel.periods, kernel.h
+    if kernel.kind == MAMBO:
+        return mambo_step(state, command, kernel.parameters, kernel.table, periods, h)
+    if kernel.kind == QUADROTOR:
+        return quadrotor_step(state, command, kernel.parameters, periods, h)
+    if kernel.kind == UNICYCLE:
+        unicycle_step(state, command, kernel.steering, h)
+    else:
+        _point_step(state, command, kernel.steering, h)
+    return command[0] ** 2 + command[1] ** 2 + command[2] ** 2 + command[3] ** 2
 
 
 @njit(cache=True)
@@ -161,26 +126,15 @@ def _close_loop(
     Return the steps to the waypoint, one too many where it is not reached, and the sum of squared
     inputs.
     """
-    kind, steering, around, term, parameters, table, tolerance, periods, h = kernel
-    obstacles, flies, termed = around.circles.shape[0] > 0, kind >= MAMBO, term.kind > 0
     cost = 0.0
     for k in range(yaws.shape[0]):
         x, y, z = state[0], state[1], state[2]
         positions[k, 0], positions[k, 1], positions[k, 2], yaws[k] = x, y, z, state[3]
-        height = 0.0 if kind == UNICYCLE else goal[2] - z
+        height = 0.0 if kernel.kind == UNICYCLE else goal[2] - z
         square = (goal[0] - x) ** 2 + (goal[1] - y) ** 2 + height * height
-        if square <= tolerance * tolerance:
+        if square <= kernel.tolerance * kernel.tolerance:
             return k, cost
-        if obstacles:
-            command = _among(kind, steering, around, state, goal, to_goal)
-        else:
-            command = _freely(kind, steering, state, goal)
-        if termed:
-            command = with_obstacle_term((x, y, z), yaws[k], command, term, parameters)
-        if flies:
-            cost += _fly(kind, parameters, table, periods, h, state, command)
-        else:
-            cost += _move(kind, steering, state, command, h)
+        cost += advance(kernel, state, steer(kernel, state, goal, to_goal))
     return yaws.shape[0], cost
 
 
@@ -218,7 +172,7 @@ def _roll_out(
 ) -> None:
     state, steering = start.copy(), kernel.steering
     straight = kernel.kind == POINT and steering.acceleration == np.inf
-    straight = straight and not (steering.face_travel or kernel.around.circles.shape[0])
+    straight = straight and not (steering.face_travel or kernel.obstructed)
     for w in range(waypoints.shape[0]):
         goal = (waypoints[w, 0], waypoints[w, 1], waypoints[w, 2])
         if straight:
@@ -295,14 +249,11 @@ class CompiledMotion(MotionModel):
         term, table = settings.obstacle_term if self.kind == MAMBO else 'none', np.zeros((0, 0))
         if self.kind == MAMBO:
             table = mambo.closed_loop(self.parameters, periods, h)
-        around = keep_out.around
-        if term != 'none':
-            # The term takes the place of ways around obstacles.
-            around = around._replace(circles=np.zeros((0, 5)))
         return Kernel(
             self.kind,
             self.steering,
-            around,
+            len(keep_out) > 0,
+            keep_out.around,
             ObstacleTerm(
                 mambo.TERMS.index(term),
                 settings.obstacle_distance,
@@ -408,8 +359,7 @@ class Mambo(CompiledMotion):
     def _limits(self) -> tuple[float, float, float]:
         settings = self.settings
         self.parameters = mambo.mambo_parameters(settings)
-        gains = mambo.lqr_gains(settings)
-        own = min(gains[chain][0] / gains[chain][1] for chain in ('pitch', 'roll', 'height'))
+        own = self.parameters[mambo.RATE]
         slowing = mambo.GRAVITY * self.parameters[mambo.TILT] / settings.speed
         self.rate = float(min(settings.approach_rate or own, slowing))
         natural = mambo.GRAVITY * self.parameters[mambo.K_VX] / self.parameters[mambo.K_Q]

@@ -95,7 +95,7 @@ def _unseen(
     x, y, z = np.ix_(*(np.arange(size) // stride for size in values.shape))
     shape = [int(blocks.max()) + 1 for blocks in (x, y, z)]
     block = (x * shape[1] + y) * shape[2] + z
-    left = np.bincount(block.ravel(), (values * volumes).ravel())
+    left = np.bincount(block.ravel(), (values * volumes).ravel()).astype(float)
     start = lower + 0.5 * (stride - 1) * step
     places = start[:, None] + (stride * step)[:, None] * np.indices(shape).reshape(3, -1)
     return places, left * (settings.expected_targets / float(volumes.sum()))

@@ -197,14 +197,15 @@ def _improve_in_pairs(
     One robot takes another candidate, the best alone first, and a second one its best reply.
     """
     table, order, start, _ = ranking
+    moving: IntArray = np.flatnonzero(chosen >= 0)
     evaluated, improved = 0, True
     while improved:
         improved = False
-        for r in np.flatnonzero(chosen >= 0):
+        for r in moving:
             for g in order[start[r] : start[r + 1]]:
                 if g == chosen[r]:
                     continue
-                for s in np.flatnonzero(chosen >= 0):
+                for s in moving:
                     if evaluated >= budget:
                         return total, evaluated
                     trial = chosen.copy()

@@ -16,11 +16,11 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
+from maasi_planner.candidates import in_bounds
 from maasi_planner.planners.base import (
     Planner,
     all_apart,
     explain,
-    in_bounds,
     search_jointly,
     usable_options,
 )
@@ -60,10 +60,9 @@ class Sequences:
             longer = []
             for index, places in kept:
                 following = places[-1] + steps
-                keep, _ = in_bounds(following, team.bounds)
                 free = [
                     place
-                    for place, inside in zip(following, keep)
+                    for place, inside in zip(following, in_bounds(following, team.bounds))
                     if inside and view.motion.keep_out.is_free(place)
                 ]
                 # Extend a dead end by staying, so that the sequence is kept.

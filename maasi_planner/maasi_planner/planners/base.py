@@ -9,12 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numba import njit
 from pydantic import BaseModel
 
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
+from maasi_planner.candidates import in_bounds
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import (
     Decision,
@@ -116,37 +116,9 @@ def _problem_of(robot: RobotDecision, bounds: FloatArray) -> str:
             return f'{field}: got a number that is not finite'
     if not (isinstance(robot.chosen, int | np.integer) and -1 <= robot.chosen < rows[0]):
         return f'chosen: got {robot.chosen!r:.80}, allowed are -1 (stay) to {rows[0] - 1}'
-    if not robot.stays and not in_bounds(robot.waypoint[None, :], bounds)[0].all():
+    if not robot.stays and not in_bounds(robot.waypoint[None, :], bounds).all():
         return f'waypoint: got {robot.waypoint.tolist()}, allowed is inside {bounds.tolist()} [m]'
     return ''
-
-
-@njit(cache=True)
-def _in_bounds(points: FloatArray, bounds: FloatArray, out: BoolArray) -> int:
-    """Fill which points are finite and within the bounds; return how many are not finite."""
-    bad = 0
-    for i in range(points.shape[0]):
-        finite = True
-        inside = True
-        for axis in range(points.shape[1]):
-            finite &= math.isfinite(points[i, axis])
-        for axis in range(bounds.shape[0]):
-            lower = bounds[axis, 0]
-            upper = bounds[axis, 1]
-            inside &= points[i, axis] >= lower - 1e-9 * (1.0 + abs(lower))
-            inside &= points[i, axis] <= upper + 1e-9 * (1.0 + abs(upper))
-        out[i] = finite and inside
-        bad += not finite
-    return bad
-
-
-def in_bounds(points: FloatArray, bounds: FloatArray) -> tuple[BoolArray, int]:
-    """Return which points (n, 3) are within the bounds (d, 2), with a little slack.
-
-    And how many are not finite, which are not within.
-    """
-    inside = np.empty(len(points), np.bool_)
-    return inside, _in_bounds(np.ascontiguousarray(points), bounds, inside)
 
 
 def usable_candidates(
@@ -154,28 +126,28 @@ def usable_candidates(
 ) -> tuple[FloatArray, str]:
     """Return a robot's candidates moved out of obstacles, and which were dropped."""
     view = team.robots[name]
-    points = np.ascontiguousarray(view.candidates, dtype=float).reshape(-1, 3)
+    points = np.asarray(view.candidates, dtype=float).reshape(-1, 3)
     dropped: list[str] = []
-    inside, bad = in_bounds(points, team.bounds)
-    out = len(points) - int(np.count_nonzero(inside))
+    bad = int((~np.isfinite(points)).any(axis=1).sum())
+    inside = in_bounds(points, team.bounds)
+    out = len(points) - int(np.count_nonzero(inside)) - bad
+    if bad:
+        dropped.append(f'{bad} not finite')
     if out:
-        if bad:
-            dropped.append(f'{bad} not finite')
-        if out > bad:
-            dropped.append(f'{out - bad} outside the bounds')
-        points = points[inside]
-    position = view.state.pose.position
+        dropped.append(f'{out} outside the bounds')
+    points = points[inside]
     number = len(points)
     if extra is not None and len(extra):
-        points = np.vstack([points, extra[in_bounds(extra, team.bounds)[0]]])
+        points = np.vstack([points, extra[in_bounds(extra, team.bounds)]])
     if len(view.motion.keep_out):
-        moved = [view.motion.keep_out.moved_out(position, point) for point in points]
+        here = view.state.pose.position
+        moved = [view.motion.keep_out.moved_out(here, point) for point in points]
         lost = sum(point is None for point in moved[:number])
         if lost:
             dropped.append(f'{lost} in obstacles')
         points = np.array([point for point in moved if point is not None]).reshape(-1, 3)
         # They move towards the robot, which may be outside.
-        points = points[in_bounds(points, team.bounds)[0]]
+        points = points[in_bounds(points, team.bounds)]
     return points, ', '.join(dropped)
 
 
