@@ -186,7 +186,7 @@ def test_a_packet_over_the_network_has_the_time_of_its_image(feed):
     ((found, taken),) = received(receiver, 1)
     assert before - 0.5 - 1e-6 <= taken <= time.monotonic() - 0.5
     assert len(found.blobs) == 3
-    with pytest.raises(OSError, match='in use'):
+    with pytest.raises(ImageSourceError, match='in use'):
         FeedReceiver(receiver.port, '127.0.0.1')
 
 

@@ -48,6 +48,13 @@ def test_back_projection_inverts_projection(seed, x, y):
     assert_allclose(view.project([[*position[0], 0.02]], pose), [[x, y]], atol=1e-7)
 
 
+def test_the_image_reaches_half_a_pixel_beyond_the_outermost_centres():
+    view = camera()
+    corners = [[0.0, 0.0], [159.0, 119.0], [159.5, 60.0], [80.0, -1.5]]
+    positions = np.pad(view.back_project(corners, DOWN)[0], ((0, 0), (0, 1)))
+    assert_allclose(view.margin(positions, DOWN), [0.5, 0.5, 0.0, -1.0], atol=1e-9)
+
+
 def test_what_cannot_be_seen_is_nan():
     view = camera()
     assert np.isnan(view.project([[0, 0, 1.5]], DOWN)).all()

@@ -99,6 +99,11 @@ def test_the_robust_rule_leaves_out_other_colours(colour):
     assert len(segment(draw_disc(floor(), 70, 50, 4.0, colour), ROBUST)) == 0
 
 
+def test_the_robust_rule_leaves_out_what_is_darker_than_the_blue_around_it():
+    image = draw_disc(floor(), 70.0, 50.0, 14.0, (150, 160, 220))
+    assert len(segment(draw_disc(image, 70.0, 50.0, 4.0, (5, 8, 30)), ROBUST)) == 0
+
+
 def test_the_robust_rule_leaves_out_lines_and_rings_and_keeps_the_disc_beside():
     image = draw_disc(floor(), 30.0, 30.0, 4.0)
     image[60:62, 20:90] = BLUE

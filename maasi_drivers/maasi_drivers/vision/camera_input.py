@@ -65,8 +65,8 @@ class CameraInput(SensorInput[Picture]):
             )
         if settings.image_source != 'topic':
             try:
-                self._open_source()
-            except (ImageSourceError, OSError) as error:
+                self._source = self._open_source()
+            except ImageSourceError as error:
                 raise SettingsError(f'parameter image_source: {error}') from error
         camera = settings.camera
         if settings.calibration_file:
@@ -142,24 +142,16 @@ class CameraInput(SensorInput[Picture]):
 
     # ---- image source: video or feed ----------------------------------------------------------
 
-    def _open_source(self) -> None:
-        if self.driver.settings.image_source == 'video':
-            self._source = VideoSource(self.driver.settings.video)
-            return
-        peer = self.driver.feed_peer
-        address, port = self.driver.settings.feed_address, self.driver.settings.feed_port
+    def _open_source(self) -> VideoSource | FeedReceiver:
+        settings, peer = self.driver.settings, self.driver.feed_peer
+        if settings.image_source == 'video':
+            return VideoSource(settings.video)
 
         def drop(reason: str, text: str, number: int) -> None:
             self.driver.drop(f'feed: {reason}', f'feed: {text}', number)
 
-        try:
-            sender = None if peer is None else peer.address
-            self._source = FeedReceiver(port, address, sender, drop)
-        except OSError as error:
-            raise OSError(
-                f'feed_address, feed_port: UDP port {port} of {address}: {error.strerror}, allowed '
-                'is a free port of an address of this host'
-            ) from error
+        sender = None if peer is None else peer.address
+        return FeedReceiver(settings.feed_port, settings.feed_address, sender, drop)
 
     def _poll_source(self) -> None:
         self.driver.arrivals.observe(time.monotonic(), self.driver.get_clock().now().nanoseconds)
@@ -177,7 +169,7 @@ class CameraInput(SensorInput[Picture]):
             return
         image = frame.image
         try:
-            self._detector.check_size(image)
+            self._detector.check_size(*image.shape[1::-1])
         except ValueError as error:
             self.driver.drop('image', f'video: {error}')
             return
@@ -186,16 +178,14 @@ class CameraInput(SensorInput[Picture]):
         )
 
     def _take_feed(self, feed: FeedReceiver) -> None:
-        camera, peer = self.camera, self.driver.feed_peer
+        peer = self.driver.feed_peer
         for packet, taken in feed.take():
             if (stamp := self.driver.arrivals.stamp(taken)) is None:
                 continue
-            if (packet.width, packet.height) != (camera.width, camera.height):
-                self.driver.drop(
-                    'image',
-                    f'feed: width, height: read {packet.width} x {packet.height} px, allowed is '
-                    f'the size of the calibration, {camera.width} x {camera.height} px',
-                )
+            try:
+                self._detector.check_size(packet.width, packet.height)
+            except ValueError as error:
+                self.driver.drop('image', f'feed: {error}')
                 continue
             if packet.pose is not None and peer is not None:
                 peer.on_pose(stamp, packet.pose)
@@ -223,7 +213,7 @@ class CameraInput(SensorInput[Picture]):
     def _on_image(self, message: Image) -> None:
         try:
             image = image_to_array(message)
-            self._detector.check_size(image)
+            self._detector.check_size(*image.shape[1::-1])
         except ValueError as error:
             self.driver.drop('image', f'camera/image_raw: {error}')
             return

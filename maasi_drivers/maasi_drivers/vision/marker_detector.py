@@ -41,18 +41,18 @@ class MarkerDetector:
 
     def segment(self, image: ImageArray) -> Blobs:
         """Return where markers are in an image, by the rule of the settings."""
-        self.check_size(image)
+        self.check_size(*image.shape[1::-1])
         if self._own is not None:
             return self._own.detect(image)
         return segment(image, self.settings.segmentation)
 
-    def check_size(self, image: ImageArray) -> None:
+    def check_size(self, width: int, height: int) -> None:
         """Raise `ValueError` for an image of another size than the calibrated one."""
         camera = self.camera
-        if image.shape[:2] != (camera.height, camera.width):
+        if (width, height) != (camera.width, camera.height):
             raise ValueError(
-                f'image: got {image.shape[1]} x {image.shape[0]} px, allowed is the size of the '
-                f'calibration, {camera.width} x {camera.height} px'
+                f'image: got {width} x {height} px, allowed is the size of the calibration, '
+                f'{camera.width} x {camera.height} px'
             )
 
     def detect(

@@ -17,6 +17,7 @@ from enum import IntEnum
 import numpy as np
 
 from maasi_drivers.vision.detector import Blobs
+from maasi_drivers.vision.images import ImageSourceError
 
 MAGIC = b'MSMF'
 VERSION = 1
@@ -213,9 +214,12 @@ class FeedReceiver:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind((address, port))
-        except OSError:
+        except OSError as error:
             self._socket.close()
-            raise
+            raise ImageSourceError(
+                f'feed_address, feed_port: UDP port {port} of {address}: {error.strerror}, allowed '
+                'is a free port of an address of this host'
+            ) from error
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
 
