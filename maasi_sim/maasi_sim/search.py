@@ -30,8 +30,7 @@ from maasi_sim.run.view.live_view import SearchTrace
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
 from maasi_sim.search_result import SearchResult, SearchState
 from maasi_sim.simulation.robots import SimulatedRobot
-from maasi_sim.simulation.simulated_world import step_of_event
-from maasi_sim.simulation.world import World
+from maasi_sim.simulation.simulated_world import Simulation
 
 # From the settings, and a function that returns the true targets that are not found yet.
 MakePlanner = Callable[[PlannerSettings, Callable[[], FloatArray]], Planner]
@@ -89,13 +88,16 @@ class _Search:
     """A search while it runs, step by step."""
 
     def __init__(self, scenario: Scenario, seed: int, make_planner: MakePlanner | None) -> None:
+        check_events(scenario)
         self.scenario = scenario
-        self.world = scenario.world(seed)
+        self.simulation = Simulation(scenario, seed)
+        self.world = self.simulation.world
         self.trace = SearchTrace(scenario, seed)
         self.step, self.time = 0, 0.0
-        self._robots = {name: _Robot(name, scenario, seed, self.world) for name in scenario.names()}
+        self._robots = {
+            name: _Robot(body, scenario) for name, body in self.simulation.robots.items()
+        }
         self._here = dict(self._robots)
-        self._departures = leaving(scenario)
         common = {'step': scenario.step, 'seed': seed, 'lockstep': True}
         self._groups = [
             _Group(
@@ -117,16 +119,17 @@ class _Search:
         truth = np.asarray(self.world.targets, dtype=float)
         self.trace.add(EventMaker.truth, 0.0, truth)
         self._radius = scoring_radius(scenario, truth)
-        self._result = SearchResult(scenario, self.trace, dict.fromkeys(self._robots, 0))
+        counts, ways = dict.fromkeys(self._robots, 0), dict.fromkeys(self._robots, 0.0)
+        self._result = SearchResult(scenario, self.trace, counts, ways)
         # Whether the last score of a step was complete.
         self._complete = False
 
     def run(self, most_measurements: int | None) -> SearchResult:
         reason = None
         for step in range(steps_of(self.scenario.limits.time, self.scenario.step)):
-            self.step, self.time = step, step * self.scenario.step
-            for name in self._departures.get(step, []):
-                self._here.pop(name, None)
+            self.step, self.time = step, self.simulation.time
+            for name in sorted(self._here.keys() & self.simulation.away):
+                del self._here[name]
                 self.trace.add(EventMaker.leave, self.time, name)
                 (group,) = (group for group in self._groups if name in group.names)
                 group.coordinator.plans[name].leave()
@@ -146,13 +149,11 @@ class _Search:
                 break
             for group in self._groups:
                 group.shared = group.filter.own_found_targets()
-            for name, robot in self._here.items():
-                robot.move(commands[name], self.step + 1, self.scenario.step)
+            self._move(commands)
         result = self._result
         result.end_reason = reason or 'time_limit'
         result.steps = self.step + 1
         result.found_targets, result.truth, result.scores = self._state()
-        result.distance = {name: robot.distance for name, robot in self._robots.items()}
         return result
 
     def _plan(self, group: _Group) -> dict[str, PresentRobot]:
@@ -186,7 +187,7 @@ class _Search:
 
     def _measure(self, group: _Group, present: Mapping[str, PresentRobot]) -> None:
         """Measure with the robots of a group that are due, update its filter, and score."""
-        able = {name for name in present if self.step % self._robots[name].imaging_steps == 0}
+        able = {name for name in present if self.simulation.images_due(name)}
         members = group.coordinator.measuring(self.step, present, able)
         if not members:
             return
@@ -207,6 +208,17 @@ class _Search:
         found = group.filter.own_found_targets() if known else None
         self.trace.update(self.time, group.space, measurements, result, found, group.coordinator)
         self._score([item.robot for item in members])
+
+    def _move(self, commands: Mapping[str, FloatArray]) -> None:
+        """Advance by a step, under the commands of the robots that are here."""
+        robots = self.simulation.robots
+        places = {name: robots[name].state.pose.position for name in commands}
+        for name, command in commands.items():
+            robots[name].command(command)
+        self.simulation.advance()
+        for name, place in places.items():
+            moved = robots[name].state.pose.position - place
+            self._result.distance[name] += float(np.sqrt((moved * moved).sum()))
 
     def _score(self, measured: list[str]) -> None:
         counts = self._result.measurements
@@ -268,21 +280,19 @@ class _Group:
 class _Robot:
     """A simulated robot with the functions of its driver."""
 
-    def __init__(self, name: str, scenario: Scenario, seed: int, world: World) -> None:
-        settings = scenario.robots[name]
-        self.name = name
-        self.sensor = settings.sensor.build(name, scenario.dimension)
-        self.body = SimulatedRobot(name, settings, world, scenario.floor, seed)
+    def __init__(self, body: SimulatedRobot, scenario: Scenario) -> None:
+        settings = body.settings
+        self.name = body.name
+        self.sensor = settings.sensor.build(self.name, scenario.dimension)
+        self.body = body
         obstacles = Obstacles.from_settings(scenario.environment.obstacles)
         self.follower = WaypointFollower(make_motion(settings.motion, obstacles, settings.radius))
         self.odometry = MapOdometry(Pose.from_yaw(settings.start, settings.yaw))
         self.detector = (
             None if settings.camera is None else MarkerDetector(settings.camera, scenario.dimension)
         )
-        self.imaging_steps = steps_of(settings.measuring_period, scenario.step)
         self.pose: StampedPose
         self.state: RobotState
-        self.distance = 0.0
 
     def observe(self, stamp: int) -> None:
         """Take the odometry of a step."""
@@ -290,14 +300,6 @@ class _Robot:
         motion = reading.velocity, reading.angular_velocity
         self.pose = self.odometry.apply(stamp, reading.pose, reading.covariance, *motion)
         self.state = RobotState(self.pose.pose, self.pose.velocity, self.pose.angular_velocity)
-
-    def move(self, command: FloatArray, step: int, dt: float) -> None:
-        """Advance by `dt` seconds under a velocity command."""
-        before = self.body.state.pose.position
-        self.body.command(command)
-        self.body.step(step, dt)
-        moved = self.body.state.pose.position - before
-        self.distance += float(np.sqrt((moved * moved).sum()))
 
     def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
         if self.detector is None:
@@ -317,13 +319,10 @@ class _Robot:
         )
 
 
-def leaving(scenario: Scenario) -> dict[int, list[str]]:
-    """Return the robots that leave, by step."""
-    steps: dict[int, list[str]] = {}
+def check_events(scenario: Scenario) -> None:
+    """Raise ValueError if a robot is to come back."""
     for event in scenario.events:
         if event.do != 'leave':
             raise ValueError(
                 f"events: read '{event.do}' of {event.robot}, in one process robots only leave"
             )
-        steps.setdefault(step_of_event(event.at, scenario.step), []).append(event.robot)
-    return steps

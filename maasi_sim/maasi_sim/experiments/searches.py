@@ -30,7 +30,7 @@ from maasi_sim.scenario.loading import (
     scenario_from_values,
 )
 from maasi_sim.scenario.schema import Scenario
-from maasi_sim.search import leaving, search
+from maasi_sim.search import check_events, search
 from maasi_sim.search_result import SearchResult
 from maasi_sim.simulation.world import noise_stream
 
@@ -333,7 +333,7 @@ def compared(
                 overrides['--time-limit'] = ('limits', 'time'), time_limit
             loaded = load_scenario(path, overrides)
             try:
-                leaving(loaded)
+                check_events(loaded)
             except ValueError as error:
                 raise ScenarioError(f'{path}: {error}') from None
             names = [planner or loaded.planner.name]

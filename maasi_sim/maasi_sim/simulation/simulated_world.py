@@ -26,7 +26,8 @@ class SimulatedTeam:
         self.away: set[str] = set()
         self._events: dict[int, list[tuple[str, str]]] = {}
         for event in sorted(scenario.events, key=lambda event: event.at):
-            step = step_of_event(event.at, scenario.step)
+            # The first step at or after it; a time as close as this to a step is the step's.
+            step = math.ceil(event.at / scenario.step - 1e-6)
             self._events.setdefault(step, []).append((event.robot, event.do))
         self._apply_events()
 
@@ -106,9 +107,3 @@ class Simulation(SimulatedTeam):
             [other.state.pose.position[:2] for other in others],
             [other.settings.radius for other in others],
         )
-
-
-def step_of_event(time: float, step: float) -> int:
-    """Return the first step at or after a time [s]."""
-    # A time as close as this to a step is the step's.
-    return math.ceil(time / step - 1e-6)
