@@ -225,6 +225,13 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     flight = Flight().flown()
     pilot, firmware = flight.pilot, flight.firmware
     flight.goal = None
+    # Where it hovers, a position that stays the same to the bit is no fault.
+    pilot.hover()
+    flight.sent = 'stuck'
+    flight.step(100)
+    assert pilot.problem == ''
+    flight.sent = 'true'
+    flight.flown().goal = None
     # No number is no command: it hovers as after a cancelled goal.
     with pytest.raises(ValueError, match='finite'):
         pilot.fly(np.array([0.1, math.nan, 0.0, 0.0]))

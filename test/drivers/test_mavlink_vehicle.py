@@ -97,14 +97,14 @@ def test_nothing_is_armed(firmware, changes, parameters, text):
         play.permitted().fly()
 
 
-@pytest.mark.parametrize('stopped', [False, True])
-def test_a_permission_that_is_not_used_or_stopped_ends(stopped):
+@pytest.mark.parametrize('end', ['', 'forbid', 'finish'])
+def test_a_permission_that_is_not_used_or_stopped_ends(end):
     play = Play(autopilot={'charge': 0.01}, arm_timeout=10.0)
     play.run(8.0)
     assert play.phase is VehiclePhase.ARMING and 'PreArm: Battery below minimum' in play.fault
     assert 'MAV_CMD_COMPONENT_ARM_DISARM: FAILED' in play.said
-    if stopped:
-        play.vehicle.forbid()
+    if end:
+        getattr(play.vehicle, end)(*['land'] * (end == 'finish'))
     else:
         play.run(6.0)
         assert 'not armed within 10 s (PreArm: Battery below minimum arming capacity' in play.said
