@@ -26,6 +26,8 @@ def say(event, pose):
     print(json.dumps(line | {'turn': [turn.z, turn.w]}) + '\n', end='', flush=True)
 
 
+# A goal with this x is answered late.
+LATE = 0.95
 present = []
 
 
@@ -52,6 +54,8 @@ def execute(handle):
 
 
 def judge(goal):
+    if goal.pose.pose.position.x == LATE:
+        time.sleep(1.0)
     return GoalResponse.ACCEPT if goal.pose.pose.position.x < 1.5 else GoalResponse.REJECT
 
 

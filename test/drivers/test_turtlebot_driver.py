@@ -216,6 +216,11 @@ def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, hea
     assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.9)
     assert team.ended(result, stand)[0] == GoalStatus.STATUS_CANCELED
     assert_array_equal(team.command, np.zeros(4))
+    # Cancelled before Nav2 has answered.
+    handle, result = send(0.95)
+    handle.cancel_goal_async()
+    assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.95)
+    assert team.ended(result, stand)[0] == GoalStatus.STATUS_CANCELED
     # Refused by Nav2 on the way: it stops.
     send(0.7)
     hear('goal')

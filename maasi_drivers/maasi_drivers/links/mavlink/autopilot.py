@@ -65,8 +65,8 @@ class Autopilot:
         self.accepted: set[int] = set()
         self._sender = sender
         self._received_at = self._heartbeat_at = self._setpoint_at = -math.inf
-        #: Time of the last request for messages.
-        self.requested_at = -math.inf
+        # Of the last request for messages.
+        self._requested_at = -math.inf
 
     @property
     def in_external_mode(self) -> bool:
@@ -180,11 +180,11 @@ class Autopilot:
         """Request parameters and messages that are missing."""
         if self.failsafes is not None:
             self.failsafes.read(now)
-        silence = now - max(self.estimate.silent_since, self.requested_at)
-        known = self.requested_at > -math.inf
+        silence = now - max(self.estimate.silent_since, self._requested_at)
+        known = self._requested_at > -math.inf
         if self.commands or self.lost or (known and silence < _STREAM_PATIENCE):
             return
-        self.requested_at = now
+        self._requested_at = now
         for name, rate in _MESSAGES.items():
             number = getattr(mavlink, f'MAVLINK_MSG_ID_{name}')
             interval = 1e6 / (rate or self.settings.position_rate)

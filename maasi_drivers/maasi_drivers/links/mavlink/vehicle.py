@@ -281,8 +281,6 @@ class Vehicle(Autopilot):
         text = 'the autopilot has restarted'
         self.log.add(WARNING, text)
         self.commands.clear()
-        # It has reset the rates of its messages.
-        self.requested_at = -math.inf
         self._permission.end()
         if self.phase in (VehiclePhase.CONNECTING, VehiclePhase.PREPARING, VehiclePhase.WAITING):
             self.read_failsafes()
