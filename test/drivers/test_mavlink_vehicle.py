@@ -184,7 +184,11 @@ def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
     assert_allclose(play.vehicle.estimate.origin[:2], [3.0, 4.0], atol=0.05)
     play.autopilot.parameters['FS_GCS_ENABLE'] = 5.0
     play.autopilot.restart()
+    play.run(2.0)
+    # A permission is for the autopilot that was heard.
+    play.permitted().autopilot.restart()
     play.run(12.0)
+    assert play.fault == NOT_ARMED and not play.commands(ARM)
     play.permitted().fly()
 
 
