@@ -248,7 +248,12 @@ class Coordinator:
         if not planning:
             return None
         arrived = [name for name in planning if robots[name].free]
-        team = self._team(step, robots, planning, taken)
+        views = {
+            name: self.plans[name].view(step, robots[name], name in planning)
+            for name in sorted(robots)
+        }
+        knowledge = self.clusters, self.exploration
+        team = TeamView(step, self.settings.step, views, *knowledge, self.obstacles, taken)
         finished = self.planner.finished(team)
         if finished is not None:
             for name in planning:
@@ -272,29 +277,8 @@ class Coordinator:
                 continue
             plan.adopt(step, robots[name], chosen)
             way = chosen.positions, chosen.yaws
-            knowledge = self.clusters, self.exploration
             self.trigger.begin(name, plan.sensor, *way, plan.period, *knowledge)
         return decision if decision.robots else None
-
-    def _team(
-        self,
-        step: int,
-        robots: Mapping[str, PresentRobot],
-        planning: Sequence[str],
-        taken: Sequence[tuple[FloatArray, float]],
-    ) -> TeamView:
-        return TeamView(
-            step=step,
-            step_time=self.settings.step,
-            robots={
-                name: self.plans[name].view(step, robots[name], name in planning)
-                for name in sorted(robots)
-            },
-            clusters=self.clusters,
-            exploration=self.exploration,
-            obstacles=self.obstacles,
-            taken=taken,
-        )
 
     def measuring(
         self, step: int, robots: Mapping[str, PresentRobot], able: Collection[str] | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import time
 from typing import Any
 
@@ -44,31 +45,20 @@ def wanted(services: dict[str, list[str]], command: str, robot: str, namespace: 
     """Return the services that a command calls, among the available ones."""
     top = '/'.join(['', *[part for part in namespace.split('/') if part]])
     known = {name for name, types in services.items() if _TRIGGER in types}
-    # A driver has both services; its robot is one level below the team.
-    drivers = {
-        name.removesuffix('/release')
-        for name in known
-        if name.endswith('/release') and name.removesuffix('release') + 'stop' in known
-    }
-    drivers = {
-        name
-        for name in drivers
-        if name.rpartition('/')[0] == top and (not robot or name == f'{top}/{robot}')
-    }
+
+    def below(tail: str) -> set[str]:
+        one = re.escape(robot) if robot else '[^/]+'
+        return {name for name in known if re.fullmatch(f'{re.escape(top)}/{one}/{tail}', name)}
+
+    # A driver has both services.
+    drivers = {name.removesuffix('/release') for name in below('release')}
+    drivers &= {name.removesuffix('/stop') for name in below('stop')}
     direct = command in ('stop', *_OF_DRIVERS)
     chosen = {f'{name}/{command}' for name in drivers} & known if direct else set()
     if command in _OF_DRIVERS:
         return chosen
     team = f'{top}/search/{command}'
-    each = {
-        name
-        for name in known
-        if name.startswith(f'{top}/')
-        and name.endswith(f'/search/{command}')
-        and name.removeprefix(f'{top}/').count('/') == 2
-        and (not robot or name == f'{top}/{robot}/search/{command}')
-    }
-    return chosen | ({team} if not robot and team in known else each)
+    return chosen | ({team} if not robot and team in known else below(f'search/{command}'))
 
 
 def call_all(node: Node, options: argparse.Namespace) -> dict[str, Any]:

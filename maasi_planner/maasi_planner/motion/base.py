@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +15,7 @@ from pydantic import BaseModel
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.obstacles import KeepOut, Obstacles, Vector
+from maasi_planner.obstacles import KeepOut, Obstacles
 from maasi_planner.settings import MotionSettings
 
 STEPS_LIMIT = 20_000
@@ -139,8 +140,8 @@ class MotionModel(ABC):
     ) -> None:
         self.settings = settings
         self.keep_out = KeepOut(obstacles or Obstacles.none(), radius, settings.clearance)
-        self._goal: Vector | None = None
-        self._goal_table = np.zeros(0)
+        # Way table of a waypoint, remembered until the waypoint changes.
+        self.table = lru_cache(maxsize=1)(self.keep_out.to_goal)
 
     def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
         """Return the trajectory to each waypoint under this controller.
@@ -228,12 +229,6 @@ class MotionModel(ABC):
             around = 2.0 * math.pi * float(self.keep_out.circles[:, 3].sum())
         seconds = 2.0 * (farthest + around) / self.settings.speed + 30.0
         return min(math.ceil(seconds / step), STEPS_LIMIT)
-
-    def table(self, waypoint: Vector) -> FloatArray:
-        """Return the way table of one waypoint, remembered until the waypoint changes."""
-        if self._goal != waypoint:
-            self._goal, self._goal_table = waypoint, self.keep_out.to_goal(waypoint)
-        return self._goal_table
 
 
 def check_waypoint(waypoint: ArrayLike) -> FloatArray:

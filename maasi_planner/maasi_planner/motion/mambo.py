@@ -261,11 +261,8 @@ def closed_loop(parameters: FloatArray, periods: int, h: float) -> FloatArray:
     largest |velocity - command| on the way for each unit deviation.
     """
     out = np.zeros((3, ENTRIES))
-    gains = np.zeros(3)
-    gains[:] = parameters[0:3]
-    _chain(out[PITCH_CHAIN], gains, GRAVITY, INERTIA[1], periods, h)
-    gains[:] = parameters[3:6]
-    _chain(out[ROLL_CHAIN], gains, -GRAVITY, INERTIA[0], periods, h)
+    _chain(out[PITCH_CHAIN], parameters[0:3], GRAVITY, INERTIA[1], periods, h)
+    _chain(out[ROLL_CHAIN], parameters[3:6], -GRAVITY, INERTIA[0], periods, h)
     # The height has one deviation only.
     v = 1.0
     height = out[HEIGHT_CHAIN]
