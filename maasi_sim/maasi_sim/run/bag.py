@@ -1,6 +1,6 @@
 """Write and read rosbag2 recordings (MCAP) from serialised messages, without ROS.
 
-The writer of `rosbags`, extended: it writes by time, with type hashes and the distribution's name.
+The writer of `rosbags`, which also writes by time.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import contextlib
 import queue
 import threading
 from collections.abc import Mapping
-from io import BytesIO
 from pathlib import Path
 from time import monotonic
 from typing import Any, ClassVar, Literal, cast
@@ -18,7 +17,6 @@ import numpy as np
 import yaml
 from rosbags.interfaces import (
     Connection,
-    ConnectionExtRosbag2,
     Qos,
     QosDurability,
     QosHistory,
@@ -27,7 +25,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.rosbag2.storage_mcap import Channel, McapWriter, write_channel, write_string
+from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -46,7 +44,6 @@ _CHANNELS = {'bgr8': 3, 'rgb8': 3, 'mono8': 1, '8UC1': 1, '8UC3': 3}
 ROS_DISTRO = 'jazzy'
 # Latest time after which written messages are in the file [s of wall time].
 FLUSH_PERIOD = 0.5
-_FOREIGN_DISTRO, _OWN_DISTRO = 'ros_distro: rosbags', f'ros_distro: {ROS_DISTRO}'
 _FOREVER = QosTime(9223372036, 854775807)
 
 
@@ -87,68 +84,27 @@ def load_types() -> Typestore:
     return store
 
 
-class FlushingStorage(McapWriter):
-    """An MCAP file that loses at most the last moments when its writer is killed."""
-
-    _flushed = 0.0
-
-    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
-        """Add a topic, with the hash of its type as rosbag2 stores it."""
-        metadata = BytesIO()
-        for key, text in (
-            ('offered_qos_profiles', offered_qos_profiles),
-            ('topic_type_hash', connection.digest),
-        ):
-            write_string(metadata, key)
-            write_string(metadata, text)
-        extension = cast('ConnectionExtRosbag2', connection.ext)
-        self.channels.append(
-            Channel(
-                connection.id,
-                connection.msgtype,
-                connection.topic,
-                extension.serialization_format,
-                metadata.getvalue(),
-            )
-        )
-        self.channel_stats[connection.id] = 0
-        write_channel(self.chunk.bio, self.channels[-1], self.schemas)
-
-    def flush(self) -> None:
-        """Write the chunk to the file if it is due."""
-        if self.chunk.msgs and monotonic() >= self._flushed + FLUSH_PERIOD:
-            self.close_chunk()
-            self.bio.flush()
-            self._flushed = monotonic()
+class _Storage(McapWriter):
+    """An MCAP file whose metadata name the distribution of ROS in place of the library."""
 
     def close(self, version: int, metadata: str) -> None:
-        """Write index and end."""
-        super().close(version, metadata.replace(_FOREIGN_DISTRO, _OWN_DISTRO))
+        super().close(version, _with_distribution(metadata))
 
 
-class BagFile(Writer):
-    """A recording in a new folder, in the format of rosbag2: version 9, MCAP, compressed chunks."""
-
-    STORAGE_PLUGINS: ClassVar[Mapping[StoragePlugin, type[FlushingStorage]]] = {  # type: ignore[misc, assignment]
-        StoragePlugin.MCAP: FlushingStorage
+class _Writer(Writer):
+    STORAGE_PLUGINS: ClassVar[Mapping[StoragePlugin, type[_Storage]]] = {  # type: ignore[misc, assignment]
+        StoragePlugin.MCAP: _Storage
     }
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        self.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-
-    def flush(self) -> None:
-        """Write a chunk that is due to the file."""
-        assert isinstance(self.storage, FlushingStorage)
-        self.storage.flush()
-
     def close(self) -> None:
-        """Write the index and `metadata.yaml`."""
         super().close()
-        text = self.metapath.read_text(encoding='utf-8')
         copy = self.metapath.with_suffix('.yaml.tmp')
-        copy.write_text(text.replace(_FOREIGN_DISTRO, _OWN_DISTRO), encoding='utf-8')
+        copy.write_text(_with_distribution(self.metapath.read_text('utf-8')), 'utf-8')
         copy.replace(self.metapath)
+
+
+def _with_distribution(metadata: str) -> str:
+    return metadata.replace('ros_distro: rosbags', f'ros_distro: {ROS_DISTRO}')
 
 
 class BagWriter(contextlib.AbstractContextManager['BagWriter']):
@@ -177,7 +133,9 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
         self._limit = backlog
         if self.path.exists():
             raise BagError(f'{path}: exists already')
-        self._writer = BagFile(self.path)
+        self._writer = _Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
+        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._flushed = 0.0
         try:
             self._writer.open()
         except OSError as error:
@@ -274,12 +232,20 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
                 try:
                     if item is not None:
                         self._store(*item)
-                    self._writer.flush()
+                    self._flush()
                 except Exception as error:
                     self._error = error
             with self._changed:
                 self._pending -= 0 if item is None else len(item[2])
                 self._changed.notify_all()
+
+    def _flush(self) -> None:
+        """Write the chunk to the file if it is due: a killed writer loses no more than the rest."""
+        storage = cast('McapWriter', self._writer.storage)
+        if storage.chunk.msgs and monotonic() >= self._flushed + FLUSH_PERIOD:
+            storage.close_chunk()
+            storage.bio.flush()
+            self._flushed = monotonic()
 
     def _store(self, topic: str, time: int, data: bytes) -> None:
         compressed = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from types import FrameType
 
@@ -22,11 +22,12 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @dataclass(frozen=True)
 class Ending:
-    """Why a run ended, its exit code, and what to say about it."""
+    """Why a run ended, its exit code, what to say about it, and the nodes that caused it."""
 
     reason: str
     code: int
     text: str = ''
+    nodes: Collection[str] = ()
 
 
 class Interruption:

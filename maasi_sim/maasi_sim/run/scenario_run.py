@@ -85,10 +85,10 @@ class ScenarioRun:
         #: Errors of writing.
         self.unwritten: list[str] = []
         self._armed_at = 0.0
-        # Wall time when all nodes were ready, of the first step, and of the end.
+        # Wall time when all nodes were ready, of the first step, and how long the run took.
         self._complete: float | None = None
         self._begun: float | None = None
-        self._ended: float | None = None
+        self._wall_time = 0.0
 
     def execute(self) -> int:
         """Run it and return the exit code."""
@@ -208,7 +208,8 @@ class ScenarioRun:
             self.supervisor.start()
         self._name_external_robots()
         self.ending = self._wait_until_ready() or self._follow()
-        self._ended = time.monotonic()
+        if self._begun is not None:
+            self._wall_time = time.monotonic() - self._begun
         self._check_recording()
         self.recorder.finish()
         self.supervisor.stop(self._is_followed())
@@ -221,9 +222,8 @@ class ScenarioRun:
             what = ', '.join(f'{name} {lack}' for name, lack in lacks.items())
             waited = time.monotonic() - begin
             if waited > self._limits.start:
-                self.supervisor.failed.update(lacks)
                 text = f'{what} after {self._limits.start:g} s'
-                return Ending('not_ready', NODE_FAILED, text)
+                return Ending('not_ready', NODE_FAILED, text, lacks)
             if waited > patience:
                 self.display.say(f'waiting: {what}')
                 patience += _START_PATIENCE
@@ -367,8 +367,8 @@ class ScenarioRun:
     def _report(self) -> int:
         """Write the report, print a summary, and return the exit code."""
         ending = self.ending
-        wall_time = 0.0 if self._begun is None or self._ended is None else self._ended - self._begun
-        end = RunEnd(ending.reason, self.recorder.elapsed, wall_time, self.supervisor.events)
+        elapsed, events = self.recorder.elapsed, self.supervisor.events
+        end = RunEnd(ending.reason, elapsed, self._wall_time, events)
         stored = StoredReport({}, 'report: skipped', None)
         with self.interruption.at_once(signal.SIGINT):
             self.display.say('writing report and replay (Ctrl-C skips each)')
@@ -376,10 +376,9 @@ class ScenarioRun:
         self.display.say(stored.words)
         if ending.text:
             self.display.say(f'ended: {ending.text}')
-        if ending.code == NODE_FAILED:
-            for name, process in self.supervisor.processes.items():
-                if name in self.supervisor.failed:
-                    self.display.say(f'--- {short(process.log)}\n{process.last_words()}')
+        for name, process in self.supervisor.processes.items():
+            if name in ending.nodes:
+                self.display.say(f'--- {short(process.log)}\n{process.last_words()}')
         unwritten = self.unwritten + ([stored.problem] if stored.problem else [])
         for problem in unwritten:
             self.display.say(f'error: {problem}')

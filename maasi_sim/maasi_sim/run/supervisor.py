@@ -37,8 +37,6 @@ class Supervisor:
         self.processes = processes
         #: Nodes that died, hung or were restarted.
         self.events: list[dict[str, Any]] = []
-        #: Nodes that caused the end of the run.
-        self.failed: set[str] = set()
         #: Whether the first step has begun; before it nodes may take long to start.
         self.running = False
         self._plans = plans
@@ -64,22 +62,15 @@ class Supervisor:
             return None
         self._checked = now
         beats = self._recorder.take_heartbeats()
-        late = []
         for name, process in self.processes.items():
             if gap > _LONGEST_GAP and process.beaten is not None:
                 process.beaten += gap
             if name in beats:
                 process.beat(beats[name])
-            if process.beaten is None and now - process.started > self._limits.start:
-                late.append(name)
-        # Before the first step `ScenarioRun` waits for the nodes.
-        if late and self.running:
-            text = f'{", ".join(late)} not ready {self._limits.start:g} s after the start'
-            return self._failure('not_ready', text, late)
-        for name, process in self.processes.items():
+            ending = None
             if not process.running:
                 ending = self._restart(name, process)
-            else:
+            elif self.running:
                 ending = self._check_heartbeat(name, process, now)
             if ending is not None:
                 return ending
@@ -99,20 +90,25 @@ class Supervisor:
         self._note(name, 'died')
         if process.restarts:
             text += f', after {process.restarts} restarts'
-        return self._failure('node_died', text, [name])
+        return Ending('node_died', NODE_FAILED, text, [name])
 
     def _check_heartbeat(self, name: str, process: NodeProcess, now: float) -> Ending | None:
         """Kill a node that hangs, or return the ending of the run."""
-        plan = self._plans[name]
+        plan, limits = self._plans[name], self._limits
+        if process.beaten is None:
+            if now - process.started <= limits.start:
+                return None
+            text = f'{name} not ready {limits.start:g} s after the start'
+            return Ending('not_ready', NODE_FAILED, text, [name])
         # A lockstep step may take long: `limits.silence` applies to awaited nodes.
         awaited = self._lockstep and (plan.says_done or plan.is_clock)
-        if not self.running or awaited or not process.hangs(now, self._limits.heartbeat):
+        if awaited or not process.hangs(now, limits.heartbeat):
             return None
-        text = f'{name} hangs: no heartbeat for {now - (process.beaten or now):.1f} s'
+        text = f'{name} hangs: no heartbeat for {now - process.beaten:.1f} s'
         self._note(name, 'hung')
         self._stop_robot_of(name)
         if not self._respawns(name):
-            return self._failure('node_hung', text, [name])
+            return Ending('node_hung', NODE_FAILED, text, [name])
         self._display.say(f'{text}; it is killed')
         process.signal(signal.SIGKILL)
         return None
@@ -124,10 +120,6 @@ class Supervisor:
     def _note(self, name: str, event: str) -> None:
         self.events.append({'time': self._recorder.elapsed, 'node': name, 'event': event})
 
-    def _failure(self, reason: str, text: str, names: list[str]) -> Ending:
-        self.failed.update(names)
-        return Ending(reason, NODE_FAILED, text)
-
     def _stop_robot_of(self, name: str) -> None:
         robot = (self._recorder.relative(name) or '').split('/')[1]
         if robot in self._scenario.robots:
@@ -138,12 +130,12 @@ class Supervisor:
         silence = f'for {self._limits.silence:g} s'
         step = self._recorder.step
         if step is None:
-            return self._failure('node_hung', f'the simulated time stands still {silence}', [])
+            return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
         steps = self._recorder.done_steps()
         doers = [name for name, plan in self._plans.items() if plan.says_done]
         late = [name for name in doers if steps.get(name, -1) < step]
         who = ', '.join(late) or next(iter(self._clocks))
-        return self._failure('node_hung', f'step {step}: nothing from {who} {silence}', late)
+        return Ending('node_hung', NODE_FAILED, f'step {step}: nothing from {who} {silence}', late)
 
     @property
     def restarting(self) -> bool:
