@@ -28,7 +28,7 @@ class Run:
         plans = {name: NodePlan('maasi', 'node', name[1:]) for name in (FILTER, PLANNER)}
         self.nodes = {name: NodeProcess(name, [], Path()) for name in plans}
         for pid, node in enumerate(self.nodes.values(), start=1):
-            node._process = SimpleNamespace(pid=pid, exitcode=None)
+            node._popen = SimpleNamespace(pid=pid, poll=lambda: None)
         recorder = SimpleNamespace(elapsed=0.0, relative=str, take_heartbeats=self.take)
         scenario = load_scenario('mambo')
         self.supervisor = Supervisor(

@@ -65,16 +65,16 @@ def started(process):
 
 def ended(process):
     process.start()
-    wait_until(lambda: not process.running)
+    wait_until(lambda: not process.is_alive())
     return process
 
 
 def test_a_process_writes_its_log_also_of_a_restart_and_says_how_it_ended(tmp_path):
     process = ended(python(tmp_path, 'print("hello"); raise SystemExit(3)'))
-    assert process.code == 3
+    assert process.exitcode == 3
     assert process.how_it_ended() == 'exited with 3'
     process.restart()
-    wait_until(lambda: not process.running)
+    wait_until(lambda: not process.is_alive())
     assert process.restarts == 1
     assert process.last_words().splitlines() == ['hello', '--- start number 2 ---', 'hello']
     dead = Path(f'/dev/shm/fastrtps_{os.getpid():016x}')
@@ -83,7 +83,7 @@ def test_a_process_writes_its_log_also_of_a_restart_and_says_how_it_ended(tmp_pa
         # Another process that looks at the same moment has the file open: once more, then.
         dead.touch()
         process.restart()
-        wait_until(lambda: not process.running)
+        wait_until(lambda: not process.is_alive())
         return not dead.exists()
 
     wait_until(is_removed)
@@ -107,8 +107,8 @@ def test_output_and_environment_are_its_own(tmp_path, monkeypatch):
 
 def test_a_node_that_cannot_be_executed_ends_and_says_why(tmp_path):
     process = NodeProcess('/node', [str(tmp_path / 'missing')], tmp_path / 'log')
-    assert process.code is None and not process.running
-    assert ended(process).code == 1
+    assert process.exitcode is None and not process.is_alive()
+    assert ended(process).exitcode == 1
     assert 'FileNotFoundError' in process.last_words()
 
 
@@ -130,7 +130,7 @@ def test_a_node_of_the_suite_that_refuses_its_input_says_so(tmp_path, domain, lo
     command = KINDS['filter'].command(tmp_path / 'node.yaml')
     (tmp_path / 'node.yaml').unlink()
     process = ended(NodeProcess('/node', command, tmp_path / log, 'maasi_filter'))
-    assert process.code not in (0, None)
+    assert process.exitcode not in (0, None)
     assert log == 'full' or 'node.yaml' in (tmp_path / 'log').read_text()
 
 
@@ -177,8 +177,8 @@ def test_a_dead_server_is_started_again(tmp_path):
     server = int(stat(process.pid)[1])
     assert os.getsid(server) == server
     os.kill(server, signal.SIGKILL)
-    wait_until(lambda: not process.running and not alive(process.pid))
-    assert ended(python(tmp_path, 'print(1)')).code == 0
+    wait_until(lambda: not process.is_alive() and not alive(process.pid))
+    assert ended(python(tmp_path, 'print(1)')).exitcode == 0
 
 
 def test_unknown_packages_and_executables_are_named(tmp_path, monkeypatch):
@@ -246,7 +246,7 @@ def test_an_interrupt_while_a_forked_node_starts_leaves_no_traceback(tmp_path, d
     try:
         wait_for(node.pid, MOMENTS[moment])
         node.signal(signal.SIGINT)
-        wait_until(lambda: not node.running)
+        wait_until(lambda: not node.is_alive())
     finally:
         stop([node])
     assert node.how_it_ended() in ('exited with 0', 'was killed by SIGINT'), node.last_words()

@@ -184,7 +184,7 @@ class World(Operator):
 
     def turn(self):
         for kind, process in self.processes.items():
-            if not process.running:
+            if not process.is_alive():
                 pytest.fail(f'{kind} {process.how_it_ended()}:\n{process.last_words(40)}')
         self.executor.spin_once(timeout_sec=0.05)
 

@@ -10,16 +10,14 @@ import contextlib
 import ctypes
 import gc
 import importlib
-import multiprocessing
 import os
 import signal
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from multiprocessing import forkserver, resource_tracker, util
-from multiprocessing.process import BaseProcess
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
@@ -42,7 +40,6 @@ _ENVIRONMENT = {
 }
 # Addresses of Unix sockets have at most 107 bytes; multiprocessing adds 32 to the folder.
 _LONGEST_FOLDER = 75
-_context = multiprocessing.get_context('forkserver')
 # A heartbeat this soon after a start is from the previous process [s].
 _LEAST_START = 0.5
 # Signals of a shutdown, and the timeout of each [s].
@@ -55,7 +52,7 @@ class ProcessError(RuntimeError):
 
 def start_server() -> None:
     """Start the server, which loads what nodes share in the background."""
-    _context.set_forkserver_preload([__name__])
+    forkserver.set_forkserver_preload([__name__])
     resource_tracker.ensure_running()
     for key, value in _ENVIRONMENT.items():
         os.environ.setdefault(key, value)
@@ -79,7 +76,7 @@ def start_server() -> None:
 
 def wait_for_server() -> None:
     """Return once the server has loaded what nodes share."""
-    process = _context.Process(target=int)
+    process = ForkServerProcess(target=int)
     try:
         process.start()
     except (OSError, EOFError) as error:
@@ -112,30 +109,6 @@ def _die_with(parent: int) -> None:
         os._exit(1)
 
 
-def _become_node(package: str, command: list[str], log: Path, environment: dict[str, str]) -> None:
-    """Become a node: an independent process that ends with the server, and so with the run."""
-    os.setsid()
-    _die_with(_server)
-    try:
-        output = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    except OSError:
-        # The disk is full: the node runs without a log.
-        output = os.open(os.devnull, os.O_WRONLY)
-    nothing = os.open(os.devnull, os.O_RDONLY)
-    for source, target in ((nothing, 0), (output, 1), (output, 2)):
-        os.dup2(source, target)
-    os.environ.clear()
-    os.environ.update(environment)
-    script = getattr(maasi_entry, Path(command[0]).name, None)
-    if package not in _PACKAGES or script is None:
-        for number in (signal.SIGPIPE, signal.SIGXFSZ):
-            signal.signal(number, signal.SIG_DFL)
-        os.execv(command[0], command)
-    sys.argv = list(command)
-    setproctitle(' '.join(command))
-    sys.exit(script())
-
-
 def find_executable(package: str, executable: str) -> Path:
     """Return the file that `ros2 run package executable` would run."""
     try:
@@ -148,8 +121,7 @@ def find_executable(package: str, executable: str) -> Path:
     return path
 
 
-@dataclass
-class NodeProcess:
+class NodeProcess(ForkServerProcess):
     """A node that runs as a process and cannot outlive this one.
 
     Its command is the path of its executable and its arguments, also shown by `ps`. Its log is kept
@@ -159,29 +131,27 @@ class NodeProcess:
     include compilation. Times are of the wall [s].
     """
 
-    name: str
-    command: list[str]
-    log: Path
-    package: str = ''
-    restarts: int = 0
-    started: float = 0.0
-    #: Time of its last heartbeat, and how long it had waited for a processor by then.
-    beaten: float | None = None
-    _waited: float = 0.0
-    _process: BaseProcess | None = None
+    def __init__(self, name: str, command: list[str], log: Path, package: str = '') -> None:
+        super().__init__(name=name)
+        self.command = command
+        self.log = log
+        self.package = package
+        self.restarts = 0
+        self.started = 0.0
+        #: Time of its last heartbeat, and how long it had waited for a processor by then.
+        self.beaten: float | None = None
+        self._waited = 0.0
 
     def start(self) -> None:
         """Start it."""
         # The node itself opens it.
         with contextlib.suppress(OSError):
             self.log.touch()
-        given = self.package, self.command, self.log, dict(os.environ)
-        self._process = _context.Process(target=_become_node, args=given)
+        self._environment = dict(os.environ)
         try:
             start_server()
-            self._process.start()
+            super().start()
         except (OSError, EOFError) as error:
-            self._process = None
             raise ProcessError(f'{self.name}: cannot be started: {error}') from error
         self.started, self.beaten = time.monotonic(), None
 
@@ -194,26 +164,37 @@ class NodeProcess:
         remove_dead()
         with contextlib.suppress(OSError), self.log.open('ab') as output:
             output.write(f'--- start number {self.restarts + 1} ---\n'.encode())
+        # One process object starts once.
+        self.join()
+        super().__init__(name=self.name)
         self.start()
 
-    @property
-    def pid(self) -> int | None:
-        """Number of the process."""
-        return None if self._process is None else self._process.pid
-
-    @property
-    def code(self) -> int | None:
-        """Exit code; negative: the signal that killed it; None while it runs."""
-        return None if self._process is None else self._process.exitcode
-
-    @property
-    def running(self) -> bool:
-        """Whether it was started and has not ended."""
-        return self._process is not None and self._process.exitcode is None
+    def run(self) -> None:
+        """Become the node: an independent process that ends with the server."""
+        os.setsid()
+        _die_with(_server)
+        try:
+            output = os.open(self.log, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError:
+            # The disk is full: the node runs without a log.
+            output = os.open(os.devnull, os.O_WRONLY)
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        for source, target in ((nothing, 0), (output, 1), (output, 2)):
+            os.dup2(source, target)
+        os.environ.clear()
+        os.environ.update(self._environment)
+        script = getattr(maasi_entry, Path(self.command[0]).name, None)
+        if self.package not in _PACKAGES or script is None:
+            for number in (signal.SIGPIPE, signal.SIGXFSZ):
+                signal.signal(number, signal.SIG_DFL)
+            os.execv(self.command[0], self.command)
+        sys.argv = list(self.command)
+        setproctitle(' '.join(self.command))
+        sys.exit(script())
 
     def signal(self, number: int) -> None:
         """Send a signal, if it still runs."""
-        if self.running and self.pid is not None:
+        if self.is_alive() and self.pid is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, number)
 
@@ -231,7 +212,7 @@ class NodeProcess:
 
     def how_it_ended(self) -> str:
         """Return in words how it ended."""
-        code = self.code
+        code = self.exitcode
         if code is None:
             return 'is running'
         if code >= 0:
@@ -269,7 +250,7 @@ def stop(
     """
     stubborn: list[str] = []
     for number, patience in ending:
-        rest = [process for process in processes if process.running]
+        rest = [process for process in processes if process.is_alive()]
         if not rest:
             break
         if number == signal.SIGKILL:
@@ -277,7 +258,7 @@ def stop(
         for process in rest:
             process.signal(number)
         deadline = time.monotonic() + patience
-        while any(process.running for process in rest) and time.monotonic() < deadline:
+        while any(process.is_alive() for process in rest) and time.monotonic() < deadline:
             time.sleep(0.005)
     return stubborn
 

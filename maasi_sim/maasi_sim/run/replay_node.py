@@ -264,7 +264,7 @@ def _feed(
             if interrupted():
                 raise _Stopped(INTERRUPTED)
             for process in processes:
-                if not process.running:
+                if not process.is_alive():
                     fail(f'{process.name} {process.how_it_ended()}', process)
             if time.monotonic() > deadline:
                 fail(f'{what} for {patience:g} s', processes[0])

@@ -68,7 +68,7 @@ class Supervisor:
             if name in beats:
                 process.beat(beats[name])
             ending = None
-            if not process.running:
+            if not process.is_alive():
                 ending = self._restart(name, process)
             elif self.running:
                 ending = self._check_heartbeat(name, process, now)
@@ -145,7 +145,7 @@ class Supervisor:
     @property
     def has_clock(self) -> bool:
         """Whether the simulation runs."""
-        return all(self.processes[name].running for name in self._clocks)
+        return all(self.processes[name].is_alive() for name in self._clocks)
 
     def stop(self, keep_clock: bool) -> None:
         """Stop the robots, then the nodes, and record their last messages."""
