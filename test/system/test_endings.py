@@ -15,7 +15,6 @@ from scenario_runs import beside, command, run_scenario, start, started, write_s
 from maasi_sim.run import scenario_run
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.ending import DONE, NOT_WRITTEN, Ending
-from maasi_sim.run.report_files import StoredReport
 from maasi_sim.run.run_folder import make_folder
 from maasi_sim.run.run_options import Options, parse
 from maasi_sim.run.scenario_run import ScenarioRun
@@ -178,7 +177,7 @@ def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path, monkeypatch
     run._check_recording()
     (gap,) = run.supervisor.events
     assert run.unwritten == [gap['reason']] == ['a gap']
-    monkeypatch.setattr(scenario_run, 'store_report', lambda *_: StoredReport({}, '', None))
+    monkeypatch.setattr(scenario_run, 'store_report', lambda *_: ({}, None, ''))
     run.observer = SimpleNamespace(record=lambda end: end)
     run._leave_replay = lambda: None
     assert run._report() == NOT_WRITTEN

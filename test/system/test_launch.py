@@ -115,8 +115,7 @@ def test_arguments_become_options_that_run_scenario_knows(monkeypatch):
         for item in (given, others)
     )
     expected = given | {'scenario': 'mambo_turtlebot', 'out': Path('-folder'), 'seed': 3}
-    expected |= {'lockstep': True, 'no_record': True, 'rate': 2.0, 'time_limit': 9.0}
+    expected |= {'lockstep': True, 'record': False, 'rate': 2.0, 'time_limit': 9.0}
     expected |= {'domain_id': 7, 'follow_clock': False, 'view': False, 'port': None}
-    del expected['record']
     assert expected.items() <= first.items()
     assert {'follow_clock': True, 'view': True, 'port': 8500}.items() <= second.items()

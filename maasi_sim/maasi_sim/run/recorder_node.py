@@ -6,7 +6,7 @@ import contextlib
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import cache
 from typing import Any
 
@@ -47,6 +47,8 @@ _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
 # The clock may come after messages of its time: they are logged at their stamp, so that no stamp is
 # later than its log time. A larger lead is assumed to be of another clock [ns].
 _LARGEST_LEAD = 10**9
+# Between two calls to take off [s].
+_ARMING_PERIOD = 2.0
 # Longest wait for the acknowledgement of stop commands [s].
 _STOP_PATIENCE = 1.0
 
@@ -118,6 +120,7 @@ class Recorder:
         #: Time of the last diagnostics of each node [s of wall time].
         self.heartbeats: dict[str, float] = {}
         self._arming: dict[str, Client] = {}
+        self._armed_at = 0.0
         self._last_done: deque[bytes] = deque(maxlen=100)
         self.ready: set[str] = set()
         # Nodes that answered the newest reader of READY, and the number of others at that time.
@@ -394,12 +397,17 @@ class Recorder:
             steps[message.node] = max(message.step, steps.get(message.node, 0))
         return steps
 
-    def arm(self, robots: Collection[str]) -> None:
-        """Call the service `arm` of drivers, as a person does with real robots.
+    def arm(self, robots: Iterable[str]) -> None:
+        """Call the service `arm` of drivers that are not ready, as a person does with real robots.
 
-        Whether a driver has followed is heard when it is ready.
+        To be called again and again: the first call may come before a driver is active.
         """
+        if time.monotonic() - self._armed_at < _ARMING_PERIOD:
+            return
+        self._armed_at = time.monotonic()
         for name in robots:
+            if self._full(f'/{name}/driver') in self.ready:
+                continue
             if name not in self._arming:
                 service = self._full(f'/{name}/arm')
                 self._arming[name] = self.node.create_client(Trigger, service)

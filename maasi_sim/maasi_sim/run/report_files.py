@@ -6,7 +6,6 @@ import contextlib
 import json
 import math
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +28,6 @@ END_REASONS = {
     'not_ready': 'the nodes did not get ready',
     'no_robot': 'no robot can go on',
 }
-
-
-@dataclass(frozen=True)
-class StoredReport:
-    """A report, its summary, and the folder of its files; None: they could not be written.
-
-    `problem` says why they are not in the folder of the run, else it is empty.
-    """
-
-    report: dict[str, Any]
-    words: str
-    folder: Path | None
-    problem: str = ''
 
 
 def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> dict[str, Any]:
@@ -103,11 +89,14 @@ def write_report(mission: Mission[Any], record: RunRecord, folder: Path) -> dict
     return report
 
 
-def store_report(mission: Mission[Any], record: RunRecord, folder: Path) -> StoredReport:
+def store_report(
+    mission: Mission[Any], record: RunRecord, folder: Path
+) -> tuple[dict[str, Any], Path | None, str]:
     """Write a report into the folder of the run, or, if that fails, into another one.
 
     The other one is a new folder below the first of these with space: that of temporary files, the
-    home of the user, `/dev/shm`.
+    home of the user, `/dev/shm`. Returned are the report, its folder, None if it could not be
+    written, and why it is not in the folder of the run.
     """
     problem = ''
     for base in (None, Path(tempfile.gettempdir()), Path.home(), Path('/dev/shm')):
@@ -116,8 +105,7 @@ def store_report(mission: Mission[Any], record: RunRecord, folder: Path) -> Stor
         except OSError:
             continue
         try:
-            report = write_report(mission, record, place)
-            return StoredReport(report, mission.summary(report), place, problem)
+            return write_report(mission, record, place), place, problem
         except (OSError, ResultsError) as error:
             cause = error.__cause__ or error
             reason = getattr(cause, 'strerror', None) or str(error)
@@ -126,5 +114,4 @@ def store_report(mission: Mission[Any], record: RunRecord, folder: Path) -> Stor
             if base is not None:
                 with contextlib.suppress(OSError):
                     place.rmdir()
-    report = mission.report(record)
-    return StoredReport(report, mission.summary(report), None, problem)
+    return mission.report(record), None, problem

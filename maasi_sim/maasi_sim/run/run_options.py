@@ -65,7 +65,11 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=f'Exit codes: {", ".join(f"{code} {what}" for code, what in EXIT_CODES.items())}.',
     )
     parser.add_argument(
-        'scenario', nargs='?', metavar='FILE', help='scenario file, or name of one in config'
+        'scenario',
+        nargs='?',
+        default='',
+        metavar='FILE',
+        help='scenario file, or name of one in config',
     )
     parser.add_argument(
         '--out', type=Path, metavar='DIR', help='folder of the run (default: runs/<time>)'
@@ -79,7 +83,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--rate', type=positive, metavar='X', help='simulated over wall time (default: 1)'
     )
-    parser.add_argument('--no-record', action='store_true', help='write no recording')
+    parser.add_argument(
+        '--no-record', dest='record', action='store_false', help='write no recording'
+    )
     parser.add_argument('--planner', metavar='NAME', help="instead of the scenario's")
     parser.add_argument(
         '--time-limit', type=positive, metavar='S', help='simulated time [s], instead of its own'
@@ -145,25 +151,19 @@ def _namespace(text: str) -> str:
 def parse(arguments: list[str] | None) -> Options:
     """Return the options of a command line; a wrong one ends the process with 2."""
     parser = build_parser()
-    options = parser.parse_args(arguments)
-    if (options.replay is None) == (options.scenario is None):
+    given = vars(parser.parse_args(arguments))
+    view = ViewOptions(*(given.pop(field.name) for field in fields(ViewOptions)))
+    if not given['view'] and (view.port is not None or view.control):
+        parser.error('--port and --control need --view')
+    given |= {'namespace': given['namespace'] or '', 'view': view if given['view'] else None}
+    options = Options(**given)
+    if (options.replay is None) == (not options.scenario):
         parser.error('give either a scenario or --replay BAG')
     if options.follow_clock and options.domain_id is None:
         parser.error('--follow-clock needs the --domain-id of the run whose clock it is')
     if options.follow_clock and (options.lockstep or options.rate is not None):
         parser.error('--follow-clock: allowed without --lockstep and --rate')
-    if not options.view and (options.port is not None or options.control):
-        parser.error('--port and --control need --view')
-    view = ViewOptions(options.port, options.host, options.control)
-    names = {item.name for item in fields(Options)}
-    given = {name: value for name, value in vars(options).items() if name in names}
-    given |= {
-        'scenario': options.scenario or '',
-        'record': not options.no_record,
-        'namespace': options.namespace or '',
-        'view': view if options.view else None,
-    }
-    return Options(**given)
+    return options
 
 
 def launch_arguments() -> dict[str, tuple[str, str]]:

@@ -25,11 +25,11 @@ from maasi_sim.run.ending import (
 )
 from maasi_sim.run.mission import RunEnd
 from maasi_sim.run.missions import load_mission
-from maasi_sim.run.node_plan import NodePlan, plan_in_run
-from maasi_sim.run.processes import stop, wait_for_server
+from maasi_sim.run.node_plan import plan_in_run
+from maasi_sim.run.processes import NodeProcess, stop, wait_for_server
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
-from maasi_sim.run.report_files import StoredReport, store_report
+from maasi_sim.run.report_files import store_report
 from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.rviz_view import view_text
@@ -48,8 +48,6 @@ _POLL = 0.02
 _FOLLOWERS_PERIOD = 0.5
 # Longest wait for a publisher of others, which may not fit the recorder [s].
 _CONNECTION_PATIENCE = 5.0
-# Between two calls to take off: the first may come before a driver is active [s].
-_ARMING_PERIOD = 2.0
 # Wall time between two messages about missing nodes [s].
 _START_PATIENCE = 10.0
 
@@ -71,10 +69,9 @@ class ScenarioRun:
         }
         overrides = {name: item for name, item in given.items() if item[1] is not None}
         self.display = ProgressDisplay()
-        with warnings.catch_warnings(record=True) as caught:
+        with warnings.catch_warnings(record=True) as self._doubts:
             warnings.simplefilter('always', ScenarioWarning)
             self.mission = load_mission(options.scenario, overrides)
-        self._doubts = [str(item.message) for item in caught]
         # A node in the namespace of a robot belongs to that robot.
         if options.namespace.rpartition('/')[2] in self.mission.scenario.names():
             raise ScenarioError(
@@ -84,7 +81,6 @@ class ScenarioRun:
         self._bag: BagWriter | None = None
         #: Errors of writing.
         self.unwritten: list[str] = []
-        self._armed_at = 0.0
         # Wall time when all nodes were ready, of the first step, and how long the run took.
         self._complete: float | None = None
         self._begun: float | None = None
@@ -100,16 +96,12 @@ class ScenarioRun:
             self.mission.prepare()
             self._scenario = self.mission.scenario
             self._limits = self._scenario.limits
-            self._plans = {plan.full_name: plan for plan in self._plan()}
-            processes = {
-                name: plan.process(self.folder, options.log_level)
-                for name, plan in self._plans.items()
-            }
+            processes = self._plan()
             self.display.say(
                 f'{self.mission.name}: seed {self._scenario.seed}, {len(processes)} nodes in ROS '
                 f'domain {domain.number}, results in {short(self.folder)}'
             )
-            self._warn(*self._doubts)
+            self._warn(*(str(doubt.message) for doubt in self._doubts or ()))
             ends.callback(self.display.close)
             page = self._page(domain.number)
             if page is not None:
@@ -149,15 +141,18 @@ class ScenarioRun:
                     self.recorder.drain()
             return code
 
-    def _plan(self) -> list[NodePlan]:
-        """Write the scenario with all layers, and return its nodes."""
+    def _plan(self) -> dict[str, NodeProcess]:
+        """Write the scenario with all layers; plan its nodes, and return their processes."""
         options, scenario = self.options, self._scenario
         file = self.folder / 'scenario.yaml'
         write_text(file, scenario.text())
         write_text(self.folder / 'view.rviz', view_text(self.mission, options.namespace))
         state = self.folder / 'state' if scenario.on_exit == 'respawn' else None
         plans = self.mission.plan_nodes(options, file)
-        return [plan_in_run(plan, options, state) for plan in plans]
+        moved = [plan_in_run(plan, options, state) for plan in plans]
+        self._plans = {plan.full_name: plan for plan in moved}
+        level = options.log_level
+        return {name: plan.process(self.folder, level) for name, plan in self._plans.items()}
 
     def _facts(self) -> str:
         """Return the data for a replay, as YAML."""
@@ -252,15 +247,6 @@ class ScenarioRun:
             return dict.fromkeys(unmatched, 'has a publisher that is not connected')
         return dict.fromkeys(recorder.unanswered(expected), 'does not know the recorder')
 
-    def _let_take_off(self) -> None:
-        """Let simulated robots take off whose drivers do not take part yet."""
-        if time.monotonic() - self._armed_at < _ARMING_PERIOD:
-            return
-        self._armed_at = time.monotonic()
-        ready = set(map(self.recorder.relative, self.recorder.ready))
-        names = [name for name, robot in self._scenario.robots.items() if robot.takes_off]
-        self.recorder.arm([name for name in names if f'/{name}/driver' not in ready])
-
     def _name_external_robots(self) -> None:
         team = self.options.namespace
         where = f' --namespace {team}' if team else ''
@@ -307,7 +293,7 @@ class ScenarioRun:
         recorder, observer, limit = self.recorder, self.observer, self._limits.time
         recorder.wait(_POLL)
         recorder.drain(round(limit * 1e9))
-        self._let_take_off()
+        recorder.arm(name for name, robot in self._scenario.robots.items() if robot.takes_off)
         if self.interruption:
             return Ending('interrupted', INTERRUPTED)
         if failure := self.supervisor.check():
@@ -369,27 +355,29 @@ class ScenarioRun:
         ending = self.ending
         elapsed, events = self.recorder.elapsed, self.supervisor.events
         end = RunEnd(ending.reason, elapsed, self._wall_time, events)
-        stored = StoredReport({}, 'report: skipped', None)
+        report: dict[str, Any] = {}
+        place, problem = None, ''
         with self.interruption.at_once(signal.SIGINT):
             self.display.say('writing report and replay (Ctrl-C skips each)')
-            stored = store_report(self.mission, self.observer.record(end), self.folder)
-        self.display.say(stored.words)
+            record = self.observer.record(end)
+            report, place, problem = store_report(self.mission, record, self.folder)
+        self.display.say(self.mission.summary(report) if report else 'report: skipped')
         if ending.text:
             self.display.say(f'ended: {ending.text}')
-        for name, process in self.supervisor.processes.items():
-            if name in ending.nodes:
+        for name in ending.nodes:
+            if process := self.supervisor.processes.get(name):
                 self.display.say(f'--- {short(process.log)}\n{process.last_words()}')
-        unwritten = self.unwritten + ([stored.problem] if stored.problem else [])
-        for problem in unwritten:
-            self.display.say(f'error: {problem}')
-        if stored.report:
-            place = 'nowhere' if stored.folder is None else short(stored.folder / 'report.json')
-            self.display.say(f'report: {place}')
+        unwritten = [*self.unwritten, problem] if problem else self.unwritten
+        for text in unwritten:
+            self.display.say(f'error: {text}')
+        if report:
+            where = 'nowhere' if place is None else short(place / 'report.json')
+            self.display.say(f'report: {where}')
         with self.interruption.at_once(signal.SIGINT):
             self._leave_replay()
         self.display.close()
         code = ending.code
-        if ending.reason == 'planner_done' and stored.report.get('missed') == 0:
+        if ending.reason == 'planner_done' and report.get('missed') == 0:
             code = DONE
         return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
