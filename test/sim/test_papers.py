@@ -12,6 +12,8 @@ from maasi_sim.experiments.campaign import Workers, plan
 from maasi_sim.experiments.outputs import write_outputs
 from maasi_sim.experiments.papers import experiments
 from maasi_sim.experiments.runs import load_run
+from maasi_sim.scenario.loading import scenario_from_values
+from maasi_sim.search import search
 
 KNOWN = experiments()
 
@@ -97,6 +99,13 @@ def test_robot_that_leaves_measures_no_more():
     assert second[time < 4.95].all() and not second[time >= 4.95].any()
     assert np.array(outcome.columns['drone1_measures']).all()
     assert outcome.summary['measurements'] == 20
+    result = search(scenario_from_values(content, 'test'), 3, 20)
+    said = [event[4:] for event in result.trace.log().events if event[1] == 'log']
+    assert ['drone2', 'left'] in said
+    # The way is at least that from one measurement to the next.
+    places = np.array([item.positions['drone1'] for item in result.progress])
+    straight = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+    assert result.distance['drone1'] >= 0.999 * straight > 1.0
     back = {'at': 8.0, 'robot': 'drone2', 'do': 'back'}
     content = {**content, 'events': [leave, back]}
     with pytest.raises(ValueError, match='only leave'):
