@@ -299,7 +299,7 @@ def _lateral(
     )
 
 
-@njit(cache=True, forceinline=True)
+@njit(cache=True)
 def mambo_step(
     state: FloatArray,
     command: Command,

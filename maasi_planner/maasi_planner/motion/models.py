@@ -81,23 +81,38 @@ def _point_step(state: FloatArray, command: Command, steering: Steering, dt: flo
     state[3] += dt * state[7]
 
 
+# Arrays are arguments only of what needs them: counting references to them costs more than a step.
 @njit(cache=True, forceinline=True)
+def _freely(kind: int, steering: Steering, state: FloatArray, goal: Vector) -> Command:
+    if kind == UNICYCLE:
+        return drive_freely(state, goal, steering)
+    return fly_freely((state[0], state[1], state[2]), state[3], goal, steering)
+
+
+@njit(cache=True)
 def steer(kernel: Kernel, state: FloatArray, goal: Vector, to_goal: FloatArray) -> Command:
     """Return the command of a robot's controller towards a waypoint."""
     position, yaw, steering = (state[0], state[1], state[2]), state[3], kernel.steering
-    if kernel.kind == UNICYCLE:
-        if kernel.obstructed:
-            return drive_among(state, goal, to_goal, steering, kernel.around)
-        return drive_freely(state, goal, steering)
+    if kernel.obstructed and kernel.kind == UNICYCLE:
+        return drive_among(state, goal, to_goal, steering, kernel.around)
     if kernel.obstructed and not kernel.term.kind:
         return fly_among(position, yaw, goal, to_goal, steering, kernel.around)
-    command = fly_freely(position, yaw, goal, steering)
+    command = _freely(kernel.kind, steering, state, goal)
     if kernel.obstructed:
         return with_obstacle_term(position, yaw, command, kernel.term, kernel.parameters)
     return command
 
 
 @njit(cache=True, forceinline=True)
+def _move(kind: int, steering: Steering, state: FloatArray, command: Command, h: float) -> float:
+    if kind == UNICYCLE:
+        unicycle_step(state, command, steering, h)
+    else:
+        _point_step(state, command, steering, h)
+    return command[0] ** 2 + command[1] ** 2 + command[2] ** 2 + command[3] ** 2
+
+
+@njit(cache=True)
 def advance(kernel: Kernel, state: FloatArray, command: Command) -> float:
     """Move a body for a step under a command, in place; return the sum of its squared inputs."""
     periods, h = kernel.periods, kernel.h
@@ -105,11 +120,7 @@ def advance(kernel: Kernel, state: FloatArray, command: Command) -> float:
         return mambo_step(state, command, kernel.parameters, kernel.table, periods, h)
     if kernel.kind == QUADROTOR:
         return quadrotor_step(state, command, kernel.parameters, periods, h)
-    if kernel.kind == UNICYCLE:
-        unicycle_step(state, command, kernel.steering, h)
-    else:
-        _point_step(state, command, kernel.steering, h)
-    return command[0] ** 2 + command[1] ** 2 + command[2] ** 2 + command[3] ** 2
+    return _move(kernel.kind, kernel.steering, state, command, h)
 
 
 @njit(cache=True)
@@ -126,15 +137,25 @@ def _close_loop(
     Return the steps to the waypoint, one too many where it is not reached, and the sum of squared
     inputs.
     """
+    kind, steering, obstructed, _, _, parameters, table, tolerance, periods, h = kernel
     cost = 0.0
     for k in range(yaws.shape[0]):
         x, y, z = state[0], state[1], state[2]
         positions[k, 0], positions[k, 1], positions[k, 2], yaws[k] = x, y, z, state[3]
-        height = 0.0 if kernel.kind == UNICYCLE else goal[2] - z
+        height = 0.0 if kind == UNICYCLE else goal[2] - z
         square = (goal[0] - x) ** 2 + (goal[1] - y) ** 2 + height * height
-        if square <= kernel.tolerance * kernel.tolerance:
+        if square <= tolerance * tolerance:
             return k, cost
-        cost += advance(kernel, state, steer(kernel, state, goal, to_goal))
+        if obstructed:
+            command = steer(kernel, state, goal, to_goal)
+        else:
+            command = _freely(kind, steering, state, goal)
+        if kind == MAMBO:
+            cost += mambo_step(state, command, parameters, table, periods, h)
+        elif kind == QUADROTOR:
+            cost += quadrotor_step(state, command, parameters, periods, h)
+        else:
+            cost += _move(kind, steering, state, command, h)
     return yaws.shape[0], cost
 
 

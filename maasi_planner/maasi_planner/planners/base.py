@@ -128,14 +128,13 @@ def usable_candidates(
     view = team.robots[name]
     points = np.asarray(view.candidates, dtype=float).reshape(-1, 3)
     dropped: list[str] = []
-    bad = int((~np.isfinite(points)).any(axis=1).sum())
     inside = in_bounds(points, team.bounds)
-    out = len(points) - int(np.count_nonzero(inside)) - bad
-    if bad:
-        dropped.append(f'{bad} not finite')
-    if out:
-        dropped.append(f'{out} outside the bounds')
-    points = points[inside]
+    if not inside.all():
+        finite = np.isfinite(points).all(axis=1)
+        for wrong, reason in ((~finite, 'not finite'), (finite & ~inside, 'outside the bounds')):
+            if wrong.any():
+                dropped.append(f'{np.count_nonzero(wrong)} {reason}')
+        points = points[inside]
     number = len(points)
     if extra is not None and len(extra):
         points = np.vstack([points, extra[in_bounds(extra, team.bounds)]])
