@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from searches import log_density
 
-from maasi_filter import ExponentialDetection, Pose, Sensor
+from maasi_filter import AgentMeasurement, ExponentialDetection, Pose, Sensor
 from maasi_filter.found_targets import FoundTargets
 from maasi_filter.ic_phd.births import (
     gaussian_births,
@@ -33,10 +33,8 @@ def test_births_weigh_what_the_constant_intensity_predicts(dimension):
     bounds = np.array([[0.0, 100.0]] * dimension)
     sensor, before = sensor_of(dimension), Pose([70.0, 60.0, 50.0])
     z = np.array([[25.0, 0.6, 0.3][:dimension]])
-    _, births = measurement_births(
-        z, sensor, POSE, bounds, 12.0, 40_000, np.random.default_rng(0),
-        [(sensor.detection, before)],
-    )  # fmt: skip
+    member, other = (AgentMeasurement('any', pose, sensor, z) for pose in (POSE, before))
+    _, births = measurement_births(member, [other], bounds, 12.0, 40_000, np.random.default_rng(0))
     axis = np.linspace(0.5, 99.5, 100)
     grid = np.stack(np.meshgrid(*[axis] * dimension, indexing='ij'), -1).reshape(-1, dimension)
     likelihood = np.exp(log_density(sensor, z, grid, POSE))
@@ -77,7 +75,7 @@ def test_noise_in_space_is_that_of_drawn_measurements(dimension):
     drawn = z + np.random.default_rng(0).standard_normal((20_000, dimension)) @ root.T
     places = precise.measurement.inverse(drawn, POSE)
     expected = np.cov(places.T)
-    spread = noise_in_space(z, precise, POSE)
+    spread = noise_in_space(AgentMeasurement('any', POSE, precise, z))
     np.testing.assert_allclose(spread, expected, atol=0.05 * np.trace(expected))
 
 

@@ -8,31 +8,28 @@ from collections.abc import Sequence
 import numpy as np
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_filter.models.detection import DetectionModel
-from maasi_filter.models.pose import Pose
-from maasi_filter.models.sensor import Sensor
+from maasi_filter.measurement_check import CheckedMeasurement
 
 
 def measurement_births(
-    values: FloatArray,
-    sensor: Sensor,
-    pose: Pose,
+    member: CheckedMeasurement,
+    before: Sequence[CheckedMeasurement],
     bounds: FloatArray,
     expected_targets: float,
     number: int,
     generator: np.random.Generator,
-    before: Sequence[tuple[DetectionModel, Pose]] = (),
 ) -> tuple[FloatArray, FloatArray]:
     """Return J births at each of m measurements, x = g^-1(z + N(0, R)), (m J, d), and b (m, J).
 
     Their intensity is N0 / V. Divided by the density of the draw and multiplied by the probability
-    that earlier robots missed them, b = (N0 / V) pi(x, q) |dx/dz| prod(1 - pi_before) / J, where
+    that robots `before` missed them, b = (N0 / V) pi(x, q) |dx/dz| prod(1 - pi_before) / J, where
     |dx/dz| = r in 2D and r^2 cos(elevation) in 3D; 0 outside E. b / C(z) is the posterior weight. A
     birth counts for its own measurement only: the sum of its b is <psi_z, Y>.
     """
-    count, d = values.shape
+    sensor, pose = member.sensor, member.pose
+    count, d = member.values.shape
     noise = generator.standard_normal((count, number, d)) @ np.linalg.cholesky(sensor.covariance).T
-    z = (values[:, None, :] + noise).reshape(-1, d)
+    z = (member.values[:, None, :] + noise).reshape(-1, d)
     particles = sensor.measurement.inverse(z, pose)
     # Exclude draws with negative range, or elevation beyond +-90 degrees.
     level = z[:, 0] * (np.cos(z[:, 2]) if d == 3 else 1.0)
@@ -42,8 +39,8 @@ def measurement_births(
     volume = float(np.prod(bounds[:, 1] - bounds[:, 0]))
     intensity = (expected_targets / volume / number) * jacobian
     intensity *= sensor.detection.probability(particles, pose)
-    for detection, place in before:
-        intensity *= 1.0 - detection.probability(particles, place)
+    for other in before:
+        intensity *= 1.0 - other.sensor.detection.probability(particles, other.pose)
     return particles, np.where(inside, intensity, 0.0).reshape(count, number)
 
 
@@ -88,11 +85,12 @@ def gaussian_births(
     return particles[inside], weights[inside]
 
 
-def noise_in_space(values: FloatArray, sensor: Sensor, pose: Pose) -> FloatArray:
-    """Return the mean covariance of the noise of measurements (m, d) in space, square metres."""
-    centres = sensor.measurement.inverse(values, pose)
-    inverse = np.linalg.pinv(sensor.measurement.jacobian(centres, pose))
-    return np.asarray((inverse @ sensor.covariance @ inverse.transpose(0, 2, 1)).mean(axis=0))
+def noise_in_space(member: CheckedMeasurement) -> FloatArray:
+    """Return the mean covariance of the noise of detections in space, square metres."""
+    model, pose = member.sensor.measurement, member.pose
+    inverse = np.linalg.pinv(model.jacobian(model.inverse(member.values, pose), pose))
+    spreads = inverse @ member.sensor.covariance @ inverse.transpose(0, 2, 1)
+    return np.asarray(spreads.mean(axis=0))
 
 
 def resample(weights: FloatArray, number: int, generator: np.random.Generator) -> IntArray:

@@ -119,17 +119,8 @@ def _explain_chunks(particles, weights, scan, probability, psi, sums, first, las
         end = min(len(weights), begin + CHUNK)
         part = probability[begin:end]
         _fill_offsets(particles[begin:end], scan, rows)
-        fill_probabilities(
-            scan.kind,
-            scan.parameters,
-            rows[X],
-            rows[Y],
-            rows[Z],
-            end - begin,
-            scan.cosine,
-            scan.sine,
-            part,
-        )
+        x, y, z = rows[X], rows[Y], rows[Z]
+        fill_probabilities(scan.kind, scan.parameters, x, y, z, scan.cosine, scan.sine, part)
         for m in range(len(scan.values)):
             psi[m, begin:end] = part
             sums[chunk, m] = _fill_psi(

@@ -141,16 +141,9 @@ class IcPhdFilter(SearchFilter):
         if numbers.births != 'measurement' or not count:
             return np.empty((0, self.dimension)), np.zeros((count, 0))
         room = numbers.particles // (2 * count)
-        return measurement_births(
-            member.values,
-            member.sensor,
-            member.pose,
-            self.bounds,
-            numbers.expected_targets,
-            max(LEAST_BIRTHS, min(numbers.birth_particles, room)),
-            self.generator,
-            [(other.sensor.detection, other.pose) for other in before],
-        )
+        number = max(LEAST_BIRTHS, min(numbers.birth_particles, room))
+        expected = numbers.expected_targets
+        return measurement_births(member, before, self.bounds, expected, number, self.generator)
 
     def _born_anywhere(
         self, members: Sequence[CheckedMeasurement]
@@ -164,7 +157,7 @@ class IcPhdFilter(SearchFilter):
         if numbers.births == 'uniform' or not seen:
             return np.empty((0, self.dimension)), np.empty(0)
         centres = np.concatenate([m.sensor.measurement.inverse(m.values, m.pose) for m in seen])
-        spreads = [noise_in_space(m.values, m.sensor, m.pose) for m in seen]
+        spreads = [noise_in_space(m) for m in seen]
         spread = np.average(spreads, axis=0, weights=[len(m.values) for m in seen])
         return gaussian_births(centres, spread, self.bounds, expected, number, self.generator)
 

@@ -135,10 +135,9 @@ def detection_probability_at(
 
 
 @njit(cache=True, error_model='numpy')
-def fill_probabilities(  # type: ignore[no-untyped-def]
-    kind, parameters, x, y, z, number, cos_yaw, sin_yaw, out
-):
-    """Fill pi for the first `number` offsets (x, y, z) [m, map axes] from the sensor."""
+def fill_probabilities(kind, parameters, x, y, z, cos_yaw, sin_yaw, out):  # type: ignore[no-untyped-def]
+    """Fill pi (n,) for the first n offsets (x, y, z) [m, map axes] from the sensor."""
+    number = len(out)
     if kind >= BOX:
         for i in range(number):
             out[i] = detection_probability_at(kind, parameters, x[i], y[i], z[i], cos_yaw, sin_yaw)
@@ -186,7 +185,7 @@ class DetectionModel:
         np.subtract(array.T, pose.position[:d, None], out=offset[:d])
         x, y, z = offset
         cos_yaw, sin_yaw = math.cos(pose.yaw), math.sin(pose.yaw)
-        fill_probabilities(self._kind, self._parameters, x, y, z, number, cos_yaw, sin_yaw, out)
+        fill_probabilities(self._kind, self._parameters, x, y, z, cos_yaw, sin_yaw, out)
         return out
 
 

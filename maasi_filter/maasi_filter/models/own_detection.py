@@ -72,7 +72,7 @@ class OwnDetection(DetectionModel):
         if function is None:
             function, values = _interpolated, self._table(reach)
         else:
-            values = self._numbers('values', self.values())
+            values = self._numbers('values', self.values()).ravel()
             # At some places, where an exception would still be seen.
             places = np.random.default_rng(1).uniform(-reach, reach, (_TRIALS, 3))
             places[:, dimension:] = places[0] = 0.0
@@ -110,21 +110,17 @@ class OwnDetection(DetectionModel):
         *,
         probabilities: bool = False,
     ) -> FloatArray:
-        """Return what a method gave as numbers of a shape; without one: (n,)."""
+        """Return what a method gave as numbers, of a shape if one is given."""
         try:
-            found = np.asarray(value)
-        except ValueError:  # rows of unequal lengths
-            found = np.asarray(None)
-        if found.dtype.kind not in 'biuf':
+            found = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):  # rows of unequal lengths too
             self._refuse(f'{what}: got {value!r:.80}, allowed are numbers')
-        if found.ndim != 1 if shape is None else found.shape != shape:
-            self._refuse(
-                f'{what}: got shape {found.shape}, allowed is {"(n,)" if shape is None else shape}'
-            )
+        if shape is not None and found.shape != shape:
+            self._refuse(f'{what}: got shape {found.shape}, allowed is {shape}')
         wrong = found[~((found >= 0.0) & (found <= 1.0))]
         if probabilities and wrong.size:
             self._refuse(f'{what}: got a probability of {wrong[0]}, allowed are numbers in [0, 1]')
-        return found.astype(float)
+        return found
 
     def _table(self, reach: float) -> FloatArray:
         """Return the numbers of `_interpolated`: corner, step and shape of a grid, and pi on it."""

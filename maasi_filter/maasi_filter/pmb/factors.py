@@ -73,17 +73,9 @@ def _detection_probabilities(head, axes, offset, probability):  # type: ignore[n
     if head[KIND] == ALWAYS:
         probability[:] = 1.0
         return
-    fill_probabilities(
-        int(head[KIND]),
-        head[MODEL:],
-        offset[0],
-        offset[1],
-        offset[2],
-        number,
-        head[COS],
-        head[SIN],
-        probability,
-    )
+    x, y, z = offset[0], offset[1], offset[2]
+    kind, cosine, sine = int(head[KIND]), head[COS], head[SIN]
+    fill_probabilities(kind, head[MODEL:], x, y, z, cosine, sine, probability)
     for i in range(number):
         probability[i] = min(probability[i], MOST_PROBABLE)
 

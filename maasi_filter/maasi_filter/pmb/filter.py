@@ -181,7 +181,7 @@ class PmbFilter(SearchFilter):
             moved = item.update(view, missed[i], caused[i], scan, self.generator)
             if caused[i].sum() > 0.5 and not item.foreign:
                 item.pose_error, item.found_radius = blurred.pose_error, radius
-            if self._is_found(item, moved) and not is_known(i, components, caused):
+            if self._review(item, moved) and not is_known(i, components, caused):
                 result.newly_found.append(self._find(item, member, time))
         # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
         real = np.where(named, 0.0, scan.intensity / (kappa + scan.intensity))
@@ -204,10 +204,10 @@ class PmbFilter(SearchFilter):
                     item.labels.identity = ''
             self.components.append(item)
 
-    def _is_found(self, item: Component, moved: bool) -> bool:
-        """Return whether a component becomes found; withdraw a found one that hardly exists.
+    def _review(self, item: Component, moved: bool) -> bool:
+        """Withdraw a found component that hardly exists; return whether another can be found.
 
-        It almost surely exists, at a precisely known position.
+        That almost surely exists, at a precisely known position.
         """
         numbers, reflecting = self._numbers.pmb, reflects(item.answers, self._rates)
         if item.foreign:

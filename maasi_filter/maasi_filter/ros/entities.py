@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Hashable
 from functools import partial
+from operator import methodcaller
 from typing import Any, TypeVar
 
 from rclpy.event_handler import EventHandler
@@ -43,9 +44,7 @@ class NodeEntities:
 
     def mark(self) -> None:
         """Mark the present entities as kept: `clear` destroys only later ones."""
-        node = self._node
-        made = (node.publishers, node.subscriptions, node.services, node.clients, node.timers)
-        self._kept = [item for items in (*made, node.waitables) for item in items]
+        self._kept = [item for item, _ in self._made()]
 
     def clear(self) -> None:
         """Destroy the entities created since `mark`; nothing without a mark."""
@@ -53,22 +52,24 @@ class NodeEntities:
             return
         kept = {id(item) for item in (*self._kept, *self._permanent.values())}
         self._kept = None
+        for item, destroy in self._made():
+            if id(item) not in kept:
+                destroy(item)
+
+    def _made(self) -> list[tuple[Any, Callable[[Any], object]]]:
+        """Return the entities of the node, each with what destroys it."""
         node = self._node
         # Of plugins; owners destroy their event handlers.
-        for waitable in list(node.waitables):
-            if id(waitable) not in kept and not isinstance(waitable, EventHandler):
-                waitable.destroy()  # type: ignore[attr-defined]
-        owners: list[tuple[Any, Any]] = [
+        waitables = [item for item in node.waitables if not isinstance(item, EventHandler)]
+        kinds: list[tuple[Any, Callable[[Any], object]]] = [
+            (waitables, methodcaller('destroy')),
             (node.timers, node.destroy_timer),
             (node.subscriptions, node.destroy_subscription),
             (node.services, node.destroy_service),
             (node.clients, node.destroy_client),
             (node.publishers, node.destroy_publisher),
         ]
-        for items, destroy in owners:
-            for item in list(items):
-                if id(item) not in kept:
-                    destroy(item)
+        return [(item, destroy) for items, destroy in kinds for item in items]
 
 
 def survive_bad_requests(node: Node, drop: Callable[[str, str], None]) -> None:

@@ -144,7 +144,7 @@ def chances(measured: Measurements, first: int, points: FloatArray) -> FloatArra
                 y[c] = points[c, 1] - measured.places[g, e, 1]
                 z[c] = points[c, 2] - measured.places[g, e, 2]
             cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
-            fill_probabilities(kind, parameters, x, y, z, number, cosine, sine, out[g, e])
+            fill_probabilities(kind, parameters, x, y, z, cosine, sine, out[g, e])
     return out
 
 
@@ -194,6 +194,6 @@ def apply_misses(
             x[i] = px[i] - x0
             y[i] = py[i] - y0
             z[i] = pz[i] - z0
-        fill_probabilities(kind, parameters, x, y, z, width, cosine, sine, chance)
+        fill_probabilities(kind, parameters, x, y, z, cosine, sine, chance)
         for i in range(width):
             after[i] *= 1.0 - chance[i]
