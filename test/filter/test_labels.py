@@ -5,7 +5,7 @@ import pytest
 from searches import floor_sensor, measured, observe, plane_filter, plane_sensor, play
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose
-from maasi_filter.ic_phd.filter import IcPhdFilter
+from maasi_filter.ic_phd.filter import IcPhdFilter, nearest_detection
 from maasi_filter.pmb.labels import MISREAD, LabelTally, associate_by_identity
 from maasi_filter.records import Label
 
@@ -63,6 +63,16 @@ def test_the_papers_filter_reports_the_label_of_the_nearest_detection():
         for target in search.found_targets
     }
     assert by_place == {0: Label('cup', 0.9, 'a'), 1: Label('plate', 0.7, 'b')}
+
+
+@pytest.mark.parametrize(('limit', 'label'), [(3.0, Label('cup')), (1.0, Label())])
+def test_the_nearest_label_within_the_limit_may_be_of_another_robot(limit, label):
+    sensor = plane_sensor()
+    near = measured(sensor, (0.0, 0.0), [[9.0, 0.0]], robot='a')
+    far = measured(sensor, (0.0, 0.0), [[12.0, 0.0]], robot='b')
+    far.labels = [Label('cup')]
+    robot, found = nearest_detection(np.array([10.0, 0.0]), [near, far], limit)
+    assert robot is near and found == label
 
 
 def test_the_class_is_that_of_the_largest_sum_of_scores():

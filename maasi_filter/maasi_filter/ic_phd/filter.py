@@ -212,7 +212,7 @@ class IcPhdFilter(SearchFilter):
             known = [distance(position, covariance, target) for target in self.found_targets]
             if min(known, default=math.inf) < SAME_TARGET:
                 continue
-            credit, label_of = _nearest(position, members, numbers.removal_distance)
+            credit, label_of = nearest_detection(position, members, numbers.removal_distance)
             number, robot, index = self._found.next_id(), credit.robot, credit.index
             target = FoundTarget(number, position, covariance, robot, index, time, label=label_of)
             self._found.targets.append(target)
@@ -259,7 +259,7 @@ class IcPhdFilter(SearchFilter):
             self.particles, self.weights = self.particles[keep], self.weights[keep]
 
 
-def _nearest(
+def nearest_detection(
     position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
 ) -> tuple[CheckedMeasurement, Label]:
     """Return the robot with the detection nearest to a position, and the nearest label.
