@@ -319,6 +319,16 @@ def test_robots_without_a_usable_candidate_stay(name, start, candidates, chosen,
     assert robot.waypoint == pytest.approx(chosen or [*start, 0.0])
 
 
+def test_no_waypoint_is_moved_out_of_the_bounds():
+    """A robot outside: the way from the obstacle towards it ends outside, too."""
+    team, view = one_robot()
+    obstacles = Obstacles(np.array([[1.6, 1.0, 0.0]]), np.array([0.5]), np.array([False]))
+    view.motion = make_motion(view.motion.settings, obstacles, 0.1)
+    view.state = at(2.6, 1.0)
+    view.candidates = np.array([[1.7, 1.0, 0.0]])
+    assert 'no candidate is usable' in decide('maas', team).reason
+
+
 def test_wrong_team_is_refused():
     team, view = one_robot()
     for change in (
