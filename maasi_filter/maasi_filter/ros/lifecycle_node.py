@@ -35,7 +35,7 @@ _PEERS_PERIOD = 0.02
 _DIAGNOSTICS_PERIOD = 1.0
 _WARNING_PERIOD = 2.0
 # From activation until a node says what it waits for [s].
-_NOTICE_DELAY = 1.0
+_NOTICE_DELAY = 3.0
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
