@@ -94,9 +94,12 @@ def test_time_in_the_queue_for_a_processor_does_not_count(run):
     assert run.until(9.0) is not None
 
 
-def test_the_run_itself_may_have_stood_still(run):
+@pytest.mark.parametrize('last', [1.0, 1.18, 61.2])
+def test_the_run_itself_may_have_stood_still(run, last):
     run.beat(FILTER, at=1.0)
     run.until(1.2)
+    # It has received this one, but not looked yet.
+    run.beats = {FILTER: last}
     run.now = 61.2
     assert run.until(65.0) is None
     assert run.until(66.5) is not None

@@ -412,8 +412,13 @@ def test_no_message_ends_or_silences_a_node(world):
     for kind, robot in (('sim', 'mambo'), ('cuboid_sim', 'red')):
         world.listen(Odometry, f'/{kind}/{robot}/odom', SENSOR_READER)
         world.heard[f'/{kind}/odom'] = world.heard[f'/{kind}/{robot}/odom']
-    known = {kind: world.known(kind, 'subscriber') for kind in NODES}
-    assert all(known.values()), known
+    known = {}
+
+    def discovered():
+        known.update({kind: world.known(kind, 'subscriber') for kind in NODES})
+        return all(known.values())
+
+    world.until(discovered, lambda: f'subscriptions: {known}')
     topics = {name: kind for inner in known.values() for name, kind in inner.items()}
     assert ROUNDS * len(topics) >= 500
     send_corpus(world, topics)

@@ -285,8 +285,11 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             return
         self._notice_at = math.inf
         missing = self._endpoints.unpublished()
-        if missing:
-            self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')
+        text = f'active, waiting for publishers of {", ".join(missing)}'
+        if '/clock' in missing:
+            self.get_logger().warning(f'{text}; use_sim_time is true')
+        elif missing:
+            self.get_logger().info(text)
         if missing and (fault := loopback_fault()):
             self.get_logger().warning(fault)
 

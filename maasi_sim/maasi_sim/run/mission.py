@@ -12,12 +12,14 @@ import numpy as np
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.arrays import FloatArray
-from maasi_sim.run.node_plan import NodePlan
-from maasi_sim.run.run_options import Options
 from maasi_sim.run.topics import STEP, seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    # These need ROS; a search in one process has records, too.
+    from maasi_sim.run.node_plan import NodePlan
+    from maasi_sim.run.run_options import Options
 
 # Goal status of `AgentState`.
 UNAVAILABLE = 5

@@ -63,10 +63,11 @@ class Supervisor:
         self._checked = now
         beats = self._recorder.take_heartbeats()
         for name, process in self.processes.items():
-            if gap > _LONGEST_GAP and process.beaten is not None:
-                process.beaten += gap
             if name in beats:
                 process.beat(beats[name])
+            # The last heartbeat may have been before the gap.
+            if gap > _LONGEST_GAP and process.beaten is not None:
+                process.beaten = min(process.beaten + gap, now)
             ending = None
             if not process.is_alive():
                 ending = self._restart(name, process)
