@@ -17,12 +17,14 @@ from maasi_filter.unexplored_map import UnexploredMap, check_bounds
 from maasi_planner.objective.predicted_measurements import reach_of
 from maasi_planner.settings import CandidateSettings
 
+# Of coordinates, also of those that are large [m].
+_ROUNDING = 1e-6
+
 
 def in_bounds(points: FloatArray, bounds: FloatArray) -> BoolArray:
-    """Return which points (n, d or more) are finite and within bounds (d, 2), a little slack."""
-    low, high = (bounds + 1e-9 * (1.0 + np.abs(bounds)) * [-1.0, 1.0]).T
+    """Return which points (n, d or more) are finite and within bounds (d, 2), up to rounding."""
     places = points[:, : len(bounds)]
-    inside = (places >= low) & (places <= high)
+    inside = (places >= bounds[:, 0] - _ROUNDING) & (places <= bounds[:, 1] + _ROUNDING)
     return np.asarray(inside.all(axis=1) & np.isfinite(points).all(axis=1))
 
 

@@ -100,8 +100,10 @@ def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurement
         when.sort(axis=1)
         own[rows] = (when <= last).sum(axis=1)
         number[rows] = (when <= (np.maximum(last, horizon) if extend else last)).sum(axis=1)
-        at = np.arange(count)[:, None], np.minimum(when, lengths)
-        times[rows], places[rows], yaws[rows] = when, ways.positions[at], ways.yaws[at]
+        # `take` is several times as fast as an index for each axis.
+        at = np.arange(count)[:, None] * ways.yaws.shape[1] + np.minimum(when, lengths)
+        times[rows], yaws[rows] = when, ways.yaws.ravel().take(at)
+        places[rows] = ways.positions.reshape(-1, 3).take(at, axis=0)
         if ways.view.sensor.dimension == 2:
             places[rows, :, 2] = 0.0
     detections = [ways.view.sensor.detection for ways in robots]
