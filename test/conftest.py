@@ -17,7 +17,7 @@ def pytest_sessionfinish():
 
 
 @pytest.fixture
-def domain(monkeypatch):
+def domain(monkeypatch, request):
     """Reserve a ROS domain for this test and the processes that it starts."""
     from maasi_sim.run.domain import Domain
 
@@ -25,7 +25,8 @@ def domain(monkeypatch):
         for name, value in reserved.environment().items():
             monkeypatch.setenv(name, value)
         yield reserved
-        # See `own_context`.
+        # See `own_context`. What fixtures returned may hold nodes, and is held by the test.
+        request.node.funcargs.clear()
         gc.collect()
 
 

@@ -65,15 +65,20 @@ def dump(context):
     executor.add_node(node)
     client = AsyncParameterClient(node, '/filter_node')
 
-    def result(future):
-        wait_until(future.done, lambda: executor.spin_once(timeout_sec=0.05))
-        return future.result()
+    def result(ask, *arguments):
+        # An answer is lost where the service has not discovered its client yet: ask again.
+        def answer():
+            future = ask(*arguments)
+            executor.spin_until_future_complete(future, timeout_sec=5.0)
+            return future.result()
+
+        return wait_until(answer)
 
     def dumped():
         assert client.wait_for_services(timeout_sec=PATIENCE)
-        names = result(client.list_parameters()).result.names
+        names = result(client.list_parameters).result.names
         nested = {}
-        for name, value in zip(names, result(client.get_parameters(names)).values):
+        for name, value in zip(names, result(client.get_parameters, names).values):
             *path, last = name.split('.')
             place = reduce(lambda place, part: place.setdefault(part, {}), path, nested)
             value = parameter_value_to_python(value)
