@@ -106,18 +106,22 @@ class Case:
         return '-'.join((self.kind, mode, reaction, self.fault, self.when, nodes))
 
     @property
+    def hangs_guards(self):
+        """Whether guards alone hang, which no start and no step waits for."""
+        return self.fault == 'hang' and all(node.endswith('/guard') for node in self.nodes)
+
+    @property
     def ends_the_run(self):
         """Whether exit code 3 is guaranteed; otherwise the run continues to its end, 0 or 1."""
         if self.fault == 'pause':
             return False
-        # No step waits for a guard, and `limits.start` is longer than these runs.
-        beside = all(node.endswith('/guard') for node in self.nodes)
-        if beside and self.fault == 'hang' and self.when == 'start':
+        # `limits.start` is longer than these runs.
+        if self.hangs_guards and self.when == 'start':
             return False
         # A restarted simulation would begin at time 0; a start that hangs is not repeated.
         if not self.respawn or SIM in self.nodes:
             return True
-        if beside:
+        if self.hangs_guards:
             return False
         return self.fault == 'hang' and (self.lockstep or self.when == 'start')
 
@@ -145,7 +149,8 @@ class Case:
 
     def options(self):
         if self.lockstep:
-            return ['--lockstep']
+            # Simulated time may pass faster than a heartbeat is missed.
+            return ['--lockstep', '--rate', '1'] if self.hangs_guards else ['--lockstep']
         return ['--rate', '3'] if self.kind == 'buildings' else []
 
 

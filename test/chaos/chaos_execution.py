@@ -15,6 +15,8 @@ from maasi_sim.scenario.layering import to_yaml
 
 # Longest wait for the moment of the fault, and for the end of the run after it [s].
 TRIGGER_PATIENCE, END_PATIENCE = 120.0, 120.0
+# Time for a first heartbeat: before it a node counts as starting [s].
+FIRST_HEARTBEAT = 2.0
 FOUND = re.compile(r'(\d+) (?:found|visited)')
 
 
@@ -49,6 +51,8 @@ def execute(case, folder, seed):
     struck, at = False, time.monotonic()
     try:
         victims = victims_of(case, run, process, output)
+        if case.hangs_guards and case.when == 'middle':
+            time.sleep(FIRST_HEARTBEAT)
         at = time.monotonic()
         struck = bool(victims) and strike(case, victims)
         process.wait(END_PATIENCE)
