@@ -94,6 +94,13 @@ def test_time_in_the_queue_for_a_processor_does_not_count(run):
     assert run.until(9.0) is not None
 
 
+def test_a_node_that_is_ready_at_once_is_watched(run):
+    for node in run.nodes.values():
+        node.beat(0.2)
+    when, words = run.until(6.0)
+    assert 'hangs' in words and when < 5.0
+
+
 @pytest.mark.parametrize('last', [1.0, 1.18, 61.2])
 def test_the_run_itself_may_have_stood_still(run, last):
     run.beat(FILTER, at=1.0)

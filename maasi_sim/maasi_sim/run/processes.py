@@ -40,7 +40,7 @@ _ENVIRONMENT = {
 }
 # Addresses of Unix sockets have at most 107 bytes; multiprocessing adds 32 to the folder.
 _LONGEST_FOLDER = 75
-# A heartbeat this soon after a start is from the previous process [s].
+# A heartbeat this soon after a restart is from the previous process [s].
 _LEAST_START = 0.5
 # Signals of a shutdown, and the timeout of each [s].
 ENDING = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5.0))
@@ -200,7 +200,8 @@ class NodeProcess(ForkServerProcess):
 
     def beat(self, now: float) -> None:
         """Note a heartbeat."""
-        if self.beaten is not None or now - self.started >= _LEAST_START:
+        first = self.beaten is None and self.restarts
+        if not first or now - self.started >= _LEAST_START:
             self.beaten, self._waited = now, waited_for_processor(self.pid)
 
     def hangs(self, now: float, limit: float) -> bool:
