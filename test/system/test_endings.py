@@ -153,7 +153,7 @@ def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(tmp_path)
         # Slow enough to discover the follower before the end.
         with start(path, tmp_path / 'run', *operator.options, '--rate', '0.1') as run:
             run.wait_for('report: ')
-            run.wait_for('the clock goes on for /other')
+            run.wait_for('the clock keeps running for /other')
             assert run.report['end_reason'] == 'all_found'
             with Bag(run.folder) as bag:
                 assert bag.counts['/mambo/state'] > 0

@@ -135,7 +135,7 @@ class ScenarioRun:
             code = self._report()
             if followed:
                 teams = ', '.join(self.recorder.followers())
-                self.display.say(f'the clock goes on for {teams} (Ctrl-C ends it)')
+                self.display.say(f'the clock keeps running for {teams} (Ctrl-C ends it)')
                 while self._is_followed():
                     self.recorder.wait(_FOLLOWERS_PERIOD)
                     self.recorder.drain()
