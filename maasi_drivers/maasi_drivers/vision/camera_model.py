@@ -87,7 +87,7 @@ class Camera:
         if not len(points):
             return np.empty((0, 2)), np.empty((0, 2, 2))
         still = np.zeros(3)
-        rays = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
+        rays = cv2.convertPointsToHomogeneous(points)
         pixels, slopes = cv2.projectPoints(rays, still, still, self.matrix, self.distortion)
         # By the translation along x and y, at a depth of 1.
         return np.reshape(pixels, (-1, 2)), np.reshape(slopes[:, 3:5], (-1, 2, 2))

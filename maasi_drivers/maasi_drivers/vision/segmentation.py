@@ -7,19 +7,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from maasi_drivers.settings.camera import DETECTORS, SegmentationSettings
 from maasi_drivers.vision.detector import Blobs
-from maasi_filter.arrays import BoolArray, FloatArray, ImageArray, IntArray
+from maasi_filter.arrays import BoolArray, ImageArray, IntArray
 
 # Added to the mean of the channels before dividing by it: noise in the dark is not blue.
 _DARK = 6.0
+# In the type of images: products with it stay so.
+_THREE = np.float32(3.0)
 
 
 def paper_mask(image: ImageArray, threshold: float = 35.0) -> BoolArray:
@@ -57,83 +60,93 @@ def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     return blobs.select(blobs.areas >= settings.minimum_area * mask.size)
 
 
-def _median(counts: NDArray[Any]) -> float:
+@njit(cache=True, error_model='numpy')
+def _median(counts):  # type: ignore[no-untyped-def]
     """Return the median of counted whole numbers, interpolated within its bin."""
     total = np.cumsum(counts)
     half = 0.5 * total[-1]
-    value = int(np.searchsorted(total, half))
+    value = np.searchsorted(total, half)
     before = total[value] - counts[value]
-    return value - 0.5 + float(half - before) / float(counts[value])
+    return value - 0.5 + (half - before) / counts[value]
 
 
-def _blueness(red: FloatArray, green: FloatArray, blue: FloatArray) -> FloatArray:
-    """Return (B - max(R, G)) over the mean of the channels, -3 to 3."""
-    return 3.0 * (blue - np.maximum(red, green)) / (red + green + blue + 3.0 * _DARK)
+@njit(cache=True, error_model='numpy')
+def _blueness(planes):  # type: ignore[no-untyped-def]
+    """Return (B - max(R, G)) over the mean of the channels (3, ...), -3 to 3, in their type."""
+    red, green, blue = planes[0], planes[1], planes[2]
+    return _THREE * (blue - np.maximum(red, green)) / (red + green + blue + _THREE * _DARK)
 
 
-def _floor_statistics(image: ImageArray) -> tuple[FloatArray, float, float]:
-    """Return white-balance gains (3,) from the floor; median and deviation of its blueness."""
-    # About 4096 pixels.
-    stride = max(1, int(np.sqrt(image.shape[0] * image.shape[1] / 4096)))
-    sample = image[stride // 2 :: stride, stride // 2 :: stride].reshape(-1, 3)
-    medians = np.array([max(_median(np.bincount(channel)), 1.0) for channel in sample.T])
+@njit(cache=True, error_model='numpy')
+def _floor_statistics(sample):  # type: ignore[no-untyped-def]
+    """Return white-balance gains (3,) from pixels (3, n); median and deviation of blueness."""
+    medians = np.array([max(_median(np.bincount(channel)), 1.0) for channel in sample])
     # Bounded, as an image of mostly marker or coloured sheet is no reference.
     gains = np.clip(medians.sum() / 3.0 / medians, 0.6, 1.7)
     # Blueness is between -3 and 3: bins of 1/256.
-    bins = np.floor(_blueness(*(gains * sample).T) * 256.0).astype(np.int64) + 768
+    bins = np.floor(_blueness(gains.reshape(3, 1) * sample) * 256.0).astype(np.int64) + 768
     counts = np.bincount(np.clip(bins, 0, 1535), minlength=1536)
     places = (np.arange(1536) + 0.5 - 768.0) / 256.0
     centre = (_median(counts) + 0.5 - 768.0) / 256.0
     offsets = np.floor(np.abs(places - centre) * 256.0).astype(np.int64)
-    deviation = 1.4826 * (_median(np.bincount(offsets, weights=counts)) + 0.5) / 256.0
+    deviation = 1.4826 * (_median(np.bincount(offsets, counts)) + 0.5) / 256.0
     return gains, centre, deviation
 
 
-def _is_compact(own: BoolArray, settings: SegmentationSettings) -> bool:
-    """Return whether a component (h, w) has an allowed aspect and solidity."""
-    moments = cv2.moments(own.astype(np.uint8), binaryImage=True)
-    xx, yy, xy = (moments[name] / moments['m00'] for name in ('mu20', 'mu02', 'mu11'))
+@njit(cache=True, error_model='numpy')
+def _is_compact(x, y, aspect, solidity):  # type: ignore[no-untyped-def]
+    """Return whether the aspect of pixels is at most, and their solidity at least, as allowed."""
+    dx, dy = x - x.mean(), y - y.mean()
+    xx, yy, xy = (dx * dx).mean(), (dy * dy).mean(), (dx * dy).mean()
     # Each pixel is a square with a second moment of 1/12.
     middle, apart = 0.5 * (xx + yy) + 1.0 / 12.0, math.hypot(0.5 * (xx - yy), xy)
     # The lengths of the axes go as the roots of the principal second moments.
     long, short = middle + apart, middle - apart
-    if long > settings.maximum_aspect**2 * short:
-        return False
     # An ellipse has area 4 pi root(long short).
-    return moments['m00'] >= settings.minimum_solidity * 4.0 * math.pi * math.sqrt(long * short)
+    least = solidity * 4.0 * math.pi * math.sqrt(long * short)
+    return long <= aspect**2 * short and len(x) >= least
 
 
-def _weigh(
-    image: ImageArray, own: BoolArray, floor: BoolArray, gains: FloatArray
-) -> tuple[float, FloatArray, FloatArray] | None:
-    """Return area, centroid and its variances (2,), by how much of each pixel is marker.
-
-    `own` and `floor` (h, w) are the pixels of the component, and those of none. None where the area
-    is much less than the pixels of the component.
-    """
-    red, green, blue = np.moveaxis(gains * image, -1, 0)
-    # O_p of 001, which is linear in how much of a pixel is marker.
-    excess = blue - 0.5 * (red + green)
+@njit(cache=True, error_model='numpy')
+def _weigh(excess, own, floor, x, y):  # type: ignore[no-untyped-def]
+    """Return area, centroid and its variances (5,), by how much of each pixel is marker."""
     # The excess of a pixel inside a marker: the mean of the upper half of the component.
-    values = np.sort(excess[own])
-    upper = float(values[len(values) // 2 :].mean())
-    pixels = np.argwhere(own)
-    (top, left), (bottom, right) = np.maximum(pixels.min(axis=0) - 1, 0), pixels.max(axis=0) + 2
-    around = floor.copy()
-    around[top:bottom, left:right] = False
-    outside = excess[around]
-    background = float(outside.mean()) if len(outside) else 0.0
-    noise = float(outside.var()) if len(outside) else 0.0
+    upper = np.sort(excess.ravel()[own.ravel()])[len(x) // 2 :].mean()
+    around, near = floor.copy(), np.zeros_like(own)
+    around[max(y.min() - 1, 0) : y.max() + 2, max(x.min() - 1, 0) : x.max() + 2] = False
+    outside = excess.ravel()[around.ravel()]
+    background, noise = (outside.mean(), outside.var()) if len(outside) else (0.0, 0.0)
     contrast = max(upper - background, 1e-6)
     # The component and the ring of one pixel around it, other components left out.
-    ring = cv2.dilate(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    places = np.argwhere(own | (ring & floor))
-    weights = (excess[places[:, 0], places[:, 1]] - background) / contrast
-    area = float(weights.sum())
-    if area < 0.25 * len(values):
-        return None
-    variances = noise / (contrast * area) ** 2 * ((places - pixels.mean(axis=0)) ** 2).sum(axis=0)
-    return area, (weights @ places / area)[::-1], variances[::-1]
+    for column, row in zip(x, y):
+        near[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = True
+    rows, columns = np.nonzero(near & (own | floor))
+    weights = (excess[rows, columns] - background) / contrast
+    area = weights.sum()
+    scale = noise / (contrast * area) ** 2
+    spread_x, spread_y = ((columns - x.mean()) ** 2).sum(), ((rows - y.mean()) ** 2).sum()
+    centre = (weights * columns).sum() / area, (weights * rows).sum() / area
+    return np.array([area, *centre, scale * spread_x, scale * spread_y])
+
+
+@njit(cache=True, error_model='numpy')
+def _measure(planes, gains, labels, boxes, reached, aspect, solidity):  # type: ignore[no-untyped-def]
+    """Return what `_weigh` does of each component (n, 5); zeros where it is no marker."""
+    found = np.zeros((len(boxes), 5))
+    for blob in np.flatnonzero(reached):
+        # The component's box and three pixels around it, for the floor.
+        first, end = np.maximum(boxes[blob, :2] - 3, 0), boxes[blob, :2] + boxes[blob, 2:] + 3
+        rows, columns = slice(first[1], end[1]), slice(first[0], end[0])
+        own, floor = labels[rows, columns] == blob + 1, labels[rows, columns] == 0
+        y, x = np.nonzero(own)
+        if _is_compact(x, y, aspect, solidity):
+            # O_p of 001, which is linear in how much of a pixel is marker.
+            red, green, blue = [gains[k] * planes[k, rows, columns] for k in range(3)]
+            measured = _weigh(blue - 0.5 * (red + green), own, floor, x, y)
+            if measured[0] >= 0.25 * len(x):
+                found[blob] = measured
+                found[blob, 1:3] += first
+    return found
 
 
 def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
@@ -146,32 +159,22 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     centroids weighted by how much of each pixel is marker. Sizes are gated where the geometry is
     known, in `maasi_drivers.vision.marker_detector`.
     """
-    gains, centre, deviation = _floor_statistics(image)
+    planes = np.array(cv2.split(image))
+    # About 4096 pixels.
+    stride = max(1, int(np.sqrt(planes[0].size / 4096)))
+    sample = planes[:, stride // 2 :: stride, stride // 2 :: stride].reshape(3, -1)
+    gains, centre, deviation = _floor_statistics(sample)
     threshold = max(settings.saturation, centre + settings.noise_factor * deviation)
-    planes = zip(gains.astype(np.float32), cv2.split(image))
-    blueness = _blueness(*(gain * plane.astype(np.float32) for gain, plane in planes))
+    blueness = _blueness(gains.astype(np.float32)[:, None, None] * planes)
     labels, boxes, blobs = _components(blueness > threshold)
-    reached = np.unique(labels[blueness >= max(settings.peak_saturation, threshold)])
-    found = []
-    for blob in (reached[reached > 0] - 1).tolist():
-        left, top, width, height = boxes[blob].tolist()
-        # The component's box and three pixels around it, for the floor.
-        first = np.maximum([left - 3, top - 3], 0)
-        window = np.s_[first[1] : top + height + 3, first[0] : left + width + 3]
-        own, floor = labels[window] == blob + 1, labels[window] == 0
-        if not _is_compact(own, settings):
-            continue
-        if (measured := _weigh(image[window], own, floor, gains)) is not None:
-            area, centroid, variances = measured
-            found.append((blob, area, centroid + first, np.diag(variances)))
-    chosen = np.array([item[0] for item in found], dtype=int)
-    return Blobs(
-        np.reshape([item[2] for item in found], (-1, 2)),
-        np.array([item[1] for item in found]),
-        blobs.extents[chosen],
-        blobs.border_cut[chosen],
-        np.reshape([item[3] for item in found], (-1, 2, 2)),
-    )
+    reached = np.zeros(len(blobs) + 1, np.bool_)
+    reached[labels[blueness >= max(settings.peak_saturation, threshold)]] = True
+    gates = settings.maximum_aspect, settings.minimum_solidity
+    found = _measure(planes, gains, labels, boxes, reached[1:], *gates)
+    markers = found[:, 0] > 0.0
+    found, blobs = found[markers], blobs.select(markers)
+    covariances = found[:, 3:, None] * np.eye(2)
+    return replace(blobs, centroids=found[:, 1:3], areas=found[:, 0], covariances=covariances)
 
 
 # Corners of a marker in its own plane, in the order of the detector.

@@ -5,8 +5,12 @@ from __future__ import annotations
 import importlib
 import inspect
 
+import numpy as np
+
 import maasi_filter
 import maasi_planner
+from maasi_drivers.settings.camera import CameraSettings
+from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_planner.settings import PLANNERS
 from maasi_sim.run.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario
@@ -33,7 +37,8 @@ def warm_up() -> None:
 
 
 def _simulate() -> None:
-    """Simulate one step of robots of each kind."""
+    """Simulate one step of robots of each kind, and look for markers."""
+    MarkerDetector(CameraSettings()).segment(np.zeros((120, 160, 3), np.uint8))
     for name in ('mambo_turtlebot_obstacles', 'ranging_pair_3d'):
         simulation = Simulation(load_scenario(name), 1)
         simulation.warm_up()
