@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,19 +19,6 @@ from maasi_planner.objective.predicted_measurements import (
 from maasi_planner.objective.terms import Terms
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import RobotView, TeamView
-
-
-def lower_factor(covariance: FloatArray) -> FloatArray:
-    """Return Cholesky's factor in plain sums, which do not depend on a linear algebra library."""
-    lower = np.zeros_like(covariance)
-    for i in range(len(lower)):
-        for j in range(i + 1):
-            rest = float(covariance[i, j]) - sum(float(lower[i, k] * lower[j, k]) for k in range(j))
-            if i == j:
-                lower[i, i] = math.sqrt(max(rest, 0.0))
-            elif lower[j, j] > 0.0:
-                lower[i, j] = rest / lower[j, j]
-    return lower
 
 
 @njit(cache=True)
@@ -70,7 +56,7 @@ def _information(
     out = np.zeros((len(measured.own), len(centres), d, d))
     chance = chances(measured, first, centres)
     for robot, view in enumerate(views):
-        lower = lower_factor(view.sensor.covariance)
+        lower: FloatArray = np.linalg.cholesky(view.sensor.covariance).astype(float)
         owner, index, cluster = np.nonzero(chance * (measured.robot == robot)[:, None, None])
         offsets = (centres[cluster] - measured.places[owner, index])[:, :d]
         # Nearer than the noise of the range the linear model would promise too much.

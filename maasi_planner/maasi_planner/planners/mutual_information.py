@@ -20,7 +20,6 @@ from numba import njit
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.objective.information import lower_factor
 from maasi_planner.planners.base import Planner, explain, search_jointly, usable_options
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotView, TeamView, single_choice, stay
@@ -83,6 +82,19 @@ def mutual_information(missed: FloatArray, weights: FloatArray) -> float:
         last = value
         begin = end
     return max(total, 0.0)
+
+
+def lower_factor(covariance: FloatArray) -> FloatArray:
+    """Return Cholesky's factor, also of a covariance that is singular."""
+    lower = np.zeros_like(covariance)
+    for i in range(len(lower)):
+        for j in range(i + 1):
+            rest = float(covariance[i, j]) - sum(float(lower[i, k] * lower[j, k]) for k in range(j))
+            if i == j:
+                lower[i, i] = math.sqrt(max(rest, 0.0))
+            elif lower[j, j] > 0.0:
+                lower[i, j] = rest / lower[j, j]
+    return lower
 
 
 def intensity(team: TeamView) -> tuple[FloatArray, FloatArray]:
