@@ -1,43 +1,89 @@
-"""A flying robot behind a link, its driver in this process or its own, and the team around it."""
+"""Flying robots behind links: each with its driver and its team, and the same verbs for all."""
 
-import signal
+import math
 import subprocess
 from functools import partial
 
 import numpy as np
-from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped
+from onboard_program import OnboardProgram
 from rclpy.executors import SingleThreadedExecutor
-from robot_team import Team, parameters_of
+from robot_team import MAMBO, STEP, Team, parameters_of
 
+from maasi_drivers.drivers import (
+    MamboDriver,
+    MamboOnboardDriver,
+    MavlinkCameraDriver,
+    MavlinkDriver,
+)
+from maasi_filter.models.pose import Pose, compose
+from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_msgs.msg import AgentState
+from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
+from maasi_sim.simulation.emulators.mambo.firmware import FirmwareSettings, MamboFirmware
+from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle import FakeVehicle
+from maasi_sim.simulation.odometry import OdometrySettings
+
+YAW = 0.6
+FULL_SPEED = 9.81 * math.tan(MAMBO['motion']['tilt']) / FirmwareSettings().drag
+FLYING = MAMBO | {
+    'start': [1.0, 1.2, 0.4],
+    'yaw': YAW,
+    'link': 'mambo_wifi',
+    'odometry_timeout': 0.5,
+    'battery_minimum': 0.0,
+}
+COPTER = {
+    'step': STEP,
+    'environment': {'bounds': [[-8.0, 8.0], [-8.0, 8.0], [-5.0, 5.0]]},
+    'radius': 0.3,
+    # The machine may be busy, and most tests have no sweeps.
+    'odometry_timeout': 5.0,
+    'sensor_timeout': 0.0,
+    'motion': {'speed': 1.0, 'acceleration': 1.0, 'tolerance': 0.25},
+    'sensor': {'detection': {'kind': 'box', 'lower': [-4, -4, -6], 'upper': [4, 4, 6]}},
+    'link': 'mavlink',
+}
 
 
 class LinkedFlight:
-    """All of it; the tests of each link add the drone as `drone`, which has `state` and `close`."""
+    """What all have in common; the drone has `state`, `cut` and `close`.
 
-    def __init__(self, context, settings):
+    `doing` is 'ground', 'air' or 'landing', whatever the driver knows of it, `inside` what counts
+    its take-offs.
+    """
+
+    program, make = 'mambo_driver', MamboDriver
+    start, far = FLYING['start'], [2.3, -0.2, 0.5]
+    outside = ([1.7, 0.8, 1.8], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5])
+    # Two waypoints, how near it is to them when the next one is sent, and its least speed.
+    way, near, least_speed = ([1.0, 0.4, 0.4], [1.0, -0.1, 0.4]), 0.4, 0.1
+
+    def __init__(self, context, drone, settings):
         self.context = context
+        self.drone = drone
         self.settings = settings
-        self.driver = None
+        self.driver, self.inside = None, drone
         self.executor = SingleThreadedExecutor(context=context)
         self.team = team = Team(context, settings, self.executor, deaf=True)
         # It is not reached by topics.
         team.used = [item for item in team.used if item not in (team.odometry, team.battery)]
         self.call = partial(team.call, until=self.until)
 
-    def run_node(self, make):
+    def run_node(self):
         """Run the driver as a node of this process."""
-        overrides = parameters_of(self.settings)
-        self.driver = make(context=self.context, namespace='/rover', parameter_overrides=overrides)
+        options = {'namespace': '/rover', 'parameter_overrides': parameters_of(self.settings)}
+        self.driver = self.make(context=self.context, **options)
         self.executor.add_node(self.driver)
         assert self.driver.trigger_configure().name == 'SUCCESS', self.driver.problem
         assert self.driver.trigger_activate().name == 'SUCCESS'
         self.team.connect()
         return self
 
-    def run_process(self, process, name):
+    def run_process(self, process):
         """Run the driver as a process of its own, by the fixture `process`."""
-        self.driver = process(program=(name,), settings=self.settings)
+        self.driver = process(program=(self.program,), settings=self.settings)
         self.team.connect()
         return self
 
@@ -59,6 +105,10 @@ class LinkedFlight:
         return float(np.linalg.norm(self.drone.state.velocity[:2]))
 
     @property
+    def grounded(self):
+        return self.doing == 'ground'
+
+    @property
     def reason(self):
         return self.team.state.reason if self.team.states else 'silent'
 
@@ -69,6 +119,9 @@ class LinkedFlight:
     def until(self, condition, what=''):
         self.team.until(condition, what or (lambda: f'{self.status}, {self.reason!r}'))
 
+    def until_said(self, reason):
+        self.until(lambda: reason in self.reason)
+
     def away(self, point):
         return float(np.linalg.norm(self.where - point))
 
@@ -77,46 +130,132 @@ class LinkedFlight:
         self.until(lambda: self.call('arm').success)
         return self
 
-    def until_it_flies(self):
+    def ready(self):
+        """Return itself, once it takes goals."""
         self.until(lambda: self.status in (AgentState.IDLE, AgentState.ABORTED))
         return self
 
-    def slowest_past(self, first, second, near):
-        """Return the lowest speed from `near` one waypoint to near the next one, where it stops."""
-        _, replaced = self.team.send_accepted(first, number=1)
-        self.until(lambda: self.away(first) < near)
-        _, result = self.team.send_accepted(second, number=2)
-        speeds = []
-        self.until(lambda: speeds.append(self.speed) or self.away(second) < near)
-        assert replaced.done() and replaced.result().result.reason == 'replaced'
-        self.until(result.done)
-        assert result.result().result.reached
-        self.until(lambda: self.speed < 0.05)
-        return min(speeds)
+    def up(self):
+        return self.arm().ready()
 
-    def restarts_by_its_clock(self, result, set_back, goal):
-        """Check that a jump back of the clock stops it, and that it takes goals again."""
-        set_back(self.driver, 1000.0)
+    def on_its_way(self):
+        """Wait until it flies to a goal; return the goal's handle and result to come."""
+        before = self.where
+        sent = self.team.send_accepted(self.far)
+        self.until(lambda: self.away(before) > 0.3)
+        return sent
+
+    def reaches(self, goal):
+        _, result = self.team.send_accepted(goal)
         self.until(result.done)
-        assert result.result().result.reason == 'the time jumped back'
+        assert result.result().result.reached, result.result().result.reason
+
+    def stops(self, since):
+        """Check that it stops soon: set-points lead by a second, then it brakes."""
         self.until(lambda: self.speed < 0.1)
-        _, result = self.until_it_flies().team.send_accepted(goal)
-        self.until(result.done)
-        assert result.result().result.reached
-
-    def is_sent(self, number, result):
-        """Send a signal to the driver's process, and wait for its end."""
-        self.driver.send_signal(number)
-        self.until(lambda: self.driver.poll() is not None)
-        if number == signal.SIGINT:
-            assert self.driver.returncode == 0
-            self.until(result.done)
-            assert result.result().result.reason == 'the driver stops'
+        assert self.away(since) < 1.5 * self.settings['motion']['speed']
 
     def gives_up(self, result, reason):
-        """Check that the goal ends, that the planner hears why, and that it is not sent on."""
+        """Check that it stops, its goal ends, the planner hears why, and that it is not sent on."""
+        before = self.where
         self.until(lambda: self.status == AgentState.UNAVAILABLE and reason in self.reason)
-        self.until(result.done)
-        assert result.result().status == GoalStatus.STATUS_ABORTED
-        assert reason in result.result().result.reason
-        assert self.team.refused(self.team.settings.start)
+        assert reason in self.team.aborted(result)
+        assert self.team.refused(self.start)
+        self.stops(before)
+
+    def seen_from_outside(self, source='pose', place=None):
+        """Have another system say where it is, from `place`; return the timer that does it."""
+        team = self.team
+        publisher = team.create_publisher(PoseStamped, 'pose', 10)
+
+        def say():
+            stamp, state = team.get_clock().now().nanoseconds, self.drone.state
+            if source == 'odometry':
+                # The robot of the team is where the drone is.
+                team.body = team.motion.body(state)
+                team.odometry.publish(team.odometry_message(stamp))
+                return
+            pose = state.pose if place is None else compose(place, state.pose)
+            message = PoseStamped(pose=pose_to_ros(pose))
+            message.header.frame_id = 'map'
+            message.header.stamp = stamp_to_ros(stamp)
+            publisher.publish(message)
+
+        return team.create_timer(0.04, say)
+
+
+def mambo_firmware(lost_link='land'):
+    return MamboFirmware(
+        Pose.from_yaw([*LinkedFlight.start[:2], 0.0], YAW),
+        FirmwareSettings(take_off_height=0.3, lost_link=lost_link),
+        odometry=OdometrySettings(position_noise=0.002, heading_noise=0.002),
+    )
+
+
+class MamboFlight(LinkedFlight):
+    """A fake Mambo behind pyparrot."""
+
+    def __init__(self, context, drone=None, own=(), **changes):
+        drone = drone or FakeMambo(mambo_firmware(), free_address())
+        # The machine may be busy.
+        mambo = {'arm': True, 'full_speed': FULL_SPEED, 'link_timeout': 2.0}
+        mambo |= {'address': drone.address, 'port': free_port()} | dict(own)
+        super().__init__(context, drone, FLYING | {'mambo': mambo} | changes)
+        self.inside = drone.firmware
+
+    @property
+    def doing(self):
+        state = self.inside.flying_state.name.lower()
+        return {'landed': 'ground', 'landing': 'landing'}.get(state, 'air')
+
+
+class OnboardFlight(LinkedFlight):
+    """A drone with a program of its own, on ground that is not at height 0."""
+
+    make = MamboOnboardDriver
+
+    def __init__(self, context, own=(), **changes):
+        port, place = free_port(), Pose.from_yaw([*self.start[:2], 0.1], YAW)
+        drone = OnboardProgram(free_address(), ('127.0.0.1', port), place)
+        mambo = {'arm': True, 'ground': 0.1, 'land_after': 1.0}
+        mambo |= {'address': drone.address, 'order_port': drone.port} | dict(own)
+        feed = {'link': 'mambo_feed', 'image_source': 'feed', 'feed_port': port}
+        super().__init__(context, drone, FLYING | feed | {'mambo': mambo} | changes)
+
+    @property
+    def doing(self):
+        return ('ground', 'air', 'landing')[self.drone.doing]
+
+
+class VehicleFlight(LinkedFlight):
+    """A fake vehicle that speaks MAVLink."""
+
+    program = 'mavlink_driver'
+    start, far = [1.0, 2.0, 0.8], [1.0, -6.0, 0.8]
+    # Without a geofence it is not sent into the ground.
+    outside = ([math.nan, 0.0, 0.8], [0.0, 0.0, math.inf], [0.0, 1.0, -0.1], [0.0, 9.0, 1.0])
+    way, near, least_speed = ([1.0, -3.0, 0.8], [3.0, -5.0, 0.8]), 1.5, 0.4
+
+    def __init__(self, context, autopilot=(), own=(), **changes):
+        self.make = MavlinkCameraDriver if 'camera' in changes else MavlinkDriver
+        mavlink = {'arm': True, 'link_timeout': 3.0, 'url': f'udpin:127.0.0.1:{free_port()}'}
+        mavlink |= dict(own)
+        drone = FakeVehicle(
+            AutopilotSettings.model_validate({'estimator_time': 0.2} | dict(autopilot)),
+            mavlink['url'].replace('udpin', 'udpout'),
+            Pose.from_yaw([*self.start[:2], 0.0], 0.0),
+            np.random.default_rng(1),
+        )
+        super().__init__(
+            context, drone, COPTER | {'start': self.start, 'mavlink': mavlink} | changes
+        )
+        self.inside, self.lock = drone.autopilot, drone._lock
+
+    @property
+    def doing(self):
+        if not self.inside.armed:
+            return 'ground'
+        return 'landing' if self.inside.mode_name == 'LAND' else 'air'
+
+
+KINDS = {'mambo': MamboFlight, 'onboard': OnboardFlight, 'vehicle': VehicleFlight}

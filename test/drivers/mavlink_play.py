@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.links.mavlink.vehicle import Vehicle, VehiclePhase
@@ -10,7 +11,8 @@ from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotS
 from maasi_sim.simulation.emulators.mavlink.fake_autopilot import FakeAutopilot
 
 PERIOD = 0.02
-TAKE_OFF = mavlink.MAV_CMD_NAV_TAKEOFF
+ARM, TAKE_OFF = mavlink.MAV_CMD_COMPONENT_ARM_DISARM, mavlink.MAV_CMD_NAV_TAKEOFF
+NOT_ARMED = f'vehicle: not armed: {UNTIL_ARM}'
 # What a vehicle may take until it has stopped [s].
 AT_MOST = 1.5
 HEIGHTS = {'arducopter': 2.0, 'px4': 2.0, 'ardusub': -1.5}
@@ -37,7 +39,7 @@ class Wire:
 
 
 class Play:
-    """Both sides, and what went over the wire; `station` is a ground station on another link."""
+    """Both sides, and what went over the wire; `stranger` is called as what others do meanwhile."""
 
     def __init__(
         self, firmware='arducopter', autopilot=None, permitted=True, memory=None, **changes
@@ -46,9 +48,7 @@ class Play:
         self.settings = MavlinkSettings.model_validate({'vehicle': kind, 'arm': True} | changes)
         self.height, self._memory = HEIGHTS[firmware], memory
         self.to_driver, self.to_autopilot = Wire(), Wire()
-        # System and component.
-        self.station = None
-        self._beat_at = 0.0
+        self.stranger = lambda: None
         self.autopilot = FakeAutopilot(
             AutopilotSettings.model_validate({'firmware': firmware} | (autopilot or {})),
             mavlink.MAVLink(self.to_driver, 1, 1),
@@ -69,7 +69,6 @@ class Play:
         self.reports = []
 
     def permit(self):
-        """Call the service `arm`."""
         return self.vehicle.permit(self.now)
 
     def permitted(self):
@@ -77,14 +76,24 @@ class Play:
         assert self.permit() == ''
         return self
 
+    def beat(self, system, component):
+        """Be another ground station, on a link of its own."""
+        wire = Wire()
+        mavlink.MAVLink(wire, system, component).heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4)
+        for message in wire.take():
+            self.autopilot.handle(message, link=1)
+
+    def stands(self, seconds=0.0):
+        """Check that nothing arms it until the service `arm` is called."""
+        armed = len(self.commands(ARM))
+        self.run(seconds)
+        assert self.fault == NOT_ARMED and not self.autopilot.armed
+        assert len(self.commands(ARM)) == armed
+        self.permitted().fly()
+
     def turn(self):
         self.now += PERIOD
-        if self.station is not None and self.now - self._beat_at >= 1.0:
-            self._beat_at = self.now
-            wire = Wire()
-            mavlink.MAVLink(wire, *self.station).heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4)
-            for message in wire.take():
-                self.autopilot.handle(message, link=1)
+        self.stranger()
         if self._permitted and self.phase is not VehiclePhase.CONNECTING:
             self._permitted = False
             self.permit()
@@ -102,12 +111,12 @@ class Play:
         for _ in range(round(seconds / PERIOD)):
             before()
             self.turn()
+        return self
 
     def unheard(self, seconds):
         """Return itself, after a time in which the driver hears nothing."""
         self.to_driver.cut = True
-        self.run(seconds)
-        self.to_driver.cut = False
+        self.run(seconds).to_driver.cut = False
         return self
 
     def without_driver(self, seconds, place=None):
@@ -130,8 +139,7 @@ class Play:
 
     def go(self):
         """Fly for a while."""
-        self.run(2.0, self.lead)
-        return self
+        return self.run(2.0, self.lead)
 
     def lead(self):
         """Set the set-point a short way ahead, as the driver does."""

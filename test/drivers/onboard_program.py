@@ -14,6 +14,8 @@ import zlib
 
 import numpy as np
 
+from maasi_filter.models.pose import Pose, compose
+from maasi_planner.motion import RobotState
 from maasi_sim.simulation.emulators.mavlink.flight_model import FlightModel
 
 _STEP, _FEED_PERIOD = 0.02, 0.1
@@ -21,20 +23,21 @@ GROUND, AIR, LANDING = range(3)
 
 
 class OnboardProgram:
-    """The drone; z is up from where it stands, x forward, y left.
+    """The drone; `place` is where it stands in the map, with its heading.
 
-    `silent`: nothing of it gets through. `blobs` are those of the next images, as the feed has
-    them; `kinds` the orders that it has heard; `patience` is how long it flies without one [s].
+    `blobs` are those of the next images, as the feed has them; `kinds` the orders that it has
+    heard; `patience` is how long it flies without one [s].
     """
 
-    def __init__(self, address, feed):
-        self.silent, self.patience = False, 3.0
+    def __init__(self, address, feed, place):
+        self.place, self.patience = place, 3.0
         self.charge = 1.0
         self.blobs, self.count = b'', 0
         self.kinds, self.take_offs = [], 0
-        self.state = GROUND
+        self.doing = GROUND
+        # Up from where it stands, x forward, y left.
         self.model = FlightModel(np.zeros(3), speed=0.5)
-        self._feed = feed
+        self._feed, self._silent = feed, False
         self._sequence = 0
         self._order, self._last, self._heard_at = 0, None, -math.inf
         self._goal = np.zeros(3)
@@ -45,6 +48,15 @@ class OnboardProgram:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._live, daemon=True)
         self._thread.start()
+
+    @property
+    def state(self):
+        pose = compose(self.place, Pose(self.model.position))
+        return RobotState(pose, self.place.rotation() @ self.model.velocity)
+
+    def cut(self, cut=True):
+        """Let nothing of it get through; it hears orders all the same."""
+        self._silent = cut
 
     def close(self):
         self._ended.set()
@@ -57,7 +69,7 @@ class OnboardProgram:
             now = time.monotonic()
             self._hear(now)
             self._fly(now)
-            if now - sent_at >= _FEED_PERIOD and not self.silent:
+            if now - sent_at >= _FEED_PERIOD and not self._silent:
                 sent_at = now
                 self._send()
 
@@ -81,21 +93,21 @@ class OnboardProgram:
             order = 0
         elif silence > 0.5:
             order = min(order, 1)
-        if self.state == GROUND:
+        if self.doing == GROUND:
             if order < 2:
                 return
             self.take_offs += 1
-        self.state = AIR if order else LANDING
+        self.doing = AIR if order else LANDING
         if order == 2:
             self.model.fly_to(self._goal, None, _STEP)
         else:
             self.model.fly(np.array([0.0, 0.0, 0.0 if order else -0.5]), _STEP)
         if order == 0 and self.model.grounded:
-            self.state = GROUND
+            self.doing = GROUND
 
     def _send(self):
         self._sequence += 1
         data = b'MSMF' + struct.pack('<BBHHHII', 1, 1, self.count, 160, 120, self._sequence, 20000)
         numbers = [*self.model.position, 0.0, 0.0, 0.0, self.charge]
-        data += struct.pack('<7fI', *numbers, self.state) + self.blobs
+        data += struct.pack('<7fI', *numbers, self.doing) + self.blobs
         self._socket.sendto(data + struct.pack('<I', zlib.crc32(data)), self._feed)

@@ -116,17 +116,14 @@ def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
         ({'arm': False}, 'mambo.arm'),
         ({'full_speed': None}, 'mambo.full_speed'),
         ({'battery': 0.05}, 'battery at 0.05, below 0.10'),
-        ({'permitted': False}, f'on the ground, {UNTIL_ARM}'),
     ],
 )
 def test_what_keeps_it_on_the_ground(changes, text):
     flight = Flight(**changes)
     flight.pilot.fly(np.array([0.1, 0.0, 0.0, 0.0]))
     flight.step(200)
-    assert text in flight.pilot.problem
+    assert text in flight.pilot.problem and text in flight.pilot.permit(flight.time)
     assert flight.firmware.take_offs == 0 and flight.firmware.height == 0.0
-    if 'permitted' not in changes:
-        assert text in flight.pilot.permit(flight.time)
     # Nor does it fly one that is in the air.
     flight.firmware.take_off()
     flight.goal = HOME.position + np.array([0.9, -0.6, 0.0])
@@ -137,6 +134,7 @@ def test_what_keeps_it_on_the_ground(changes, text):
 def test_each_call_of_the_service_is_for_one_take_off():
     flight = Flight(permitted=False)
     flight.step(20)
+    assert flight.pilot.problem == f'on the ground, {UNTIL_ARM}'
     # A permission that is not used ends.
     flight.pilot._permission.timeout = 1.0
     assert flight.pilot.permit(flight.time - 2.0) == ''
@@ -195,28 +193,39 @@ def drift(flight):
     flight.firmware.body.position[0] += 0.05
 
 
+STOPPED = f'landed: its take-off was stopped, {UNTIL_ARM}'
+
+
 @pytest.mark.parametrize(
-    ('fault', 'text'),
+    ('phase', 'fault', 'text'),
     [
-        (lambda flight: flight.pilot.end('the end'), f'landed: the end, {UNTIL_ARM}'),
+        (None, lambda flight: flight.pilot.end('the end'), f'landed: the end, {UNTIL_ARM}'),
         (
+            None,
             lambda flight: setattr(flight.firmware.charge, 'charge', 0.08),
             f'battery at 0.08, below 0.10, {UNTIL_ARM}',
         ),
-        (drift, f'outside the geofence, -0.4 to 2.5 m, {UNTIL_ARM}'),
-        (lambda flight: flight.firmware.land(), f'by itself, {UNTIL_ARM}'),
-        (lambda flight: flight.firmware.emergency(), 'emergency'),
+        (None, drift, f'outside the geofence, -0.4 to 2.5 m, {UNTIL_ARM}'),
+        (None, lambda flight: flight.firmware.land(), f'by itself, {UNTIL_ARM}'),
+        (None, lambda flight: flight.firmware.emergency(), 'emergency'),
+        (MamboPhase.TAKING_OFF, lambda flight: flight.pilot.stop(flight.time), STOPPED),
+        (MamboPhase.CLIMBING, lambda flight: flight.pilot.stop(flight.time), STOPPED),
     ],
 )
-def test_what_else_lands_it_and_keeps_it_down(fault, text):
-    flight = Flight().flown()
+def test_what_else_lands_it_and_keeps_it_down(phase, fault, text):
+    flight = Flight()
+    if phase is None:
+        flight.flown()
+    else:
+        flight.until(lambda: flight.pilot.phase is phase)
+        assert flight.where[2] < HOME.position[2] - 0.1
     began = flight.time
     flight.until(lambda: fault(flight) or flight.pilot.problem)
     assert fault is drift or flight.time - began <= AT_MOST
     assert flight.where[0] < FENCE[0, 1] + 0.5 + 0.4 * AT_MOST
     down = FlyingState.LANDED, FlyingState.EMERGENCY
     flight.until(lambda: flight.firmware.flying_state in down)
-    flight.step(100)
+    flight.step(200)
     assert text in flight.pilot.problem
     assert flight.firmware.take_offs == 1
 
@@ -261,18 +270,6 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     assert firmware.take_offs == 2
 
 
-@pytest.mark.parametrize('phase', [MamboPhase.TAKING_OFF, MamboPhase.CLIMBING])
-def test_a_stop_ends_a_take_off(phase):
-    flight = Flight()
-    flight.until(lambda: flight.pilot.phase is phase)
-    flight.pilot.stop(flight.time)
-    assert flight.where[2] < HOME.position[2] - 0.1
-    flight.until_it_is(FlyingState.LANDED)
-    flight.step(200)
-    assert flight.pilot.problem == f'landed: its take-off was stopped, {UNTIL_ARM}'
-    assert flight.firmware.take_offs == 1
-
-
 def test_a_permission_ends_with_the_link():
     flight = Flight(pose='pose')
     # No pose yet: it stands.
@@ -282,8 +279,7 @@ def test_a_permission_ends_with_the_link():
     for _ in range(100):
         flight.pilot.take_pose(flight.time, flight.firmware.state)
         flight.step()
-    assert flight.pilot.phase is MamboPhase.GROUND and UNTIL_ARM in flight.pilot.problem
-    assert flight.firmware.take_offs == 0
+    assert UNTIL_ARM in flight.pilot.problem and flight.firmware.take_offs == 0
     # Nor is there one while it is not heard.
     flight.is_silent(60)
     assert 'link lost' in flight.pilot.permit(flight.time)

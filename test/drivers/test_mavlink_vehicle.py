@@ -1,14 +1,14 @@
 """What the driver says to an autopilot, against a fake one, in simulated time."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
-from mavlink_play import AT_MOST, HEIGHTS, TAKE_OFF, Play, mavlink
+from mavlink_play import ARM, AT_MOST, HEIGHTS, NOT_ARMED, TAKE_OFF, Play, mavlink
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
-from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.links.mavlink.firmware import identify
 from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.vehicle import VehiclePhase
@@ -17,20 +17,9 @@ from maasi_filter.models.pose import Pose
 
 # What counts as stopped [m/s].
 STOPPED = 0.1
-ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
 MODE = mavlink.MAV_CMD_DO_SET_MODE
 SETPOINT = 'SET_POSITION_TARGET_LOCAL_NED'
-NOT_ARMED = f'vehicle: not armed: {UNTIL_ARM}'
 firmwares = pytest.mark.parametrize('firmware', HEIGHTS)
-
-
-@pytest.mark.parametrize(
-    ('key', 'bad'),
-    [('geofence', [[0, 1], [1, 0], [0, 1]]), ('own_system', 1), ('lead', math.nan)],
-)
-def test_settings_that_make_no_sense_are_refused(key, bad):
-    with pytest.raises(ValidationError, match=key):
-        MavlinkSettings.model_validate({key: bad})
 
 
 @firmwares
@@ -77,14 +66,18 @@ OTHER_STATION = 'MAV_GCS_SYSID_HI is 255: any ground station with an id from'
         ('px4', {}, {'COM_OBL_RC_ACT': 6}, 'failsafe COM_OBL_RC_ACT is 6, and require_failsafe is'),
         ('px4', {}, {'COM_OBL_RC_ACT': 7}, 'failsafe COM_OBL_RC_ACT is 7, and require_failsafe is'),
         ('ardusub', {}, {'FS_GCS_ENABLE': 2}, 'failsafe FS_GCS_ENABLE is 2, and require_failsafe'),
+        ('arducopter', {'vehicle': 'submarine'}, {}, 'is left alone'),
+        ('arducopter', {'system': 7}, {}, 'nothing heard yet'),
     ],
 )
 def test_nothing_is_armed(firmware, changes, parameters, text):
     play = Play(firmware, {'parameters': parameters or {}}, **changes)
     play.vehicle.active = parameters is not None
     play.run(10.0)
-    assert play.phase is VehiclePhase.WAITING
-    assert f'vehicle: not armed: {text}' in play.fault
+    waits = play.phase is VehiclePhase.WAITING
+    assert f'vehicle: {"not armed: " * waits}{text}' in play.fault
+    # Whether it is asked for messages.
+    assert bool(play.sent('COMMAND_LONG')) == waits
     assert not play.commands(ARM) and not play.commands(MODE) and not play.sent(SETPOINT)
     for name, value in (parameters or {}).items():
         assert f'{name} is {value}{", which does not help" * ("failsafe" in text)}' in play.said
@@ -92,9 +85,7 @@ def test_nothing_is_armed(firmware, changes, parameters, text):
         assert NO_LINK_FAILSAFE in play.permit()
         # A correction after the refusal does not take it off.
         play.autopilot._sender.param_value_send(b'FS_GCS_ENABLE', 5.0, 9, 1, 0)
-        play.run(20.0)
-        assert UNTIL_ARM in play.fault and not play.commands(ARM)
-        play.permitted().fly()
+        play.stands(20.0)
 
 
 @pytest.mark.parametrize('end', ['', 'forbid', 'finish'])
@@ -109,49 +100,37 @@ def test_a_permission_that_is_not_used_or_stopped_ends(end):
         play.run(6.0)
         assert 'not armed within 10 s (PreArm: Battery below minimum arming capacity' in play.said
     play.autopilot.charge = 1.0
-    play.run(20.0)
-    assert not play.autopilot.armed and play.fault == NOT_ARMED
+    play.stands(20.0)
 
 
-@pytest.mark.parametrize('component', [1, 190, 191])
-def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver(component):
+def sends(play, kind, source, values):
+    getattr(mavlink.MAVLink(play.to_driver, *source), f'{kind}_send')(*values)
+
+
+@pytest.mark.parametrize(
+    'stranger',
+    [
+        *(partial(Play.beat, system=240, component=component) for component in (1, 190, 191)),
+        # Behind a router that keeps programs apart, and on a link without heartbeats.
+        partial(sends, kind='command_ack', source=(1, 1), values=(0, 0, 0, 0, 240, 190)),
+        partial(sends, kind='system_time', source=(240, 190), values=(0, 0)),
+    ],
+)
+def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver(stranger):
     play = Play()
-    play.station = (240, component)
+    play.stranger = partial(stranger, play)
     play.run(10.0)
     assert OTHER_PROGRAM in play.fault and not play.commands(ARM)
-    play.station = None
-    play.run(6.0)
-    play.permitted().fly()
+    play.stranger = lambda: None
+    play.stands(6.0)
     # In the air it is reported: the failsafe would not act now.
     play.reports.clear()
-    play.station = (240, component)
+    play.stranger = partial(stranger, play)
     play.run(2.0)
     assert OTHER_PROGRAM in play.said
     # Two drivers differ, also from ground stations, companion computers, cameras and radios.
     senders = {make_sender(240).srcComponent for _ in range(200)}
     assert len(senders) > 20 and senders <= set(range(25, 68))
-
-
-@pytest.mark.parametrize(
-    ('kind', 'source', 'values'),
-    [('command_ack', (1, 1), (0, 0, 0, 0, 240, 190)), ('system_time', (240, 190), (0, 0))],
-)
-def test_the_id_of_the_driver_shows_in_other_messages_than_heartbeats(kind, source, values):
-    """Behind a router that keeps programs apart, and on a link where heartbeats do not come."""
-    play = Play()
-    play.run(1.0)
-    getattr(mavlink.MAVLink(play.to_driver, *source), f'{kind}_send')(*values)
-    play.run(3.0)
-    assert OTHER_PROGRAM in play.fault and not play.commands(ARM)
-
-
-def test_a_vehicle_that_does_not_rise_lands_and_says_why():
-    play = Play(rise_timeout=6.0)
-    play.body.climb = 0.0
-    play.run(20.0)
-    assert 'it came no nearer to its height in 6 s: at ' in play.fault
-    assert 'm of 2.0 m' in play.fault
-    assert not play.autopilot.armed
 
 
 @pytest.mark.parametrize('phase', [VehiclePhase.ARMING, VehiclePhase.RISING])
@@ -165,9 +144,8 @@ def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on(phase):
         return
     play.autopilot.charge = 1.0
     play.autopilot.take_mode('GUIDED')
-    play.run(10.0)
-    assert 'GUIDED is back' in play.said and play.fault == NOT_ARMED
-    play.permitted().fly()
+    play.stands(10.0)
+    assert 'GUIDED is back' in play.said
 
 
 def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
@@ -187,27 +165,35 @@ def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
     play.run(2.0)
     # A permission is for the autopilot that was heard.
     play.permitted().autopilot.restart()
-    play.run(12.0)
-    assert play.fault == NOT_ARMED and not play.commands(ARM)
-    play.permitted().fly()
+    play.stands(12.0)
 
 
-def test_an_autopilot_that_restarts_in_the_air_is_left_alone():
-    play = Play().fly().go()
-    play.autopilot.restart()
-    play.run(5.0)
-    restarted = 'the autopilot has restarted: start the driver again'
-    assert play.fault == f'vehicle: is disarmed: {restarted}'
-    assert play.permit() == restarted
-
-
-def test_a_disarmed_vehicle_is_not_armed_by_a_request_without_an_answer():
-    play = Play()
+def disarmed(play):
+    """The pilot disarms it; the answer to the request to arm it was lost."""
     play.autopilot._sender.command_ack_send = lambda *_: None
     play.until(lambda: play.phase is VehiclePhase.RISING)
     play.autopilot.disarm('Disarming motors')
-    play.run(8.0)
+
+
+RESTARTED = 'the autopilot has restarted: start the driver again'
+
+
+@pytest.mark.parametrize(
+    ('fault', 'words', 'answer'),
+    [
+        (lambda play: setattr(play.body, 'climb', 0.0), 'came no nearer to its height in 6 s', ''),
+        (disarmed, 'is disarmed: by the autopilot or the pilot (Disarming motors)', ''),
+        (lambda play: play.fly().go().autopilot.restart(), f'is disarmed: {RESTARTED}', RESTARTED),
+    ],
+)
+def test_what_ends_a_flight_and_keeps_it_down(fault, words, answer):
+    play = Play(rise_timeout=6.0)
+    fault(play)
+    play.run(20.0)
+    assert words in play.fault.replace('Arming motors; ', '')
+    assert ('m of 2.0 m' in play.fault) == ('nearer' in words)
     assert play.phase is VehiclePhase.STOPPED and not play.autopilot.armed
+    assert play.permit() == answer
 
 
 def test_a_driver_restarted_while_its_vehicle_lands_does_not_take_off_again():
@@ -216,10 +202,7 @@ def test_a_driver_restarted_while_its_vehicle_lands_does_not_take_off_again():
     play.start_driver()
     play.run(2.0)
     assert 'it is flown in LAND' in play.permit()
-    play.run(20.0)
-    assert not play.autopilot.armed and play.mode == 'LAND'
-    assert play.fault == NOT_ARMED and len(play.commands(ARM)) == 1
-    play.permitted().fly()
+    play.stands(20.0)
 
 
 def test_a_driver_restarted_in_the_air_sends_it_nowhere_before_it_may():
@@ -262,31 +245,25 @@ def test_a_permission_needs_a_vehicle_that_is_heard_and_ends_with_the_link():
     assert play.permit() == 'vehicle: nothing heard yet'
     play.run(3.0)
     assert play.permit() == '' and 'no position estimate yet' in play.fault
-    play.unheard(2.0).run(25.0)
-    assert play.fault == NOT_ARMED and not play.commands(ARM)
-    play.permitted().fly()
+    play.unheard(2.0).stands(25.0)
     play.vehicle.finish('land')
     play.until(lambda: not play.autopilot.armed).unheard(2.0)
     assert 'nothing heard' in play.permit()
 
 
-@pytest.mark.parametrize('kind', [{'vehicle': 'submarine'}, {'vehicle': 'copter', 'system': 7}])
-def test_vehicles_of_another_kind_or_id_are_left_alone(kind):
-    play = Play(**kind)
-    play.run(8.0)
-    assert not play.autopilot.armed and not play.sent('COMMAND_LONG')
-    assert ('is left alone' in play.fault) == ('system' not in kind)
+@pytest.mark.parametrize(
+    ('key', 'bad'),
+    [('geofence', [[0, 1], [1, 0], [0, 1]]), ('own_system', 1), ('lead', math.nan)],
+)
+def test_what_makes_no_sense_is_refused(key, bad):
+    with pytest.raises(ValidationError, match=key):
+        MavlinkSettings.model_validate({key: bad})
     with pytest.raises(ValueError, match='HEARTBEAT: read autopilot 3, type 10'):
         identify(3, 10)
-
-
-def test_targets_that_are_not_finite_are_refused():
     play = Play().fly()
     for position, yaw in (([0.0, math.inf, 2.0], 0.0), ([0.0, 0.0, 2.0], math.nan)):
         with pytest.raises(ValueError, match='setpoint: got'):
             play.vehicle.set_target(position, yaw)
-    play.run(2.0)
-    assert play.autopilot.crashed == ''
 
 
 @firmwares
@@ -298,7 +275,7 @@ def test_a_dead_driver_leaves_a_vehicle_that_stops(firmware, lives):
     assert play.speed > 0.28
     play.driver_lives, play.to_driver.cut, play.to_autopilot.cut = lives, lives, lives
     # That of another ground station does not keep the failsafe from acting.
-    play.station = (255, 190)
+    play.stranger = partial(play.beat, 255, 190)
     play.run(AT_MOST)
     assert play.speed < STOPPED or play.autopilot.mode == play.autopilot.firmware.land
     assert np.linalg.norm((play.body.position - before)[:2]) <= 0.45

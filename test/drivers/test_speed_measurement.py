@@ -64,39 +64,23 @@ def test_what_says_too_little_or_does_not_fit_is_refused(places, text):
 # ---- the command -----------------------------------------------------------------------------
 
 
-@pytest.fixture
-def measure():
-    """Return a fake, and a function that starts the command for it."""
+@pytest.mark.parametrize('ends', [True, False])
+def test_the_command_measures_through_pyparrot_and_lands(ends):
     fake = FakeMambo(MamboFirmware(Pose.from_yaw([0.0, 0.0, 0.0], 0.0)), free_address())
-    line = [sys.executable, '-m', 'maasi_drivers.measure_mambo', '--address', fake.address]
-    line += ['--port', str(free_port()), '--fly']
-
-    def start(*options):
-        return subprocess.Popen([*line, *options], stdout=subprocess.PIPE, text=True)
-
-    yield fake.firmware, start
-    fake.close()
-
-
-def test_the_command_measures_through_pyparrot_and_lands(measure):
-    firmware, start = measure
-    process = start('--legs', '2')
-    output, _ = process.communicate(timeout=LIMIT)
-    assert process.returncode == 0, output
-    lines = dict(line.split(': ') for line in output.splitlines() if line.startswith('mambo.'))
-    measured = float(lines['mambo.full_speed'].split()[0])
-    assert_allclose(measured, full_speed(firmware.settings.drag), rtol=0.3)
+    firmware, options = fake.firmware, ['--address', fake.address, '--port', str(free_port())]
+    command = [sys.executable, '-m', 'maasi_drivers.measure_mambo', '--fly', '--legs', '2']
+    with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True) as process:
+        if not ends:
+            wait_until(lambda: firmware.flying_state == FlyingState.HOVERING)
+            process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=LIMIT)
+    assert process.returncode == (0 if ends else 1), output
     assert firmware.flying_state == FlyingState.LANDED and firmware.take_offs == 1
-
-
-def test_the_command_lands_when_it_is_interrupted(measure):
-    firmware, start = measure
-    process = start()
-    wait_until(lambda: firmware.flying_state == FlyingState.HOVERING)
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=LIMIT)
-    assert process.returncode == 1
-    assert firmware.flying_state == FlyingState.LANDED
+    fake.close()
+    if ends:
+        lines = dict(line.split(': ') for line in output.splitlines() if line.startswith('mambo.'))
+        measured = float(lines['mambo.full_speed'].split()[0])
+        assert_allclose(measured, full_speed(firmware.settings.drag), rtol=0.3)
 
 
 def test_the_command_says_what_it_would_do_and_what_cannot_be(capsys):

@@ -1,23 +1,14 @@
 """Whole searches by vehicles under MAVLink and by a Mambo that pyparrot reaches."""
 
-import socket
-from contextlib import ExitStack
 from copy import deepcopy
 
 import pytest
 from scenario_runs import run_scenario
 
 from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.simulation.emulators.mambo.fake_mambo import free_address
 
 pytestmark = pytest.mark.system
-
-
-def free_ports(number):
-    with ExitStack() as taken:
-        probes = [taken.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(number)]
-        for probe in probes:
-            probe.bind(('127.0.0.1', 0))
-        return [probe.getsockname()[1] for probe in probes]
 
 
 def short_search():
@@ -33,16 +24,11 @@ def short_search():
     robots['other'] = deepcopy(robots['drone'])
     robots['other'] |= {'start': [36.0, 36.0, 2.5]}
     robots['other']['autopilot'] |= {'firmware': 'px4', 'parameters': {'COM_OF_LOSS_T': 5.0}}
-    for number, port in enumerate(free_ports(3)):
-        robot = list(robots.values())[number]
+    for system, robot in enumerate(robots.values(), 11):
         robot['link'] = 'mavlink'
-        robot['mavlink'] |= {
-            'arm': True,
-            'url': f'udpin:127.0.0.1:{port}',
-            'system': 11 + number,
-            # The machine may be busy.
-            'link_timeout': 3.0,
-        }
+        # The machine may be busy.
+        robot['mavlink'] |= {'arm': True, 'system': system, 'link_timeout': 3.0}
+        robot['mavlink']['url'] = f'udpin:{free_address()}:14550'
     scenario['limits']['time'] = 150.0
     return scenario
 

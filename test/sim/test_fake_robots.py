@@ -1,4 +1,4 @@
-"""The fake Mambo's wire under pyparrot as it is on PyPI, and its command."""
+"""The fakes on real sockets: a Mambo's wire under pyparrot as it is on PyPI, and both commands."""
 
 import math
 import signal
@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -14,16 +15,19 @@ from numpy.testing import assert_allclose
 from waiting import wait_until
 
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
+from maasi_drivers.links.mavlink.link import open_connection
 from maasi_filter.models.pose import Pose
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import BatterySettings
 from maasi_sim.simulation.emulators.linked_robots import with_addresses
-from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port, main
+from maasi_sim.simulation.emulators.mambo import fake_mambo
+from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.simulation.emulators.mambo.firmware import (
     FirmwareSettings,
     FlyingState,
     MamboFirmware,
 )
+from maasi_sim.simulation.emulators.mavlink import fake_mavlink_vehicle
 
 START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
 
@@ -65,9 +69,8 @@ def test_pyparrot_flies_it(pair):
     assert fake.firmware.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
     fake.cut_up = False
     wait_until(lambda: link.flying_state == 'landed')
-    assert fake.refused == 0
     # Acknowledged commands are not repeated.
-    assert fake.heard[(2, 0, 1)] == 1
+    assert fake.refused == 0 and fake.heard[(2, 0, 1)] == 1
     wait_until(lambda: not fake._unacked)
 
 
@@ -165,29 +168,56 @@ def test_an_address_of_a_scenario_that_was_asked_for_stays():
     assert robots['mambo'].mambo.address not in ('127.0.0.9', robot.mambo.address)
 
 
-# ---- the command -----------------------------------------------------------------------------
+# ---- the commands ----------------------------------------------------------------------------
 
 
-def test_the_command_runs_a_fake_that_a_link_finds():
-    address = free_address()
-    command = [sys.executable, '-m', 'maasi_sim.simulation.emulators.mambo.fake_mambo']
-    command += ['--address', address, '--charge', '0.4']
+@contextmanager
+def running(module, *options):
+    """Run a fake's command; yield it, and check that it ends well when it is interrupted."""
+    command = [sys.executable, '-m', module.__name__, *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        link = MamboLink('wifi', address, free_port())
         try:
-            assert address in process.stdout.readline()
-            link.connect()
-            wait_until(lambda: link.battery == 0.4)
+            yield process
         finally:
-            link.close()
             process.send_signal(signal.SIGINT)
-        assert 'landed' in process.stdout.read()
     assert process.returncode == 0
 
 
+def test_a_fake_mambo_is_found_by_a_link():
+    address = free_address()
+    with running(fake_mambo, '--address', address, '--charge', '0.4') as fake:
+        assert address in fake.stdout.readline()
+        link = MamboLink('wifi', address, free_port())
+        link.connect()
+        wait_until(lambda: link.battery == 0.4)
+        link.close()
+        assert 'landed' in fake.stdout.readline()
+
+
+def test_a_fake_vehicle_is_heard_in_mavlink_2():
+    url = f'127.0.0.1:{free_port()}'
+    connection = open_connection(f'udpin:{url}', 255, 190)
+    options = ('--system', '7', '--firmware', 'ardusub', '--url', f'udpout:{url}')
+    with running(fake_mavlink_vehicle, *options) as fake:
+        beat = connection.recv_match(type='HEARTBEAT', blocking=True, timeout=60.0)
+        assert (beat.get_srcSystem(), beat.type) == (7, 12)
+        # The first byte of MAVLink 2.
+        assert beat.get_msgbuf()[0] == 0xFD
+        assert 'not armed, at 0.00, 0.00, 0.00 m' in fake.stdout.readline()
+    connection.close()
+
+
 @pytest.mark.parametrize(
-    ('option', 'value'), [('--drag', '-1.0'), ('--delay', '-0.1'), ('--charge', '2.0')]
+    ('fake', 'option', 'value', 'words'),
+    [
+        (fake_mambo, '--drag', '-1.0', '--drag: read -1.0'),
+        (fake_mambo, '--delay', '-0.1', '--delay: read -0.1'),
+        (fake_mambo, '--charge', '2.0', '--charge: read 2.0'),
+        (fake_mavlink_vehicle, '--parameter', 'FS_GCS_ENABLE', 'allowed is NAME=NUMBER'),
+        (fake_mavlink_vehicle, '--url', 'udpout:nowhere', 'host:port'),
+        (fake_mavlink_vehicle, '--charge', '3', 'charge'),
+    ],
 )
-def test_the_command_says_what_it_does_not_take(capsys, option, value):
-    assert main([option, value]) == 2
-    assert f'error: {option}: read {value}' in capsys.readouterr().err
+def test_what_makes_no_sense_is_refused(capsys, fake, option, value, words):
+    assert fake.main([option, value]) == 2
+    assert words in capsys.readouterr().err
