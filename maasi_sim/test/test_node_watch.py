@@ -1,15 +1,16 @@
 """Who hangs: silent nodes, but not those that start or wait for a processor."""
 
 import os
-from pathlib import Path
+import signal
 from types import SimpleNamespace
 
 import pytest
 
 from maasi_sim.run import processes, supervisor
 from maasi_sim.run.node_plan import NodePlan
-from maasi_sim.run.processes import NodeProcess, waited_for_processor
+from maasi_sim.run.processes import waited_for_processor
 from maasi_sim.run.progress import ProgressDisplay
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.supervisor import Supervisor
 from maasi_sim.scenario.loading import load_scenario
 
@@ -19,22 +20,25 @@ FILTER, PLANNER = '/filter_node', '/planner_node'
 class Run:
     """Two nodes whose heartbeats, clock and waits for a processor are played."""
 
-    def __init__(self, monkeypatch):
+    def __init__(self, monkeypatch, folder, **overrides):
         self.now = 0.0
         self.beats, self.queued, self.stopped = {}, {}, []
         clock = SimpleNamespace(monotonic=lambda: self.now)
         monkeypatch.setattr(supervisor, 'time', clock)
         monkeypatch.setattr(processes, 'waited_for_processor', lambda pid: self.queued.get(pid, 0))
-        plans = {name: NodePlan('maasi', 'node', name[1:]) for name in (FILTER, PLANNER)}
-        self.nodes = {name: NodeProcess(name, [], Path()) for name in plans}
+        names = ('filter_node', 'planner_node')
+        plans = [NodePlan(f'maasi_{name[:-5]}', name, name) for name in names]
+        mission = SimpleNamespace(
+            scenario=load_scenario('mambo', overrides), plan_nodes=lambda *_: plans
+        )
+        self.supervisor = Supervisor(mission, Options(), folder, ProgressDisplay())
+        self.supervisor.running = True
+        self.supervisor.recorder = SimpleNamespace(
+            elapsed=0.0, ready={PLANNER}, take_heartbeats=self.take
+        )
+        self.nodes = self.supervisor.processes
         for pid, node in enumerate(self.nodes.values(), start=1):
             node._popen = SimpleNamespace(pid=pid, poll=lambda: None)
-        recorder = SimpleNamespace(elapsed=0.0, relative=str, take_heartbeats=self.take)
-        scenario = load_scenario('mambo')
-        self.supervisor = Supervisor(
-            plans, self.nodes, scenario, False, recorder, ProgressDisplay()
-        )
-        self.supervisor.running = True
 
     def take(self):
         beats, self.beats = self.beats, {}
@@ -55,8 +59,8 @@ class Run:
 
 
 @pytest.fixture
-def run(monkeypatch):
-    return Run(monkeypatch)
+def run(monkeypatch, tmp_path):
+    return Run(monkeypatch, tmp_path)
 
 
 def test_a_silent_node_is_named_within_five_seconds_and_no_pause_of_three(run):
@@ -110,6 +114,33 @@ def test_the_run_itself_may_have_stood_still(run, last):
     run.now = 61.2
     assert run.until(65.0) is None
     assert run.until(66.5) is not None
+
+
+def test_a_node_is_killed_if_it_hangs_and_restarted_as_often_as_the_limit_says(
+    monkeypatch, tmp_path
+):
+    limits = {'on_exit': (('on_exit',), 'respawn'), 'restarts': (('limits', 'restarts'), 1)}
+    run = Run(monkeypatch, tmp_path, **limits)
+    node, signals, starts = run.nodes[PLANNER], [], []
+    monkeypatch.setattr(node, 'signal', signals.append)
+    monkeypatch.setattr(node, 'start', lambda: starts.append(node.restarts))
+    monkeypatch.setattr(node, 'join', lambda: None)
+    removed = []
+    monkeypatch.setattr(supervisor, 'remove_dead', lambda: removed.append(len(starts)))
+    run.beat(FILTER, PLANNER, at=1.0)
+    run.until(4.0)
+    run.beat(FILTER, at=4.0)
+    assert run.until(6.3) is None and set(signals) == {signal.SIGKILL}
+    node._popen = SimpleNamespace(pid=2, poll=lambda: -9)
+    run.beat(FILTER, at=6.4)
+    assert starts == [1] and removed == [0] and run.supervisor.recorder.ready == set()
+    assert 'start number 2' in node.last_words()
+    node._popen = SimpleNamespace(pid=3, poll=lambda: 7)
+    ending = run.beat(FILTER, at=6.6)
+    assert ending.text == f'{PLANNER} exited with 7, after 1 restarts'
+    events = [event['event'] for event in run.supervisor.events]
+    assert events[0] == 'hung' and events[-2:] == ['restarted', 'died']
+    assert ending.nodes == [PLANNER]
 
 
 def test_the_wait_for_a_processor_is_read_from_the_system():

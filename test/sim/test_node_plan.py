@@ -9,7 +9,7 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_sim.run.node_plan import NodePlan, plan_in_run
+from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario.loading import config_folder, load_scenario
@@ -74,34 +74,36 @@ def test_the_sim_gets_the_file_how_fast_it_goes_and_whose_clock_it_is(lockstep, 
     assert values == ('/s.yaml', 4, lockstep, expected, True)
     # The clock is its own.
     assert not simulated
-    follows = Options(follow_clock=True)
-    for plan in plans.values():
-        assert (plan_in_run(plan, follows, None) == plan) == (not plan.is_clock)
-        assert plan.says_ready == (plan.name != 'guard')
-    settings, simulated = read_back(plan_in_run(plans['/sim_node'], follows, None), SimNodeSettings)
+    follower = plans_of(scenario, lockstep=False, follow_clock=True)['/sim_node']
+    settings, simulated = read_back(follower, SimNodeSettings)
     assert settings.follow_clock and simulated
 
 
-def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there():
-    plans = plans_of(load_scenario('mambo_turtlebot'), lockstep=False)
-    for name, plan in plans.items():
-        moved = plan_in_run(plan, Options(namespace='north/one'), None)
-        assert moved.full_name == f'/north/one{name}'
-        assert plan_in_run(plan, Options(), None) == plan
+def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there(tmp_path):
+    for name, plan in plans_of(load_scenario('mambo_turtlebot'), lockstep=False).items():
+        process = plan.process(tmp_path, 'north/one', 'warn')
+        assert process.name == f'/north/one{name}'
+        assert process.log == tmp_path / f'north_one{name.replace("/", "_")}.log'
+        assert process.command[-2:] == ['--log-level', 'warn']
+    assert NodePlan('p', 'e', 'sim').command(Path('e'), Path('f'))[6] == '__ns:=/'
     plan = NodePlan('p', 'e', 'driver', 'a', {'a.b': 1.5}, remaps={'/batch': '/a/batch'})
-    for moved, space, batch in (
-        (plan, '/a', '/batch:=/a/batch'),
-        (
-            plan_in_run(plan, Options(namespace='team'), None),
-            '/team/a',
-            '/team/batch:=/team/a/batch',
-        ),
+    for team, space, batch in (
+        ('', '/a', '/batch:=/a/batch'),
+        ('team', '/team/a', '/team/batch:=/team/a/batch'),
     ):
-        command = moved.command(Path('/lib/e'), Path('/run/p.yaml'))
+        command = plan.command(Path('/lib/e'), Path('/run/p.yaml'), team)
         assert command[:2] == ['/lib/e', '--ros-args']
         assert {'__node:=driver', f'__ns:={space}', batch} <= set(command)
         assert command[command.index('--params-file') + 1] == '/run/p.yaml'
-        assert yaml.safe_load(moved.parameter_text()) == {'/**': {'ros__parameters': {'a.b': 1.5}}}
+    assert yaml.safe_load(plan.parameter_text()) == {'/**': {'ros__parameters': {'a.b': 1.5}}}
+
+
+def test_a_filter_that_may_be_restarted_saves_its_state_in_the_folder_of_the_run():
+    scenario = load_scenario('mambo', {'on_exit': (('on_exit',), 'respawn')})
+    settings, _ = read_back(plans_of(scenario)['/filter_node'], FilterNodeSettings)
+    assert (settings.save_file, settings.save_batches) == ('/state/filter_node.maasi', True)
+    settings, _ = read_back(plans_of(load_scenario('mambo'))['/filter_node'], FilterNodeSettings)
+    assert (settings.save_file, settings.save_batches) == ('', False)
 
 
 def test_independent_robots_have_filter_and_planner_of_their_own():

@@ -12,6 +12,7 @@ import pytest
 from node_kinds import KINDS
 from waiting import PATIENCE, wait_until
 
+from maasi_sim.run import processes
 from maasi_sim.run.processes import NodeProcess, ProcessError, find_executable, stop
 
 # Ignores the signals that are named.
@@ -30,7 +31,7 @@ from maasi_sim.run.processes import NodeProcess
 if __name__ == '__main__':
     nodes = [
         NodeProcess('/node', [sys.executable, '-u', '-c', sys.argv[2]], Path(sys.argv[1]) / 'node'),
-        NodeProcess('/own', [sys.argv[3], '--help'], Path(sys.argv[1]) / 'own', 'maasi_filter'),
+        NodeProcess('/own', [sys.argv[3], '--help'], Path(sys.argv[1]) / 'own'),
     ]
     for node in nodes:
         node.start()
@@ -77,16 +78,6 @@ def test_a_process_writes_its_log_also_of_a_restart_and_says_how_it_ended(tmp_pa
     wait_until(lambda: not process.is_alive())
     assert process.restarts == 1
     assert process.last_words().splitlines() == ['hello', '--- start number 2 ---', 'hello']
-    dead = Path(f'/dev/shm/fastrtps_{os.getpid():016x}')
-
-    def is_removed():
-        # Another process that looks at the same moment has the file open: once more, then.
-        dead.touch()
-        process.restart()
-        wait_until(lambda: not process.is_alive())
-        return not dead.exists()
-
-    wait_until(is_removed)
 
 
 def test_output_and_environment_are_its_own(tmp_path, monkeypatch):
@@ -115,7 +106,7 @@ def test_a_node_that_cannot_be_executed_ends_and_says_why(tmp_path):
 def test_a_node_of_the_suite_is_shown_by_its_command_and_ends_as_it_says(tmp_path, domain):
     command = KINDS['filter'].command(tmp_path / 'node.yaml')
     # It inherits what the server has loaded.
-    process = NodeProcess('/node', command, tmp_path / 'log', 'maasi_filter')
+    process = NodeProcess('/node', command, tmp_path / 'log')
     process.start()
     line = Path(f'/proc/{process.pid}/cmdline')
     wait_until(lambda: line.read_bytes().rstrip(bytes(1)).decode() == ' '.join(process.command))
@@ -129,7 +120,7 @@ def test_a_node_of_the_suite_that_refuses_its_input_says_so(tmp_path, domain, lo
     (tmp_path / 'full').symlink_to('/dev/full')
     command = KINDS['filter'].command(tmp_path / 'node.yaml')
     (tmp_path / 'node.yaml').unlink()
-    process = ended(NodeProcess('/node', command, tmp_path / log, 'maasi_filter'))
+    process = ended(NodeProcess('/node', command, tmp_path / log))
     assert process.exitcode not in (0, None)
     assert log == 'full' or 'node.yaml' in (tmp_path / 'log').read_text()
 
@@ -142,15 +133,16 @@ def test_a_node_of_the_suite_that_refuses_its_input_says_so(tmp_path, domain, lo
         (IGNORE_ALL, signal.SIGKILL, True),
     ],
 )
-def test_signals_get_stronger_until_all_processes_have_ended(tmp_path, code, last, killed):
-    processes = [started(python(tmp_path, code, f'/node{i}')) for i in range(2)]
+def test_signals_get_stronger_until_all_have_ended(tmp_path, monkeypatch, code, last, killed):
+    nodes = [started(python(tmp_path, code, f'/node{i}')) for i in range(2)]
     every = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
     ending = [(number, PATIENCE if number == last else 0.05) for number in every]
-    names = [process.name for process in processes]
-    assert stop(processes, ending) == (names if killed else [])
-    assert {process.how_it_ended() for process in processes} == {f'was killed by {last.name}'}
+    monkeypatch.setattr(processes, 'ENDING', ending)
+    names = [node.name for node in nodes]
+    assert stop(nodes) == (names if killed else [])
+    assert {node.how_it_ended() for node in nodes} == {f'was killed by {last.name}'}
     # What has ended, or never started.
-    assert stop([*processes, python(tmp_path, '', '/other')]) == []
+    assert stop([*nodes, python(tmp_path, '', '/other')]) == []
 
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
@@ -163,7 +155,8 @@ def test_nodes_do_not_outlive_a_killed_run(tmp_path, number):
         text=True,
     )
     pid = int(run.stdout.readline())
-    wait_until(lambda: 'ready' in (tmp_path / 'node').read_text())
+    log = tmp_path / 'node'
+    wait_until(lambda: log.exists() and 'ready' in log.read_text())
     server = int(stat(pid)[1])
     assert alive(pid) and server != run.pid
     run.send_signal(number)
@@ -241,7 +234,7 @@ def test_an_interrupt_while_a_script_starts_leaves_no_traceback(tmp_path, domain
 
 @pytest.mark.parametrize('moment', ['ROS imports', 'node is made'])
 def test_an_interrupt_while_a_forked_node_starts_leaves_no_traceback(tmp_path, domain, moment):
-    node = NodeProcess('/node', command_of('filter', tmp_path), tmp_path / 'log', 'maasi_filter')
+    node = NodeProcess('/node', command_of('filter', tmp_path), tmp_path / 'log')
     node.start()
     try:
         wait_for(node.pid, MOMENTS[moment])

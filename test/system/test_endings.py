@@ -170,7 +170,7 @@ def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(tmp_path)
 def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path, monkeypatch):
     path = write_scenario(tmp_path / 'near.yaml', NEAR)
     run = ScenarioRun(Options(path), SimpleNamespace(at_once=lambda *_: nullcontext()))
-    run.ending, run.folder = Ending('all_found', DONE), tmp_path
+    run.ending, run.wall_time, run.folder = Ending('all_found', DONE), 1.0, tmp_path
     run._scenario = run.mission.scenario
     run.recorder = SimpleNamespace(gaps=lambda *_: ['a gap'], elapsed=8.0)
     run.supervisor = SimpleNamespace(events=[])

@@ -165,7 +165,7 @@ class World(Operator):
             namespace = f'/{kind}{made.namespace}'
             self.names[kind] = f'{namespace}/{made.name}'
             command = made.command(folder / f'{kind}.yaml', namespace, **CHANGES.get(kind, {}))
-            process = NodeProcess(kind, command, folder / f'{kind}.log', made.package)
+            process = NodeProcess(kind, command, folder / f'{kind}.log')
             process.start()
             self.processes[kind] = process
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self.on_status, 50)

@@ -27,6 +27,7 @@ import maasi_entry
 
 _PR_SET_PDEATHSIG = 1
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# Of the suite: a node of another one is executed, and inherits nothing.
 _PACKAGES = ('maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
 # In the environment of the server only: the process that started it.
 _STARTED_BY = 'MAASI_NODE_SERVER_OF'
@@ -125,17 +126,16 @@ class NodeProcess(ForkServerProcess):
     """A node that runs as a process and cannot outlive this one.
 
     Its command is the path of its executable and its arguments, also shown by `ps`. Its log is kept
-    over restarts. A node of a package of this suite inherits what the server has loaded.
+    over restarts. A node of this suite inherits what the server has loaded.
 
     Its executor publishes a heartbeat each second. Until the first one it is starting, which may
     include compilation. Times are of the wall [s].
     """
 
-    def __init__(self, name: str, command: list[str], log: Path, package: str = '') -> None:
+    def __init__(self, name: str, command: list[str], log: Path) -> None:
         super().__init__(name=name)
         self.command = command
         self.log = log
-        self.package = package
         self.restarts = 0
         self.started = 0.0
         #: Time of its last heartbeat, and how long it had waited for a processor by then.
@@ -144,9 +144,6 @@ class NodeProcess(ForkServerProcess):
 
     def start(self) -> None:
         """Start it."""
-        # The node itself opens it.
-        with contextlib.suppress(OSError):
-            self.log.touch()
         self._environment = dict(os.environ)
         try:
             start_server()
@@ -157,11 +154,7 @@ class NodeProcess(ForkServerProcess):
 
     def restart(self) -> None:
         """Restart it after it died."""
-        # Deferred: the server is to be started first.
-        from maasi_sim.run.domain import remove_dead
-
         self.restarts += 1
-        remove_dead()
         with contextlib.suppress(OSError), self.log.open('ab') as output:
             output.write(f'--- start number {self.restarts + 1} ---\n'.encode())
         # One process object starts once.
@@ -183,8 +176,9 @@ class NodeProcess(ForkServerProcess):
             os.dup2(source, target)
         os.environ.clear()
         os.environ.update(self._environment)
-        script = getattr(maasi_entry, Path(self.command[0]).name, None)
-        if self.package not in _PACKAGES or script is None:
+        executable = Path(self.command[0])
+        script = getattr(maasi_entry, executable.name, None)
+        if executable.parent.name not in _PACKAGES or script is None:
             for number in (signal.SIGPIPE, signal.SIGXFSZ):
                 signal.signal(number, signal.SIG_DFL)
             os.execv(self.command[0], self.command)
@@ -240,17 +234,13 @@ def waited_for_processor(pid: int | None) -> float:
         return 0.0
 
 
-def stop(
-    processes: Sequence[NodeProcess],
-    ending: Sequence[tuple[signal.Signals, float]] = ENDING,
-) -> list[str]:
-    """Stop processes with increasingly strong signals; return when all have ended.
+def stop(processes: Sequence[NodeProcess]) -> list[str]:
+    """Stop processes, all at the same time, by stronger and stronger signals.
 
-    All get each signal of `ending` at the same time, and that many seconds [s] until the next one.
     Returned are the names of those that had to be killed.
     """
     stubborn: list[str] = []
-    for number, patience in ending:
+    for number, patience in ENDING:
         rest = [process for process in processes if process.is_alive()]
         if not rest:
             break

@@ -25,8 +25,7 @@ from maasi_sim.run.ending import (
 )
 from maasi_sim.run.mission import RunEnd
 from maasi_sim.run.missions import load_mission
-from maasi_sim.run.node_plan import plan_in_run
-from maasi_sim.run.processes import NodeProcess, stop, wait_for_server
+from maasi_sim.run.processes import stop, wait_for_server
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.report_files import store_report
@@ -58,6 +57,7 @@ class ScenarioRun:
     supervisor: Supervisor
     recorder: Recorder
     ending: Ending
+    wall_time: float
 
     def __init__(self, options: Options, interruption: Interruption) -> None:
         self.options = options
@@ -69,9 +69,10 @@ class ScenarioRun:
         }
         overrides = {name: item for name, item in given.items() if item[1] is not None}
         self.display = ProgressDisplay()
-        with warnings.catch_warnings(record=True) as self._doubts:
+        with warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter('always', ScenarioWarning)
             self.mission = load_mission(options.scenario, overrides)
+        self._warn(*(str(doubt.message) for doubt in doubts))
         # A node in the namespace of a robot belongs to that robot.
         if options.namespace.rpartition('/')[2] in self.mission.scenario.names():
             raise ScenarioError(
@@ -81,10 +82,9 @@ class ScenarioRun:
         self._bag: BagWriter | None = None
         #: Errors of writing.
         self.unwritten: list[str] = []
-        # Wall time when all nodes were ready, of the first step, and how long the run took.
+        # Wall time when all nodes were ready, and of the first step.
         self._complete: float | None = None
         self._begun: float | None = None
-        self._wall_time = 0.0
 
     def execute(self) -> int:
         """Run it and return the exit code."""
@@ -96,12 +96,14 @@ class ScenarioRun:
             self.mission.prepare()
             self._scenario = self.mission.scenario
             self._limits = self._scenario.limits
-            processes = self._plan()
+            write_text(self.folder / 'scenario.yaml', self._scenario.text())
+            write_text(self.folder / 'view.rviz', view_text(self.mission, team))
+            self.supervisor = Supervisor(self.mission, options, self.folder, self.display)
+            processes = list(self.supervisor.processes.values())
             self.display.say(
                 f'{self.mission.name}: seed {self._scenario.seed}, {len(processes)} nodes in ROS '
                 f'domain {domain.number}, results in {short(self.folder)}'
             )
-            self._warn(*(str(doubt.message) for doubt in self._doubts or ()))
             ends.callback(self.display.close)
             page = self._page(domain.number)
             if page is not None:
@@ -117,20 +119,12 @@ class ScenarioRun:
             self.recorder.listener = None if page is None else page.put_message
             if self._bag is not None:
                 self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
-            self.supervisor = Supervisor(
-                self._plans,
-                processes,
-                self._scenario,
-                options.lockstep,
-                self.recorder,
-                self.display,
-            )
-            ends.callback(stop, list(processes.values()))
+            self.supervisor.recorder = self.recorder
+            ends.callback(stop, processes)
             self._monitor()
+            self._close_bag()
             followed = self._is_followed()
-            if followed:
-                self._close_bag()
-            else:
+            if not followed:
                 ends.close()
             code = self._report()
             if followed:
@@ -140,19 +134,6 @@ class ScenarioRun:
                     self.recorder.wait(_FOLLOWERS_PERIOD)
                     self.recorder.drain()
             return code
-
-    def _plan(self) -> dict[str, NodeProcess]:
-        """Write the scenario with all layers; plan its nodes, and return their processes."""
-        options, scenario = self.options, self._scenario
-        file = self.folder / 'scenario.yaml'
-        write_text(file, scenario.text())
-        write_text(self.folder / 'view.rviz', view_text(self.mission, options.namespace))
-        state = self.folder / 'state' if scenario.on_exit == 'respawn' else None
-        plans = self.mission.plan_nodes(options, file)
-        moved = [plan_in_run(plan, options, state) for plan in plans]
-        self._plans = {plan.full_name: plan for plan in moved}
-        level = options.log_level
-        return {name: plan.process(self.folder, level) for name, plan in self._plans.items()}
 
     def _facts(self) -> str:
         """Return the data for a replay, as YAML."""
@@ -166,12 +147,12 @@ class ScenarioRun:
             'follow_clock': options.follow_clock,
             'scenario': self._scenario.content(),
             'nodes': {
-                self.recorder.relative(name): {
+                plan.full_name: {
                     'package': plan.package,
                     'executable': plan.executable,
                     'parameters': plan.parameters,
                 }
-                for name, plan in self._plans.items()
+                for plan in self.supervisor.plans.values()
             },
         }
         return to_yaml(facts)
@@ -203,15 +184,15 @@ class ScenarioRun:
             self.supervisor.start()
         self._name_external_robots()
         self.ending = self._wait_until_ready() or self._follow()
-        if self._begun is not None:
-            self._wall_time = time.monotonic() - self._begun
+        now = time.monotonic()
+        self.wall_time = now - (self._begun or now)
         self._check_recording()
         self.recorder.finish()
         self.supervisor.stop(self._is_followed())
 
     def _wait_until_ready(self) -> Ending | None:
         """Wait until every node is ready, the recorder last; return an ending if one is not."""
-        expected = [name for name, plan in self._plans.items() if plan.says_ready]
+        expected = self.supervisor.names('clock', 'driver', 'other')
         begin, patience = time.monotonic(), _START_PATIENCE
         while (ending := self._turn()) is None and (lacks := self._lacks(expected)):
             what = ', '.join(f'{name} {lack}' for name, lack in lacks.items())
@@ -354,7 +335,7 @@ class ScenarioRun:
         """Write the report, print a summary, and return the exit code."""
         ending = self.ending
         elapsed, events = self.recorder.elapsed, self.supervisor.events
-        end = RunEnd(ending.reason, elapsed, self._wall_time, events)
+        end = RunEnd(ending.reason, elapsed, self.wall_time, events)
         report: dict[str, Any] = {}
         place, problem = None, ''
         with self.interruption.at_once(signal.SIGINT):
@@ -367,8 +348,9 @@ class ScenarioRun:
         for name in ending.nodes:
             if process := self.supervisor.processes.get(name):
                 self.display.say(f'--- {short(process.log)}\n{process.last_words()}')
-        unwritten = [*self.unwritten, problem] if problem else self.unwritten
-        for text in unwritten:
+        if problem:
+            self.unwritten.append(problem)
+        for text in self.unwritten:
             self.display.say(f'error: {text}')
         if report:
             where = 'nowhere' if place is None else short(place / 'report.json')
@@ -379,7 +361,7 @@ class ScenarioRun:
         code = ending.code
         if ending.reason == 'planner_done' and report.get('missed') == 0:
             code = DONE
-        return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
+        return NOT_WRITTEN if self.unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
     def _leave_replay(self) -> None:
         """Write the page that shows the run, from its recording."""

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+from maasi_sim.run.domain import remove_dead
 from maasi_sim.run.ending import NODE_FAILED, Ending
+from maasi_sim.run.mission import Mission
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import NodeProcess, stop
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
-from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.run.run_options import Options
+from maasi_sim.run.topics import within
 
 # Wall time between two checks of the processes, where steps come in quick succession [s].
 _CHECK_PERIOD = 0.05
@@ -25,28 +28,26 @@ _LAST_MESSAGES = 0.02
 class Supervisor:
     """Starts the nodes of a run; restarts a node that dies or hangs, or ends the run."""
 
+    #: Set before the start: it takes heartbeats, and stops robots.
+    recorder: Recorder
+
     def __init__(
-        self,
-        plans: Mapping[str, NodePlan],
-        processes: Mapping[str, NodeProcess],
-        scenario: BaseScenario,
-        lockstep: bool,
-        recorder: Recorder,
-        display: ProgressDisplay,
+        self, mission: Mission[Any], options: Options, folder: Path, display: ProgressDisplay
     ) -> None:
-        self.processes = processes
+        team, level = options.namespace, options.log_level
+        plans = mission.plan_nodes(options, folder / 'scenario.yaml')
+        self.plans = {within(team, plan.full_name): plan for plan in plans}
+        self.processes = {
+            name: plan.process(folder, team, level) for name, plan in self.plans.items()
+        }
         #: Nodes that died, hung or were restarted.
         self.events: list[dict[str, Any]] = []
         #: Whether the first step has begun; before it nodes may take long to start.
         self.running = False
-        self._plans = plans
-        self._scenario = scenario
-        self._limits = scenario.limits
-        self._lockstep = lockstep
-        self._recorder = recorder
+        self._scenario = mission.scenario
+        self._lockstep = options.lockstep
         self._display = display
         self._checked = 0.0
-        self._clocks = {name for name, plan in plans.items() if plan.is_clock}
 
     def start(self) -> None:
         """Start all nodes."""
@@ -61,82 +62,73 @@ class Supervisor:
         if gap < _CHECK_PERIOD:
             return None
         self._checked = now
-        beats = self._recorder.take_heartbeats()
+        beats = self.recorder.take_heartbeats()
         for name, process in self.processes.items():
             if name in beats:
                 process.beat(beats[name])
             # The last heartbeat may have been before the gap.
             if gap > _LONGEST_GAP and process.beaten is not None:
                 process.beaten = min(process.beaten + gap, now)
-            ending = None
-            if not process.is_alive():
-                ending = self._restart(name, process)
-            elif self.running:
-                ending = self._check_heartbeat(name, process, now)
-            if ending is not None:
+            if ending := self._check_node(self.plans[name], process, now):
                 return ending
         return None
 
-    def _restart(self, name: str, process: NodeProcess) -> Ending | None:
-        """Restart a node that has died, or return the ending of the run."""
-        text = f'{name} {process.how_it_ended()}'
-        if self._plans[name].drives:
-            self._stop_robot_of(name)
-        if self._respawns(name) and process.restarts < self._limits.restarts:
-            self._note(name, 'restarted')
-            self._recorder.ready.discard(name)
-            process.restart()
-            self._display.say(f'{text}; it is restarted')
+    def _check_node(self, plan: NodePlan, process: NodeProcess, now: float) -> Ending | None:
+        """Restart a node that has died, kill one that hangs, or return the ending of the run."""
+        name, limits = process.name, self._scenario.limits
+        died = not process.is_alive()
+        if died:
+            text = f'{name} {process.how_it_ended()}'
+        elif not self.running:
             return None
-        self._note(name, 'died')
-        if process.restarts:
-            text += f', after {process.restarts} restarts'
-        return Ending('node_died', NODE_FAILED, text, [name])
-
-    def _check_heartbeat(self, name: str, process: NodeProcess, now: float) -> Ending | None:
-        """Kill a node that hangs, or return the ending of the run."""
-        plan, limits = self._plans[name], self._limits
-        if process.beaten is None:
+        elif process.beaten is None:
             if now - process.started <= limits.start:
                 return None
             text = f'{name} not ready {limits.start:g} s after the start'
             return Ending('not_ready', NODE_FAILED, text, [name])
         # A lockstep step may take long: `limits.silence` applies to awaited nodes.
-        awaited = self._lockstep and (plan.says_done or plan.is_clock)
-        if awaited or not process.hangs(now, limits.heartbeat):
+        elif (self._lockstep and plan.role != 'guard') or not process.hangs(now, limits.heartbeat):
             return None
-        text = f'{name} hangs: no heartbeat for {now - process.beaten:.1f} s'
-        self._note(name, 'hung')
-        self._stop_robot_of(name)
-        if not self._respawns(name):
-            return Ending('node_hung', NODE_FAILED, text, [name])
-        self._display.say(f'{text}; it is killed')
-        process.signal(signal.SIGKILL)
+        else:
+            text = f'{name} hangs: no heartbeat for {now - process.beaten:.1f} s'
+        if plan.namespace in self._scenario.robots and (not died or plan.role == 'driver'):
+            self.recorder.stop_robots([plan.namespace])
+        # A restarted simulation would begin at time 0.
+        respawns = self._scenario.on_exit == 'respawn' and plan.role != 'clock'
+        if not respawns or process.restarts >= limits.restarts:
+            if process.restarts:
+                text += f', after {process.restarts} restarts'
+            word = 'died' if died else 'hung'
+            self._note(name, word)
+            return Ending(f'node_{word}', NODE_FAILED, text, [name])
+        if died:
+            self._note(name, 'restarted')
+            self.recorder.ready.discard(name)
+            remove_dead()
+            process.restart()
+        else:
+            self._note(name, 'hung')
+            process.signal(signal.SIGKILL)
+        self._display.say(f'{text}; it is {"restarted" if died else "killed"}')
         return None
 
-    def _respawns(self, name: str) -> bool:
-        # A restarted simulation would begin at time 0.
-        return self._scenario.on_exit == 'respawn' and name not in self._clocks
-
     def _note(self, name: str, event: str) -> None:
-        self.events.append({'time': self._recorder.elapsed, 'node': name, 'event': event})
-
-    def _stop_robot_of(self, name: str) -> None:
-        robot = (self._recorder.relative(name) or '').split('/')[1]
-        if robot in self._scenario.robots:
-            self._recorder.stop_robots([robot])
+        self.events.append({'time': self.recorder.elapsed, 'node': name, 'event': event})
 
     def standstill(self) -> Ending:
         """Return the ending of a run whose time has stopped."""
-        silence = f'for {self._limits.silence:g} s'
-        step = self._recorder.step
+        silence = f'for {self._scenario.limits.silence:g} s'
+        step = self.recorder.step
         if step is None:
             return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
-        steps = self._recorder.done_steps()
-        doers = [name for name, plan in self._plans.items() if plan.says_done]
-        late = [name for name in doers if steps.get(name, -1) < step]
-        who = ', '.join(late) or next(iter(self._clocks))
+        steps = self.recorder.done_steps()
+        late = [name for name in self.names('driver', 'other') if steps.get(name, -1) < step]
+        who = ', '.join(late or self.names('clock'))
         return Ending('node_hung', NODE_FAILED, f'step {step}: nothing from {who} {silence}', late)
+
+    def names(self, *roles: str) -> list[str]:
+        """Return the names of the nodes of some roles."""
+        return [name for name, plan in self.plans.items() if plan.role in roles]
 
     @property
     def restarting(self) -> bool:
@@ -146,25 +138,20 @@ class Supervisor:
     @property
     def has_clock(self) -> bool:
         """Whether the simulation runs."""
-        return all(self.processes[name].is_alive() for name in self._clocks)
+        return all(self.processes[name].is_alive() for name in self.names('clock'))
 
     def stop(self, keep_clock: bool) -> None:
         """Stop the robots, then the nodes, and record their last messages."""
-        recorder, robots = self._recorder, self._scenario.names()
-        drivers, others = [], []
-        for name, plan in self._plans.items():
-            if plan.drives or plan.package == 'maasi_drivers':
-                drivers.append(self.processes[name])
-            elif not (keep_clock and plan.is_clock):
-                others.append(self.processes[name])
+        recorder, robots = self.recorder, self._scenario.names()
+        others = self.names('other') if keep_clock else self.names('other', 'clock')
         # Drivers stop their robots while the simulation, or the robot, still runs. One that hangs
         # does not, and may send a command until it is killed: stop the robots before and after.
         recorder.stop_robots(robots)
-        stubborn = stop(drivers)
+        stubborn = stop([self.processes[name] for name in self.names('driver', 'guard')])
         recorder.stop_robots(robots)
         recorder.wait(_LAST_MESSAGES)
         recorder.drain()
-        stubborn += stop(others)
+        stubborn += stop([self.processes[name] for name in others])
         recorder.drain()
         if stubborn:
             self._display.say(f'had to be killed: {", ".join(stubborn)}')

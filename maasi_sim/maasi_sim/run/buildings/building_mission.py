@@ -86,5 +86,5 @@ def _planner_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -
         name,
         {**flatten(settings), **SIMULATED},
         given={'search_on_start': True},
-        drives=True,
+        role='driver',
     )

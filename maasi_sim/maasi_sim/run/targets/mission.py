@@ -57,10 +57,11 @@ class TargetMission:
         scenario.check_pace(options.lockstep, options.rate)
         common = common_parameters(scenario, options)
         plans = [sim_plan('sim_node', scenario, options, file)]
+        state = file.parent / 'state'
         for name in scenario.names():
             plans += _robot_plans(name, scenario.robots[name], scenario, common)
         for namespace, names in scenario.namespaces().items():
-            plans += _team_plans(namespace, names, scenario, common)
+            plans += _team_plans(namespace, names, scenario, common, state)
         return plans
 
     def warning(self) -> str:
@@ -97,10 +98,12 @@ class TargetMission:
 
 
 def _team_plans(
-    namespace: str, names: list[str], scenario: Scenario, common: dict[str, Any]
+    namespace: str, names: list[str], scenario: Scenario, common: dict[str, Any], state: Path
 ) -> list[NodePlan]:
-    """Return filter and planner of robots that share them."""
+    """Return filter and planner of robots that share them; a restarted filter has its state."""
     others = [name for name in scenario.names() if name not in names]
+    respawns = scenario.on_exit == 'respawn'
+    file = state / f'{namespace}_filter_node.maasi'.strip('_')
     filter_settings = FilterNodeSettings.model_validate(
         {
             **common,
@@ -108,6 +111,8 @@ def _team_plans(
             'filter': scenario.filter,
             'robots': {name: {'sensor': scenario.robots[name].sensor} for name in names},
             'share_with': others,
+            'save_file': str(file) if respawns else '',
+            'save_batches': respawns,
         }
     )
     return [
@@ -165,7 +170,7 @@ def _robot_plans(
             {**flatten(settings), **SIMULATED},
             # A robot with its own planner gets its batches from that one.
             remaps={BATCH: within(name, BATCH)} if own else {},
-            drives=True,
+            role='driver',
             arguments=_plugin(name, robot.driver, scenario),
         )
     ]
