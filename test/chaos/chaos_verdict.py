@@ -8,13 +8,17 @@ from chaos_cases import SIM
 
 from maasi_sim.run.bag import Bag, BagError
 
-# From a driver's last state until its robot stands, and from the last update of the filter until
-# all do: held after 5 s, and then braking [s].
+# From a driver's last state until its robot stands, and from the first batch without an update of
+# the filter until all do: held after 5 s, and then braking [s].
 DRIVER_STOP, FILTER_STOP = 2.5, 7.0
 # Without the guard the run itself stops the robot, after 5 s [s].
 UNGUARDED_STOP = 7.0
-# A drone that flies at 3 m/s brakes for longer [s].
+# A drone that flies at 3 m/s overshoots, and comes back to where it was held [s].
 DRONE_BRAKING = 4.0
+# An autopilot without its driver flies to the last set-point, a second's way ahead at 3 m/s, here
+# with what was flown since the last state that arrived [m]. It slows down by 1 m/s for each metre
+# left: from 3 m/s it is at rest after ln(3 / 0.06) = 3.9 s [s].
+AUTOPILOT_WAY, AUTOPILOT_STOP = 3.5, 5.0
 # Below this speed, noise of odometry, a robot is at rest [m/s].
 STANDING = 0.06
 
@@ -83,23 +87,83 @@ def judge_gaps(case, bag, robots):
     """Check, free running, that a robot stands while its driver or the filter is silent."""
     problems = []
     end = max(times_of(bag, '/clock'), default=0.0)
-    held = FILTER_STOP + (DRONE_BRAKING if case.kind == 'mavlink' else 0.0)
     for name in robots:
-        patience = UNGUARDED_STOP if f'/{name}/guard' in case.nodes else DRIVER_STOP
-        silences = [('its driver', patience, f'/{name}/state')]
+        silences = []
+        if case.kind == 'mavlink':
+            problems += judge_autopilot(bag, name)
+        else:
+            patience = UNGUARDED_STOP if f'/{name}/guard' in case.nodes else DRIVER_STOP
+            times = signs_of_driver(bag, name)
+            silences += [('its driver', patience, *gap) for gap in zip(times, [*times[1:], end])]
         if '/planner_node' not in case.nodes:
-            silences.append(('the filter', held, '/filter_update'))
+            held = FILTER_STOP + (DRONE_BRAKING if case.kind == 'mavlink' else 0.0)
+            silences += [('the filter', held, *gap) for gap in silences_of_filter(bag, end)]
         speeds = speeds_of(bag, name)
-        for who, patience, topic in silences:
-            times = times_of(bag, topic)
-            for since, until in zip(times, [*times[1:], end]):
-                inside = (speeds[:, 0] > since + patience) & (speeds[:, 0] < until)
-                moving = speeds[inside & (speeds[:, 1] > STANDING)]
-                if len(moving):
-                    problems.append(
-                        f'{name} moves at {moving[0, 1]:.2f} m/s at {moving[0, 0]:.1f} s, though '
-                        f'{who} is silent since {since:.1f} s'
-                    )
+        for who, patience, since, until in silences:
+            inside = (speeds[:, 0] > since + patience) & (speeds[:, 0] < until)
+            moving = speeds[inside & (speeds[:, 1] > STANDING)]
+            if len(moving):
+                problems.append(
+                    f'{name} moves at {moving[0, 1]:.2f} m/s at {moving[0, 0]:.1f} s, though '
+                    f'{who} is silent since {since:.1f} s'
+                )
+    return problems
+
+
+def signs_of_driver(bag, robot):
+    """Return the times of a driver's states, and those at which its guard heard it again.
+
+    A restarted driver may move its robot before the recorder has discovered it.
+    """
+    heard = [
+        item.time * 1e-9
+        for item in bag.messages(['/rosout'])
+        if item.message.name == f'{robot}.guard' and item.message.msg == 'the driver is back'
+    ]
+    return sorted([*times_of(bag, f'/{robot}/state'), *heard])
+
+
+def silences_of_filter(bag, end):
+    """Return from when to when there was no update, though a batch waited for one.
+
+    No batch is published while no robot takes part.
+    """
+    asked = [(item.message.id, item.time * 1e-9) for item in bag.messages(['/measurement_batch'])]
+    answers = [
+        (item.message.batch_id, item.time * 1e-9) for item in bag.messages(['/filter_update'])
+    ]
+    silences, last = [], 0
+    for (number, since), (_, until) in zip([(0, 0.0), *answers], [*answers, (0, end)]):
+        last = max(last, number)
+        first = min((time for batch, time in asked if batch > last), default=end)
+        silences.append((max(since, first), until))
+    return silences
+
+
+def judge_autopilot(bag, robot):
+    """Check that a vehicle flies no farther than its last set-point without its driver.
+
+    Only its driver reports it: the first state after a silence tells what it did.
+    """
+    problems = []
+    before = None
+    for item in bag.messages([f'/{robot}/state']):
+        state = item.message
+        place, linear = state.pose.pose.position, state.twist.linear
+        # Before the first pose a driver publishes its start, exactly at rest.
+        if not any((linear.x, linear.y, linear.z)):
+            continue
+        time = state.header.stamp.sec + 1e-9 * state.header.stamp.nanosec
+        if before is not None:
+            since, x, y = before
+            way = math.hypot(place.x - x, place.y - y)
+            speed = math.hypot(linear.x, linear.y)
+            silence = f'while its driver was silent, {since:.1f} to {time:.1f} s'
+            if way > AUTOPILOT_WAY:
+                problems.append(f'{robot} flew {way:.1f} m {silence}')
+            if time > since + AUTOPILOT_STOP and speed > STANDING:
+                problems.append(f'{robot} still moves at {speed:.2f} m/s {silence}')
+        before = time, place.x, place.y
     return problems
 
 

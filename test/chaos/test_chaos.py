@@ -13,11 +13,18 @@ from chaos_execution import Outcome
 from chaos_verdict import judge
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray
+from maasi_msgs.msg import (
+    AgentState,
+    FilterUpdate,
+    FoundTarget,
+    FoundTargetArray,
+    MeasurementBatch,
+)
 from maasi_sim.run.bag import BagWriter, load_types
 
 pytestmark = pytest.mark.system
@@ -82,23 +89,26 @@ def test_wrong_arguments_are_refused(tmp_path, capsys):
 
 
 KILLED = Case('kill', ('/filter_node',), 'middle', False, False)
+PAUSED_DRONE = Case('pause', ('/drone/driver',), kind='mavlink')
 
 
 @pytest.fixture
 def problems_of(tmp_path):
     """Return the function that judges a run of 20 s by its messages: topic, time and message."""
 
-    def judged(messages=(), code=3, output='/filter_node', left=()):
-        (tmp_path / 'report.json').write_text('{"end_reason": "time_limit"}')
+    def judged(messages=(), code=3, output='/filter_node', left=(), case=KILLED):
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        folder.mkdir()
+        (folder / 'report.json').write_text('{"end_reason": "time_limit"}')
         clock = [('/clock', second, Clock(clock=Time(sec=second))) for second in range(20)]
-        with BagWriter(tmp_path / 'bag', load_types()) as bag:
+        with BagWriter(folder / 'bag', load_types()) as bag:
             for topic, time, message in sorted((*clock, *messages), key=lambda item: item[1]):
                 if hasattr(message, 'header'):
                     message.header.stamp = stamp_to_ros(round(time * 1e9))
                 package = type(message).__module__.partition('.')[0]
                 bag.add_topic(topic, f'{package}/msg/{type(message).__name__}')
                 bag.write(topic, round(1e9 * time), serialize_message(message))
-        return judge(KILLED, Outcome(tmp_path, code, output, True, 1.0, list(left)))
+        return judge(case, Outcome(folder, code, output, True, 1.0, list(left)))
 
     return judged
 
@@ -137,6 +147,61 @@ def test_a_robot_that_moves_when_it_must_stand_is_found(problems_of):
     )
     assert gap == 'mambo moves at 0.20 m/s at 10.0 s, though its driver is silent since 1.0 s'
     assert last.startswith('turtlebot: the last command is (0.2,')
+
+
+def test_a_driver_that_its_guard_hears_again_is_not_silent_before_it_is_recorded(problems_of):
+    moving = Odometry()
+    moving.twist.twist.linear.x = 0.2
+    back = ('/rosout', 3.0, Log(name='mambo.guard', msg='the driver is back'))
+    messages = [
+        ('/mambo/state', 1.0, AgentState()),
+        ('/mambo/odom', 5.0, moving),
+        ('/mambo/state', 7.0, AgentState()),
+    ]
+    text = 'mambo moves at 0.20 m/s at {} s, though its driver is silent since {} s'
+    assert problems_of(messages) == [text.format(5.0, 1.0)]
+    assert problems_of([*messages, back]) == []
+    # Without a state afterwards that does not last.
+    late = ('/mambo/odom', 6.0, moving)
+    assert problems_of([*messages, back, late]) == [text.format(6.0, 3.0)]
+
+
+def test_a_filter_is_silent_only_while_a_batch_waits_for_it(problems_of):
+    moving = Odometry()
+    moving.twist.twist.linear.x = 0.2
+    messages = [
+        ('/measurement_batch', 1.0, MeasurementBatch(id=1)),
+        ('/filter_update', 2.0, FilterUpdate(batch_id=1)),
+        ('/mambo/odom', 10.0, moving),
+        ('/mambo/odom', 18.0, moving),
+    ]
+    assert problems_of(messages) == []
+    asked = ('/measurement_batch', 9.5, MeasurementBatch(id=2))
+    assert problems_of([*messages, asked]) == [
+        'mambo moves at 0.20 m/s at 18.0 s, though the filter is silent since 9.5 s'
+    ]
+
+
+def test_a_vehicle_that_flies_past_its_last_set_point_is_found(problems_of):
+    def state(x, speed):
+        message = AgentState()
+        message.pose.pose.position.x, message.twist.linear.x = x, speed
+        return message
+
+    def judged(silence, way, speed):
+        messages = [
+            ('/drone/state', 1.0, state(5.0, 2.8)),
+            # Of a restarted driver, which does not know the place yet.
+            ('/drone/state', 2.0, state(0.0, 0.0)),
+            ('/drone/state', 1.0 + silence, state(5.0 + way, speed)),
+        ]
+        return problems_of(messages, code=0, case=PAUSED_DRONE)
+
+    assert judged(3.0, 2.8, 0.2) == judged(6.0, 3.0, 0.01) == []
+    assert judged(3.0, 6.0, 0.2) == ['drone flew 6.0 m while its driver was silent, 1.0 to 4.0 s']
+    assert judged(6.0, 2.8, 0.2) == [
+        'drone still moves at 0.20 m/s while its driver was silent, 1.0 to 7.0 s'
+    ]
 
 
 def test_a_recording_or_report_that_cannot_be_read_is_found(tmp_path):
