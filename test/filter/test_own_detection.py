@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from functools import cache
 
 import numpy as np
 import pytest
@@ -115,6 +116,7 @@ def test_a_saved_filter_goes_on_in_another_process(method, monkeypatch, tmp_path
     # As in another process, where the function is elsewhere.
     before = sensor.detection.kernel()[1][detection.VALUES]
     monkeypatch.setattr(detection, '_known', {})
+    monkeypatch.setattr(detection, '_entries', cache(detection._entries.__wrapped__))
     if method == 'pmb':
         with pytest.raises(StateFileError, match='make the sensors'):
             load_filter(tmp_path / 'state')

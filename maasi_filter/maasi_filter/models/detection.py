@@ -1,9 +1,8 @@
 """Probability that a sensor detects a target, pi(x, q).
 
 Every model has a kernel that other numba kernels evaluate inline, except a user's own function,
-which they call (`OwnDetection`).
-Arrays of the sensor's parameters always have PARAMETERS entries, so that one compiled kernel
-serves all kinds.
+which they call (`OwnDetection`). Arrays of the sensor's parameters always have PARAMETERS entries,
+so that one compiled kernel serves all kinds.
 """
 
 from __future__ import annotations
@@ -31,9 +30,8 @@ PARAMETERS = 9
 # of the function, address of its values, and how many there are.
 REACH, NUMBER, FUNCTION, VALUES, LENGTH = 4, 5, 6, 7, 8
 
-# Functions, and their entries from NUMBER on, by number; values that kernels may still read.
-_known: dict[int, tuple[Callable[..., float], FloatArray]] = {}
-_alive: list[FloatArray] = []
+# Entries from NUMBER on of functions with their values, by number: the latest of each.
+_known: dict[float, FloatArray] = {}
 
 
 @intrinsic
@@ -57,17 +55,31 @@ def register(function: Callable[..., float], values: FloatArray) -> FloatArray:
 
     The number is the same in every process for the same name of the function and values.
     """
+    entries = _entries(function, np.asarray(values, dtype=float).tobytes())
+    _known[entries[0]] = entries
+    return entries
+
+
+# Both caches keep what kernels read by its address.
+@cache
+def _entries(function: Callable[..., float], content: bytes) -> FloatArray:
     name = f'{function.__module__}:{function.__qualname__}'
-    digest = hashlib.sha256(name.encode() + b'\0' + values.tobytes()).digest()
+    digest = hashlib.sha256(name.encode() + b'\0' + content).digest()
+    values = np.frombuffer(content)
     # Floats are exact up to 2^53.
     number = int.from_bytes(digest[:6], 'little')
-    # A notebook may define it again.
-    if number not in _known or _known[number][0] is not function:
-        own = np.array(values, dtype=float)
-        _alive.append(own)
-        entries = np.array([number, _compiled(function).address, own.ctypes.data, len(own)], float)
-        _known[number] = (function, entries)
-    return _known[number][1]
+    return np.array([number, _compiled(function).address, values.ctypes.data, len(values)], float)
+
+
+@cache
+def _compiled(function: Callable[..., float]) -> Any:
+    inner = function if isinstance(function, Dispatcher) else njit(error_model='numpy')(function)
+
+    @cfunc('float64(float64, float64, float64, CPointer(float64), int64)')
+    def call(forward, left, up, values, size):  # type: ignore[no-untyped-def]  # pragma: no cover
+        return inner(forward, left, up, carray(values, (size,)))
+
+    return call
 
 
 def renew_addresses(kinds: FloatArray, parameters: FloatArray) -> None:
@@ -78,31 +90,11 @@ def renew_addresses(kinds: FloatArray, parameters: FloatArray) -> None:
                 'it was saved with a detection model of your own, which no sensor of this process '
                 'has: make the sensors, with the same settings, before it is loaded'
             )
-        parameters[row, NUMBER:] = _known[parameters[row, NUMBER]][1]
-
-
-@cache
-def _compiled(function: Callable[..., float]) -> Any:
-    inner = function if isinstance(function, Dispatcher) else njit(error_model='numpy')(function)
-    number = types.float64
-
-    @cfunc(number(number, number, number, types.CPointer(number), types.int64))
-    def call(forward, left, up, values, size):  # type: ignore[no-untyped-def]  # pragma: no cover
-        return inner(forward, left, up, carray(values, (size,)))
-
-    return call
+        parameters[row, NUMBER:] = _known[parameters[row, NUMBER]]
 
 
 @njit(cache=True, error_model='numpy')
-def detection_probability_at(
-    kind: int,
-    parameters: FloatArray,
-    dx: float,
-    dy: float,
-    dz: float,
-    cos_yaw: float,
-    sin_yaw: float,
-) -> float:
+def detection_probability_at(kind, parameters, dx, dy, dz, cos_yaw, sin_yaw):  # type: ignore[no-untyped-def]
     """Return pi for a target at offset (dx, dy, dz) [m, map axes] from the sensor.
 
     `kind` is EXPONENTIAL (000, eq. (3), (4)), GAUSSIAN (003, section 2.2) or BOX (000, eq. (25)
@@ -117,7 +109,7 @@ def detection_probability_at(
             return 0.0
         address, values = np.int64(parameters[FUNCTION]), np.int64(parameters[VALUES])
         length = np.int64(parameters[LENGTH])
-        value: float = parameters[0] * _call(address, values, length, x, y, dz)  # type: ignore[call-arg]
+        value = parameters[0] * _call(address, values, length, x, y, dz)  # type: ignore[call-arg]
         # What is not a number is not above 0 either.
         return min(value, 1.0) if value > 0.0 else 0.0
     if kind == BOX:
@@ -137,14 +129,13 @@ def detection_probability_at(
 @njit(cache=True, error_model='numpy')
 def fill_probabilities(kind, parameters, x, y, z, cos_yaw, sin_yaw, out):  # type: ignore[no-untyped-def]
     """Fill pi (n,) for the first n offsets (x, y, z) [m, map axes] from the sensor."""
-    number = len(out)
     if kind >= BOX:
-        for i in range(number):
+        for i in range(len(out)):
             out[i] = detection_probability_at(kind, parameters, x[i], y[i], z[i], cos_yaw, sin_yaw)
         return
     gain, p, q, r = parameters[0], parameters[1], parameters[2], parameters[3]
     gaussian = kind == GAUSSIAN
-    for i in range(number):
+    for i in range(len(out)):
         u = x[i] * p
         v = y[i] * q
         w = z[i] * r
@@ -153,13 +144,9 @@ def fill_probabilities(kind, parameters, x, y, z, cos_yaw, sin_yaw, out):  # typ
 
 
 class DetectionModel:
-    """Probability of detection of a target at x by a sensor at pose q.
-
-    Its formula is in `detection_probability_at`.
-    """
+    """Probability of detection of a target, by the formula in `detection_probability_at`."""
 
     _kind: int
-    _parameters: FloatArray
 
     def __init__(self, probability: float) -> None:
         if not (math.isfinite(probability) and 0.0 <= probability <= 1.0):
@@ -183,20 +170,18 @@ class DetectionModel:
         number, d = array.shape
         offset, out = np.zeros((3, number)), np.empty(number)
         np.subtract(array.T, pose.position[:d, None], out=offset[:d])
-        x, y, z = offset
-        cos_yaw, sin_yaw = math.cos(pose.yaw), math.sin(pose.yaw)
-        fill_probabilities(self._kind, self._parameters, x, y, z, cos_yaw, sin_yaw, out)
+        turn = math.cos(pose.yaw), math.sin(pose.yaw)
+        fill_probabilities(*self.kernel(), *offset, *turn, out)  # type: ignore[call-arg]
         return out
 
 
 class _RadialDetection(DetectionModel):
     def __init__(self, probability: float, size: Sequence[float]) -> None:
-        values = np.array(size, dtype=float)
-        if values.shape not in ((2,), (3,)) or not (values > 0.0).all():
+        self.size = np.array(size, dtype=float)
+        if self.size.shape not in ((2,), (3,)) or not (self.size > 0.0).all():
             raise ValueError(f'size: got {list(size)}, allowed are 2 or 3 positive numbers')
         super().__init__(probability)
-        self.size = values
-        self._parameters[1 : 1 + len(values)] = 1.0 / values
+        self._parameters[1 : 1 + len(self.size)] = 1.0 / self.size
 
 
 class ExponentialDetection(_RadialDetection):
@@ -245,8 +230,7 @@ class BoxDetection(DetectionModel):
         frame: str = 'robot',
         edge: float = 0.0,
     ) -> None:
-        low = np.array(lower, dtype=float)
-        high = np.array(upper, dtype=float)
+        low, high = self.lower, self.upper = np.array(lower, float), np.array(upper, float)
         if low.shape not in ((2,), (3,)) or low.shape != high.shape or not (low < high).all():
             raise ValueError(
                 f'lower, upper: got {list(lower)}, {list(upper)}, allowed are 2 or 3 numbers '
@@ -257,16 +241,12 @@ class BoxDetection(DetectionModel):
         if not (math.isfinite(edge) and edge >= 0.0):
             raise ValueError(f'edge: got {edge}, allowed are finite numbers from 0')
         super().__init__(probability)
-        self.lower = low
-        self.upper = high
-        self.frame = frame
-        self.edge = float(edge)
+        self.frame, self.edge = frame, float(edge)
         everywhere = [math.inf] * (3 - len(low))
-        self._parameters[1:4] = [*low, *np.negative(everywhere)]
-        self._parameters[4:7] = [*high, *everywhere]
+        self._parameters[1:7] = [*low, *np.negative(everywhere), *high, *everywhere]
         self._parameters[7:] = self.edge, frame == 'robot'
 
     def softened(self, edge: float) -> BoxDetection:
         """Return the same box with a ramp of at least `edge` metres."""
-        edge = max(edge, self.edge)
-        return BoxDetection(self.lower.tolist(), self.upper.tolist(), self.gain, self.frame, edge)
+        corners = self.lower.tolist(), self.upper.tolist()
+        return BoxDetection(*corners, self.gain, self.frame, max(edge, self.edge))

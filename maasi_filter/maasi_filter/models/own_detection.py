@@ -26,9 +26,7 @@ class OwnDetection(DetectionModel):
 
     A subclass has `reach`, and either `compiled` with `values`, or `evaluate`. The result is
     multiplied with `probability` of the settings, and 0 beyond the reach. In two dimensions `up`
-    is 0.
-
-    Both ways are compared in docs/plugins.md.
+    is 0. Both ways are compared in docs/plugins.md.
 
     Parameters
     ----------
@@ -61,9 +59,7 @@ class OwnDetection(DetectionModel):
 
     def __init__(self, settings: Any = None, probability: float = 1.0, dimension: int = 3) -> None:
         super().__init__(probability)
-        if settings is None and self.Settings is not None:
-            settings = self.Settings()
-        self.own = settings
+        self.own = self.Settings() if settings is None and self.Settings is not None else settings
         self.dimension = dimension
         reach = float(self._numbers('reach', self.reach(), ()))
         if not 0.0 < reach < math.inf:
@@ -77,7 +73,7 @@ class OwnDetection(DetectionModel):
             places = np.random.default_rng(1).uniform(-reach, reach, (_TRIALS, 3))
             places[:, dimension:] = places[0] = 0.0
             results = [function(*place, values) for place in places.tolist()]
-            self._numbers('compiled', results, (_TRIALS,), probabilities=True)
+            self._probabilities('compiled', results, _TRIALS)
         # As of the radial models: the inverse of half the width of the view.
         self._parameters[1 : 1 + dimension] = 2.0 / reach
         self._parameters[REACH] = reach
@@ -102,14 +98,7 @@ class OwnDetection(DetectionModel):
     def _refuse(self, problem: str) -> NoReturn:
         raise PluginError(f'{type(self).__module__}:{type(self).__qualname__}: {problem}')
 
-    def _numbers(
-        self,
-        what: str,
-        value: Any,
-        shape: tuple[int, ...] | None = None,
-        *,
-        probabilities: bool = False,
-    ) -> FloatArray:
+    def _numbers(self, what: str, value: Any, shape: tuple[int, ...] | None = None) -> FloatArray:
         """Return what a method gave as numbers, of a shape if one is given."""
         try:
             found = np.asarray(value, dtype=float)
@@ -117,8 +106,12 @@ class OwnDetection(DetectionModel):
             self._refuse(f'{what}: got {value!r:.80}, allowed are numbers')
         if shape is not None and found.shape != shape:
             self._refuse(f'{what}: got shape {found.shape}, allowed is {shape}')
+        return found
+
+    def _probabilities(self, what: str, value: Any, number: int) -> FloatArray:
+        found = self._numbers(what, value, (number,))
         wrong = found[~((found >= 0.0) & (found <= 1.0))]
-        if probabilities and wrong.size:
+        if wrong.size:
             self._refuse(f'{what}: got a probability of {wrong[0]}, allowed are numbers in [0, 1]')
         return found
 
@@ -127,9 +120,8 @@ class OwnDetection(DetectionModel):
         cells = _CELLS[self.dimension]
         axis = np.linspace(-reach, reach, 2 * cells + 1)
         height = axis if self.dimension == 3 else np.zeros(1)
-        grids = [grid.ravel() for grid in np.meshgrid(axis, axis, height, indexing='ij')]
-        given = self.evaluate(*grids)
-        table = self._numbers('evaluate', given, grids[0].shape, probabilities=True)
+        places = np.stack(np.meshgrid(axis, axis, height, indexing='ij')).reshape(3, -1)
+        table = self._probabilities('evaluate', self.evaluate(*places), places.shape[1])
         return np.concatenate([[-reach] * 3, [reach / cells] * 3, [len(axis), len(height)], table])
 
 
