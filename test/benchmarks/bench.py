@@ -18,20 +18,15 @@ def show(row):
 
 def main():
     parser = argparse.ArgumentParser(prog='bench', description=__doc__)
-    parser.add_argument('areas', nargs='*', metavar='AREA', help=f'{", ".join(AREAS)}; all if none')
+    areas = f'{", ".join(AREAS)}; all if none'
+    parser.add_argument('areas', nargs='*', choices=AREAS, metavar='AREA', help=areas)
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the results there as well')
-    parser.add_argument(
-        '--quick',
-        action='store_true',
-        help='a tenth of the calls: shows that all works and roughly how fast',
-    )
+    quick = 'a tenth of the calls: shows that all works and roughly how fast'
+    parser.add_argument('--quick', action='store_true', help=quick)
     options = parser.parse_args()
     file = options.json
     if file and (file.is_dir() or not os.access(file.absolute().parent, os.W_OK)):
         parser.error(f'--json: read {file}, allowed is a file in a folder that is there')
-    for area in options.areas:
-        if area not in AREAS:
-            parser.error(f'unknown area {area!r}, known are {", ".join(AREAS)}')
     rows = []
     for area in options.areas or AREAS:
         for row in import_module(f'{area}_benchmark').run(0.1 if options.quick else 1.0):

@@ -38,10 +38,10 @@ class _Robots(NamedTuple):
 
 
 @njit(cache=True)
-def _expected_end(robots, routes, targets, detected, dimension, stops):
+def _expected_end(robots, routes, targets, detected, dimension):
     """Return the expected time to find all on `routes` (R, n), -1 after the last, in ticks.
 
-    Sets `stops` (R, 3) to the position where each robot leaves for its second target.
+    And the places (R, 3) where each robot leaves for its second target.
     """
     number, size = routes.shape
     # Probabilities of no detection and of exactly one.
@@ -53,7 +53,7 @@ def _expected_end(robots, routes, targets, detected, dimension, stops):
     sine = np.where(travels, 0.0, np.sin(robots.yaw))
     wait = np.zeros(number)
     current = np.zeros(number, np.int64)
-    stops[:] = robots.remaining_path[:, -1]
+    stops = robots.remaining_path[:, -1].copy()
     cost = 0.0
     for tick in range(TICKS):
         for r in range(number):
@@ -84,17 +84,11 @@ def _expected_end(robots, routes, targets, detected, dimension, stops):
                     share = min(1.0, robots.speed[r] / distance)
                 place[r] += share * offset
             if tick % robots.period[r] == 0:
+                kind, parameters = robots.kind[r], robots.parameters[r]
                 for j in range(len(targets)):
                     away = targets[j] - place[r]
-                    chance = detection_probability_at(
-                        robots.kind[r],
-                        robots.parameters[r],
-                        away[0],
-                        away[1],
-                        away[2] if dimension == 3 else 0.0,
-                        cosine[r],
-                        sine[r],
-                    )
+                    x, y, z = away[0], away[1], away[2] if dimension == 3 else 0.0
+                    chance = detection_probability_at(kind, parameters, x, y, z, cosine[r], sine[r])
                     one[j] += none[j] * chance - one[j] * chance
                     none[j] *= 1.0 - chance
         missing = none + one
@@ -105,7 +99,7 @@ def _expected_end(robots, routes, targets, detected, dimension, stops):
     for r in range(number):
         if current[r] == 0 and routes[r, 0] >= 0:
             stops[r] = place[r]
-    return cost
+    return cost, stops
 
 
 class Clairvoyant(Planner):
@@ -158,16 +152,15 @@ def _best_routes(team, targets):
         # A target was detected where a cluster is near it.
         gaps = ((cluster.position[:d] - targets[:, :d]) ** 2).sum(axis=1)
         detected |= gaps <= 9.0 * np.trace(cluster.covariance[:d, :d])
-    stops = np.zeros((len(robots.free), 3))
 
-    def cost(routes):
+    def simulated(routes):
         array = np.full((len(routes), len(targets) + 1), -1, np.int64)
         for row, route in zip(array, routes):
             row[: len(route)] = route
-        return _expected_end(robots, array, targets, detected, d, stops)
+        return *_expected_end(robots, array, targets, detected, d), routes
 
     # Whichever target a robot reaches first is the next of its route.
-    routes = [[] for _ in stops]
+    routes = [[] for _ in robots.free]
     ends, times = robots.remaining_path[:, -1].copy(), robots.free.astype(float)
     left = list(range(len(targets)))
     while left:
@@ -176,14 +169,13 @@ def _best_routes(team, targets):
         times[r] += gaps[r, column]
         ends[r] = targets[left[column]]
         routes[r].append(left.pop(int(column)))
-    best = cost(routes)
+    best, stops, routes = simulated(routes)
     for _ in range(ROUNDS):
-        costs = ((cost(changed), changed) for changed in _neighbours(routes))
-        found = next((item for item in costs if item[0] < best - 1e-9), None)
+        every = map(simulated, _neighbours(routes))
+        found = next((item for item in every if item[0] < best - 1e-9), None)
         if found is None:
             break
-        best, routes = found
-    cost(routes)
+        best, stops, routes = found
     return routes, stops
 
 

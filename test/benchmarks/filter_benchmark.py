@@ -4,7 +4,6 @@ The state before each step of `ic_phd` is the same; restoring it is not timed.
 """
 
 import time
-from functools import partial
 
 import numpy as np
 from quality_conditions import NOISES
@@ -29,18 +28,6 @@ RADIANS, DEGREES = (
 )
 
 
-def middle_of_search(number, robots):
-    """Return particles around 12 targets, their weights, and precise measurements of robots."""
-    generator = np.random.default_rng(0)
-    targets = 40.0 + 180.0 * generator.random((TARGETS, 3))
-    group = np.sort(np.arange(number) % TARGETS)
-    spread = generator.uniform(1.0, 6.0, (TARGETS, 3))
-    particles = targets[group] + spread[group] * generator.standard_normal((number, 3))
-    covariance = np.diag(np.square([1.5, 0.05, 0.05]))
-    members = batch(np.random.default_rng(2), RADIANS, targets, robots, covariance)
-    return np.clip(particles, 0.0, 260.0), np.full(number, TARGETS / number), members
-
-
 def batch(generator, device, targets, robots, covariance, first=0):
     """Return what `robots` robots measure at one step, three detections each."""
     members = []
@@ -51,6 +38,18 @@ def batch(generator, device, targets, robots, covariance, first=0):
         values += generator.multivariate_normal(np.zeros(3), covariance, DETECTED)
         members.append(AgentMeasurement(f'robot_{robot:02d}', pose, device, values))
     return members
+
+
+def middle_of_search(number, robots):
+    """Return particles around 12 targets, their weights, and precise measurements of robots."""
+    generator = np.random.default_rng(0)
+    targets = 40.0 + 180.0 * generator.random((TARGETS, 3))
+    group = np.sort(np.arange(number) % TARGETS)
+    spread = generator.uniform(1.0, 6.0, (TARGETS, 3))
+    particles = targets[group] + spread[group] * generator.standard_normal((number, 3))
+    covariance = np.diag(np.square([1.5, 0.05, 0.05]))
+    members = batch(np.random.default_rng(2), RADIANS, targets, robots, covariance)
+    return np.clip(particles, 0.0, 260.0), np.full(number, TARGETS / number), members
 
 
 def phd_step_time(number, robots, repeats, threads):
@@ -65,10 +64,7 @@ def phd_step_time(number, robots, repeats, threads):
         search.exploration.values[...] = values
         search.found_targets.clear()
 
-    step = partial(search.step, members, 1, 0.0)
-    prepare()
-    step()
-    return median_time(step, repeats, prepare)
+    return median_time(lambda: search.step(members, 1, 0.0), repeats, prepare)
 
 
 def phd_update_time():
@@ -79,7 +75,6 @@ def phd_update_time():
         scan = phd_scan(member.values, member.sensor, member.pose)
         return weights * phd_correct(particles, weights, scan, np.full(DETECTED, 1e-6))[0]
 
-    update()
     return median_time(update, 200)
 
 

@@ -101,7 +101,6 @@ def whole_grid_decision(team):
 def run(share=1.0):
     warm_up()
     single, pair, floor = drones(1), drones(2), floor_pair()
-    whole_grid_decision(single)
     whole = median_time(lambda: whole_grid_decision(single), 3)
     information = PlannerSettings()
     for name, team, repeats, settings in (
@@ -115,7 +114,6 @@ def run(share=1.0):
         ('maasi_decision_mambo_turtlebot_information', floor, 30, information),
     ):
         planner = make_planner('maasi', settings)
-        planner.decide(team)
         value = median_time(lambda: planner.decide(team), max(1, round(share * repeats)))  # noqa: B023
         compared = (
             ('e on the whole grid, h = 10 m', whole / value) if name == 'asi_decision' else ()

@@ -6,14 +6,16 @@ tuned on.
 """
 
 import argparse
+import contextlib
 import json
 import math
+import os
 from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from quality_conditions import CONDITIONS, DEGREES, RETURNS, SCENARIOS, endless, wanted
+from quality_conditions import CONDITIONS, DEGREES, RETURNS, SCENARIOS, changed, wanted
 from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
@@ -21,8 +23,6 @@ from maasi_filter.vector_math import squared_distance
 from maasi_sim.experiments.campaign import make_workers, run_command
 from maasi_sim.experiments.statistics import mean_interval, paired_difference
 from maasi_sim.experiments.tables import markdown_table
-from maasi_sim.scenario.layering import merged
-from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
 from maasi_sim.simulation.sensors import RangingSensor
 
@@ -40,19 +40,10 @@ HEAD = (
 
 def prepared(condition, method, seed, settings=None):
     """Return the scenario of one run, with no limit but the number of measurements."""
-    cube = condition not in SCENARIOS
-    content = endless(
-        'ranging_drone_3d' if cube else SCENARIOS[condition],
-        {'filter': {'method': method}, 'limits': {'time': 1e4}},
-        {'scoring': {'radius': RADIUS} if cube else {}},
-    )
-    for change in ([DEGREES] if cube else []) + CONDITIONS[condition]:
-        content = change(content, seed) if callable(change) else merged(content, change)
-        common = content.pop('every_robot', {})
-        content['robots'] = {
-            name: merged(robot, common) for name, robot in content['robots'].items()
-        }
-    return Scenario.model_validate(merged(content, {'filter': settings or {}}))
+    common = {'filter': {'method': method}, 'limits': {'time': 1e4}}
+    cube = [{'scoring': {'radius': RADIUS}}, DEGREES] if condition not in SCENARIOS else []
+    changes = [common, *cube, *CONDITIONS[condition], {'filter': settings or {}}]
+    return changed(SCENARIOS.get(condition, 'ranging_drone_3d'), changes, seed)
 
 
 def run_one(key, settings=None):
@@ -64,11 +55,11 @@ def run_one(key, settings=None):
     """
     condition, method, seed = key
     scenario = prepared(condition, method, seed, settings)
-    measure, besides = RangingSensor.measure, RETURNS.get(condition)
+    measure = RangingSensor.measure
+    besides = RETURNS.get(condition, lambda sensor, pose, step, *seen: seen)
 
     def returned(sensor, pose, step, *rest):
-        seen = measure(sensor, pose, step, *rest)
-        return besides(sensor, pose, step, *seen) if besides else seen
+        return besides(sensor, pose, step, *measure(sensor, pose, step, *rest))
 
     with patch.object(RangingSensor, 'measure', returned):
         result = search(scenario, seed, CAP_OF_IMAGES if condition in SCENARIOS else CAP)
@@ -118,12 +109,11 @@ def row(runs, others):
 
 def rows(options, conditions, seeds):
     """Make the runs that are missing; yield the rows of the table."""
-    kept, file = {}, options.json
-    if file is not None and file.exists():
-        for run in map(json.loads, file.read_text(encoding='utf-8').splitlines()):
-            kept[tuple(run[name] for name in KEYS)] = run
-    workers = make_workers(len(seeds), options.jobs)
-    try:
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context((options.json or Path(os.devnull)).open('a+', encoding='utf-8'))
+        file.seek(0)
+        kept = {tuple(run[name] for name in KEYS): run for run in map(json.loads, file)}
+        workers = stack.enter_context(contextlib.closing(make_workers(len(seeds), options.jobs)))
         for condition in conditions:
             reference = None
             for method in options.method:
@@ -131,14 +121,10 @@ def rows(options, conditions, seeds):
                 missing = [key for key in keys if key not in kept]
                 for key, run in workers.make(partial(run_one, settings=options.filter), missing):
                     kept[key] = run
-                    if file is not None:
-                        with file.open('a', encoding='utf-8') as lines:
-                            lines.write(json.dumps(run) + '\n')
+                    print(json.dumps(run), file=file, flush=True)
                 runs = [kept[key] for key in keys]
                 yield condition, method, *row(runs, reference)
                 reference = runs if method == 'ic_phd' else None
-    finally:
-        workers.close()
 
 
 def main():

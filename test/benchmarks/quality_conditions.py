@@ -7,6 +7,7 @@ import numpy as np
 from maasi_filter import NoiseSettings
 from maasi_sim.scenario.layering import merged
 from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.schema import Scenario
 from maasi_sim.simulation.world import noise_stream
 
 # What is tuned is tuned on the first block and looked at again on the second; the third is for
@@ -28,15 +29,21 @@ SIDE = 260.0
 SPACE = SIDE * math.sqrt(3.0) * 2.0 * math.pi * math.pi
 
 
-def endless(scenario, *changes):
-    """Return the content of a scenario whose planner ends no search, with changes on top."""
-    content = load_scenario(scenario).model_dump(by_alias=True, exclude_unset=True)
-    never_done = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
-    return merged(content, {'planner': never_done}, *changes)
+def changed(name, changes, seed=None):
+    """Return a scenario whose planner ends no search, with changes on top.
 
-
-# A condition is a list of changes: a layer over the content of the scenario, its `every_robot` over
-# each robot, or a function that makes other content of it and the seed.
+    Each is a layer over the content of the scenario, its `every_robot` over each robot, or a
+    function that makes other content of it and the seed.
+    """
+    content = load_scenario(name).model_dump(by_alias=True, exclude_unset=True)
+    never_done = {'planner': {'explored_threshold': 1.0, 'gain_threshold': 0.0}}
+    for change in (never_done, *changes):
+        content = change(content, seed) if callable(change) else merged(content, change)
+        common = content.pop('every_robot', {})
+        content['robots'] = {
+            robot: merged(values, common) for robot, values in content['robots'].items()
+        }
+    return Scenario.model_validate(content)
 
 
 def robots(**values):
@@ -65,13 +72,13 @@ def pairs(content, seed):
     return content | {'targets': {'positions': positions.tolist()}}
 
 
-def two(name, start, **values):
-    """A second robot of the same kind that starts elsewhere."""
+def copies(robot, name, *layers):
+    """Robots like one of the scenario in its place, each with a layer of its own."""
 
     def change(content, seed):
-        robot = content['robots'][name]
-        other = merged(robot, {'start': start}, values)
-        return content | {'robots': {f'{name}1': robot, f'{name}2': other}}
+        first = content['robots'][robot]
+        every = {f'{name}{n}': merged(first, layer) for n, layer in enumerate(layers, 1)}
+        return content | {'robots': every}
 
     return change
 
@@ -123,7 +130,7 @@ CONDITIONS = {
     **{
         f'{drones}{errors}{estimated}': [
             robots(odometry=change),
-            *([two('drone', [250.0, 250.0, 250.0])] if drones else []),
+            *([copies('drone', 'drone', {}, {'start': [250.0] * 3})] if drones else []),
             *([{'filter': {'pmb': {'offset': told}}}] if estimated else []),
         ]
         for errors, change, told in (
@@ -158,7 +165,9 @@ CONDITIONS = {
     'demo': [],
     'mambo': [],
     'drone_rov': [],
-    'two TurtleBots': [two('turtlebot', [2.1, 2.1, 0.0], yaw=3.14)],
+    'two TurtleBots': [
+        copies('turtlebot', 'turtlebot', {}, {'start': [2.1, 2.1, 0.0], 'yaw': 3.14})
+    ],
 }
 # What the sensor returns besides, by condition.
 RETURNS = {'one in five detections twice': duplicates, 'five reflections': reflections}
@@ -179,14 +188,10 @@ def wanted(parser, known, runs, jobs):
     parser.add_argument('--jobs', type=int, default=jobs, metavar='N', help='processes')
     options = parser.parse_args()
     parts = [part for part in options.names if part not in known]
-    names = [
-        name
-        for name in known
-        if not options.names or name in options.names or any(part in name for part in parts)
-    ]
-    if not names:
+    names = [n for n in known if n in options.names or any(part in n for part in parts)]
+    if options.names and not names:
         parser.error(f'names: read {options.names}, known are {", ".join(known)}')
     block = SEEDS[options.seeds]
     if not 1 <= options.runs <= len(block):
         parser.error(f'--runs: read {options.runs}, allowed is 1 to {len(block)}')
-    return options, names, block[: options.runs]
+    return options, names or list(known), block[: options.runs]

@@ -8,18 +8,16 @@ on.
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from quality_conditions import NOISES, endless, wanted
+from quality_conditions import RADIANS, changed, copies, robots, wanted
 
 from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
 from maasi_sim.experiments.experiment import Case
 from maasi_sim.experiments.searches import comparison_of, search_settings
 from maasi_sim.experiments.tables import SearchTable
-from maasi_sim.scenario.layering import merged
-from maasi_sim.scenario.schema import Scenario
 
 BEGIN, END = '<!-- table: begin -->', '<!-- table: end -->'
 PAPER = {'objective': 'paper', 'alpha': 0.75, 'beta': 0.75, 'control_weight': 0.0}
@@ -30,33 +28,32 @@ NEAR_3D, NEAR_FLOOR = {'ring': 6, 'distance': 30.0}, {'ring': 8, 'distance': 0.3
 class Regime(NamedTuple):
     """A kind of search; a run that does not find all counts with `limit` [s].
 
-    `neighbours` are candidates of planners that measure at waypoints only. `change` is merged over
-    the scenario, its robots like the first one of the scenario.
+    `neighbours` are candidates of planners that measure at waypoints only.
     """
 
     scenario: str
     limit: float
     neighbours: dict[str, Any]
-    change: dict[str, Any] = MappingProxyType({})
+    changes: Sequence[Any] = ()
 
 
 class Kind(NamedTuple):
     """A planner as it is compared: its settings, and most seeds, fewer where runs take long.
 
-    `stops`: robots stop at every waypoint; `neighbours`: it chooses among a regime's; `maker` makes
-    the planner, as of `search`, in place of the scenario's.
+    `neighbours`: it chooses among a regime's; `maker` makes the planner, as of `search`, in place
+    of the scenario's.
     """
 
-    change: dict[str, Any]
+    planner: dict[str, Any]
     runs: int = 64
-    stops: bool = False
+    changes: Sequence[Any] = ()
     neighbours: bool = False
     maker: str | None = None
 
 
-def drones(*starts, **change):
+def drones(*starts):
     """Return the change of a scenario to drones that start at these places."""
-    return {'robots': {f'drone{n}': {'start': [*at], **change} for n, at in enumerate(starts, 1)}}
+    return copies('drone1', 'drone', *({'start': [*at]} for at in starts))
 
 
 REGIMES = {
@@ -68,63 +65,54 @@ REGIMES = {
         PAIR,
         900.0,
         {'ring': 8, 'distance': 50.0},
-        {
-            'environment': {'bounds': [[0.0, 1000.0]] * 2},
-            **drones(
-                (1.0, 1.0, 30.0),
-                (999.0, 1.0, 30.0),
-                (1.0, 999.0, 30.0),
+        [
+            {'environment': {'bounds': [[0.0, 1000.0]] * 2}},
+            drones((1.0, 1.0, 30.0), (999.0, 1.0, 30.0), (1.0, 999.0, 30.0)),
+            robots(
                 candidates={'grid': [10, 10], 'spacing': 100.0, 'corner': [50.0, 50.0]},
                 sensor={'detection': {'size': [25.0, 25.0]}},
             ),
-        },
+        ],
     ),
     'ten robots': Regime(
         PAIR,
         100.0,
         NEAR_3D,
-        drones(*[(10.0 + 25.0 * i, 130.0 + 120.0 * (-1) ** i, 1.0) for i in range(10)]),
+        [drones(*[(10.0 + 25.0 * i, 130.0 + 120.0 * (-1) ** i, 1.0) for i in range(10)])],
     ),
     'two clusters': Regime(
         CUBE,
         400.0,
         NEAR_3D,
-        {'targets': {'distribution': 'clustered', 'clusters': 2, 'separation': 5.0}},
+        [{'targets': {'distribution': 'clustered', 'clusters': 2, 'separation': 5.0}}],
     ),
-    'radians': Regime(
-        CUBE,
-        600.0,
-        NEAR_3D,
-        {'robots': {'drone': {'sensor': {'noise': NOISES['radians'].model_dump(by_alias=True)}}}},
-    ),
+    'radians': Regime(CUBE, 600.0, NEAR_3D, [RADIANS]),
 }
+STOPS = [robots(motion={'arrival_radius': 0.0})]
 # What is compared; differences are to the first one.
 KINDS = {
-    'before': Kind({'name': 'maasi'}, stops=True),
-    'lawnmower': Kind({'name': 'lawnmower'}, runs=16, stops=True),
-    'nearest_widest': Kind({'name': 'nearest_widest'}, runs=32, stops=True),
-    'mutual_information': Kind({'name': 'mutual_information'}, 16, stops=True, neighbours=True),
-    'paper': Kind({'name': 'maasi', **PAPER}, stops=True),
+    'before': Kind({'name': 'maasi'}, changes=STOPS),
+    'lawnmower': Kind({'name': 'lawnmower'}, 16, STOPS),
+    'nearest_widest': Kind({'name': 'nearest_widest'}, 32, STOPS),
+    'mutual_information': Kind({'name': 'mutual_information'}, 16, STOPS, neighbours=True),
+    'paper': Kind({'name': 'maasi', **PAPER}, changes=STOPS),
     'maasi': Kind({'name': 'maasi'}),
-    'clairvoyant': Kind({'name': 'maasi'}, runs=32, maker='clairvoyant:clairvoyant'),
+    'clairvoyant': Kind({'name': 'maasi'}, 32, maker='clairvoyant:clairvoyant'),
 }
 
 
 def prepared(regime, kind):
     """Return the scenario of a regime with a planner."""
     what, how = REGIMES[regime], KINDS[kind]
-    content = endless(what.scenario)
-    robots = what.change.get('robots', {})
-    if len(robots) > 1:
-        content['robots'] = dict.fromkeys(robots, next(iter(content['robots'].values())))
-    limits = {'limits': {'time': what.limit}, 'filter': {'threads': 1}}
-    content = merged(content, what.change, limits, {'planner': how.change})
-    for robot in content['robots'].values():
-        if how.neighbours:
+
+    def among_neighbours(content, seed):
+        for robot in content['robots'].values():
             robot['candidates'] = what.neighbours
-        if how.stops:
-            robot['motion'] = merged(robot['motion'], {'arrival_radius': 0.0})
-    return Scenario.model_validate(content)
+        return content
+
+    common = {'limits': {'time': what.limit}, 'filter': {'threads': 1}, 'planner': how.planner}
+    choice = [among_neighbours] if how.neighbours else []
+    return changed(what.scenario, [*what.changes, common, *choice, *how.changes])
 
 
 def comparison(regime, kinds):
@@ -140,13 +128,9 @@ def comparison(regime, kinds):
 def main():
     parser = argparse.ArgumentParser(prog='search_quality', description=__doc__)
     parser.add_argument('--planner', nargs='*', choices=tuple(KINDS), default=list(KINDS))
-    parser.add_argument(
-        '--out',
-        type=Path,
-        default=Path('runs/search_quality'),
-        metavar='DIR',
-        help='folder of the runs; those there are kept',
-    )
+    folder = Path('runs/search_quality')
+    kept = 'folder of the runs; those there are kept'
+    parser.add_argument('--out', type=Path, default=folder, metavar='DIR', help=kept)
     parser.add_argument('--document', type=Path, metavar='FILE', help='write the tables into it')
     options, regimes, seeds = wanted(parser, REGIMES, runs=16, jobs=os.cpu_count() or 1)
     plans = [

@@ -53,7 +53,7 @@ LEAST_WALK = 1e-6
 def probability(scan, state):
     """Return pi at a track, by the sensor and its pose at the scan that is processed."""
     place = np.asarray(state.mean, float).reshape(1, 3)
-    return min(float(scan[0].sensor.detection.probability(place, scan[0].pose)[0]), 0.999)
+    return min(float(scan.sensor.detection.probability(place, scan.pose)[0]), 0.999)
 
 
 class ViewedHypothesiser(PDAHypothesiser):
@@ -86,34 +86,32 @@ class StoneSoup:
     """
 
     def __init__(self, scan, bounds, walk):
-        # One place that all read.
-        self.scan = [scan]
         walks = [RandomWalk(max(walk**2, LEAST_WALK))] * 3
         predictor = ExtendedKalmanPredictor(CombinedLinearGaussianTransitionModel(walks))
         updater = ExtendedKalmanUpdater(None)
         least = LEAST_CLUTTER / scan.sensor.measurement_space(bounds)
-        hypothesiser = ViewedHypothesiser(
+        self.hypothesiser = ViewedHypothesiser(
             predictor=predictor,
             updater=updater,
             clutter_spatial_density=max(scan.sensor.clutter, least),
             prob_gate=Probability(0.9999),
-            scan=self.scan,
+            scan=scan,
         )
-        deleter = MissedDeleter(scan=self.scan)
+        self.deleter = MissedDeleter(scan=scan)
         distance = DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=4)
         # A detection says where a target is on each axis: the prior is not used.
         initiator = MultiMeasurementInitiator(
             prior_state=GaussianState(np.zeros((3, 1)), np.eye(3)),
-            deleter=deleter,
+            deleter=self.deleter,
             data_associator=GNNWith2DAssignment(distance),
             updater=updater,
             min_points=2,
         )
-        associator = JPDA(hypothesiser=hypothesiser)
-        self.tracker = MultiTargetMixtureTracker(initiator, deleter, None, associator, updater)
+        associator = JPDA(hypothesiser=self.hypothesiser)
+        self.tracker = MultiTargetMixtureTracker(initiator, self.deleter, None, associator, updater)
 
     def step(self, scan, seconds):
-        self.scan[0] = scan
+        self.hypothesiser.scan = self.deleter.scan = scan
         now = START + datetime.timedelta(seconds=seconds)
         # Stone Soup's order is elevation, bearing, range.
         order = [2, 1, 0]

@@ -85,9 +85,9 @@ def test_expected_end_of_a_sure_sensor(seen, ends):
         yaw=np.zeros(1),
     )
     targets = np.array([[3.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
-    stops, routes = np.zeros((1, 3)), np.array([[0, 1, -1]])
+    routes = np.array([[0, 1, -1]])
     # The cost is the time to find all plus the mean time to find, both without the last tick.
-    cost = _expected_end(robot, routes, targets, np.full(2, seen), 2, stops)
+    cost, stops = _expected_end(robot, routes, targets, np.full(2, seen), 2)
     assert cost == pytest.approx(ends[1] + 0.5 * sum(ends))
     assert stops[0] == pytest.approx([3.0, 0.0, 0.0])
 
