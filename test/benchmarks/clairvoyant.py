@@ -45,14 +45,12 @@ def _expected_end(robots, routes, targets, detected, dimension):
     """
     number, size = routes.shape
     # Probabilities of no detection and of exactly one.
-    none = np.where(detected, 0.0, 1.0)
-    one = np.where(detected, 1.0, 0.0)
+    none, one = np.where(detected, 0.0, 1.0), np.where(detected, 1.0, 0.0)
     place = robots.remaining_path[:, 0].copy()
     travels = np.isnan(robots.yaw)
     cosine = np.where(travels, 1.0, np.cos(robots.yaw))
     sine = np.where(travels, 0.0, np.sin(robots.yaw))
-    wait = np.zeros(number)
-    current = np.zeros(number, np.int64)
+    wait, current = np.zeros(number), np.zeros(number, np.int64)
     stops = robots.remaining_path[:, -1].copy()
     cost = 0.0
     for tick in range(TICKS):

@@ -5,8 +5,10 @@ paper's undiscounted rewards. SCIP gets the same instances in the same run, as t
 formulation of `MixedProblem`, to an absolute gap of 1e-4, and at most 20 s each.
 """
 
+from functools import partial
+
 import numpy as np
-from timing import entry, times_of
+from timing import entry, few, times_of
 
 from maasi_planner.buildings.centralized import solve_jointly
 
@@ -15,7 +17,13 @@ GAP, LIMIT = 1e-4, 20.0
 
 def least_times(solve, problems, repeats):
     """Return the least wall time of a few calls for each problem [s]."""
-    return [min(times_of(lambda: solve(problem), repeats)) for problem in problems]  # noqa: B023
+    return np.array([min(times_of(partial(solve, item), repeats)) for item in problems])
+
+
+def rows(name, times, **others):
+    """Yield the median of times [ms], another of their values by name, and the largest."""
+    for what, value in {name: np.median(times), **others, 'max': times.max()}.items():
+        yield entry(what if what == name else f'{name}_{what}', float(value))
 
 
 def against_scip(solver, problems):
@@ -41,21 +49,12 @@ def against_scip(solver, problems):
 def run(share=1.0):
     from cuboid_instances import joint_problems, problems_of_missions
 
-    def few(number):
-        return max(1, round(share * number))
-
     for horizon in (3, 7, 10):
-        solver, problems = problems_of_missions(horizon, few(300), seed=21)
-        times = 1e3 * np.array(least_times(solver.solve, problems, 2))
-        name = f'cuboid_solve_t{horizon}'
-        yield entry(name, float(np.median(times)))
-        yield entry(f'{name}_p95', float(np.percentile(times, 95)))
-        yield entry(f'{name}_max', float(times.max()))
+        solver, problems = problems_of_missions(horizon, few(share, 300), seed=21)
+        times = 1e3 * least_times(solver.solve, problems, 2)
+        yield from rows(f'cuboid_solve_t{horizon}', times, p95=np.percentile(times, 95))
     for robots in (3, 5):
-        solver, joint = joint_problems(robots, 7, few(60), seed=22)
-        times = 1e3 * np.array(least_times(lambda p: solve_jointly(solver, p), joint, 1))  # noqa: B023
-        name = f'cuboid_centralized_{robots}_7'
-        yield entry(name, float(np.median(times)))
-        yield entry(f'{name}_mean', float(times.mean()))
-        yield entry(f'{name}_max', float(times.max()))
-    yield against_scip(*problems_of_missions(7, few(15), seed=11))
+        solver, problems = joint_problems(robots, 7, few(share, 60), seed=22)
+        times = 1e3 * least_times(partial(solve_jointly, solver), problems, 1)
+        yield from rows(f'cuboid_centralized_{robots}_7', times, mean=times.mean())
+    yield against_scip(*problems_of_missions(7, few(share, 15), seed=11))

@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from timing import entry, median_time
+from timing import entry, few, median_time
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
@@ -30,7 +30,6 @@ def renderer(settings):
 
 
 def run(share=1.0):
-    repeats = max(1, round(share * 300))
     for width, height, focal in ((160, 120, 220.0), (640, 480, 880.0)):
         shape = {'width': width, 'height': height, 'focal_length': [focal, focal]}
         times, drawn = [], None
@@ -40,8 +39,8 @@ def run(share=1.0):
             drawn = drawn or renderer(settings)
             image = drawn.render(POSE, 0, 0.0)
             detect = partial(MarkerDetector(settings).detect, image, POSE)
-            times.append(1e3 * median_time(detect, repeats))
+            times.append(1e3 * median_time(detect, few(share, 300)))
         what = "the paper's rule on the same image"
         yield entry(f'segment_{width}x{height}', times[0], 'ms', what, times[1] / times[0])
         render = partial(drawn.render, POSE, 1, 0.1, (0.3, 0.1, 0.0))
-        yield entry(f'render_{width}x{height}', 1e3 * median_time(render, repeats))
+        yield entry(f'render_{width}x{height}', 1e3 * median_time(render, few(share, 300)))

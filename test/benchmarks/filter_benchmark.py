@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 from quality_conditions import NOISES
-from timing import entry, median_time, times_of
+from timing import entry, few, median_time, times_of
 
 from maasi_filter import (
     AgentMeasurement,
@@ -91,22 +91,19 @@ def pmb_step_time(device, number, robots, steps):
 
 
 def run(share=1.0):
-    def few(number):
-        return max(1, round(share * number))
-
     start = time.perf_counter()
     warm_up()
     yield entry('filter_warm_up', 1e3 * (time.perf_counter() - start))
-    steps = max(12, few(60))
+    steps = max(12, few(share, 60))
     for name, function, *arguments in (
-        ('ic_phd_step_10k', phd_step_time, 10_000, 1, few(200), 1),
-        ('ic_phd_step_100k', phd_step_time, 100_000, 1, few(30), None),
-        ('ic_phd_step_1m', phd_step_time, 1_000_000, 1, few(9), None),
-        ('ic_phd_step_ten_robots', phd_step_time, 10_000, 10, few(100), 1),
+        ('ic_phd_step_10k', phd_step_time, 10_000, 1, few(share, 200), 1),
+        ('ic_phd_step_100k', phd_step_time, 100_000, 1, few(share, 30), None),
+        ('ic_phd_step_1m', phd_step_time, 1_000_000, 1, few(share, 9), None),
+        ('ic_phd_step_ten_robots', phd_step_time, 10_000, 10, few(share, 100), 1),
         ('ic_phd_update', phd_update_time),
         ('pmb_step_degrees', pmb_step_time, DEGREES, TARGETS, 1, steps),
         ('pmb_step_radians', pmb_step_time, RADIANS, TARGETS, 1, steps),
-        ('pmb_step_100_targets', pmb_step_time, DEGREES, 100, 1, max(12, few(200))),
+        ('pmb_step_100_targets', pmb_step_time, DEGREES, 100, 1, max(12, few(share, 200))),
         ('pmb_step_ten_robots', pmb_step_time, DEGREES, TARGETS, 10, steps),
     ):
         yield entry(name, 1e3 * function(*arguments))

@@ -5,7 +5,7 @@ The baseline is measured in the same run: the same objective with e updated on t
 """
 
 import numpy as np
-from timing import entry, median_time
+from timing import entry, few, median_time
 
 from maasi_filter.models.detection import ExponentialDetection
 from maasi_filter.models.sensor import Sensor
@@ -114,7 +114,7 @@ def run(share=1.0):
         ('maasi_decision_mambo_turtlebot_information', floor, 30, information),
     ):
         planner = make_planner('maasi', settings)
-        value = median_time(lambda: planner.decide(team), max(1, round(share * repeats)))  # noqa: B023
+        value = median_time(lambda: planner.decide(team), few(share, repeats))  # noqa: B023
         compared = (
             ('e on the whole grid, h = 10 m', whole / value) if name == 'asi_decision' else ()
         )

@@ -11,6 +11,11 @@ TESTS = Path(__file__).resolve().parents[1]
 sys.path += [str(TESTS), *(str(TESTS / room) for room in ('chaos', 'planner', 'system'))]
 
 
+def few(share, number):
+    """Return the share of a number of calls, at least one."""
+    return max(1, round(share * number))
+
+
 def times_of(function, repeats, prepare=lambda: None):
     """Return the wall times of calls [s]; `prepare` comes before each and is not timed."""
     times = []
