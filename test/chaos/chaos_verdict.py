@@ -8,19 +8,20 @@ from chaos_cases import SIM
 
 from maasi_sim.run.bag import Bag, BagError
 
-# From a driver's last state until its robot stands, and from the first batch without an update of
-# the filter until all do: held after 5 s, and then braking [s].
-DRIVER_STOP, FILTER_STOP = 2.5, 7.0
+# From a driver's last state until its robot stands [s].
+DRIVER_STOP = 2.5
 # Without the guard the run itself stops the robot, after 5 s [s].
 UNGUARDED_STOP = 7.0
-# A drone that flies at 3 m/s overshoots, and comes back to where it was held [s].
-DRONE_BRAKING = 4.0
 # An autopilot without its driver flies to the last set-point, a second's way ahead at 3 m/s, here
 # with what was flown since the last state that arrived [m]. It slows down by 1 m/s for each metre
 # left: from 3 m/s it is at rest after ln(3 / 0.06) = 3.9 s [s].
 AUTOPILOT_WAY, AUTOPILOT_STOP = 3.5, 5.0
 # Below this speed, noise of odometry, a robot is at rest [m/s].
 STANDING = 0.06
+# From the first batch without an update of the filter on, how fast a robot may be, and after what
+# time: held after 5 s, and then braking. A drone that flies at 3 m/s overshoots, and comes back to
+# where it was held [s, m/s].
+HELD = {'search': ((7.0, STANDING),), 'mavlink': ((7.0, 1.0), (11.0, STANDING))}
 
 
 def judge(case, outcome):
@@ -94,14 +95,15 @@ def judge_gaps(case, bag, robots):
         else:
             patience = UNGUARDED_STOP if f'/{name}/guard' in case.nodes else DRIVER_STOP
             times = signs_of_driver(bag, name)
-            silences += [('its driver', patience, *gap) for gap in zip(times, [*times[1:], end])]
+            gaps = zip(times, [*times[1:], end])
+            silences += [('its driver', patience, STANDING, *gap) for gap in gaps]
         if '/planner_node' not in case.nodes:
-            held = FILTER_STOP + (DRONE_BRAKING if case.kind == 'mavlink' else 0.0)
-            silences += [('the filter', held, *gap) for gap in silences_of_filter(bag, end)]
+            gaps = silences_of_filter(bag, end)
+            silences += [('the filter', *held, *gap) for held in HELD[case.kind] for gap in gaps]
         speeds = speeds_of(bag, name)
-        for who, patience, since, until in silences:
+        for who, patience, limit, since, until in silences:
             inside = (speeds[:, 0] > since + patience) & (speeds[:, 0] < until)
-            moving = speeds[inside & (speeds[:, 1] > STANDING)]
+            moving = speeds[inside & (speeds[:, 1] > limit)]
             if len(moving):
                 problems.append(
                     f'{name} moves at {moving[0, 1]:.2f} m/s at {moving[0, 0]:.1f} s, though '

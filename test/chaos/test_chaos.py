@@ -182,6 +182,17 @@ def test_a_filter_is_silent_only_while_a_batch_waits_for_it(problems_of):
     ]
 
 
+def test_a_drone_that_is_not_held_without_the_filter_is_found(problems_of):
+    state = AgentState()
+    asked = ('/measurement_batch', 1.0, MeasurementBatch(id=1))
+    text = 'drone moves at {:.2f} m/s at {} s, though the filter is silent since 1.0 s'
+    for time, allowed, fast in ((9.0, 0.6, 1.5), (13.0, 0.05, 0.6)):
+        for speed, problems in ((allowed, []), (fast, [text.format(fast, time)])):
+            state.twist.linear.x = speed
+            messages = [asked, ('/drone/state', time, state)]
+            assert problems_of(messages, code=0, case=PAUSED_DRONE) == problems
+
+
 def test_a_vehicle_that_flies_past_its_last_set_point_is_found(problems_of):
     def state(x, speed):
         message = AgentState()
