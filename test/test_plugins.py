@@ -369,6 +369,6 @@ def test_driver_of_ones_own_is_tried_before_anything_starts(folder):
         'from maasi_drivers.drivers import RangingDriver\nclass Driver(RangingDriver):\n    pass\n'
     )
     (plan,) = [plan for plan in mission.plan_nodes(*run) if plan.role == 'driver']
-    assert plan.command(Path('x'), Path('y'))[:3] == ['x', 'mine:Driver', str(folder)]
+    assert plan.process(folder).command[1:3] == ['mine:Driver', str(folder)]
     with pytest.raises(ScenarioError, match=r"unknown driver 'mambo_drive' .*mean 'mambo_d"):
         load_scenario(folder / 'search.yaml', {'d': (('robots', 'rover', 'driver'), 'mambo_drive')})

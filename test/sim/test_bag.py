@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from ament_index_python.packages import get_package_share_directory
+from waiting import wait_until
 
 from maasi_sim.run.bag import Bag, BagError, BagWriter, load_types, topic_qos
 
@@ -48,9 +49,9 @@ def read_steps(bag):
 
 
 def test_messages_come_back_in_order_with_rising_times(types, tmp_path):
-    with BagWriter(tmp_path / 'bag', types, backlog=100) as writer:
+    # Each message is larger than what may wait.
+    with BagWriter(tmp_path / 'bag', types, backlog=10) as writer:
         write_steps(writer, range(300))
-        writer.wait()
     writer.close()
     with Bag(tmp_path) as bag:
         assert read_steps(bag) == list(range(300))
@@ -115,7 +116,8 @@ def test_what_cannot_be_written_is_named(types, tmp_path):
     # An error of the thread is raised, not swallowed.
     writer.add_topic('/image', 'sensor_msgs/msg/Image')
     writer.write('/image', 0, b'no message')
-    for end in (writer.wait, writer.close):
+    wait_until(lambda: writer.failed)
+    for end in (lambda: writer.write('/image', 1, b''), writer.close):
         with pytest.raises(BagError, match='writing failed'):
             end()
     with Bag(tmp_path / 'bag') as bag, pytest.raises(BagError, match='holds no scenario'):

@@ -10,6 +10,7 @@ from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_sim.run.node_plan import NodePlan
+from maasi_sim.run.processes import find_executable
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario.loading import config_folder, load_scenario
@@ -85,16 +86,19 @@ def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there(tmp_path):
         assert process.name == f'/north/one{name}'
         assert process.log == tmp_path / f'north_one{name.replace("/", "_")}.log'
         assert process.command[-2:] == ['--log-level', 'warn']
-    assert NodePlan('p', 'e', 'sim').command(Path('e'), Path('f'))[6] == '__ns:=/'
-    plan = NodePlan('p', 'e', 'driver', 'a', {'a.b': 1.5}, remaps={'/batch': '/a/batch'})
+    kind = 'maasi_drivers', 'mambo_driver'
+    plan = NodePlan(*kind, 'driver', 'a', {'a.b': 1.5}, remaps={'/batch': '/a/batch'})
     for team, space, batch in (
         ('', '/a', '/batch:=/a/batch'),
         ('team', '/team/a', '/team/batch:=/team/a/batch'),
     ):
-        command = plan.command(Path('/lib/e'), Path('/run/p.yaml'), team)
-        assert command[:2] == ['/lib/e', '--ros-args']
+        command = plan.process(tmp_path, team).command
+        assert command[:2] == [str(find_executable(*kind)), '--ros-args']
         assert {'__node:=driver', f'__ns:={space}', batch} <= set(command)
-        assert command[command.index('--params-file') + 1] == '/run/p.yaml'
+        assert Path(command[command.index('--params-file') + 1]).read_text() == (
+            plan.parameter_text()
+        )
+    assert '__ns:=/' in NodePlan(*kind, 'driver').process(tmp_path).command
     assert yaml.safe_load(plan.parameter_text()) == {'/**': {'ros__parameters': {'a.b': 1.5}}}
 
 

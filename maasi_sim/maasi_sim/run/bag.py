@@ -117,7 +117,7 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
     that image_transport would use. JPEG has quality 95 without chroma subsampling; PNG costs ten
     times the time. `write` blocks while more than `backlog` bytes wait.
 
-    An error of the thread is raised by `write`, `wait` and `close`, after it.
+    An error of the thread is raised by `write` and `close`, after it.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
         path: Path,
         types: Typestore,
         images: ImageFormat = 'jpeg',
-        backlog: int = 256 * 2**20,
+        backlog: int = 8 * 2**20,
     ) -> None:
         self.path = Path(path)
         self._types = types
@@ -164,8 +164,8 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
             raise BagError(f'topic {topic}: not announced')
         with self._changed:
             self._pending += len(data)
+            self._queue.put((topic, time, data))
             self._changed.wait_for(lambda: self._pending <= self._limit or self._error)
-        self._queue.put((topic, time, data))
 
     def write_message(self, topic: str, time: int, message: Any) -> None:
         """Serialise and write a message of the classes of `rosbags`."""
@@ -184,12 +184,6 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
     def failed(self) -> bool:
         """Whether writing has failed; nothing more is written then."""
         return self._error is not None
-
-    def wait(self, backlog: int = 0) -> None:
-        """Wait until at most `backlog` bytes are waiting to be written."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._pending <= backlog or self._error)
-        self._check()
 
     def close(self) -> None:
         """Write all waiting messages and the index; closing again does nothing."""

@@ -51,30 +51,28 @@ class NodePlan:
         """Return its parameter file."""
         return to_yaml({'/**': {'ros__parameters': dict(self.parameters)}})
 
-    def process(self, folder: Path, team: str = '', level: str | None = None) -> NodeProcess:
-        """Write its parameter file, and return its process, not started yet, with its log there."""
+    def process(self, folder: Path, team: str = '', log_level: str | None = None) -> NodeProcess:
+        """Write its parameter file, and return its process, not started yet, with its log there.
+
+        Topics of other teams are not remapped.
+        """
         name = within(team, self.full_name)
         file = name.strip('/').replace('/', '_')
-        path = folder / 'parameters' / f'{file}.yaml'
-        write_text(path, self.parameter_text())
-        command = self.command(find_executable(self.package, self.executable), path, team, level)
-        return NodeProcess(name, command, folder / f'{file}.log')
-
-    def command(
-        self, executable: Path, parameter_file: Path, team: str = '', log_level: str | None = None
-    ) -> list[str]:
-        """Return the command line of its process; topics of other teams are not remapped."""
+        parameters = folder / 'parameters' / f'{file}.yaml'
+        write_text(parameters, self.parameter_text())
+        executable = find_executable(self.package, self.executable)
         namespace = within(team, f'/{self.namespace}').rstrip('/') or '/'
         remaps = {'__node': self.name, '__ns': namespace}
         remaps |= {within(team, old): within(team, new) for old, new in self.remaps.items()}
-        level = ['--log-level', log_level] if log_level else []
         words = [str(executable), *self.arguments, '--ros-args', '--disable-external-lib-logs']
         for before, after in remaps.items():
             words += ['--remap', f'{before}:={after}']
-        words += ['--params-file', str(parameter_file)]
-        for name, value in self.given.items():
-            words += ['--param', f'{name}:={json.dumps(value)}']
-        return words + level
+        words += ['--params-file', str(parameters)]
+        for key, value in self.given.items():
+            words += ['--param', f'{key}:={json.dumps(value)}']
+        if log_level:
+            words += ['--log-level', log_level]
+        return NodeProcess(name, words, folder / f'{file}.log')
 
 
 def common_parameters(scenario: BaseScenario, options: Options) -> dict[str, Any]:

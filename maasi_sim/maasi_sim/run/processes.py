@@ -67,8 +67,6 @@ def start_server() -> None:
             tempfile.tempdir = '/tmp'
         util.get_temp_dir()
         forkserver.ensure_running()
-    except OSError as error:
-        raise ProcessError(f'the server of the nodes cannot be started: {error}') from error
     finally:
         tempfile.tempdir = folder
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -239,19 +237,15 @@ def stop(processes: Sequence[NodeProcess]) -> list[str]:
 
     Returned are the names of those that had to be killed.
     """
-    stubborn: list[str] = []
     for number, patience in ENDING:
         rest = [process for process in processes if process.is_alive()]
-        if not rest:
-            break
-        if number == signal.SIGKILL:
-            stubborn = [process.name for process in rest]
         for process in rest:
             process.signal(number)
         deadline = time.monotonic() + patience
         while any(process.is_alive() for process in rest) and time.monotonic() < deadline:
             time.sleep(0.005)
-    return stubborn
+    # The last signal is SIGKILL.
+    return [process.name for process in rest]
 
 
 if _STARTED_BY in os.environ:

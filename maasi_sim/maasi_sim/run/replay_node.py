@@ -30,6 +30,7 @@ from maasi_msgs.msg import (
 )
 from maasi_sim.run.bag import Bag, BagError
 from maasi_sim.run.domain import Domain
+from maasi_sim.run.ending import Interruption
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import NodeProcess, stop
 from maasi_sim.run.run_folder import make_folder
@@ -214,13 +215,10 @@ def differences(recorded: list[Any], found: list[Any]) -> list[str]:
     return lines
 
 
-def replay(
-    path: Path, out: Path | None, domain_id: int | None, interrupted: Callable[[], bool]
-) -> int:
+def replay(path: Path, out: Path | None, domain_id: int | None, interruption: Interruption) -> int:
     """Replay a recording, print whether the found targets are equal, and return the exit code.
 
-    Logs and parameters of the nodes are written to a folder, `interrupted` returns true after an
-    interruption.
+    Logs and parameters of the nodes are written to a folder.
     """
     recording = read_recording(path)
     folder = make_folder(out, '_replay')
@@ -239,7 +237,7 @@ def replay(
         node = ReplayNode(domain.number, robots, list(recording.found))
         ends.callback(node.close)
         try:
-            return _feed(node, recording, processes, interrupted)
+            return _feed(node, recording, processes, interruption)
         except _Stopped as stopped:
             code, *words = stopped.args
             print(*words, end='', file=sys.stderr)
@@ -250,7 +248,7 @@ def _feed(
     node: ReplayNode,
     recording: Recording,
     processes: list[NodeProcess],
-    interrupted: Callable[[], bool],
+    interruption: Interruption,
 ) -> int:
     first_difference = None
 
@@ -261,7 +259,7 @@ def _feed(
     def wait_for(condition: Callable[[], bool], what: str, patience: float = _PATIENCE) -> None:
         deadline = time.monotonic() + patience
         while not condition():
-            if interrupted():
+            if interruption:
                 raise _Stopped(INTERRUPTED)
             for process in processes:
                 if not process.is_alive():

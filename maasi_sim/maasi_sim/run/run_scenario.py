@@ -21,8 +21,8 @@ def main(arguments: list[str] | None = None) -> int:
     # Nodes load what they share while this process loads what is its own.
     try:
         start_server()
-    except ProcessError as error:
-        print(f'error: {error}', file=sys.stderr)
+    except OSError as error:
+        print(f'error: the server of the nodes cannot be started: {error}', file=sys.stderr)
         return WRONG_INPUT
     gc.disable()
     from maasi_sim.run.bag import BagError, BagWriteError
@@ -37,8 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
     gc.enable()
     try:
         if options.replay is not None:
-            stop_asked = interruption.__bool__
-            return replay(options.replay, options.out, options.domain_id, stop_asked)
+            return replay(options.replay, options.out, options.domain_id, interruption)
         return ScenarioRun(options, interruption).execute()
     except (ScenarioError, DomainError, ProcessError, BagError, ResultsError) as error:
         with contextlib.suppress(OSError):

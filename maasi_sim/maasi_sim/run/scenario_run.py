@@ -39,8 +39,6 @@ from maasi_sim.run.view.page_file import REPLAY, write_replay
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning, to_yaml
 
-# Bytes that may wait for the disk when the recorder reports a step done.
-_BACKLOG = 8 * 2**20
 # Longest wall time between two checks of processes and topics [s].
 _POLL = 0.02
 # Between two checks for runs that follow the clock [s].
@@ -79,6 +77,8 @@ class ScenarioRun:
                 f"--namespace: read '{options.namespace}', allowed is a name that is none of "
                 'a robot of the scenario'
             )
+        # Whether its time is that of others.
+        self._follows = options.follow_clock or self.mission.scenario.external_clock
         self._bag: BagWriter | None = None
         #: Errors of writing.
         self.unwritten: list[str] = []
@@ -113,12 +113,11 @@ class ScenarioRun:
             if options.record:
                 self._bag = BagWriter(self.folder / 'bag', types, self._scenario.record.images)
                 ends.callback(self._close_bag)
+                self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
             step = self._scenario.step
             self.recorder = Recorder(domain.number, self.observer, step, self._bag, team)
             ends.callback(self.recorder.close)
             self.recorder.listener = None if page is None else page.put_message
-            if self._bag is not None:
-                self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
             self.supervisor.recorder = self.recorder
             ends.callback(stop, processes)
             self._monitor()
@@ -192,7 +191,8 @@ class ScenarioRun:
 
     def _wait_until_ready(self) -> Ending | None:
         """Wait until every node is ready, the recorder last; return an ending if one is not."""
-        expected = self.supervisor.names('clock', 'driver', 'other')
+        nodes = self.supervisor.nodes('clock', 'driver', 'other')
+        expected = [node.name for node in nodes]
         begin, patience = time.monotonic(), _START_PATIENCE
         while (ending := self._turn()) is None and (lacks := self._lacks(expected)):
             what = ', '.join(f'{name} {lack}' for name, lack in lacks.items())
@@ -204,8 +204,8 @@ class ScenarioRun:
                 self.display.say(f'waiting: {what}')
                 patience += _START_PATIENCE
         # Their executors run, even if no heartbeat has arrived so far.
-        for name in expected:
-            self.supervisor.processes[name].beat(time.monotonic())
+        for node in nodes:
+            node.beat(time.monotonic())
         if ending is None:
             loose = self.recorder.unmatched()
             self._warn(*(f'{topic} has a publisher that is not recorded' for topic in loose))
@@ -241,29 +241,15 @@ class ScenarioRun:
 
     def _follow(self) -> Ending:
         """Monitor the run until it ends, and return its ending."""
-        recorder, supervisor, silence = self.recorder, self.supervisor, self._limits.silence
-        moved = time.monotonic()
+        recorder, self.supervisor.running = self.recorder, True
         last: tuple[int | None, int] = (None, 0)
         while (ending := self._turn()) is None:
             now = (recorder.step, recorder.time)
             if now != last:
-                last, moved = now, time.monotonic()
-                self._begun = self._begun or moved
-                supervisor.running = True
-                # The step is done once the disk keeps up.
-                if self._bag is not None:
-                    with contextlib.suppress(BagError):
-                        self._bag.wait(_BACKLOG)
+                last = now
+                self._begun = self._begun or time.monotonic()
                 if self.options.lockstep and recorder.step is not None:
                     recorder.publish_done(recorder.step)
-            elif supervisor.restarting:
-                # A restarted node may have to compile: `limits.start` applies.
-                moved = time.monotonic()
-            elif time.monotonic() - moved > silence:
-                if not self.options.follow_clock:
-                    return supervisor.standstill()
-                text = f'/clock, which this run follows, stands still for {silence:g} s'
-                return Ending('clock_stopped', NODE_FAILED, text)
             self._warn(*recorder.take_complaints())
             if self.display.due or self.observer.news:
                 self._show()
@@ -307,15 +293,12 @@ class ScenarioRun:
 
     def _check_recording(self) -> None:
         """Note which topics with a message at each step lack a recording of their beginning."""
-        recorder, options = self.recorder, self.options
-        if not options.record or self.ending.code not in (DONE, NOT_ALL_FOUND):
+        if not self.options.record or self.ending.code not in (DONE, NOT_ALL_FOUND):
             return
-        follows = options.follow_clock or self._scenario.external_clock
-        for gap in recorder.gaps(follows, _CONNECTION_PATIENCE * (options.rate or 1.0)):
+        patience = _CONNECTION_PATIENCE * (self.options.rate or 1.0)
+        for gap in self.recorder.gaps(self._follows, patience):
             self.unwritten.append(gap)
-            self.supervisor.events.append(
-                {'time': recorder.elapsed, 'node': 'recorder', 'event': 'gap', 'reason': gap}
-            )
+            self.supervisor.note('recorder', 'gap', reason=gap)
 
     def _close_bag(self) -> None:
         try:
@@ -326,10 +309,10 @@ class ScenarioRun:
 
     def _is_followed(self) -> bool:
         """Return whether another run follows the clock of this one."""
-        follows = self.options.follow_clock or self._scenario.external_clock
-        if follows or self.options.lockstep or self.interruption:
+        if self._follows or self.options.lockstep or self.interruption:
             return False
-        return self.supervisor.has_clock and bool(self.recorder.followers())
+        alive = all(clock.is_alive() for clock in self.supervisor.nodes('clock'))
+        return alive and bool(self.recorder.followers())
 
     def _report(self) -> int:
         """Write the report, print a summary, and return the exit code."""
@@ -378,7 +361,5 @@ class ScenarioRun:
 
 def short(path: Path) -> str:
     """Return a path relative to the working directory, if it is below."""
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
+    here = Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)

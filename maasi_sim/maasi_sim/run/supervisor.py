@@ -42,12 +42,15 @@ class Supervisor:
         }
         #: Nodes that died, hung or were restarted.
         self.events: list[dict[str, Any]] = []
-        #: Whether the first step has begun; before it nodes may take long to start.
+        #: Whether all nodes were ready once; until then they may take long.
         self.running = False
         self._scenario = mission.scenario
-        self._lockstep = options.lockstep
+        self._options = options
         self._display = display
         self._checked = 0.0
+        # Newest step and simulated time, and since when they have been so [s].
+        self._moment: tuple[int | None, int] = (None, 0)
+        self._moved = 0.0
 
     def start(self) -> None:
         """Start all nodes."""
@@ -55,7 +58,7 @@ class Supervisor:
             process.start()
 
     def check(self) -> Ending | None:
-        """Return an ending if a node has died or hangs and is not restarted."""
+        """Return an ending if time stands still, or a node has died or hangs for good."""
         now = time.monotonic()
         gap = now - self._checked
         # Polling each process takes longer than a short step.
@@ -71,6 +74,13 @@ class Supervisor:
                 process.beaten = min(process.beaten + gap, now)
             if ending := self._check_node(self.plans[name], process, now):
                 return ending
+        moment = self.recorder.step, self.recorder.time
+        # A restarted node may have to compile: `limits.start` applies.
+        restarting = any(item.restarts and item.beaten is None for item in self.processes.values())
+        if not self.running or restarting or moment != self._moment:
+            self._moment, self._moved = moment, now
+        elif now - self._moved > self._scenario.limits.silence:
+            return self._standstill()
         return None
 
     def _check_node(self, plan: NodePlan, process: NodeProcess, now: float) -> Ending | None:
@@ -86,11 +96,13 @@ class Supervisor:
                 return None
             text = f'{name} not ready {limits.start:g} s after the start'
             return Ending('not_ready', NODE_FAILED, text, [name])
-        # A lockstep step may take long: `limits.silence` applies to awaited nodes.
-        elif (self._lockstep and plan.role != 'guard') or not process.hangs(now, limits.heartbeat):
+        elif self._options.lockstep and plan.role != 'guard':
+            # A step may take long: `limits.silence` applies to awaited nodes.
             return None
-        else:
+        elif process.hangs(now, limits.heartbeat):
             text = f'{name} hangs: no heartbeat for {now - process.beaten:.1f} s'
+        else:
+            return None
         if plan.namespace in self._scenario.robots and (not died or plan.role == 'driver'):
             self.recorder.stop_robots([plan.namespace])
         # A restarted simulation would begin at time 0.
@@ -99,59 +111,53 @@ class Supervisor:
             if process.restarts:
                 text += f', after {process.restarts} restarts'
             word = 'died' if died else 'hung'
-            self._note(name, word)
+            self.note(name, word)
             return Ending(f'node_{word}', NODE_FAILED, text, [name])
         if died:
-            self._note(name, 'restarted')
+            self.note(name, 'restarted')
             self.recorder.ready.discard(name)
             remove_dead()
             process.restart()
         else:
-            self._note(name, 'hung')
+            self.note(name, 'hung')
             process.signal(signal.SIGKILL)
         self._display.say(f'{text}; it is {"restarted" if died else "killed"}')
         return None
 
-    def _note(self, name: str, event: str) -> None:
-        self.events.append({'time': self.recorder.elapsed, 'node': name, 'event': event})
+    def note(self, name: str, event: str, **details: str) -> None:
+        """Add to the events."""
+        time_ = self.recorder.elapsed
+        self.events.append({'time': time_, 'node': name, 'event': event, **details})
 
-    def standstill(self) -> Ending:
+    def _standstill(self) -> Ending:
         """Return the ending of a run whose time has stopped."""
         silence = f'for {self._scenario.limits.silence:g} s'
+        if self._options.follow_clock:
+            text = f'/clock, which this run follows, stands still {silence}'
+            return Ending('clock_stopped', NODE_FAILED, text)
         step = self.recorder.step
         if step is None:
             return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
         steps = self.recorder.done_steps()
-        late = [name for name in self.names('driver', 'other') if steps.get(name, -1) < step]
-        who = ', '.join(late or self.names('clock'))
+        late = [n.name for n in self.nodes('driver', 'other') if steps.get(n.name, -1) < step]
+        who = ', '.join(late) or self.nodes('clock')[0].name
         return Ending('node_hung', NODE_FAILED, f'step {step}: nothing from {who} {silence}', late)
 
-    def names(self, *roles: str) -> list[str]:
-        """Return the names of the nodes of some roles."""
-        return [name for name, plan in self.plans.items() if plan.role in roles]
-
-    @property
-    def restarting(self) -> bool:
-        """Whether a restarted node has not had a heartbeat yet."""
-        return any(item.restarts and item.beaten is None for item in self.processes.values())
-
-    @property
-    def has_clock(self) -> bool:
-        """Whether the simulation runs."""
-        return all(self.processes[name].is_alive() for name in self.names('clock'))
+    def nodes(self, *roles: str) -> list[NodeProcess]:
+        """Return the processes of the nodes of some roles."""
+        return [self.processes[name] for name, plan in self.plans.items() if plan.role in roles]
 
     def stop(self, keep_clock: bool) -> None:
         """Stop the robots, then the nodes, and record their last messages."""
         recorder, robots = self.recorder, self._scenario.names()
-        others = self.names('other') if keep_clock else self.names('other', 'clock')
         # Drivers stop their robots while the simulation, or the robot, still runs. One that hangs
         # does not, and may send a command until it is killed: stop the robots before and after.
         recorder.stop_robots(robots)
-        stubborn = stop([self.processes[name] for name in self.names('driver', 'guard')])
+        stubborn = stop(self.nodes('driver', 'guard'))
         recorder.stop_robots(robots)
         recorder.wait(_LAST_MESSAGES)
         recorder.drain()
-        stubborn += stop([self.processes[name] for name in others])
+        stubborn += stop(self.nodes('other') if keep_clock else self.nodes('other', 'clock'))
         recorder.drain()
         if stubborn:
             self._display.say(f'had to be killed: {", ".join(stubborn)}')
