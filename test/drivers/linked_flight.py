@@ -1,7 +1,6 @@
 """Flying robots behind links: each with its driver and its team, and the same verbs for all."""
 
 import math
-import subprocess
 from functools import partial
 
 import numpy as np
@@ -71,24 +70,21 @@ class LinkedFlight:
         team.used = [item for item in team.used if item not in (team.odometry, team.battery)]
         self.call = partial(team.call, until=self.until)
 
-    def run_node(self):
-        """Run the driver as a node of this process."""
-        options = {'namespace': '/rover', 'parameter_overrides': parameters_of(self.settings)}
-        self.driver = self.make(context=self.context, **options)
-        self.executor.add_node(self.driver)
-        assert self.driver.trigger_configure().name == 'SUCCESS', self.driver.problem
-        assert self.driver.trigger_activate().name == 'SUCCESS'
-        self.team.connect()
-        return self
-
-    def run_process(self, process):
-        """Run the driver as a process of its own, by the fixture `process`."""
-        self.driver = process(program=(self.program,), settings=self.settings)
+    def begin(self, process=None):
+        """Run the driver here, or in a process of its own by the fixture `process`."""
+        if process is not None:
+            self.driver = process(program=(self.program,), settings=self.settings)
+        else:
+            options = {'namespace': '/rover', 'parameter_overrides': parameters_of(self.settings)}
+            self.driver = self.make(context=self.context, **options)
+            self.executor.add_node(self.driver)
+            assert self.driver.trigger_configure().name == 'SUCCESS', self.driver.problem
+            assert self.driver.trigger_activate().name == 'SUCCESS'
         self.team.connect()
         return self
 
     def close(self):
-        if self.driver is not None and not isinstance(self.driver, subprocess.Popen):
+        if hasattr(self.driver, 'halt'):
             self.driver.halt()
             self.driver.destroy_node()
         self.drone.close()

@@ -50,8 +50,7 @@ def fly(context, flights, monkeypatch, tmp_path):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
 
     def start(kind, own=(), process=None, **changes):
-        flight = flights(KINDS[kind](context, own=own, **changes))
-        return flight.run_process(process) if process else flight.run_node()
+        return flights(KINDS[kind](context, own=own, **changes)).begin(process)
 
     return start
 
@@ -146,8 +145,8 @@ def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly, kind):
     flight = fly(kind, {'land_after': 1.0})
     if kind == 'mambo':
         # Not by its own watchdog: the last command would be flown for ever.
-        settings = replace(flight.inside.settings, command_timeout=math.inf)
-        flight.inside.settings = settings
+        inside = flight.inside
+        inside.settings = replace(inside.settings, command_timeout=math.inf)
     flight.up().on_its_way()
     assert flight.speed > 0.1
     # Nothing spins the executor meanwhile.
