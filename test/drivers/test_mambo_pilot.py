@@ -270,6 +270,23 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     assert firmware.take_offs == 2
 
 
+@pytest.mark.parametrize(
+    ('ignored', 'text'),
+    [
+        ('take_off', 'it did not take off in 5 s'),
+        ('pilot', 'it did not come to its altitude in 5 s'),
+    ],
+)
+def test_a_take_off_that_takes_too_long_is_given_up(ignored, text):
+    flight = Flight(take_off_timeout=5.0)
+    flight.pilot.home = Pose.from_yaw([*HOME.position[:2], 1.6], HOME.yaw)
+    setattr(flight.firmware, ignored, lambda *_: None)
+    flight.until(lambda: text in flight.pilot.problem)
+    flight.until_it_is(FlyingState.LANDED)
+    flight.step(50)
+    assert flight.pilot.phase is MamboPhase.GROUND and UNTIL_ARM in flight.pilot.problem
+
+
 def test_a_permission_ends_with_the_link():
     flight = Flight(pose='pose')
     # No pose yet: it stands.

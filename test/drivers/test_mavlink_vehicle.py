@@ -123,8 +123,13 @@ def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver(strange
     assert OTHER_PROGRAM in play.fault and not play.commands(ARM)
     play.stranger = lambda: None
     play.stands(6.0)
-    # In the air it is reported: the failsafe would not act now.
     play.reports.clear()
+    # An answer to its own commands is not one to another program.
+    own = play.vehicle._sender.srcComponent
+    sends(play, 'command_ack', (1, 1), (0, 0, 0, 0, 240, own))
+    play.run(2.0)
+    assert OTHER_PROGRAM not in play.said
+    # In the air it is reported: the failsafe would not act now.
     play.stranger = partial(stranger, play)
     play.run(2.0)
     assert OTHER_PROGRAM in play.said
@@ -221,6 +226,13 @@ def test_a_driver_restarted_in_the_air_sends_it_nowhere_before_it_may():
     play.permitted().fly()
 
 
+@firmwares
+def test_a_stop_before_it_is_armed_keeps_it_where_it_is(firmware):
+    play = Play(firmware)
+    play.until(lambda: play.phase is VehiclePhase.STARTING).vehicle.stop()
+    play.stands(20.0)
+
+
 @pytest.mark.parametrize('share', [0.2, 0.7])
 @firmwares
 def test_a_stop_ends_a_take_off(firmware, share):
@@ -305,13 +317,13 @@ def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
     assert play.vehicle.at_rest
     play.run(1.0)
     assert play.mode == PILOT[firmware]
-    if firmware == 'arducopter':
-        # The pilot gives it back: it stays where it is.
-        here = play.body.position.copy()
-        play.autopilot.take_mode('GUIDED')
-        play.run(3.0)
-        assert play.vehicle.flying and 'the pilot gives GUIDED back' in play.said
-        assert_allclose(play.body.position, here, atol=0.15)
+    # The pilot gives it back: it stays where it is; PX4 is not taken back.
+    here = play.body.position.copy()
+    play.autopilot.take_mode('OFFBOARD' if firmware == 'px4' else 'GUIDED')
+    play.run(3.0)
+    back = firmware != 'px4'
+    assert play.vehicle.flying == ('the pilot gives GUIDED back' in play.said) == back
+    assert not back or np.linalg.norm(play.body.position - here) < 0.15
 
 
 @firmwares
