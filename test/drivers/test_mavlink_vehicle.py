@@ -319,6 +319,8 @@ def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
     assert play.mode == PILOT[firmware]
     # The pilot gives it back: it stays where it is; PX4 is not taken back.
     here = play.body.position.copy()
+    # Without set-points it would leave OFFBOARD before a heartbeat shows it.
+    play.autopilot.parameters['COM_OF_LOSS_T'] = 60.0
     play.autopilot.take_mode('OFFBOARD' if firmware == 'px4' else 'GUIDED')
     play.run(3.0)
     back = firmware != 'px4'

@@ -28,7 +28,7 @@ def short_search():
         robot['link'] = 'mavlink'
         # The machine may be busy.
         robot['mavlink'] |= {'arm': True, 'system': system, 'link_timeout': 3.0}
-        robot['mavlink']['url'] = f'udpin:{free_address()}:14550'
+        robot['mavlink']['url'] = f'udpin:{free_address()}:{14550 + system}'
     scenario['limits']['time'] = 150.0
     return scenario
 
