@@ -60,7 +60,8 @@ _MAVLINK = {
             'mavlink': {'arm': True},
         }
     },
-    'filter': {'method': 'pmb'},
+    # A target in view once or twice at the edge would be withdrawn, which is no loss by a fault.
+    'filter': {'method': 'pmb', 'pmb': {'withdrawn_probability': 0.0}},
     'planner': {'name': 'maasi', 'measurement': 'periodic'},
 }
 _BUILDINGS = {
