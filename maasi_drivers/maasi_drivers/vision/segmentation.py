@@ -117,10 +117,10 @@ def _weigh(excess, own, floor, x, y):  # type: ignore[no-untyped-def]
     outside = excess.ravel()[around.ravel()]
     background, noise = (outside.mean(), outside.var()) if len(outside) else (0.0, 0.0)
     contrast = max(upper - background, 1e-6)
-    # The component and the ring of one pixel around it, other components left out.
+    # The component and the ring of one pixel around it, in which there is no other component.
     for column, row in zip(x, y):
         near[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = True
-    rows, columns = np.nonzero(near & (own | floor))
+    rows, columns = np.nonzero(near)
     weights = (excess[rows, columns] - background) / contrast
     area = weights.sum()
     scale = noise / (contrast * area) ** 2
