@@ -6,6 +6,7 @@ import signal
 import sys
 from contextlib import nullcontext
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from rclpy.node import Node
@@ -173,10 +174,10 @@ def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path, monkeypatch
     run.ending, run.wall_time, run.folder = Ending('all_found', DONE), 1.0, tmp_path
     run._scenario = run.mission.scenario
     run.recorder = SimpleNamespace(gaps=lambda *_: ['a gap'], elapsed=8.0)
-    run.supervisor = SimpleNamespace(events=[])
+    run.supervisor = SimpleNamespace(events=[], note=Mock())
     run._check_recording()
-    (gap,) = run.supervisor.events
-    assert run.unwritten == [gap['reason']] == ['a gap']
+    run.supervisor.note.assert_called_once_with('recorder', 'gap', reason='a gap')
+    assert run.unwritten == ['a gap']
     monkeypatch.setattr(scenario_run, 'store_report', lambda *_: ({}, None, ''))
     run.observer = SimpleNamespace(record=lambda end: end)
     run._leave_replay = lambda: None
