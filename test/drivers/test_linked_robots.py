@@ -281,14 +281,20 @@ def test_it_is_ordered_to_stay_on_the_ground_where_it_may_not_take_off(fly):
         encode_order(1, OrderKind.GO, np.array([math.nan, 0.0, 0.0]))
 
 
+def test_a_permission_needs_a_drone_that_is_heard(fly):
+    flight = fly('onboard')
+    flight.until_said(UNTIL_ARM)
+    flight.drone.cut()
+    flight.until_said('no ')
+    assert flight.call('arm').message == 'it is in the air, or not heard'
+
+
 def lose(flight):
     # It obeys commands, however late they come.
     flight.drone.patience, known = math.inf, len(flight.drone.kinds)
     flight.drone.cut()
     flight.until(lambda: flight.grounded)
     assert OrderKind.HOLD in flight.drone.kinds[known:]
-    # A permission needs a drone that is heard.
-    assert flight.call('arm').message == 'it is in the air, or not heard'
     flight.drone.cut(False)
 
 
