@@ -175,14 +175,13 @@ class NodeProcess(ForkServerProcess):
         os.environ.clear()
         os.environ.update(self._environment)
         executable = Path(self.command[0])
-        script = getattr(maasi_entry, executable.name, None)
-        if executable.parent.name not in _PACKAGES or script is None:
+        if executable.parent.name not in _PACKAGES:
             for number in (signal.SIGPIPE, signal.SIGXFSZ):
                 signal.signal(number, signal.SIG_DFL)
             os.execv(self.command[0], self.command)
         sys.argv = list(self.command)
         setproctitle(' '.join(self.command))
-        sys.exit(script())
+        sys.exit(getattr(maasi_entry, executable.name)())
 
     def signal(self, number: int) -> None:
         """Send a signal, if it still runs."""

@@ -180,7 +180,8 @@ class ScenarioRun:
         with self.interruption.at_once():
             wait_for_server()
         if not self.interruption:
-            self.supervisor.start()
+            for process in self.supervisor.processes.values():
+                process.start()
         self._name_external_robots()
         self.ending = self._wait_until_ready() or self._follow()
         now = time.monotonic()

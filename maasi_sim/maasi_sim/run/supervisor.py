@@ -1,4 +1,4 @@
-"""The nodes of a run: started, watched, restarted and stopped."""
+"""The nodes of a run: planned, watched, restarted and stopped."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _LAST_MESSAGES = 0.02
 
 
 class Supervisor:
-    """Starts the nodes of a run; restarts a node that dies or hangs, or ends the run."""
+    """Watches the nodes of a run: one that dies or hangs is restarted, or ends the run."""
 
-    #: Set before the start: it takes heartbeats, and stops robots.
+    #: Set before the nodes are started: it takes heartbeats, and stops robots.
     recorder: Recorder
 
     def __init__(
@@ -51,11 +51,6 @@ class Supervisor:
         # Newest step and simulated time, and since when they have been so [s].
         self._moment: tuple[int | None, int] = (None, 0)
         self._moved = 0.0
-
-    def start(self) -> None:
-        """Start all nodes."""
-        for process in self.processes.values():
-            process.start()
 
     def check(self) -> Ending | None:
         """Return an ending if time stands still, or a node has died or hangs for good."""
