@@ -4,7 +4,6 @@ import array
 import importlib
 import math
 import os
-import signal
 import time
 from functools import partial
 
@@ -19,7 +18,7 @@ from rclpy.action import ActionClient
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from scenario_runs import Operator, beside
 from std_srvs.srv import Trigger
-from waiting import PATIENCE, wait_until
+from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE, SENSOR_READER, UPDATES
@@ -33,7 +32,7 @@ from maasi_msgs.msg import (
     LockstepDone,
     MeasurementBatch,
 )
-from maasi_sim.run.processes import NodeProcess, stop
+from maasi_sim.run.processes import NodeProcess
 
 ROUNDS = 24
 DRIVERS = ('turtlebot', 'mambo', 'ranging', 'mavlink')
@@ -179,7 +178,9 @@ class World(Operator):
         wait_until(condition, self.turn, what)
 
     def close(self):
-        stop(list(self.processes.values()), [(signal.SIGKILL, PATIENCE)])
+        for process in self.processes.values():
+            process.kill()
+            process.join()
         super().close()
 
     def turn(self):
