@@ -231,18 +231,22 @@ class World(Operator):
         self.node.create_subscription(kind, topic, self.heard[topic].append, quality)
 
     def call(self, requests):
-        waiting = {}
-        for service, (kind, request) in requests.items():
+        """Ask until each has answered: an answer is lost to a client that is not discovered yet."""
+        asked = {service: [] for service in requests}
+        for service, (kind, _) in requests.items():
             if service not in self.clients:
                 self.clients[service] = self.node.create_client(kind, service)
-            client = self.clients[service]
-            self.until(client.service_is_ready, f'no {service}')
-            waiting[service] = client.call_async(request)
-        self.until(
-            lambda: all(item.done() for item in waiting.values()),
-            lambda: f'no answer of {[name for name, item in waiting.items() if not item.done()]}',
-        )
-        return {service: item.result() for service, item in waiting.items()}
+            self.until(self.clients[service].service_is_ready, f'no {service}')
+
+        def silent():
+            return [name for name, items in asked.items() if not any(i.done() for i in items)]
+
+        def ask():
+            for service in silent():
+                asked[service].append(self.clients[service].call_async(requests[service][1]))
+
+        self.play(ask, lambda: not silent(), lambda: f'no answer of {silent()}', period=5.0)
+        return {name: next(i for i in items if i.done()).result() for name, items in asked.items()}
 
     def settle(self):
         """Wait until each node has worked off what came before: it answers twice."""
