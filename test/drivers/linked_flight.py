@@ -153,8 +153,9 @@ class LinkedFlight:
 
     def gives_up(self, result, reason):
         """Check that it stops, its goal ends, the planner hears why, and that it is not sent on."""
-        before = self.where
         self.until(lambda: self.status == AgentState.UNAVAILABLE and reason in self.reason)
+        # Until it is noticed, which takes up to the timeout of the link, it flies on.
+        before = self.where
         assert reason in self.team.aborted(result)
         assert self.team.refused(self.start)
         self.stops(before)
