@@ -167,6 +167,6 @@ def test_a_node_started_alone_says_that_the_loopback_interface_is_down(process):
     # A network namespace of its own has a loopback interface that is down.
     alone = ['unshare', '--map-root-user', '--net']
     if subprocess.run([*alone, 'true'], capture_output=True).returncode:
-        pytest.skip('no network namespaces here')
+        pytest.skip('a network namespace needs root, or user namespaces in the kernel')
     said = iter(process(flatten(SETTINGS), alone).stderr.readline, '')
     assert any('the loopback interface cannot be used' in line for line in said)

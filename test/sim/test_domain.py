@@ -218,7 +218,7 @@ def test_a_run_says_that_the_loopback_interface_is_down():
     # A network namespace of its own has a loopback interface that is down.
     alone = ['unshare', '--map-root-user', '--net']
     if subprocess.run([*alone, 'true'], capture_output=True).returncode:
-        pytest.skip('no network namespaces here')
+        pytest.skip('a network namespace needs root, or user namespaces in the kernel')
     done = subprocess.run([*alone, sys.executable, '-c', code], capture_output=True, text=True)
     assert done.returncode == 2
     assert 'error: the loopback interface cannot be used' in done.stderr
