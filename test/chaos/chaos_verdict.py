@@ -113,16 +113,18 @@ def judge_gaps(case, bag, robots):
 
 
 def signs_of_driver(bag, robot):
-    """Return the times of a driver's states, and those at which its guard heard it again.
+    """Return the stamps of a driver's states, and the times at which its guard heard it again.
 
-    A restarted driver may move its robot before the recorder has discovered it.
+    A restarted driver may move its robot before the recorder has discovered it. The recorder's own
+    times are no measure: on a busy machine a restart keeps it from taking messages for seconds.
     """
+    states = [stamp_of(item.message) for item in bag.messages([f'/{robot}/state'])]
     heard = [
         item.time * 1e-9
         for item in bag.messages(['/rosout'])
         if item.message.name == f'{robot}.guard' and item.message.msg == 'the driver is back'
     ]
-    return sorted([*times_of(bag, f'/{robot}/state'), *heard])
+    return sorted([*states, *heard])
 
 
 def silences_of_filter(bag, end):
@@ -155,7 +157,7 @@ def judge_autopilot(bag, robot):
         # Before the first pose a driver publishes its start, exactly at rest.
         if not any((linear.x, linear.y, linear.z)):
             continue
-        time = state.header.stamp.sec + 1e-9 * state.header.stamp.nanosec
+        time = stamp_of(state)
         if before is not None:
             since, x, y = before
             way = math.hypot(place.x - x, place.y - y)
@@ -173,6 +175,11 @@ def times_of(bag, topic):
     return [time * 1e-9 for _, _, time, _ in bag.raw([topic])]
 
 
+def stamp_of(message):
+    stamp = message.header.stamp
+    return stamp.sec + 1e-9 * stamp.nanosec
+
+
 def speeds_of(bag, robot):
     """Return time [s] and speed [m/s] of a robot, (n, 2).
 
@@ -181,10 +188,10 @@ def speeds_of(bag, robot):
     rows = []
     for topic, up in ((f'/{robot}/odom', 1.0), (f'/{robot}/state', 0.0)):
         for item in () if rows else bag.messages([topic]):
-            stamp, twist = item.message.header.stamp, item.message.twist
+            twist = item.message.twist
             linear = getattr(twist, 'twist', twist).linear
             speed = math.hypot(linear.x, linear.y, up * linear.z)
-            rows.append((stamp.sec + 1e-9 * stamp.nanosec, speed))
+            rows.append((stamp_of(item.message), speed))
     return np.array(rows, dtype=float).reshape(-1, 2)
 
 
