@@ -47,8 +47,8 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
     def __init__(self, **options: Any) -> None:
         super().__init__('guard', GuardSettings, in_robot=True, lockstep_member=False, **options)
         self._last = b''
-        # Whether there was a driver, and is none any more.
-        self._lost = False
+        # Whether it ever heard a driver, and whether there is none any more.
+        self._heard = self._lost = False
         self._stop_timer: Any = None
 
     def set_up(self) -> None:
@@ -60,6 +60,8 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         self.create_wall_timer(_REFRESH_PERIOD, self._refresh)
         self._lease = lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
         quality = liveliness_reader(lease)
+        # Until then it would not notice that the driver is lost.
+        self.expect(lambda: self._heard)
         # Of the messages only the last one is used, and only once no other comes.
         self.permanent(
             lease,
@@ -100,6 +102,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             return
         self._lost = event.alive_count == 0
         if not self._lost:
+            self._heard = True
             if self._stop_timer is not None:
                 self.get_logger().info('the driver is back')
             self.halt()

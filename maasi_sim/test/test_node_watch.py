@@ -31,11 +31,11 @@ class Run:
         mission = SimpleNamespace(
             scenario=load_scenario('mambo', overrides), plan_nodes=lambda *_: plans
         )
-        self.supervisor = Supervisor(mission, Options(), folder, ProgressDisplay())
-        self.supervisor.running = True
-        self.recorder = self.supervisor.recorder = SimpleNamespace(
+        self.recorder = SimpleNamespace(
             elapsed=0.0, step=None, time=0, ready={PLANNER}, take_heartbeats=self.take
         )
+        self.supervisor = Supervisor(mission, Options(), folder, ProgressDisplay(), self.recorder)
+        self.supervisor.running = True
         self.nodes = self.supervisor.processes
         for pid, node in enumerate(self.nodes.values(), start=1):
             node._popen = SimpleNamespace(pid=pid, poll=lambda: None)
@@ -151,7 +151,7 @@ def test_a_node_is_killed_if_it_hangs_and_restarted_as_often_as_the_limit_says(
     assert run.until(6.3) is None and set(signals) == {signal.SIGKILL}
     node._popen = SimpleNamespace(pid=2, poll=lambda: -9)
     run.beat(FILTER, at=6.4)
-    assert starts == [1] and removed == [0] and run.supervisor.recorder.ready == set()
+    assert starts == [1] and removed == [0] and run.recorder.ready == set()
     assert 'start number 2' in node.last_words()
     node._popen = SimpleNamespace(pid=3, poll=lambda: 7)
     ending = run.beat(FILTER, at=6.6)

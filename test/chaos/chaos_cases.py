@@ -60,8 +60,8 @@ _MAVLINK = {
             'mavlink': {'arm': True},
         }
     },
-    # A target in view once or twice at the edge would be withdrawn, which is no loss by a fault.
-    'filter': {'method': 'pmb', 'pmb': {'withdrawn_probability': 0.0}},
+    # The other filter may give up a found target, without any fault.
+    'filter': {'method': 'ic_phd'},
     'planner': {'name': 'maasi', 'measurement': 'periodic'},
 }
 _BUILDINGS = {
@@ -108,7 +108,7 @@ class Case:
 
     @property
     def hangs_guards(self):
-        """Whether guards alone hang, which no start and no step waits for."""
+        """Whether guards alone hang, which no step waits for."""
         return self.fault == 'hang' and all(node.endswith('/guard') for node in self.nodes)
 
     @property
@@ -116,8 +116,8 @@ class Case:
         """Whether exit code 3 is guaranteed; otherwise the run continues to its end, 0 or 1."""
         if self.fault == 'pause':
             return False
-        # `limits.start` is longer than these runs.
-        if self.hangs_guards and self.when == 'start':
+        # `limits.start` is longer than these runs, which do not wait for guards.
+        if self.hangs_guards and self.when == 'start' and self.lockstep:
             return False
         # A restarted simulation would begin at time 0; a start that hangs is not repeated.
         if not self.respawn or SIM in self.nodes:

@@ -283,9 +283,14 @@ def drive_without_the_guard(team):
 
 def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(start_guard, process, team):
     guard = start_guard()
+    # Nobody relies on a guard before it has heard its driver.
+    end = time.monotonic() + 1.0
+    team.until(lambda: time.monotonic() > end and team.count_publishers('/lockstep/ready'))
+    assert not team.ready
     driver = process(program=[sys.executable, str(Path(__file__).with_name('hanging_driver.py'))])
     team.connect()
     team.awaken()
+    team.until(lambda: '/rover/guard' in [message.node for message in team.ready])
     # A driver stops the robot itself where odometry is missing: to its guard it is alive, for
     # longer than the lease and without any state.
     end = time.monotonic() + 1.5 * LIVELINESS_LEASE

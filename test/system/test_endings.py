@@ -11,7 +11,7 @@ from unittest.mock import Mock
 import pytest
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-from scenario_runs import beside, command, run_scenario, start, started, write_scenario
+from scenario_runs import beside, command, run_scenario, start, started, wait_for, write_scenario
 
 from maasi_sim.run import scenario_run
 from maasi_sim.run.bag import Bag
@@ -101,6 +101,17 @@ def test_a_node_that_never_gets_ready_is_named(tmp_path):
     run = run_scenario(scripted(tmp_path, 'waits', limits={'start': 10.0}), tmp_path / 'run')
     assert run.code == 3, run.output
     assert '/planner_node is not ready' in run.output
+    assert run.report['end_reason'] == 'not_ready'
+
+
+def test_a_free_run_waits_for_the_guards(tmp_path):
+    path = write_scenario(tmp_path / 'far.yaml', FAR, limits={'start': 10.0})
+    with start(path, tmp_path / 'run') as run:
+        wait_for(lambda: run.processes('/mambo/guard'), 'no guard')
+        os.kill(run.processes('/mambo/guard')[0], signal.SIGSTOP)
+        run.finish()
+    assert run.code == 3, run.output
+    assert 'ended: /mambo/guard is not ready after 10 s' in run.output
     assert run.report['end_reason'] == 'not_ready'
 
 

@@ -98,27 +98,29 @@ class ScenarioRun:
             self._limits = self._scenario.limits
             write_text(self.folder / 'scenario.yaml', self._scenario.text())
             write_text(self.folder / 'view.rviz', view_text(self.mission, team))
-            self.supervisor = Supervisor(self.mission, options, self.folder, self.display)
-            processes = list(self.supervisor.processes.values())
-            self.display.say(
-                f'{self.mission.name}: seed {self._scenario.seed}, {len(processes)} nodes in ROS '
-                f'domain {domain.number}, results in {short(self.folder)}'
-            )
             ends.callback(self.display.close)
-            page = self._page(domain.number)
-            if page is not None:
-                ends.callback(page.end)
             types = load_types()
             self.observer = self.mission.observer(types)
             if options.record:
                 self._bag = BagWriter(self.folder / 'bag', types, self._scenario.record.images)
                 ends.callback(self._close_bag)
-                self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
             step = self._scenario.step
             self.recorder = Recorder(domain.number, self.observer, step, self._bag, team)
             ends.callback(self.recorder.close)
-            self.recorder.listener = None if page is None else page.put_message
-            self.supervisor.recorder = self.recorder
+            self.supervisor = Supervisor(
+                self.mission, options, self.folder, self.display, self.recorder
+            )
+            processes = list(self.supervisor.processes.values())
+            self.display.say(
+                f'{self.mission.name}: seed {self._scenario.seed}, {len(processes)} nodes in ROS '
+                f'domain {domain.number}, results in {short(self.folder)}'
+            )
+            if self._bag is not None:
+                self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
+            page = self._page(domain.number)
+            if page is not None:
+                ends.callback(page.end)
+                self.recorder.listener = page.put_message
             ends.callback(stop, processes)
             self._monitor()
             self._close_bag()
@@ -193,6 +195,8 @@ class ScenarioRun:
     def _wait_until_ready(self) -> Ending | None:
         """Wait until every node is ready, the recorder last; return an ending if one is not."""
         nodes = self.supervisor.nodes('clock', 'driver', 'other')
+        if not self.options.lockstep:
+            nodes += self.supervisor.nodes('guard')
         expected = [node.name for node in nodes]
         begin, patience = time.monotonic(), _START_PATIENCE
         while (ending := self._turn()) is None and (lacks := self._lacks(expected)):
