@@ -107,10 +107,18 @@ def test_all_of_the_ablation_decides_as_the_recommended_case():
     small = [KNOWN[name].cases(True) for name in ('000-ablation', '000-fig4')]
     (every,) = (case for case in small[0] if case.name == 'all')
     (recommended,) = (case for case in small[1] if case.name == 'ASI, recommended')
-    one, other = (KNOWN['000-fig4'].run(case.settings, 3) for case in (every, recommended))
-    assert one.columns.keys() == other.columns.keys()
-    for name, column in one.columns.items():
-        np.testing.assert_array_equal(column, other.columns[name], err_msg=name)
+    one, other = (KNOWN['000-fig4'].run(case.settings, 3).columns for case in (every, recommended))
+    for column, values in one.items():
+        np.testing.assert_array_equal(values, other[column], err_msg=column)
+
+
+@pytest.mark.parametrize('name', ['000-table1', '000-table3'])
+def test_only_the_ratio_of_the_weights_counts_without_control_cost(name):
+    cases = {case.name: case.settings for case in KNOWN[name].cases(True)}
+    names = ('alpha 0.05, beta 0.05', 'alpha 5, beta 5')
+    one, other = (KNOWN[name].run(cases[item], 3).columns for item in names)
+    for column, values in one.items():
+        np.testing.assert_array_equal(values, other[column], err_msg=column)
 
 
 def test_runs_on_one_map_differ_by_noise_only():
