@@ -111,7 +111,7 @@ def test_runs_that_did_not_finish_count_with_the_limit_and_are_counted():
 
 
 def test_ratio_is_that_of_pairs_with_its_interval():
-    noisy = [2 * one + n for n, one in enumerate(LOW)]
+    noisy = [one + 20 + 3 * n for n, one in enumerate(LOW)]
     here = finding(a=LOW, b=noisy).here
     ratio = np.exp(np.mean(np.log(LOW) - np.log(noisy)))
     low, high = map(float, here.split(' [')[1].split(']')[0].split(', '))
@@ -150,6 +150,8 @@ def test_page_and_summary_have_each_claim_of_each_experiment():
     holds = {'000-toy': [found_with(1.0)]}
     assert 'the wind' not in claims.claims_page('', known, holds, 'there.md')
     assert '| 000 | 1 | 1 (1) | 0 | 0 (0) | 0 |' in claims.summary(known, holds)
+    one_run = {'000-toy': [found_with(None)]}
+    assert '| no interval |  |' in claims.claims_page('', known, one_run, 'there.md')
     text = f'before\n{claims.BEGIN}old\n{claims.END}after\n'
     new = claims.with_summary(text, 'table\n')
     assert new == f'before\n{claims.BEGIN}\ntable\n\n{claims.END}after\n'

@@ -185,7 +185,7 @@ def corrected_level(found: Mapping[str, Sequence[Finding]]) -> tuple[int, float]
 
 def summary(experiments: Mapping[str, Experiment], found: Mapping[str, Sequence[Finding]]) -> str:
     """Return the verdicts of each paper, counted; in brackets those that the correction leaves."""
-    _, level = corrected_level(found)
+    intervals, level = corrected_level(found)
     papers: dict[str, Counter[str]] = {}
     for name, experiment in experiments.items():
         count = papers.setdefault(name[:3], Counter())
@@ -195,7 +195,8 @@ def summary(experiments: Mapping[str, Experiment], found: Mapping[str, Sequence[
             verdict = one.verdict() if one else NOT_RUN
             count.update([verdict, 'claims'])
             count[f'{verdict} left'] += one is not None and one.marked(level) != verdict
-    rows = [['paper', 'claims', HOLDS, NOT_SHOWN, f'{NOT_HERE}, or the number differs', NOT_RUN]]
+    heads = ['paper', 'claims', HOLDS, NOT_SHOWN, f'{NOT_HERE}, or differs', 'one run, or none']
+    rows = [heads]
     for paper, count in papers.items():
         against = count[NOT_HERE] + count[DIFFERS]
         left = count[f'{NOT_HERE} left'] + count[f'{DIFFERS} left']
@@ -204,8 +205,8 @@ def summary(experiments: Mapping[str, Experiment], found: Mapping[str, Sequence[
         rows.append(
             [paper, f'{count["claims"]}', holds, f'{count[NOT_SHOWN]}', f'{against} ({left})', rest]
         )
-    rows[0][-1] = 'one run, or none'
-    return markdown_table(rows)
+    caption = "Claims of each paper by verdict; in brackets those that Bonferroni's correction for"
+    return f'{caption}\n{intervals} intervals leaves as they are.\n\n{markdown_table(rows)}'
 
 
 def claims_page(
@@ -228,7 +229,7 @@ def claims_page(
             if one is None:
                 row += ['', '', NOT_RUN, '']
             else:
-                cause = '' if one.verdict() == HOLDS else claim.cause or 'unknown'
+                cause = '' if one.verdict() in (HOLDS, ONE_RUN) else claim.cause or 'unknown'
                 earlier = ' (earlier)' if one.earlier else ''
                 row += [one.paper, one.here + earlier, one.marked(level), cause]
             papers.setdefault(name[:3], []).append(row)
