@@ -14,8 +14,10 @@ import yaml
 from maasi_sim import machine
 from maasi_sim.experiments import campaign, papers, reproduce, runs, tables
 from maasi_sim.experiments.campaign import Workers, make_workers, plan
+from maasi_sim.experiments.claims import BEGIN, END
 from maasi_sim.experiments.experiment import (
     Case,
+    Claim,
     Comparison,
     Experiment,
     Outcome,
@@ -61,6 +63,10 @@ def toy(monkeypatch):
         draw=lambda figure, results: figure.add_subplot().plot([0, 1]),
         published=(Published('first', 'steps', 30.0, 2.0, note='table 9'),),
         comparisons=(Comparison('first', 'second', 'steps'),),
+        claims=(
+            Claim('the first is faster', 'steps', 'first', 'second'),
+            Claim('30 steps', 'steps', case='first', expects='number'),
+        ),
         runs=4,
     )
     monkeypatch.setattr(papers, 'PAPERS', ('toy',))
@@ -219,6 +225,8 @@ def test_page_says_what_was_run_and_keeps_what_was_not_run_again(toy, tmp_path):
     file = tmp_path / 'docs' / 'page.md'
     picture = file.parent / 'reproduction' / '000-toy.png'
     write = ('--document', file)
+    readme = tmp_path / 'README.md'
+    readme.write_text(f'# Read me\n{BEGIN}old\n{END}')
     assert command(tmp_path / 'out', '--runs', 3, *write) == 0
     text = file.read_text()
     assert '1 to 3 runs of each case, the paper has 4' in text
@@ -226,6 +234,11 @@ def test_page_says_what_was_run_and_keeps_what_was_not_run_again(toy, tmp_path):
     assert 'reproduction/000-toy.png' in text and picture.read_bytes().startswith(b'\x89PNG')
     assert command(tmp_path / 'out', *write) == 0
     first, shown = file.read_text(), picture.read_bytes()
+    claims = file.with_name('claims.md')
+    claimed = claims.read_text()
+    assert '| the first is faster, [000-toy](page.md#000-toy) |' in claimed
+    assert '2 such intervals' in claimed and readme.read_text().startswith('# Read me\n')
+    assert 'Claims of each paper' in readme.read_text()
     assert 'not in full' not in first
     nothing = ['--out', str(tmp_path / 'nothing'), '--document']
     for _ in range(2):
@@ -233,6 +246,8 @@ def test_page_says_what_was_run_and_keeps_what_was_not_run_again(toy, tmp_path):
         text = file.read_text()
         assert 'runs of each case, from an earlier campaign.' in text
         assert text.replace(', from an earlier campaign', '') == first
+        assert claims.read_text().count(' (earlier) | ') == 2
+        assert claims.read_text().replace(' (earlier) | ', ' | ') == claimed
     # Of the case that is run again there is the new row only; the others are marked.
     assert command(tmp_path / 'new', '--case', 'first', '--runs', 2, *write) == 0
     rows = [line for line in file.read_text().splitlines() if line.startswith('| ')]
@@ -244,6 +259,9 @@ def test_page_says_what_was_run_and_keeps_what_was_not_run_again(toy, tmp_path):
         cells[2 if row.startswith('| first m') else 1] += ' (earlier)'
         assert ' | '.join(cells) in rows
     assert picture.read_bytes() == shown
+    # The number rests on the new runs, the comparison on the earlier ones.
+    kept = [line for line in claims.read_text().splitlines() if ' (earlier) | ' in line]
+    assert [row[:21] for row in kept] == ['| the first is faster']
     assert command(tmp_path / 'out', *write) == 0
     assert file.read_text() == first
     new = tmp_path / 'docs' / 'none' / 'new.md'

@@ -12,7 +12,7 @@ from maasi_planner.buildings.agent import inflated
 from maasi_planner.buildings.preplanning import plan_mission
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
 from maasi_sim.experiments.experiment import Outcome, Quantity, Results
-from maasi_sim.experiments.statistics import mean_interval
+from maasi_sim.experiments.tables import interval
 from maasi_sim.run.buildings.mission import CuboidMission
 from maasi_sim.run.buildings.picture import draw_mission, legend
 
@@ -24,8 +24,9 @@ _LIMIT = 1000
 # Without a limit on wall time a decision does not depend on the machine [s].
 _FOR_EVER = 1e9
 
+STEPS = Quantity('steps', 'time until all cuboids are visited', 's', 'restricted')
 QUANTITIES = (
-    Quantity('steps', 'time until all cuboids are visited', 's', 'restricted'),
+    STEPS,
     Quantity('cuboids', 'cuboids'),
     Quantity('coverage', 'share of the faces that is seen'),
     Quantity('complete', 'missions with all cuboids visited'),
@@ -162,11 +163,9 @@ def draw_batteries_and_ranges(figure: Figure, results: Results) -> None:
         for reach in (50, 100, 250):
             points = []
             for agents in (3, 5, 7, 9, 11):
-                runs = results.runs.get(f'profile {profile}, C_R {reach} m, {agents} agents')
-                if runs:
-                    # A mission that did not get there counts with the limit.
-                    times = [run.value('steps') or run.value('limit') or 0.0 for run in runs]
-                    points.append((agents, float(np.mean(times))))
+                name = f'profile {profile}, C_R {reach} m, {agents} agents'
+                if results.runs.get(name):
+                    points.append((agents, interval(results, name, STEPS).mean))
             if points:
                 axes.plot(*zip(*points), 'o-', ms=4, label=f'C_R = {reach} m')
         _label(axes, 'agents', 'mission time [s]', f'battery profile {profile}')
@@ -202,7 +201,7 @@ def draw_mission_times(figure: Figure, results: Results) -> None:
     """Draw the mission time of each case as a bar, the paper's of 3 agents as lines."""
     axes = figure.subplots()
     names = results.names()
-    times = [mean_interval(results.values(name, 'steps')) for name in names]
+    times = [interval(results, name, STEPS) for name in names]
     places = np.arange(len(names))
     errors = np.nan_to_num([time.half_width for time in times])
     axes.barh(places, [time.mean for time in times], xerr=errors, color='#56B4E9')

@@ -97,6 +97,25 @@ class Comparison:
     quantity: str
 
 
+@dataclass(frozen=True)
+class Claim:
+    """Something that a paper says, and the cases here that it rests on.
+
+    Of two cases the paper expects the quantity of `first` to be less than, greater than or alike
+    that of `second`; of one `case` it prints a number, the one in `published`. `note` is added to
+    the words; `cause` says why it does not hold here, '' if no run has shown it.
+    """
+
+    says: str
+    quantity: str
+    first: str = ''
+    second: str = ''
+    case: str = ''
+    expects: Literal['less', 'greater', 'alike', 'number'] = 'less'
+    note: str = ''
+    cause: str = ''
+
+
 @dataclass
 class Outcome:
     """Results of one run: numbers, texts or None by quantity, and columns with a row for each step.
@@ -150,11 +169,11 @@ class Experiment:
     `cases` returns the cases; with True small ones that take a second, for tests and a first look.
     `run` runs a case once, from its settings and the seed of the map, the same for every case.
     `quantities` are the columns of the table. `draw` draws a figure in the form of the paper's.
-    `published` are the paper's numbers, `comparisons` paired differences, and `choices` open points
-    of the paper. `causes` of differences from the paper are likely ones, `tested` are those that
-    were tested. `runs` are the maps in the paper, `seconds` the approximate time of a run on one
-    core. Experiments with the same `maps` have the same maps; None: maps of its own. `compared`:
-    searches are compared, and the seed is the number of the map.
+    `published` are the paper's numbers, `comparisons` paired differences, `claims` what the paper
+    says of them, and `choices` open points of the paper. `causes` of differences from the paper are
+    likely ones, `tested` are those that were tested. `runs` are the maps in the paper, `seconds`
+    the approximate time of a run on one core. Experiments with the same `maps` have the same maps;
+    None: maps of its own. `compared`: searches are compared, and the seed is the number of the map.
     """
 
     name: str
@@ -165,6 +184,7 @@ class Experiment:
     draw: Callable[[Figure, Results], None]
     published: Sequence[Published] = ()
     comparisons: Sequence[Comparison] = ()
+    claims: Sequence[Claim] = ()
     choices: Sequence[OpenPoint] = ()
     causes: str = ''
     tested: str = ''

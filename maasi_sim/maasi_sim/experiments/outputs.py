@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from maasi_sim.experiments.campaign import Campaign, maps_in, plan
+from maasi_sim.experiments.claims import Finding, claims_page, findings, summary, with_summary
 from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
 from maasi_sim.experiments.figures import as_png
 from maasi_sim.experiments.papers import FOLDER, experiments, title_of
@@ -96,14 +97,15 @@ def listed(choices: Sequence[OpenPoint]) -> str:
 class Section:
     """What the page shows of an experiment, stored beside its figure.
 
-    `rests` is the number of runs in words, `duration` the time of a run in words or '', and `cases`
-    and `pairs` are the cells of its tables.
+    `rests` is the number of runs in words, `duration` the time of a run in words or '', `cases` and
+    `pairs` are the cells of its tables, and `claims` what the runs say about the paper's.
     """
 
     rests: str
     duration: str
     cases: dict[str, dict[str, str]]
     pairs: list[list[str]]
+    claims: list[Finding] = field(default_factory=list)
 
     def complete(self, earlier: Section) -> None:
         """Add the rows of an earlier section that it does not have, marked."""
@@ -113,6 +115,12 @@ class Section:
         for who, what, maps, gap in earlier.pairs:
             if (who, what) not in known:
                 self.pairs.append([who, what, _earlier(maps), gap])
+        answered = {one.says for one in self.claims}
+        self.claims += [one for one in earlier.earlier_claims() if one.says not in answered]
+
+    def earlier_claims(self) -> list[Finding]:
+        """Return the claims, marked as of an earlier campaign."""
+        return [replace(one, earlier=True) for one in self.claims]
 
 
 def _earlier(number: str) -> str:
@@ -132,7 +140,16 @@ def section_of(results: Results, every: bool = True) -> Section:
     times = np.concatenate([results.values(name, 'processor_time') for name in results.names()])
     times = times[~np.isnan(times)]
     duration = f' A run takes about {np.median(times):.1f} s on one core.' if len(times) else ''
-    return Section(rests, duration, case_cells(results), pair_cells(results))
+    return Section(rests, duration, case_cells(results), pair_cells(results), findings(results))
+
+
+def stored_section(store: Path) -> Section | None:
+    """Return the section in a file, None if there is none."""
+    if not store.exists():
+        return None
+    content = json.loads(store.read_text(encoding='utf-8'))
+    content['claims'] = [Finding(**one) for one in content.get('claims', ())]
+    return Section(**content)
 
 
 def page(sections: dict[str, Section]) -> str:
@@ -187,14 +204,15 @@ def wrapped(text: str) -> str:
 def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) -> list[str]:
     """Write the page of the experiments in the folder `out`, and return those that have runs there.
 
-    Figures and tables are written to `reproduction/` beside the page; experiments and cases
-    without runs keep theirs.
+    The page of the claims, `claims.md`, is written beside it, and their summary to the README.md of
+    the folder above, if that has its marks. Figures and tables are written to `reproduction/`
+    beside the page; experiments and cases without runs keep theirs.
     """
     sections, shown = {}, []
     for name, experiment in experiments().items():
         image = file.parent / 'reproduction' / f'{name}.png'
         store = image.with_suffix('.json')
-        earlier = Section(**json.loads(store.read_text())) if store.exists() else None
+        earlier = stored_section(store)
         results = plan(experiment, out, maps_in(out / name), seed, small).results()
         every = len(results.names()) == len(results.cases)
         if results.names():
@@ -210,6 +228,21 @@ def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) ->
             sections[name] = section
         elif earlier is not None:
             earlier.rests += EARLIER
+            earlier.claims = earlier.earlier_claims()
             sections[name] = earlier
     write_file(file, wrapped(page(sections)))
+    found = {name: section.claims for name, section in sections.items()}
+    write_file(file.with_name('claims.md'), claims_text(found, file.name))
+    readme = file.resolve().parents[1] / 'README.md'
+    if readme.exists():
+        before = readme.read_text(encoding='utf-8')
+        after = with_summary(before, summary(experiments(), found))
+        if after != before:
+            write_file(readme, after)
     return shown
+
+
+def claims_text(found: Mapping[str, Sequence[Finding]], file: str = 'reproduction.md') -> str:
+    """Return the page of the claims beside that of the experiments."""
+    introduction = (FOLDER / 'claims.txt').read_text(encoding='utf-8')
+    return wrapped(claims_page(introduction, experiments(), found, file))

@@ -19,6 +19,7 @@ import yaml
 from maasi_sim.experiments import buildings, figures, searches
 from maasi_sim.experiments.experiment import (
     Case,
+    Claim,
     Comparison,
     Experiment,
     OpenPoint,
@@ -110,6 +111,7 @@ def _experiment(name: str, content: Mapping[str, Any], paper: Mapping[str, Any])
             for row in entry.pop('comparisons', [])
             for names in product(row['first'], row['second'], row['quantities'])
         ],
+        claims=[Claim(**row) for row in entry.pop('claims', [])],
         choices=[OpenPoint(**paper['choices'][key]) for key in entry.pop('choices')],
         **entry,
     )

@@ -45,9 +45,13 @@ QUANTITIES = (
     Quantity('filter_time', 'filter step', 's'),
     Quantity('planning_time', 'decision', 's'),
     Quantity('explored', 'share explored in the end'),
+    Quantity('lanes', 'share of the way in lanes'),
     Quantity('clearance', 'smallest distance to an obstacle', 'm'),
 )
 
+# A lane is at least this share of the longest side, and straight to this share of each step.
+_LANE = 0.5
+_STRAIGHT = 0.99
 # Measurements, and particles, of a small case.
 _SMALL = 12
 _SMALL_PARTICLES = 1000
@@ -125,15 +129,37 @@ def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: 
     )
 
 
+def lane_share(places: FloatArray, side: float) -> float:
+    """Return which share of a way is lanes as of a lawnmower, from 0 to 1.
+
+    A lane is straight along an axis, without turning back, for at least half a side. `places` are
+    those of the measurements, (n, 3); `side` is the longest side of the environment [m].
+    """
+    steps = np.diff(places, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    steps, lengths = steps[lengths > 0.0], lengths[lengths > 0.0]
+    if not len(steps):
+        return 0.0
+    # 1 to 6 along an axis, 0 askew.
+    axis = np.abs(steps).argmax(axis=1)
+    along = steps[np.arange(len(steps)), axis]
+    heading = np.where(np.abs(along) >= _STRAIGHT * lengths, 2 * axis + 1 + (along > 0.0), 0)
+    turns = np.flatnonzero(np.diff(heading)) + 1
+    legs = zip(np.split(heading, turns), np.split(lengths, turns))
+    lanes = [leg.sum() for way, leg in legs if way[0] and leg.sum() >= _LANE * side]
+    return float(sum(lanes) / lengths.sum())
+
+
 def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a search and measure the explored share of the environment, the mean of 1 - e.
+    """Run a search and measure the explored share of the environment, the mean of 1 - e, and lanes.
 
     Column 'explored' is after each measurement batch, that of the summary at the end.
     """
     outcome = run_search(settings, seed)
     scenario = scenario_from_values(settings['scenario'], 'settings')
     bounds = scenario.environment.array()
-    exploration = UnexploredMap(bounds, float((bounds[:, 1] - bounds[:, 0]).max()) / 26.0)
+    side = float((bounds[:, 1] - bounds[:, 0]).max())
+    exploration = UnexploredMap(bounds, side / 26.0)
     columns = outcome.columns
     detections = {
         name: robot.sensor.build(name, scenario.dimension).detection
@@ -148,6 +174,8 @@ def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
         explored.append(exploration.explored_fraction())
     outcome.columns = {**columns, 'explored': explored}
     outcome.summary['explored'] = explored[-1] if explored else 0.0
+    ways = [np.stack([columns[f'{name}_{axis}'] for axis in 'xyz'], 1) for name in detections]
+    outcome.summary['lanes'] = float(np.mean([lane_share(way, side) for way in ways]))
     return outcome
 
 

@@ -29,9 +29,9 @@ class Interval:
     degrees: float
 
 
-def _student(degrees: float) -> float:
+def student(degrees: float, level: float = LEVEL) -> float:
     """Return the half width of the interval of Student's t with variance 1."""
-    return float(stats.t.ppf(_TAIL, degrees))
+    return float(stats.t.ppf(0.5 + 0.5 * level, degrees))
 
 
 def mean_interval(values: ArrayLike) -> Interval:
@@ -43,7 +43,7 @@ def mean_interval(values: ArrayLike) -> Interval:
     if number < 2:
         return Interval(mean, math.nan, number, 0.0)
     error = float(array.std(ddof=1)) / math.sqrt(number)
-    return Interval(mean, error * _student(number - 1), number, number - 1.0)
+    return Interval(mean, error * student(number - 1), number, number - 1.0)
 
 
 def _gaps(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
@@ -119,22 +119,25 @@ def pairs_needed(gaps: ArrayLike) -> int | None:
 def independent_difference(first: Interval, second: Interval) -> Interval:
     """Return the difference of two means of different runs, after Welch and Satterthwaite.
 
-    If the interval of one is unknown, that of the other is used, which is too narrow.
+    If the interval of one is unknown, its values are taken to spread as those of the other.
     """
-    parts = [
-        ((item.half_width / _student(item.degrees)) ** 2, item.degrees)
-        for item in (first, second)
-        if item.degrees > 0.0 and math.isfinite(item.half_width)
-    ]
     difference = first.mean - second.mean
-    variance = sum(part for part, _ in parts)
     number = min(first.number, second.number)
-    if not parts:
+    known = [
+        item for item in (first, second) if item.degrees > 0.0 and math.isfinite(item.half_width)
+    ]
+    if not known:
         return Interval(difference, math.nan, number, 0.0)
+    if len(known) == 1:
+        other = second if known[0] is first else first
+        width = known[0].half_width * math.sqrt(1.0 + known[0].number / other.number)
+        return Interval(difference, width, number, known[0].degrees)
+    parts = [((item.half_width / student(item.degrees)) ** 2, item.degrees) for item in known]
+    variance = sum(part for part, _ in parts)
     if variance == 0.0:
         return Interval(difference, 0.0, number, min(degrees for _, degrees in parts))
     degrees = variance**2 / sum(part**2 / free for part, free in parts)
-    return Interval(difference, math.sqrt(variance) * _student(degrees), number, degrees)
+    return Interval(difference, math.sqrt(variance) * student(degrees), number, degrees)
 
 
 def from_published(value: float, half_width: float | None, runs: int) -> Interval:

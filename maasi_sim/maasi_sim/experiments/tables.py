@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from maasi_filter.arrays import FloatArray
 from maasi_sim.experiments.experiment import Quantity, Results, plain
 from maasi_sim.experiments.runs import csv_text
 from maasi_sim.experiments.statistics import (
@@ -30,14 +31,27 @@ VERSION = 1
 FEWEST = 10
 
 
+def capped(values: FloatArray, limit: float) -> FloatArray:
+    """Return durations with what is unfinished (nan) or longer at a limit."""
+    return np.minimum(np.where(np.isnan(values), limit, values), limit)
+
+
 def interval(results: Results, case: str, quantity: Quantity) -> Interval:
     """Return the mean of a quantity over the runs of a case."""
     values = results.values(case, quantity.name)
     if quantity.kind == 'mean':
         return mean_interval(values)
-    limits = results.values(case, quantity.limit)
     # All that is censored reached a limit, so that this is the area under the survival curve.
-    return mean_interval(np.minimum(np.where(np.isnan(values), limits, values), limits.min()))
+    return mean_interval(capped(values, float(results.values(case, quantity.limit).min())))
+
+
+def paired(results: Results, first: str, second: str, quantity: Quantity) -> list[FloatArray]:
+    """Return a quantity of two cases on the maps of both; durations up to the shortest limit."""
+    both = results.pairs(first, second, quantity.name)
+    if quantity.kind == 'mean' or not len(both[0]):
+        return both
+    limit = float(np.min(results.pairs(first, second, quantity.limit)))
+    return [capped(one, limit) for one in both]
 
 
 def median(values: np.ndarray, quantity: Quantity) -> float:
@@ -119,13 +133,9 @@ def pairs(results: Results) -> Iterator[tuple[str, str, Quantity, Interval]]:
     """Yield the paired differences of the experiment: two cases, first minus second."""
     for item in results.experiment.comparisons:
         quantity = results.experiment.quantity(item.quantity)
-        both = results.pairs(item.first, item.second, item.quantity)
-        if not len(both[0]):
-            continue
-        if quantity.kind == 'restricted':
-            limit = float(np.min(results.pairs(item.first, item.second, quantity.limit)))
-            both = [np.minimum(np.where(np.isnan(one), limit, one), limit) for one in both]
-        yield item.first, item.second, quantity, paired_difference(*both)
+        both = paired(results, item.first, item.second, quantity)
+        if len(both[0]):
+            yield item.first, item.second, quantity, paired_difference(*both)
 
 
 def number(value: float) -> str:
