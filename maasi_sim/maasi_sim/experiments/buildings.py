@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings.agent import inflated
 from maasi_planner.buildings.preplanning import plan_mission
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
-from maasi_sim.experiments.experiment import Outcome, Quantity, Results
+from maasi_sim.experiments.experiment import Outcome, Quantity, Results, Run
 from maasi_sim.experiments.statistics import mean_interval
 from maasi_sim.run.buildings.mission import CuboidMission
 from maasi_sim.run.buildings.picture import draw_mission, legend
@@ -162,9 +163,7 @@ def draw_batteries_and_ranges(figure: Figure, results: Results) -> None:
             for agents in (3, 5, 7, 9, 11):
                 runs = results.runs.get(f'profile {profile}, C_R {reach} m, {agents} agents')
                 if runs:
-                    # A mission that did not get there counts with the limit.
-                    times = [run.value('steps') or run.value('limit') or 0.0 for run in runs]
-                    points.append((agents, float(np.mean(times))))
+                    points.append((agents, float(_times(runs).mean())))
             if points:
                 axes.plot(*zip(*points), 'o-', ms=4, label=f'C_R = {reach} m')
         _label(axes, 'agents', 'mission time [s]', f'battery profile {profile}')
@@ -200,12 +199,13 @@ def draw_mission_times(figure: Figure, results: Results) -> None:
     """Draw the mission time of each case as a bar, the paper's of 3 agents as lines."""
     axes = figure.subplots()
     names = results.names()
-    times = [mean_interval(results.values(name, 'steps')) for name in names]
+    times = [mean_interval(_times(results.runs[name])) for name in names]
     places = np.arange(len(names))
     errors = np.nan_to_num([time.half_width for time in times])
     axes.barh(places, [time.mean for time in times], xerr=errors, color='#56B4E9')
     axes.set_yticks(places, names, fontsize=8)
     axes.invert_yaxis()
+    axes.set_xlim(left=0.0)
     for item in results.experiment.published:
         if item.case.count(',') == 1:
             label = f'paper, {item.case}'
@@ -233,6 +233,11 @@ def draw_decision_times(figure: Figure, results: Results) -> None:
     axes.set_yscale('log')
     axes.set_xticks(places, names)
     _label(axes, '', 'mean time of a decision [s]')
+
+
+def _times(runs: Sequence[Run]) -> FloatArray:
+    """Return mission times [s]; a mission that did not get there counts with the limit."""
+    return np.array([run.value('steps') or run.value('limit') or 0.0 for run in runs])
 
 
 def _label(axes: Any, across: str, up: str = '', title: str = '') -> None:
