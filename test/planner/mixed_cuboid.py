@@ -30,7 +30,8 @@ class MixedProblem:
         self._dynamics_rows()
         self._visit_rows()
         self._obstacle_rows()
-        self._braking_rows()
+        if self.settings.brake_at_end:
+            self._braking_rows()
         self._objective()
 
     def column(self, lower, upper, integer=False, cost=0.0):

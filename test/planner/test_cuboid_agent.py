@@ -23,8 +23,8 @@ from maasi_planner.buildings.sharing import Broadcast, assigned, rewards
 HOME = [166.0, 235.0, 5.0]
 
 
-def make_agent(name='purple', home=HOME, obstacles=(), **hazard):
-    options = two_buildings(obstacles=list(obstacles))
+def make_agent(name='purple', home=HOME, obstacles=(), depth=1e-3, **hazard):
+    options = two_buildings(obstacles=list(obstacles), visit_depth=depth)
     robot = robots_at({name: home}, **hazard)[name]
     return SearchAgent(name, options, plan_mission(options, AREA), robot)
 
@@ -116,6 +116,17 @@ def test_snapshot_looks_along_the_normal_and_says_its_probability():
     assert shot.detection_probability == pytest.approx(1 - (distance - 17) / 73)
     agent.observe(1, agent.mission.centres[5], np.zeros(3))
     assert len(agent.snapshots) == 1
+
+
+@pytest.mark.parametrize('depth', [0.0, 1e-3, 0.4])
+def test_planned_visits_touch_a_face_or_are_as_deep_as_wanted(depth):
+    agent = make_agent(depth=depth)
+    agent.observe(0, HOME, np.zeros(3))
+    plan = agent.decide([], random())
+    boxes = agent.mission.boxes[[n for _, n in plan.visits]]
+    places = plan.positions[[k for k, _ in plan.visits]]
+    inside = np.minimum(places - boxes[:, :, 0], boxes[:, :, 1] - places)
+    assert len(boxes) and inside.min() == pytest.approx(depth, abs=1e-6)
 
 
 def test_nothing_left_to_do_holds_the_place():

@@ -38,9 +38,10 @@ def test_same_optimum_as_scip_on_problems_of_missions():
 def test_same_optimum_as_scip_among_obstacles(part):
     rng = np.random.default_rng(part)
     horizon, discount = 4 if part == 0 else 3, 1.0 if part % 2 else 0.9
-    solvers = [solver_for(horizon, discount, between_samples=way) for way in (True, False)]
+    ways = ({}, {'between_samples': False}, {'between_samples': False, 'brake_at_end': False})
+    solvers = [solver_for(horizon, discount, **way) for way in ways]
     solved = sum(
-        same_optimum(solvers[number % 3 == 2], random_problem(rng, 6, int(rng.integers(1, 3))))
+        same_optimum(solvers[number % 3], random_problem(rng, 6, int(rng.integers(1, 3))))
         for number in range(12)
     )
     assert solved >= 6
@@ -98,6 +99,16 @@ def test_falling_stops_above_the_floor():
     dynamics, steps = solver.dynamics, solver.dynamics.braking_steps()
     places, speeds, _ = dynamics.fly(problem.position, problem.velocity, [], steps)
     assert np.abs(speeds[-1]).max() < 1e-9 and 30.0 < 95.0 - places[-1, 2] < 70.0
+
+
+def test_as_printed_a_plan_leaves_no_room_to_brake():
+    falling = problem_at([50, 50, 48], [0, 0, -15], [50, 50, 5])
+    printed = solver_for(5, brake_at_end=False)
+    plan = printed.solve(falling)
+    assert solver_for(5).solve(falling) is None and plan.positions[-1, 2] >= -1e-3
+    # The next problem has no solution.
+    problem = replace(falling, position=plan.positions[1], velocity=plan.velocities[1])
+    assert printed.solve(problem) is None
 
 
 def test_every_plan_leaves_a_problem_that_has_one():

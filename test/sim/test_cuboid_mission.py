@@ -5,6 +5,7 @@ import pytest
 
 from maasi_planner.buildings.agent import SearchAgent
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
+from maasi_sim.experiments.papers import find
 from maasi_sim.run.buildings.mission import CuboidMission, within_range
 
 AREA = [[0, 300], [0, 300], [0, 80]]
@@ -24,8 +25,14 @@ def make_mission(starts=STARTS, scheme='distributed', seed=1, hazard=None, **set
 
 def check_complete(record):
     """Assert what holds for every mission that ends well."""
+    assert record.collisions == 0
+    check_visits(record)
+
+
+def check_visits(record):
+    """Assert what holds also where corners may be cut, as printed."""
     assert record.complete and record.visited[-1] == len(record.mission.cells)
-    assert record.collisions == 0 and record.outside == 0
+    assert record.outside == 0
     # Every cuboid has a snapshot from inside it.
     assert {shot.cuboid for shot in record.snapshots} == set(range(record.visited[-1]))
     for shot in record.snapshots:
@@ -82,6 +89,55 @@ def test_what_is_put_off_is_discounted_more(monkeypatch):
     never = property(lambda self: 0, lambda self, value: None)
     monkeypatch.setattr(SearchAgent, 'put_off', never, raising=False)
     assert not make_mission(starts, **options).run(200).complete
+
+
+def cases_of(name):
+    return {case.name: case.settings['mission'] for case in find(name).cases(False)}
+
+
+def test_rows_as_printed_have_nothing_of_ours():
+    expected = {
+        'discount': 1.0,
+        'assignment': 'printed',
+        'condition': 'printed',
+        'around_corners': False,
+        'between_samples': False,
+        'brake_at_end': False,
+        'visit_depth': 0.0,
+    }
+    rows = [cases_of(f'004-fig{number}')['as printed'] for number in (3, 4, 5)]
+    every = cases_of('004-fig8')
+    for scheme in ('distributed', 'sequential', 'centralized'):
+        rows.append(every[f'{scheme}, 3 agents, as printed'])
+    for row in rows:
+        assert {key: row.get(key) for key in expected} == expected
+
+
+def test_condition_13_as_printed_lets_robots_drop_and_take_up_the_same_cuboids_for_ever():
+    starts = {'a': [59.0, 237.0, 33.0], 'b': [220.0, 269.0, 30.0], 'c': [83.0, 78.0, 41.0]}
+    rows = cases_of('004-fig8')
+    printed, other = (
+        make_mission(starts, **rows[f'distributed, 3 agents, as printed{what}'])
+        for what in ('', ' except (13)')
+    )
+    plans = {}
+
+    def noting(agent, decide):
+        def wrapped(*arguments):
+            plan = decide(*arguments)
+            plans.setdefault(agent.step, []).append({n for _, n in plan.visits})
+            return plan
+
+        return wrapped
+
+    for agent in printed.agents.values():
+        agent.decide = noting(agent, agent.decide)
+    record = printed.run(100)
+    assert not record.complete and set(record.how) == {'optimal'}
+    assert plans[99] == plans[97] and plans[98] == plans[96]
+    # All three plan the same, and at the next step none of these.
+    assert set.intersection(*plans[98]) and not set.union(*plans[98]) & set.union(*plans[99])
+    check_visits(other.run(100))
 
 
 def test_what_is_planned_for_the_next_step_is_visited():

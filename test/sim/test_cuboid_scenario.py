@@ -99,6 +99,9 @@ def planned(**changes):
         ),
         (planned(objects=[]), r'planner\.objects: got none'),
         (planned(hoizon=5), r'planner\.hoizon'),
+        (planned(visit_depth=0.5), r'planner\.visit_depth: .*0\.5.*less than 0\.5'),
+        (planned(visit_depth=-1e-3), r'planner\.visit_depth: .*-0\.001.*0'),
+        (planned(brake_at_end='late'), r"planner\.brake_at_end: .*'late'.*(true|bool)"),
         (
             lambda content: content['events'].append({'at': 5.0, 'robot': 'rad', 'do': 'leave'}),
             r"events\[0\]\.robot: .*'rad'",

@@ -35,7 +35,10 @@ def test_small_version_writes_what_makes_sense(name, tmp_path):
         elif name != '004-table1':
             summary = run.summary
             assert summary['complete'] and summary['visited'] == summary['cuboids'] > 0
-            assert summary['collisions'] == 0 and summary['outside'] == 0
+            assert summary['outside'] == 0
+            # As printed, corners of objects may be cut between samples.
+            between = case.settings['mission'].get('between_samples', True)
+            assert summary['collisions'] == 0 or not between
             assert run.columns['visited'][-1] == summary['cuboids']
             shots = {shot['cuboid'] for shot in run.details['snapshots']}
             assert shots == set(range(summary['cuboids']))

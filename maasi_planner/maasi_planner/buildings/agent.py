@@ -22,8 +22,6 @@ from maasi_planner.buildings.way_finder import WayFinder
 _ARRIVED, _ARRIVED_SPEED = 2.0, 2.0
 # Largest deviation from the last plan for which that plan may be continued [m, m/s].
 _SAME_STATE = 0.5
-# Depth of planned visits: on a face, rounding would decide whether a cuboid is visited [m].
-_INTO = 1e-3
 
 
 class Activity(Enum):
@@ -86,7 +84,7 @@ class SearchAgent:
         self.home = np.array(robot.start, dtype=float)
         self.solver = PlanSolver(self.dynamics, settings)
         self._solids = inflated(mission.solids, settings.clearance)
-        self._cuboids = inflated(mission.boxes, -_INTO)
+        self._cuboids = inflated(mission.boxes, -settings.visit_depth)
         speed = self.dynamics.speed
         climb = float(self.dynamics.deceleration[1, 2]) / max(1.0 - self.dynamics.retained, 1e-9)
         self._ways = WayFinder(self._solids, mission.area, speed, min(climb, speed))

@@ -54,8 +54,13 @@ class AxisRows:
     pull: FloatArray
 
 
-def axis_rows(dynamics: Dynamics, horizon: int, pull: FloatArray, smoothness: float) -> AxisRows:
-    """Return the rows of an axis; `pull` (T + 1,) and `smoothness` not scaled yet."""
+def axis_rows(
+    dynamics: Dynamics, horizon: int, pull: FloatArray, smoothness: float, rolling: FloatArray
+) -> AxisRows:
+    """Return the rows of an axis; `pull` (T + 1,) and `smoothness` not scaled yet.
+
+    rolling (J,): ways to brake from a speed of 1, by air resistance alone [m]; none: no such rows.
+    """
     forces = np.eye(horizon)
     gamma = dynamics.step / dynamics.mass
     velocities = np.zeros((horizon + 1, horizon))
@@ -63,7 +68,7 @@ def axis_rows(dynamics: Dynamics, horizon: int, pull: FloatArray, smoothness: fl
     for k in range(horizon):
         velocities[k + 1] = dynamics.retained * velocities[k] + gamma * forces[k]
         positions[k + 1] = positions[k] + dynamics.step * velocities[k]
-    terminal = positions[horizon] + dynamics.rolling_ways()[:, None] * velocities[horizon]
+    terminal = positions[horizon] + rolling[:, None] * velocities[horizon]
     matrix = np.vstack([positions[2:], velocities[1:], forces, terminal])
     differences = np.diff(forces, axis=0)
     hessian = (

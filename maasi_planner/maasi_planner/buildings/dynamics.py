@@ -71,15 +71,15 @@ class Dynamics:
             steps += 1
         return steps
 
-    def rolling_ways(self) -> FloatArray:
+    def rolling_ways(self, steps: int) -> FloatArray:
         """Return the way [m] from a speed of 1 after each step of braking by air resistance."""
-        return self.step * np.cumsum(self.retained ** np.arange(self.braking_steps()))
+        return self.step * np.cumsum(self.retained ** np.arange(steps))
 
-    def shorter_ways(self) -> FloatArray:
+    def shorter_ways(self, steps: int) -> FloatArray:
         """Return by how much full force shortens these ways, going up and down, (2, 3, steps)."""
         lost = np.zeros((2, 3))
-        ways = np.zeros((2, 3, self.braking_steps()))
-        for j in range(1, ways.shape[2]):
+        ways = np.zeros((2, 3, steps))
+        for j in range(1, steps):
             lost = self.retained * lost + self.deceleration
             ways[:, :, j] = ways[:, :, j - 1] + self.step * lost
         return ways

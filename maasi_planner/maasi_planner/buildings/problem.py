@@ -83,13 +83,17 @@ class PlanSolver:
         horizon, smoothness = settings.horizon, settings.smoothness_weight
         pull = np.zeros(horizon + 1)
         pull[settings.guided] = settings.guidance_weight
-        self._search = axis_rows(dynamics, horizon, pull, smoothness)
+        # As printed, nothing is asked of the way after the horizon.
+        steps = dynamics.braking_steps() if settings.brake_at_end else 0
+        self._rolling = dynamics.rolling_ways(steps)
+        self._rise, self._sink = dynamics.shorter_ways(steps)
+        self._search = axis_rows(dynamics, horizon, pull, smoothness, self._rolling)
         pull = np.full(horizon + 1, settings.guidance_weight)
         pull[0] = 0.0
-        self._homing = axis_rows(dynamics, horizon, pull, _HOMING_SMOOTHNESS * smoothness)
+        self._homing = axis_rows(
+            dynamics, horizon, pull, _HOMING_SMOOTHNESS * smoothness, self._rolling
+        )
         self._tree = make_tree(_ROOM, horizon, len(self._search.matrix))
-        self._rolling = dynamics.rolling_ways()
-        self._rise, self._sink = dynamics.shorter_ways()
 
     def solve(self, problem: Problem) -> Plan | None:
         """Return the best plan; None if there is none.

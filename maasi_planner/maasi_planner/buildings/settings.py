@@ -169,7 +169,19 @@ class CuboidMethodSettings(Settings):
     between_samples: bool = Field(
         default=True, description='Whether obstacles are kept away from between samples, too'
     )
+    brake_at_end: bool = Field(
+        default=True,
+        description='Whether each plan leaves room to brake after its last step; without it, as '
+        'printed, the next problem may have no solution',
+    )
     clearance: float = Field(default=0.01, ge=0.0, description='Kept from obstacles [m]')
+    visit_depth: float = Field(
+        default=1e-3,
+        ge=0.0,
+        lt=0.5,
+        description='How far inside its cuboid a visit is planned; 0 is the paper: an optimum '
+        'touches a face, and rounding decides whether it was a visit [m]',
+    )
     alpha: float = Field(default=2.0, gt=0.0, description='alpha_2 of (13) [1]')
     beta: float = Field(default=0.5, gt=0.0, description='beta_2 of (13) [1]')
     condition: Literal['low_hazard', 'printed'] = Field(

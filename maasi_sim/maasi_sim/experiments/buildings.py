@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from itertools import zip_longest
+from collections.abc import Sequence
+from itertools import product, zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,7 +69,7 @@ def _mission(settings: dict[str, Any], seed: int, scheme: Any) -> CuboidMission:
         hazard = {'failures': False, **settings.get('hazard', {})}
         if 'alpha_range' in settings:
             hazard['alpha'] = float(rng.uniform(*settings['alpha_range']))
-        robot = {'start': starts[name], 'dynamics': settings.get('dynamics', {}), 'hazard': hazard}
+        robot = {'start': starts[name], 'hazard': hazard}
         robots[name] = SearcherSettings.model_validate(robot)
     return CuboidMission(search, area, robots, seed=seed, scheme=scheme)
 
@@ -128,15 +129,12 @@ def run_timing(settings: dict[str, Any], seed: int) -> Outcome:
 
 
 def draw_missions(
-    figure: Figure, results: Results, case: str | None = None, step: int | None = None
+    figure: Figure, results: Results, cases: Sequence[str], step: int | None = None
 ) -> None:
-    """Draw the first run of each case; with `step` that of one case, at that step and whole."""
-    names = results.names()
-    if step is None:
-        panels: list[tuple[str, int | None]] = [(name, None) for name in names]
-    else:
-        name = case if case in names else names[0]
-        panels = [(name, step), (name, None)]
+    """Draw the first run of cases, whole, and with `step` at that step, too."""
+    names = [name for name in cases if name in results.names()] or results.names()[:1]
+    steps = [None] if step is None else [step, None]
+    panels = list(product(names, steps))
     grid = figure.add_gridspec(1, len(panels))
     for index, (name, until) in enumerate(panels):
         axes = figure.add_subplot(grid[index], projection='3d')
@@ -207,6 +205,7 @@ def draw_mission_times(figure: Figure, results: Results) -> None:
     axes.barh(places, [time.mean for time in times], xerr=errors, color='#56B4E9')
     axes.set_yticks(places, names, fontsize=8)
     axes.invert_yaxis()
+    axes.set_xlim(left=0.0)
     for item in results.experiment.published:
         if item.case.count(',') == 1:
             label = f'paper, {item.case}'
