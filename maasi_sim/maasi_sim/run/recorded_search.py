@@ -6,7 +6,6 @@ went: there are no decisions, and each robot measures once in each period of its
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,24 +30,8 @@ from maasi_sim.scenario.schema import Scenario, planner_settings
 
 _IMAGES = ('camera/image_raw', 'camera/image_raw/compressed')
 _POSES = ('state', 'pose', 'odom')
-
-
-@dataclass(frozen=True)
-class RecordedMeasurement:
-    """What a robot saw, and where it was then."""
-
-    place: StampedPose
-    measurement: AgentMeasurement
-
-
-@dataclass
-class RecordedSearch:
-    """Result of a search of a recording: found targets, measurements, share explored, events."""
-
-    found: list[FoundTarget]
-    measurements: int
-    explored: float
-    trace: SearchTrace
+# Where a robot was, and what it saw there.
+Measured = tuple[StampedPose, AgentMeasurement]
 
 
 def search_recording(scenario: str, bag: Path, out: Path | None, seed: int | None) -> int:
@@ -58,23 +41,23 @@ def search_recording(scenario: str, bag: Path, out: Path | None, seed: int | Non
     recorded = [
         item for name in loaded.names() for item in recorded_measurements(loaded, name, bag)
     ]
-    result = search_measurements(loaded, recorded)
+    found, explored, trace = search_measurements(loaded, recorded)
     folder = make_folder(out, '_replay')
     origin = loaded.environment.origin
-    rows = found_rows(result.found, np.zeros((0, loaded.dimension)), [], origin)
+    rows = found_rows(found, np.zeros((0, loaded.dimension)), [], origin)
     write_text(folder / 'found_targets.csv', csv_text(rows, loaded.dimension, origin))
-    write_replay(result.trace.log(bag.name), folder / REPLAY)
-    for target in result.found:
+    write_replay(trace.log(bag.name), folder / REPLAY)
+    for target in found:
         place = ' '.join(f'{value:.3f}' for value in target.position)
         print(f'target {target.id} of {target.robot} at {place} m, after {target.time:.1f} s')
     print(
-        f'{result.measurements} measurements: {len(result.found)} targets found, '
-        f'{result.explored:.0%} explored; results in {folder}'
+        f'{len(recorded)} measurements: {len(found)} targets found, {explored:.0%} explored; '
+        f'results in {folder}'
     )
     return DONE
 
 
-def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[RecordedMeasurement]:
+def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Measured]:
     """Return the measurements of a robot by its recorded images, by the steps of its driver."""
     robot = scenario.robots[name]
     if robot.camera is None:
@@ -88,18 +71,16 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Reco
         sensor=robot.sensor,
         camera=robot.camera,
     )
-    space = _check_topics(bag, name, alone=len(scenario.robots) == 1)
+    space, poses = _topics(bag, name, alone=len(scenario.robots) == 1)
     try:
-        recorded = RecordedRobot(bag, settings, space, 'images')
+        recorded = RecordedRobot(bag, settings, space, 'images', poses)
         detector, sensor = recorded.detector(), robot.sensor.build(name, scenario.dimension)
-        found: list[RecordedMeasurement] = []
+        found: list[Measured] = []
         for place, image in recorded.images(robot.sensor.period):
             seen = read_markers(image, place, detector, sensor)
             known = place.covariance[:3, :3]
             values = seen.values, seen.covariances, len(found), known, seen.labels
-            found.append(
-                RecordedMeasurement(place, AgentMeasurement(name, place.pose, sensor, *values))
-            )
+            found.append((place, AgentMeasurement(name, place.pose, sensor, *values)))
     except ValueError as error:
         raise BagError(str(error)) from error
     if recorded.recovered:
@@ -113,27 +94,19 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Reco
     return found
 
 
-def _check_topics(bag: Path, name: str, alone: bool) -> str:
-    """Return the namespace of a robot in a recording, in which its topics have messages.
+def _topics(bag: Path, name: str, alone: bool) -> tuple[str, str]:
+    """Return the namespace of a robot in a recording, and the topic of its poses.
 
-    A robot that is alone in its scenario may have any, as the root.
+    A robot that is alone in its scenario may have any namespace, or none.
     """
     with BagReader(bag) as reader:
         counts = {topic: number for topic, number in reader.counts.items() if number}
-    spaces = [name]
+    starts = [f'/{name}/']
     if alone:
-        ends = [f'/{image}' for image in _IMAGES]
-        spaces += [
-            topic[: -len(end)].strip('/') for topic in counts for end in ends if topic.endswith(end)
-        ]
-    for space in spaces:
-        start = f'/{space}/' if space else '/'
-        if any(start + image in counts for image in _IMAGES):
-            break
-    else:
-        space, start = name, f'/{name}/'
+        starts += [topic.rpartition(image)[0] for topic in counts for image in _IMAGES]
+    start = next((start for start in starts if _recorded(counts, start, _IMAGES)), starts[0])
     for topics in (_IMAGES, _POSES):
-        if not any(start + topic in counts for topic in topics):
+        if not _recorded(counts, start, topics):
             raise BagError(
                 f'{bag}: {name}: holds no messages of {start}{topics[-1]}, allowed are '
                 f'{" or ".join(start + topic for topic in topics)}; '
@@ -141,31 +114,35 @@ def _check_topics(bag: Path, name: str, alone: bool) -> str:
             )
     if f'{start}camera/camera_info' not in counts:
         print(f'{name}: no {start}camera/camera_info, its camera is that of the scenario')
-    return space
+    return start.strip('/'), _recorded(counts, start, _POSES)[0]
 
 
-def search_measurements(scenario: Scenario, recorded: list[RecordedMeasurement]) -> RecordedSearch:
-    """Feed a filter with measurements in the order of their stamps, as in a search."""
+def _recorded(counts: dict[str, int], start: str, topics: tuple[str, ...]) -> list[str]:
+    return [start + topic for topic in topics if start and start + topic in counts]
+
+
+def search_measurements(
+    scenario: Scenario, recorded: list[Measured]
+) -> tuple[list[FoundTarget], float, SearchTrace]:
+    """Feed a filter with measurements in the order of their stamps.
+
+    Return what is found, the share explored, and the events.
+    """
     common = {'step': scenario.step, 'seed': scenario.seed, 'lockstep': True}
     coordinator = Coordinator(planner_settings(scenario, scenario.names(), common))
     generator = np.random.default_rng(scenario.seed)
     search_filter = make_filter(scenario.filter, scenario.environment.array(), generator)
     trace = SearchTrace(scenario, scenario.seed)
-    recorded = sorted(recorded, key=lambda item: (item.place.stamp, item.measurement.robot))
-    first, before = recorded[0].place.stamp, 0
-    for item in recorded:
-        time = 1e-9 * (item.place.stamp - first)
+    recorded = sorted(recorded, key=lambda item: (item[0].stamp, item[1].robot))
+    first, before = recorded[0][0].stamp, 0
+    for place, measurement in recorded:
+        time, name = 1e-9 * (place.stamp - first), measurement.robot
         step = round(time / scenario.step)
-        result = search_filter.step([item.measurement], step - before, time)
+        result = search_filter.step([measurement], step - before, time)
         before = step
-        place, name = item.place, item.measurement.robot
         coordinator.absorb({name: place.pose}, result.clusters)
         trace.add(EventMaker.robot, time, name, (*place.pose.position.tolist(), place.pose.yaw))
         found = search_filter.found_targets if result.found_changed else None
-        trace.update(time, '', [item.measurement], result, found, coordinator)
-    return RecordedSearch(
-        search_filter.found_targets,
-        len(recorded),
-        coordinator.exploration.explored_fraction(),
-        trace,
-    )
+        trace.update(time, '', [measurement], result, found, coordinator)
+    explored = coordinator.exploration.explored_fraction()
+    return search_filter.found_targets, explored, trace
