@@ -14,24 +14,13 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
-from maasi_drivers.calibration.bag_reader import BagError, BagReader
-from maasi_drivers.calibration.sensor_calibration import Observation, SensorNoise, sensor_noise
+from maasi_drivers.calibration.bag_reader import BagError
+from maasi_drivers.calibration.recorded_robot import RecordedRobot
+from maasi_drivers.calibration.sensor_calibration import SensorNoise, sensor_noise
 from maasi_drivers.settings.camera import load_calibration
 from maasi_drivers.settings.driver import DriverSettings
-from maasi_drivers.vision.images import decode_image, image_to_array
-from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_filter.models.pose import Pose
 from maasi_filter.ros.parameters import parameter_fields, unflatten
 
-# Topics of a robot that show its target.
-_USED = {
-    'images': ('/camera/image_raw', '/camera/image_raw/compressed'),
-    'detections': ('/detections',),
-}
-# The driver's own poses come first: its detections are relative to them.
-_POSES = ('/state', '/odom')
-_POSE_TYPES = ('AgentState', 'Odometry', 'PoseStamped')
 # Mean errors above this multiple of their standard deviation are significant.
 _CLEAR = 4.0
 
@@ -72,7 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
         '--poses',
         metavar='TOPIC',
         help='where the robot was: AgentState or PoseStamped in the map, or Odometry (default: '
-        'state, else odom)',
+        'state, else pose, else odom)',
     )
     parser.add_argument(
         '--least-range',
@@ -124,146 +113,6 @@ def _dotted(node: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
             yield from _dotted(value, f'{prefix}{key}.')
         else:
             yield f'{prefix}{key}', value
-
-
-class RecordedRobot:
-    """A robot in a recording."""
-
-    def __init__(
-        self,
-        bag: Path,
-        settings: DriverSettings,
-        robot: str | None = None,
-        use: str | None = None,
-        poses: str | None = None,
-    ) -> None:
-        self.settings = settings
-        self.left_out = 0
-        self._bag = bag
-        with BagReader(bag) as reader:
-            self._types, self.recovered = reader.types, reader.recovered
-        kinds = (use,) if use else (*_USED,)
-        for kind in kinds:
-            robots = {
-                topic[: -len(end)].strip('/')
-                for topic in self._types
-                for end in _USED[kind]
-                if topic.endswith(end)
-            }
-            if robot is not None:
-                robots &= {robot.strip('/')}
-            if robots:
-                break
-        if len(robots) != 1:
-            there = ', '.join(sorted(self._types)) or 'no topics'
-            raise ValueError(
-                f'{bag}: robot: found {", ".join(sorted(robots)) or "none"} with '
-                f'{" or ".join(kinds)}, allowed is one (--robot, --use); recorded are {there}'
-            )
-        self.robot, self.use = robots.pop(), kind
-        state, odometry = map(self._topic, _POSES)
-        self.poses = poses or (state if state in self._types else odometry)
-        known = self._types.get(self.poses, 'not recorded')
-        self._pose_type = known.rpartition('/')[2]
-        if self._pose_type not in _POSE_TYPES:
-            raise ValueError(
-                f'{bag}: poses: {self.poses} is {known}, allowed are {", ".join(_POSE_TYPES)}'
-            )
-
-    def _topic(self, name: str) -> str:
-        return f'/{self.robot}{name}' if self.robot else name
-
-    def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
-        with BagReader(self._bag) as reader:
-            try:
-                for item in reader.messages(topics):
-                    yield item.topic, item.message
-            except BagError as error:
-                # Messages before the damage are used.
-                self.recovered = f'{error}; what is before it is read'
-
-    def observations(self) -> list[Observation]:
-        """Return what it saw, each with where it was then."""
-        if self.use == 'detections':
-            return list(self._published())
-        if self.settings.camera is None:
-            raise ValueError(
-                'parameter camera: got nothing, allowed with images are the settings of a camera'
-            )
-        return list(self._segmented())
-
-    def _published(self) -> Iterator[Observation]:
-        dimension = self.settings.environment.dimension
-        for _, message in self._messages(*map(self._topic, _USED['detections'])):
-            values = [[item.range, item.bearing, item.elevation] for item in message.detections]
-            array = np.reshape(np.array(values, dtype=float), (-1, 3))[:, :dimension]
-            pose = _pose(message.pose.pose)
-            if pose is None or not np.isfinite(array).all():
-                self.left_out += 1
-            else:
-                yield Observation(pose, array)
-
-    def _segmented(self) -> Iterator[Observation]:
-        assert self.settings.camera is not None
-        camera = self.settings.camera
-        for _, message in self._messages(self._topic('/camera/camera_info')):
-            if message.k[0] != 0.0:
-                camera = camera.with_calibration(
-                    message.width,
-                    message.height,
-                    message.k.tolist(),
-                    message.d.tolist(),
-                    message.distortion_model,
-                )
-                break
-        detector = MarkerDetector(camera, self.settings.environment.dimension)
-        history = self._history()
-        offset = round(camera.stamp_offset * 1e9)
-        for topic, message in self._messages(*map(self._topic, _USED['images'])):
-            placed = history.at(_stamp(message) + offset)
-            try:
-                if placed is None:
-                    raise ValueError
-                decode = decode_image if topic.endswith('/compressed') else image_to_array
-                seen = detector.detect(decode(message), placed.pose)
-            except ValueError:
-                self.left_out += 1
-                continue
-            yield Observation(placed.pose, seen.values)
-
-    def _history(self) -> PoseHistory:
-        settings, kind = self.settings, self._pose_type
-        history = PoseHistory(sys.maxsize)
-        odometry: MapOdometry | None = None
-        start = Pose.from_yaw(settings.start, settings.yaw)
-        for _, message in self._messages(self.poses):
-            pose = _pose(message.pose if kind == 'PoseStamped' else message.pose.pose)
-            if pose is None:
-                continue
-            if kind == 'Odometry':
-                if odometry is None:
-                    first = settings.odometry_origin == 'first'
-                    odometry = MapOdometry(start, pose if first else None)
-                history.add(odometry.apply(_stamp(message), pose))
-            else:
-                history.add(StampedPose(_stamp(message), pose))
-        return history
-
-
-def _stamp(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def _pose(message: Any) -> Pose | None:
-    """Return a recorded pose; None where it is none."""
-    point, turn = message.position, message.orientation
-    try:
-        return Pose(
-            np.array([point.x, point.y, point.z]), np.array([turn.w, turn.x, turn.y, turn.z])
-        )
-    except ValueError:
-        return None
 
 
 def report(recorded: RecordedRobot, noise: SensorNoise, given: bool) -> str:

@@ -155,7 +155,8 @@ class MotionSettings(Settings):
     )
     obstacle_term: Literal['none', 'printed', 'away'] = Field(
         default='none',
-        description='001, eq. (14), (15): none, as printed, or pushing away from the obstacle',
+        description='001, eq. (14), (15), in place of ways around obstacles: none, as printed, or '
+        'pushing away from the obstacle',
     )
     obstacle_distance: float = Field(
         default=0.12,
@@ -168,6 +169,15 @@ class MotionSettings(Settings):
     avoidance: Literal['steer', 'dynamic_window'] = Field(
         default='steer', description='How a ground robot gets around obstacles'
     )
+
+    @model_validator(mode='after')
+    def _one_way_around(self) -> MotionSettings:
+        if self.obstacle_term != 'none' and self.avoidance != 'steer':
+            raise ValueError(
+                f'avoidance: got {self.avoidance} with obstacle_term {self.obstacle_term}, which '
+                'acts in place of it; allowed is one of them'
+            )
+        return self
 
 
 class Weights(NamedTuple):

@@ -187,6 +187,47 @@ def test_obstacle_term_of_the_paper(kind):
     assert inputs == pytest.approx(expected, abs=1e-12)
 
 
+UNICYCLE = {'model': 'unicycle', 'speed': 0.2, 'obstacle_distance': 0.12, 'obstacle_gain': 0.3}
+
+
+@pytest.mark.parametrize(
+    ('kind', 'change'), [('printed', [-0.3, 0.0, 0.0, -0.3]), ('away', [0.0, 0.0, 0.0, 0.3])]
+)
+def test_obstacle_term_of_a_ground_robot(kind, change):
+    """It acts on forward speed and turn rate: an obstacle to the right turns it to the left."""
+    disc = Obstacles(np.array([[1.0, -0.3, 0.0]]), np.array([0.2]), np.array([False]))
+    term = make_motion(MotionSettings(**UNICYCLE, obstacle_term=kind), disc)
+    goal, near = [3.0, 0.0, 0.0], RobotState.at_rest([1.0, 0.0, 0.0])
+    plain = make_motion(MotionSettings(**UNICYCLE))
+    assert term.command(near, goal) - plain.command(near, goal) == pytest.approx(change)
+
+
+def test_ground_robot_keeps_away_by_the_obstacle_term():
+    """It gets by a disc with more room than without the term, or stays before the disc."""
+    start, goal = RobotState.at_rest([0.0, 0.0, 0.0]), [[2.0, 0.0, 0.0]]
+    for side, gets_by, gain in ((-0.21, True, 0.01), (-0.05, False, 0.2)):
+        disc = Obstacles(np.array([[1.0, side, 0.0]]), np.array([0.15]), np.array([False]))
+        term = make_motion(MotionSettings(**UNICYCLE, obstacle_term='away'), disc)
+        plain = make_motion(MotionSettings(**UNICYCLE))
+        room = {}
+        for name, motion in (('term', term), ('plain', plain)):
+            prediction = motion.predict(start, goal, 0.05)
+            assert prediction.reached[0] == (name == 'plain' or gets_by)
+            room[name] = min(disc.distances(place)[0] for place in prediction.positions[0])
+        assert room['term'] > max(0.0, room['plain'] + gain)
+
+
+@pytest.mark.parametrize('model', ['constant_speed', 'quadrotor'])
+def test_obstacle_term_pushes_away_in_every_model(model):
+    sphere = Obstacles(np.array([[0.0, 0.3, 1.0]]), np.array([0.2]), np.array([True]))
+    settings = {'model': model, 'obstacle_distance': 0.12, 'obstacle_gain': 0.1}
+    near, goal = RobotState.at_rest([0.0, 0.0, 1.0]), [3.0, 0.0, 1.0]
+    term = make_motion(MotionSettings(**settings, obstacle_term='away'), sphere)
+    change = term.command(near, goal) - make_motion(MotionSettings(**settings)).command(near, goal)
+    assert change[1] < -1e-3
+    assert change[[0, 2, 3]] == pytest.approx(0.0, abs=1e-12)
+
+
 REST = RobotState.at_rest([0.0, 0.0, 0.0])
 
 
@@ -199,6 +240,10 @@ REST = RobotState.at_rest([0.0, 0.0, 0.0])
         (lambda motion: motion.body(REST).step([0.0, 0.0, np.nan, 0.0], 0.05), 'command'),
         (lambda motion: motion.body(REST).step([0.0, 0.0, 0.0, 0.0], 0.0), 'step'),
         (lambda motion: MotionSettings(speed=-1.0), 'speed'),
+        (
+            lambda motion: MotionSettings(obstacle_term='away', avoidance='dynamic_window'),
+            'avoidance: got dynamic_window',
+        ),
         (lambda motion: MotionSettings(speed=math.inf), 'finite'),
     ],
 )

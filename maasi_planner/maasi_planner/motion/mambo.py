@@ -10,24 +10,18 @@ them, so that pitch > 0 accelerates forward and roll > 0 to the right.
 
 state (12,): position [m, map], yaw, roll, pitch [rad], velocity [m/s, map], angular velocity
 [rad/s].
-
-The obstacle term of 001, eq. (14) and (15), subtracts k_obs from the input whenever an obstacle is
-nearer than d_l. With u = K_v (v - velocity) - ... that equals a change of the velocity command by
-k_obs / K_v, so it needs no access to the torques. As printed the term has no direction; `away`
-gives it the direction from the obstacle to the robot.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion.steering import Command, turned
-from maasi_planner.obstacles import Vector, from_centre, norm
+from maasi_planner.obstacles import norm
 from maasi_planner.settings import MotionSettings
 
 GRAVITY = 9.81
@@ -173,48 +167,6 @@ def mambo_parameters(settings: MotionSettings) -> FloatArray:
     out[RATE] = min(gains[chain][0] / gains[chain][1] for chain in ('pitch', 'roll', 'height'))
     _PARAMETERS[key] = out
     return out.copy()
-
-
-class ObstacleTerm(NamedTuple):
-    """Obstacle term of a robot.
-
-    kind: index in TERMS: none; the same k_obs off every input; k_obs along the way out; distance,
-    gain: d_l [m] and k_obs [N m and N]; circles (n, 5): obstacles: x, y, z, radius, 1 for a sphere;
-    the nearest surface counts.
-    """
-
-    kind: int
-    distance: float
-    gain: float
-    circles: FloatArray
-
-
-TERMS = ('none', 'printed', 'away')
-PRINTED = 1
-
-
-@njit(cache=True)
-def with_obstacle_term(
-    position: Vector, yaw: float, command: Command, term: ObstacleTerm, parameters: FloatArray
-) -> Command:
-    """Return a command with the obstacle term."""
-    nearest, way = np.inf, (0.0, 0.0, 0.0)
-    for i in range(term.circles.shape[0]):
-        offset = from_centre(position, term.circles, i)
-        size = norm(offset)
-        if size - term.circles[i, 3] < nearest:
-            nearest, size = size - term.circles[i, 3], max(size, 1e-9)
-            way = (offset[0] / size, offset[1] / size, offset[2] / size)
-    if nearest >= term.distance:
-        return command
-    x, y, z, turn = command
-    # A roll torque of -k_obs tips the robot to its left: the roll gain has the other sign.
-    by_x, by_y = term.gain / parameters[K_VX], term.gain / parameters[K_VY]
-    by_z, by_turn = term.gain / parameters[K_VZ], term.gain / parameters[K_R]
-    if term.kind == PRINTED:
-        return x - by_x, y - by_y, z - by_z, turn - by_turn
-    forward, left = turned(way[0], way[1], -yaw)
-    return x + abs(by_x) * forward, y + abs(by_y) * left, z + by_z * way[2], turn
 
 
 # Rows of the tables of `closed_loop`: the chains, and the entries of each.

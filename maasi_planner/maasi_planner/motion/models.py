@@ -23,7 +23,8 @@ from maasi_planner.motion.base import (
     check_step,
     check_waypoint,
 )
-from maasi_planner.motion.mambo import ObstacleTerm, mambo_step, with_obstacle_term
+from maasi_planner.motion.mambo import mambo_step
+from maasi_planner.motion.obstacle_term import TERMS, ObstacleTerm, with_obstacle_term
 from maasi_planner.motion.quadrotor import quadrotor_step
 from maasi_planner.motion.steering import Command, Steering, fly_among, fly_freely, turned
 from maasi_planner.motion.unicycle import K_RHO, drive_among, drive_freely, unicycle_step
@@ -93,13 +94,13 @@ def _freely(kind: int, steering: Steering, state: FloatArray, goal: Vector) -> C
 def steer(kernel: Kernel, state: FloatArray, goal: Vector, to_goal: FloatArray) -> Command:
     """Return the command of a robot's controller towards a waypoint."""
     position, yaw, steering = (state[0], state[1], state[2]), state[3], kernel.steering
-    if kernel.obstructed and kernel.kind == UNICYCLE:
-        return drive_among(state, goal, to_goal, steering, kernel.around)
     if kernel.obstructed and not kernel.term.kind:
+        if kernel.kind == UNICYCLE:
+            return drive_among(state, goal, to_goal, steering, kernel.around)
         return fly_among(position, yaw, goal, to_goal, steering, kernel.around)
     command = _freely(kernel.kind, steering, state, goal)
     if kernel.obstructed:
-        return with_obstacle_term(position, yaw, command, kernel.term, kernel.parameters)
+        return with_obstacle_term(position, yaw, command, kernel.term)
     return command
 
 
@@ -254,6 +255,10 @@ class CompiledMotion(MotionModel):
     def _limits(self) -> tuple[float, float, float]:
         """Set parameters and approach rate; return speed, barrier and acceleration of steering."""
 
+    def _push(self, gain: float) -> Command:
+        """Return the change of the velocity command whose input is `gain`."""
+        return gain, gain, gain, gain
+
     @abstractmethod
     def _to_array(self, state: RobotState) -> FloatArray:
         """Return the array of a state."""
@@ -266,8 +271,7 @@ class CompiledMotion(MotionModel):
         """Return what the compiled functions need for steps of `step` seconds."""
         periods = max(1, round(step / mambo.PERIOD)) if self.kind >= MAMBO else 1
         h = step / periods
-        settings, keep_out = self.settings, self.keep_out
-        term, table = settings.obstacle_term if self.kind == MAMBO else 'none', np.zeros((0, 0))
+        settings, keep_out, table = self.settings, self.keep_out, np.zeros((0, 0))
         if self.kind == MAMBO:
             table = mambo.closed_loop(self.parameters, periods, h)
         return Kernel(
@@ -276,9 +280,9 @@ class CompiledMotion(MotionModel):
             len(keep_out) > 0,
             keep_out.around,
             ObstacleTerm(
-                mambo.TERMS.index(term),
+                TERMS.index(settings.obstacle_term),
                 settings.obstacle_distance,
-                settings.obstacle_gain,
+                self._push(settings.obstacle_gain),
                 keep_out.circles,
             ),
             self.parameters,
@@ -351,6 +355,10 @@ class Unicycle(CompiledMotion):
         self.rate = min(self.rate, slowing)
         return settings.speed, min(braking, 0.5 * slowing), settings.acceleration
 
+    def _push(self, gain: float) -> Command:
+        # Its inputs are forward speed and turn rate.
+        return gain, 0.0, 0.0, gain
+
     def _to_array(self, state: RobotState) -> FloatArray:
         yaw = state.pose.yaw
         forward = state.velocity[0] * math.cos(yaw) + state.velocity[1] * math.sin(yaw)
@@ -386,6 +394,11 @@ class Mambo(CompiledMotion):
         natural = mambo.GRAVITY * self.parameters[mambo.K_VX] / self.parameters[mambo.K_Q]
         barrier = float(min(0.18 * math.sqrt(natural), 0.5 * slowing))
         return float(self.parameters[mambo.SPEED]), barrier, math.inf
+
+    def _push(self, gain: float) -> Command:
+        # A roll torque of -k_obs tips the robot to its left: the roll gain has the other sign.
+        per_input = self.parameters[[mambo.K_VX, mambo.K_VY, mambo.K_VZ, mambo.K_R]].tolist()
+        return tuple(gain / size for size in per_input)
 
     def _to_array(self, state: RobotState) -> FloatArray:
         w, x, y, z = state.pose.orientation.tolist()
@@ -428,6 +441,11 @@ class Quadrotor(CompiledMotion):
         self.rate = float(min(settings.approach_rate or quadrotor.C1, slowing / settings.speed))
         barrier = float(min(0.15 * quadrotor.C2, 0.5 * slowing / settings.speed))
         return float(limits[quadrotor.SPEED]), barrier, math.inf
+
+    def _push(self, gain: float) -> Command:
+        # Inputs are the force that the velocity stage asks for, and the yaw torque.
+        by_force = gain / (quadrotor.MASS * quadrotor.C2)
+        return by_force, by_force, by_force, gain / (quadrotor.INERTIA[2] * quadrotor.C4)
 
     def _to_array(self, state: RobotState) -> FloatArray:
         pose = state.pose

@@ -109,7 +109,8 @@ def build_parser() -> argparse.ArgumentParser:
         '--replay',
         type=Path,
         metavar='BAG',
-        help='feed the filter the recorded measurements, and compare what it finds',
+        help='feed the filter the recorded measurements, and compare what it finds; with a '
+        'scenario: search a recording of cameras and poses, which needs nothing else of this suite',
     )
     add_view_options(parser)
     parser.add_argument('--view', action='store_true', help='show the run in a browser')
@@ -157,7 +158,7 @@ def parse(arguments: list[str] | None) -> Options:
         parser.error('--port and --control need --view')
     given |= {'namespace': given['namespace'] or '', 'view': view if given['view'] else None}
     options = Options(**given)
-    if (options.replay is None) == (not options.scenario):
+    if options.replay is None and not options.scenario:
         parser.error('give either a scenario or --replay BAG')
     if options.follow_clock and options.domain_id is None:
         parser.error('--follow-clock needs the --domain-id of the run whose clock it is')

@@ -1,0 +1,192 @@
+"""A robot in a recording: where it was, and its images or detections."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
+from maasi_drivers.calibration.bag_reader import BagError, BagReader
+from maasi_drivers.calibration.sensor_calibration import Observation
+from maasi_drivers.settings.driver import DriverSettings
+from maasi_drivers.vision.images import decode_image, image_to_array
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.arrays import ImageArray
+from maasi_filter.models.pose import Pose
+
+# Topics of a robot that show targets.
+USED = {
+    'images': ('/camera/image_raw', '/camera/image_raw/compressed'),
+    'detections': ('/detections',),
+}
+# The driver's own poses come first: its detections are relative to them.
+_POSES = ('/state', '/pose', '/odom')
+_POSE_TYPES = ('AgentState', 'Odometry', 'PoseStamped')
+
+
+class RecordedRobot:
+    """A robot in a recording."""
+
+    def __init__(
+        self,
+        bag: Path,
+        settings: DriverSettings,
+        robot: str | None = None,
+        use: str | None = None,
+        poses: str | None = None,
+    ) -> None:
+        self.settings = settings
+        self.left_out = 0
+        self._bag = bag
+        with BagReader(bag) as reader:
+            self._types, self.recovered = reader.types, reader.recovered
+        kinds = (use,) if use else (*USED,)
+        for kind in kinds:
+            robots = {
+                topic[: -len(end)].strip('/')
+                for topic in self._types
+                for end in USED[kind]
+                if topic.endswith(end)
+            }
+            if robot is not None:
+                robots &= {robot.strip('/')}
+            if robots:
+                break
+        if len(robots) != 1:
+            there = ', '.join(sorted(self._types)) or 'no topics'
+            raise ValueError(
+                f'{bag}: robot: found {", ".join(sorted(robots)) or "none"} with '
+                f'{" or ".join(kinds)}, allowed is one (--robot, --use); recorded are {there}'
+            )
+        self.robot, self.use = robots.pop(), kind
+        places = list(map(self._topic, _POSES))
+        recorded = [topic for topic in places if topic in self._types]
+        self.poses = poses or (recorded or places[-1:])[0]
+        known = self._types.get(self.poses, 'not recorded')
+        self._pose_type = known.rpartition('/')[2]
+        if self._pose_type not in _POSE_TYPES:
+            raise ValueError(
+                f'{bag}: poses: {self.poses} is {known}, allowed are {", ".join(_POSE_TYPES)}'
+            )
+
+    def _topic(self, name: str) -> str:
+        return f'/{self.robot}{name}' if self.robot else name
+
+    def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
+        with BagReader(self._bag) as reader:
+            try:
+                for item in reader.messages(topics):
+                    yield item.topic, item.message
+            except BagError as error:
+                # Messages before the damage are used.
+                self.recovered = f'{error}; what is before it is read'
+
+    def observations(self) -> list[Observation]:
+        """Return what it saw, each with where it was then."""
+        if self.use == 'detections':
+            return list(self._published())
+        if self.settings.camera is None:
+            raise ValueError(
+                'parameter camera: got nothing, allowed with images are the settings of a camera'
+            )
+        return list(self._segmented())
+
+    def _published(self) -> Iterator[Observation]:
+        dimension = self.settings.environment.dimension
+        for _, message in self._messages(*map(self._topic, USED['detections'])):
+            values = [[item.range, item.bearing, item.elevation] for item in message.detections]
+            array = np.reshape(np.array(values, dtype=float), (-1, 3))[:, :dimension]
+            pose = _pose(message.pose.pose)
+            if pose is None or not np.isfinite(array).all():
+                self.left_out += 1
+            else:
+                yield Observation(pose, array)
+
+    def _segmented(self) -> Iterator[Observation]:
+        detector = self.detector()
+        for placed, image in self.images():
+            try:
+                seen = detector.detect(image, placed.pose)
+            except ValueError:
+                self.left_out += 1
+                continue
+            yield Observation(placed.pose, seen.values)
+
+    def detector(self) -> MarkerDetector:
+        """Return the detector of its camera, calibrated as recorded."""
+        assert self.settings.camera is not None
+        camera = self.settings.camera
+        for _, message in self._messages(self._topic('/camera/camera_info')):
+            if message.k[0] != 0.0:
+                camera = camera.with_calibration(
+                    message.width,
+                    message.height,
+                    message.k.tolist(),
+                    message.d.tolist(),
+                    message.distortion_model,
+                )
+                break
+        return MarkerDetector(camera, self.settings.environment.dimension)
+
+    def images(self, period: float = 0.0) -> Iterator[tuple[StampedPose, ImageArray]]:
+        """Yield where it was at its images, and these: in each period [s] the first good one."""
+        assert self.settings.camera is not None
+        history, due = self._history(), 0
+        offset, gap = round(self.settings.camera.stamp_offset * 1e9), round(period * 1e9)
+        for topic, message in self._messages(*map(self._topic, USED['images'])):
+            stamp = _stamp(message)
+            if stamp < due:
+                continue
+            placed = history.at(stamp + offset)
+            try:
+                if placed is None:
+                    raise ValueError
+                decode = decode_image if topic.endswith('/compressed') else image_to_array
+                image = decode(message)
+            except ValueError:
+                self.left_out += 1
+                continue
+            if gap:
+                due = stamp + gap if due == 0 else due + gap * ((stamp - due) // gap + 1)
+            yield placed, image
+
+    def _history(self) -> PoseHistory:
+        settings, kind = self.settings, self._pose_type
+        history = PoseHistory(sys.maxsize)
+        odometry: MapOdometry | None = None
+        start = Pose.from_yaw(settings.start, settings.yaw)
+        for _, message in self._messages(self.poses):
+            pose = _pose(message.pose if kind == 'PoseStamped' else message.pose.pose)
+            if pose is None:
+                continue
+            if kind == 'Odometry':
+                if odometry is None:
+                    first = settings.odometry_origin == 'first'
+                    odometry = MapOdometry(start, pose if first else None)
+                covariance = message.pose.covariance
+                known = covariance.any() and covariance[0] >= 0.0
+                stamp = _stamp(message)
+                history.add(odometry.apply(stamp, pose, covariance if known else None))
+            else:
+                history.add(StampedPose(_stamp(message), pose))
+        return history
+
+
+def _stamp(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def _pose(message: Any) -> Pose | None:
+    """Return a recorded pose; None where it is none."""
+    point, turn = message.position, message.orientation
+    try:
+        return Pose(
+            np.array([point.x, point.y, point.z]), np.array([turn.w, turn.x, turn.y, turn.z])
+        )
+    except ValueError:
+        return None

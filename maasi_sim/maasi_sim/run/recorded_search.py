@@ -1,0 +1,148 @@
+"""Search a recording of robots' cameras and poses, as `ros2 bag record` makes it of real robots.
+
+The scenario says what the recording lacks: sensors, start and filter. The robots went where they
+went: there are no decisions, and each robot measures once in each period of its sensor.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.calibration.bag_reader import BagError, BagReader
+from maasi_drivers.calibration.recorded_robot import RecordedRobot
+from maasi_drivers.settings.driver import DriverSettings
+from maasi_drivers.vision.marker_detector import read_markers
+from maasi_filter.make_filter import make_filter
+from maasi_filter.records import AgentMeasurement, FoundTarget
+from maasi_planner.coordinator import Coordinator
+from maasi_sim.run.ending import DONE
+from maasi_sim.run.run_folder import make_folder, write_text
+from maasi_sim.run.targets.tables import csv_text, found_rows
+from maasi_sim.run.view.event_maker import EventMaker
+from maasi_sim.run.view.live_view import SearchTrace
+from maasi_sim.run.view.page_file import REPLAY, write_replay
+from maasi_sim.scenario.layering import Key, ScenarioError
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.schema import Scenario, planner_settings
+
+_IMAGES = ('camera/image_raw', 'camera/image_raw/compressed')
+_POSES = ('state', 'pose', 'odom')
+# Where a robot was, and what it saw there.
+Measured = tuple[StampedPose, AgentMeasurement]
+
+
+def search_recording(scenario: str, bag: Path, out: Path | None, seed: int | None) -> int:
+    """Search a recording, print and write what is found, and return the exit code."""
+    overrides: dict[str, tuple[Key, object]] = {} if seed is None else {'--seed': (('seed',), seed)}
+    loaded = load_scenario(scenario, overrides)
+    recorded = [
+        item for name in loaded.names() for item in recorded_measurements(loaded, name, bag)
+    ]
+    found, explored, trace = search_measurements(loaded, recorded)
+    folder = make_folder(out, '_replay')
+    origin = loaded.environment.origin
+    rows = found_rows(found, np.zeros((0, loaded.dimension)), [], origin)
+    write_text(folder / 'found_targets.csv', csv_text(rows, loaded.dimension, origin))
+    write_replay(trace.log(bag.name), folder / REPLAY)
+    for target in found:
+        place = ' '.join(f'{value:.3f}' for value in target.position)
+        print(f'target {target.id} of {target.robot} at {place} m, after {target.time:.1f} s')
+    print(
+        f'{len(recorded)} measurements: {len(found)} targets found, {explored:.0%} explored; '
+        f'results in {folder}'
+    )
+    return DONE
+
+
+def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Measured]:
+    """Return the measurements of a robot by its recorded images, by the steps of its driver."""
+    robot = scenario.robots[name]
+    if robot.camera is None:
+        raise ScenarioError(
+            f'robots.{name}.camera: got nothing, allowed with --replay is a robot with a camera'
+        )
+    settings = DriverSettings(
+        environment=scenario.environment.of_nodes(),
+        start=robot.start,
+        yaw=robot.yaw,
+        sensor=robot.sensor,
+        camera=robot.camera,
+    )
+    space, poses = _topics(bag, name, alone=len(scenario.robots) == 1)
+    try:
+        recorded = RecordedRobot(bag, settings, space, 'images', poses)
+        detector, sensor = recorded.detector(), robot.sensor.build(name, scenario.dimension)
+        found: list[Measured] = []
+        for place, image in recorded.images(robot.sensor.period):
+            seen = read_markers(image, place, detector, sensor)
+            known = place.covariance[:3, :3]
+            values = seen.values, seen.covariances, len(found), known, seen.labels
+            found.append((place, AgentMeasurement(name, place.pose, sensor, *values)))
+    except ValueError as error:
+        raise BagError(str(error)) from error
+    if recorded.recovered:
+        print(f'warning: {recorded.recovered}')
+    if not found:
+        raise BagError(
+            f'{bag}: {name}: none of {recorded.left_out} images can be used, allowed are images '
+            f'with stamps between the first and the last of {recorded.poses}'
+        )
+    print(f'{name}: {len(found)} images at poses of {recorded.poses}, {recorded.left_out} left out')
+    return found
+
+
+def _topics(bag: Path, name: str, alone: bool) -> tuple[str, str]:
+    """Return the namespace of a robot in a recording, and the topic of its poses.
+
+    A robot that is alone in its scenario may have any namespace, or none.
+    """
+    with BagReader(bag) as reader:
+        counts = {topic: number for topic, number in reader.counts.items() if number}
+    starts = [f'/{name}/']
+    if alone:
+        starts += [topic.rpartition(image)[0] for topic in counts for image in _IMAGES]
+    start = next((start for start in starts if _recorded(counts, start, _IMAGES)), starts[0])
+    for topics in (_IMAGES, _POSES):
+        if not _recorded(counts, start, topics):
+            raise BagError(
+                f'{bag}: {name}: holds no messages of {start}{topics[-1]}, allowed are '
+                f'{" or ".join(start + topic for topic in topics)}; '
+                f'recorded are {", ".join(sorted(counts)) or "none"}'
+            )
+    if f'{start}camera/camera_info' not in counts:
+        print(f'{name}: no {start}camera/camera_info, its camera is that of the scenario')
+    return start.strip('/'), _recorded(counts, start, _POSES)[0]
+
+
+def _recorded(counts: dict[str, int], start: str, topics: tuple[str, ...]) -> list[str]:
+    return [start + topic for topic in topics if start and start + topic in counts]
+
+
+def search_measurements(
+    scenario: Scenario, recorded: list[Measured]
+) -> tuple[list[FoundTarget], float, SearchTrace]:
+    """Feed a filter with measurements in the order of their stamps.
+
+    Return what is found, the share explored, and the events.
+    """
+    common = {'step': scenario.step, 'seed': scenario.seed, 'lockstep': True}
+    coordinator = Coordinator(planner_settings(scenario, scenario.names(), common))
+    generator = np.random.default_rng(scenario.seed)
+    search_filter = make_filter(scenario.filter, scenario.environment.array(), generator)
+    trace = SearchTrace(scenario, scenario.seed)
+    recorded = sorted(recorded, key=lambda item: (item[0].stamp, item[1].robot))
+    first, before = recorded[0][0].stamp, 0
+    for place, measurement in recorded:
+        time, name = 1e-9 * (place.stamp - first), measurement.robot
+        step = round(time / scenario.step)
+        result = search_filter.step([measurement], step - before, time)
+        before = step
+        coordinator.absorb({name: place.pose}, result.clusters)
+        trace.add(EventMaker.robot, time, name, (*place.pose.position.tolist(), place.pose.yaw))
+        found = search_filter.found_targets if result.found_changed else None
+        trace.update(time, '', [measurement], result, found, coordinator)
+    explored = coordinator.exploration.explored_fraction()
+    return search_filter.found_targets, explored, trace

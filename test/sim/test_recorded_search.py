@@ -1,0 +1,162 @@
+"""A recording of a robot's camera and poses, without decisions, is searched again."""
+
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import CameraInfo, Image
+
+from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
+from maasi_sim import search as search_module
+from maasi_sim.run.bag import BagWriter, load_types
+from maasi_sim.run.run_scenario import main
+from maasi_sim.scenario.loading import load_scenario
+
+SEED = 900
+# Stamps of a real robot are those of the wall clock [ns].
+BEGIN = 1_760_000_000_000_000_000
+SCENARIO = {
+    'version': 1,
+    'seed': SEED,
+    'environment': {'bounds': [[-0.3, 0.9], [-0.3, 0.9]]},
+    'step': 0.05,
+    'targets': {'count': 4, 'distribution': 'uniform', 'separation': 0.2, 'margin': 0.1},
+    'robots': {
+        'mambo': {
+            'type': 'mambo',
+            'start': [0.0, 0.0, 1.0],
+            'candidates': {'grid': [4, 4], 'spacing': 0.3, 'corner': [-0.15, -0.15]},
+        }
+    },
+    'filter': {
+        'preset': 'paper_000',
+        'found_radius': 0.02,
+        'removal_distance': 0.05,
+        'jitter_deviation': 0.003,
+    },
+    'stop': 'planner_done',
+    'limits': {'time': 120.0},
+}
+
+
+def write(writer, topic, stamp, message):
+    message.header.stamp = stamp_to_ros(stamp)
+    writer.write(topic, stamp, serialize_message(message))
+
+
+def image_message(image):
+    height, width, _ = image.shape
+    return Image(height=height, width=width, encoding='rgb8', step=3 * width, data=image.tobytes())
+
+
+@pytest.fixture(scope='module')
+def searched(tmp_path_factory):
+    """Search in this process, and record what a real robot would; return folder and result."""
+    folder = tmp_path_factory.mktemp('recorded')
+    file = folder / 'field.yaml'
+    file.write_text(yaml.safe_dump(SCENARIO))
+    scenario = load_scenario(file)
+    topics = {
+        'camera/image_raw': 'sensor_msgs/msg/Image',
+        'camera/camera_info': 'sensor_msgs/msg/CameraInfo',
+        'odom': 'nav_msgs/msg/Odometry',
+        'pose': 'geometry_msgs/msg/PoseStamped',
+    }
+    camera = scenario.robots['mambo'].camera
+    info = CameraInfo(width=camera.width, height=camera.height, distortion_model='plumb_bob')
+    fx, fy = camera.focal_length
+    info.k = [fx, 0.0, (camera.width - 1) / 2, 0.0, fy, (camera.height - 1) / 2, 0.0, 0.0, 1.0]
+
+    class RecordedRobot(search_module._Robot):
+        """Publishes as a real robot does, at each step."""
+
+        def observe(self, stamp):
+            super().observe(stamp)
+            step = round(stamp * 1e-9 / scenario.step)
+            odometry, place = Odometry(), PoseStamped()
+            odometry.pose.pose = pose_to_ros(self.body.odometry.pose)
+            place.pose = pose_to_ros(self.pose.pose)
+            write(bags['odom'], '/mambo/odom', BEGIN + stamp, odometry)
+            # Of the other one all topics are in the root.
+            write(bags['pose'], '/pose', BEGIN + stamp, place)
+            if step % round(1.0 / camera.rate / scenario.step) == 0:
+                image = image_message(self.body.image(step, stamp * 1e-9))
+                for kind, space in (('odom', '/mambo'), ('pose', '')):
+                    write(bags[kind], f'{space}/camera/image_raw', BEGIN + stamp, image)
+                    write(bags[kind], f'{space}/camera/camera_info', BEGIN + stamp, info)
+
+    bags = {kind: BagWriter(folder / kind, load_types()) for kind in ('odom', 'pose')}
+    for kind, space in (('odom', '/mambo'), ('pose', '')):
+        for topic, name in topics.items():
+            if topic not in ('odom', 'pose') or topic == kind:
+                bags[kind].add_topic(f'{space}/{topic}', name)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search_module, '_Robot', RecordedRobot)
+        result = search_module.search(scenario, SEED)
+    for bag in bags.values():
+        bag.close()
+    assert len(result.found_targets) == 4
+    assert result.complete
+    return folder, result
+
+
+def found_in(folder):
+    rows = np.genfromtxt(folder / 'found_targets.csv', delimiter=',', names=True, dtype=None)
+    return np.stack([rows['x'], rows['y']], axis=1)
+
+
+@pytest.mark.parametrize('kind', ['odom', 'pose'])
+def test_the_same_targets_are_found_again(searched, tmp_path, capsys, kind):
+    folder, result = searched
+    words = [str(folder / 'field.yaml'), '--replay', str(folder / kind), '--out', str(tmp_path)]
+    assert main(words) == 0
+    again = found_in(tmp_path)
+    before = np.array([target.position for target in result.found_targets])
+    assert len(again) == len(before)
+    distances = np.linalg.norm(again[:, None] - before, axis=2)
+    # Half the radius of a marker; other images are used than in the search.
+    assert distances.min(axis=1).max() < 0.015
+    assert sorted(distances.argmin(axis=1)) == list(range(len(before)))
+    assert (tmp_path / 'replay.html').exists()
+    said = capsys.readouterr().out
+    topic = {'odom': '/mambo/odom', 'pose': '/pose'}[kind]
+    assert f'poses of {topic}' in said and '4 targets found' in said
+
+
+def without(folder, target, lacking):
+    """Copy a recording without the messages of some topics."""
+    from maasi_sim.run.bag import Bag
+
+    with Bag(folder) as bag, BagWriter(target, load_types(), images='raw') as writer:
+        for topic, name in bag.types.items():
+            writer.add_topic(topic, name)
+        for topic, _, time, data in bag.raw():
+            if not topic.startswith(lacking):
+                writer.write(topic, time, data)
+    return target
+
+
+@pytest.mark.parametrize(
+    ('lacking', 'words'),
+    [
+        ('/mambo/camera/image_raw', ['/mambo/camera/image_raw/compressed, allowed are']),
+        ('/mambo/odom', ['/mambo/odom, allowed are /mambo/state or /mambo/pose or /mambo/odom']),
+    ],
+)
+def test_a_topic_that_lacks_is_named(searched, tmp_path, capsys, lacking, words):
+    folder, _ = searched
+    bag = without(folder / 'odom', tmp_path / 'bag', lacking)
+    scenario = shutil.copy(folder / 'field.yaml', tmp_path)
+    assert main([str(scenario), '--replay', str(bag)]) == 2
+    said = capsys.readouterr().err
+    assert all(word in said for word in [*words, 'recorded are']), said
+
+
+def test_a_robot_without_camera_is_refused(searched, capsys):
+    folder, _ = searched
+    assert main(['ranging_drone_3d', '--replay', str(folder / 'odom')]) == 2
+    assert 'camera: got nothing, allowed with --replay' in capsys.readouterr().err
