@@ -16,6 +16,7 @@ from scipy import ndimage
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
+from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import PLANNERS
 from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Quantity
 from maasi_sim.experiments.figures import draw_comparison
@@ -180,20 +181,18 @@ def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
 
 
 def run_among_obstacles(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a search and measure the clearance, straight from one measurement to the next."""
-    outcome = run_search(settings, seed)
-    scenario = settings['scenario']
-    nearest = []
-    for name, robot in scenario['robots'].items():
-        places = np.stack([np.asarray(outcome.columns[f'{name}_{axis}']) for axis in 'xyz'], axis=1)
-        places = np.vstack([np.asarray(robot['start'], float), places])
-        share = np.linspace(0.0, 1.0, 25)[:, None, None]
-        way = (places[:-1] + share * np.diff(places, axis=0)).reshape(-1, 3)
-        nearest += [
-            float(np.linalg.norm(way - item['centre'], axis=1).min()) - item['radius']
-            for item in scenario['environment']['obstacles']
-        ]
-    outcome.summary['clearance'] = min(nearest) if nearest else None
+    """Run a search and measure the least distance of a robot's centre to an obstacle on its way."""
+    scenario = scenario_from_values(settings['scenario'], 'settings')
+    result = search(scenario, seed, settings['most_measurements'])
+    outcome = outcome_of(result, settings['most_measurements'], scenario.limits.time)
+    obstacles = Obstacles.from_settings(scenario.environment.obstacles)
+    share = np.linspace(0.0, 1.0, 5)[:, None, None]
+    ways = [
+        (places[:-1] + share * np.diff(places, axis=0)).reshape(-1, 3)
+        for places in result.trace.positions().values()
+    ]
+    nearest = [obstacles.distances(place).min(initial=np.inf) for way in ways for place in way]
+    outcome.summary['clearance'] = float(min(nearest)) if len(obstacles) else None
     return outcome
 
 

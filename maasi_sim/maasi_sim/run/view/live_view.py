@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.records import AgentMeasurement, FilterResult, FoundTarget
 from maasi_planner.coordinator import Coordinator
 from maasi_planner.motion.base import RobotState
@@ -184,6 +185,15 @@ class SearchTrace:
             for name, state in states.items():
                 pose = (*state.pose.position.tolist(), float(state.pose.yaw))
                 self.add(EventMaker.robot, time, name, pose)
+
+    def positions(self) -> dict[str, FloatArray]:
+        """Return where each robot was, (n, 3) [m], as often as is shown."""
+        ways: dict[str, list[tuple[float, ...]]] = {}
+        for function, arguments in self._calls:
+            if function is EventMaker.robot:
+                _, name, pose = arguments
+                ways.setdefault(name, []).append(pose[:3])
+        return {name: np.array(way) for name, way in ways.items()}
 
     def decision(
         self, time: float, space: str, decision: Decision, coordinator: Coordinator
