@@ -119,11 +119,6 @@ def test_ratio_is_that_of_pairs_with_its_interval():
     assert ' x ' not in finding(a=[0, 10, 5], b=[10, 20, 30]).here
 
 
-def test_no_runs_no_finding():
-    assert finding(a=[], b=LOW) is None
-    assert finding('number', (Published('a', 'steps', 1.0),), a=[]) is None
-
-
 def found_with(half_width, gap=-10.0, says='a claim', expects='less'):
     return Finding(says, expects, 'less', 'here', gap, half_width, 9.0, 100.0)
 

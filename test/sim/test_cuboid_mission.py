@@ -95,24 +95,6 @@ def cases_of(name):
     return {case.name: case.settings['mission'] for case in find(name).cases(False)}
 
 
-def test_rows_as_printed_have_nothing_of_ours():
-    expected = {
-        'discount': 1.0,
-        'assignment': 'printed',
-        'condition': 'printed',
-        'around_corners': False,
-        'between_samples': False,
-        'brake_at_end': False,
-        'visit_depth': 0.0,
-    }
-    rows = [cases_of(f'004-fig{number}')['as printed'] for number in (3, 4, 5)]
-    every = cases_of('004-fig8')
-    for scheme in ('distributed', 'sequential', 'centralized'):
-        rows.append(every[f'{scheme}, 3 agents, as printed'])
-    for row in rows:
-        assert {key: row.get(key) for key in expected} == expected
-
-
 def test_condition_13_as_printed_lets_robots_drop_and_take_up_the_same_cuboids_for_ever():
     starts = {'a': [59.0, 237.0, 33.0], 'b': [220.0, 269.0, 30.0], 'c': [83.0, 78.0, 41.0]}
     rows = cases_of('004-fig8')

@@ -91,21 +91,6 @@ def test_maps_of_one_figure_are_those_of_its_neighbour():
     assert KNOWN['000-fig5'].seed(0) == KNOWN['000-fig4'].seed(0) != KNOWN['000-table1'].seed(0)
 
 
-def test_grids_of_000_are_the_printed_spacing_centred():
-    printed = {'000-fig9': {0.6}, '000-fig13': {0.6, 0.25}, '000-fig15': {0.6, 0.25}}
-    others = ('wide', 'all places in view', 'recommended')
-    for name in (name for name in KNOWN if name.startswith('000-')):
-        spacings = set()
-        for case in KNOWN[name].cases(False):
-            for robot in case.settings['scenario']['robots'].values():
-                grid = robot['candidates']
-                if grid['spacing'] is None or any(word in case.name for word in others):
-                    continue
-                assert grid['corner'] is None, (name, case.name)
-                spacings.add(grid['spacing'])
-        assert spacings == printed.get(name, {80.0}), name
-
-
 def test_all_of_the_ablation_decides_as_the_recommended_case():
     small = [KNOWN[name].cases(True) for name in ('000-ablation', '000-fig4')]
     (every,) = (case for case in small[0] if case.name == 'all')
@@ -113,23 +98,6 @@ def test_all_of_the_ablation_decides_as_the_recommended_case():
     one, other = (KNOWN['000-fig4'].run(case.settings, 3).columns for case in (every, recommended))
     for column, values in one.items():
         np.testing.assert_array_equal(values, other[column], err_msg=column)
-
-
-@pytest.mark.parametrize('name', ['000-table1', '000-table3'])
-def test_only_the_ratio_of_the_weights_counts_without_control_cost(name):
-    cases = {case.name: case.settings for case in KNOWN[name].cases(True)}
-    names = ('alpha 0.05, beta 0.05', 'alpha 5, beta 5')
-    one, other = (KNOWN[name].run(cases[item], 3).columns for item in names)
-    for column, values in one.items():
-        np.testing.assert_array_equal(values, other[column], err_msg=column)
-
-
-def test_runs_on_one_map_differ_by_noise_only():
-    experiment = KNOWN['000-table2-map']
-    settings = {**experiment.cases(False)[0].settings, 'most_measurements': 100}
-    runs = [experiment.run(settings, experiment.seed(number)) for number in (0, 1)]
-    assert runs[0].details['truth'] == runs[1].details['truth']
-    assert runs[0].details['found'] != runs[1].details['found']
 
 
 def test_robot_that_leaves_measures_no_more():
