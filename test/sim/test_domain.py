@@ -51,7 +51,8 @@ def started():
         [sys.executable, '-c', NODE], stdout=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
-        assert process.stdout.readline() == 'heard\n'
+        # Fast DDS says so where a port has gone that it was about to open, and takes another one.
+        assert 'heard\n' in iter(process.stdout.readline, '')
         maps = Path(f'/proc/{process.pid}/maps').read_text().split()
         opened = map(os.readlink, Path(f'/proc/{process.pid}/fd').iterdir())
         yield process, {Path(file) for file in (*maps, *opened) if '/dev/shm/fastrtps' in file}
@@ -72,7 +73,7 @@ def test_files_of_a_killed_node_go_and_those_of_a_live_one_stay(domain):
     with started() as (live, used):
         remove_dead()
         assert used and all(path.exists() for path in used)
-        assert live.stdout.readline() == 'heard\n'
+        assert 'heard\n' in iter(live.stdout.readline, '')
         # A port is known by its mark.
         ports = [path for path in used if re.fullmatch(r'fastrtps_port\d+', path.name)]
         assert ports
