@@ -81,7 +81,7 @@ class Supervisor:
         if not self.running or restarting or moment != self._moment:
             self._moment, self._moved = moment, now
         elif now - self._moved > self._scenario.limits.silence:
-            return self._standstill()
+            return self._standstill(now)
         return None
 
     def _check_node(self, plan: NodePlan, process: NodeProcess, now: float) -> Ending | None:
@@ -130,7 +130,7 @@ class Supervisor:
         time_ = self._recorder.elapsed
         self.events.append({'time': time_, 'node': name, 'event': event, **details})
 
-    def _standstill(self) -> Ending:
+    def _standstill(self, now: float) -> Ending:
         """Return the ending of a run whose time has stopped."""
         silence = f'for {self._scenario.limits.silence:g} s'
         if self._options.follow_clock:
@@ -140,7 +140,10 @@ class Supervisor:
         if step is None:
             return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
         steps = self._recorder.done_steps()
-        late = [n.name for n in self.nodes('driver', 'other') if steps.get(n.name, -1) < step]
+        nodes = self.nodes('driver', 'other')
+        # One that is late may wait for one that hangs after its own part of the step.
+        hung = [n.name for n in nodes if n.hangs(now, self._scenario.limits.heartbeat)]
+        late = hung or [n.name for n in nodes if steps.get(n.name, -1) < step]
         who = ', '.join(late) or self.nodes('clock')[0].name
         return Ending('node_hung', NODE_FAILED, f'step {step}: nothing from {who} {silence}', late)
 
