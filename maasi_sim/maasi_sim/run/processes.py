@@ -232,10 +232,7 @@ def waited_for_processor(pid: int | None) -> float:
 
 
 def stop(processes: Sequence[NodeProcess]) -> list[str]:
-    """Stop processes, all at the same time, by stronger and stronger signals.
-
-    Returned are the names of those that had to be killed.
-    """
+    """Stop processes by stronger and stronger signals; return the names of those it killed."""
     for number, patience in ENDING:
         rest = [process for process in processes if process.is_alive()]
         for process in rest:

@@ -52,11 +52,6 @@ _START_PATIENCE = 10.0
 class ScenarioRun:
     """One run of a scenario, from the file to the report; ends when `interruption` is true."""
 
-    supervisor: Supervisor
-    recorder: Recorder
-    ending: Ending
-    wall_time: float
-
     def __init__(self, options: Options, interruption: Interruption) -> None:
         self.options = options
         self.interruption = interruption

@@ -26,10 +26,7 @@ _LAST_MESSAGES = 0.02
 
 
 class Supervisor:
-    """Watches the nodes of a run: one that dies or hangs is restarted, or ends the run.
-
-    The recorder takes heartbeats, and stops robots.
-    """
+    """Watches the nodes of a run: one that dies or hangs is restarted, or ends the run."""
 
     def __init__(
         self,
