@@ -43,7 +43,8 @@ class RecordedRobot:
         self.left_out = 0
         self._bag = bag
         with BagReader(bag) as reader:
-            self._types, self.recovered = reader.types, reader.recovered
+            self._types = {topic: reader.types[topic] for topic, n in reader.counts.items() if n}
+            self.recovered = reader.recovered
         kinds = (use,) if use else (*USED,)
         for kind in kinds:
             robots = {
@@ -58,9 +59,11 @@ class RecordedRobot:
                 break
         if len(robots) != 1:
             there = ', '.join(sorted(self._types)) or 'no topics'
+            ends = [end.removeprefix('/') for kind in kinds for end in USED[kind]]
+            wanted = '' if robot is None else f' named {robot}'
             raise ValueError(
-                f'{bag}: robot: found {", ".join(sorted(robots)) or "none"} with '
-                f'{" or ".join(kinds)}, allowed is one (--robot, --use); recorded are {there}'
+                f'{bag}: robot: found {", ".join(sorted(robots)) or "none"}{wanted} with '
+                f'{" or ".join(ends)}, allowed is one; recorded are {there}'
             )
         self.robot, self.use = robots.pop(), kind
         places = list(map(self._topic, _POSES))
@@ -70,11 +73,16 @@ class RecordedRobot:
         self._pose_type = known.rpartition('/')[2]
         if self._pose_type not in _POSE_TYPES:
             raise ValueError(
-                f'{bag}: poses: {self.poses} is {known}, allowed are {", ".join(_POSE_TYPES)}'
+                f'{bag}: poses: {self.poses} is {known}, allowed are {", ".join(_POSE_TYPES)}; '
+                f'looked for are {", ".join(places)}'
             )
 
     def _topic(self, name: str) -> str:
         return f'/{self.robot}{name}' if self.robot else name
+
+    def records(self, name: str) -> bool:
+        """Return whether it has messages of a topic, named from its namespace."""
+        return self._topic(name) in self._types
 
     def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
         with BagReader(self._bag) as reader:

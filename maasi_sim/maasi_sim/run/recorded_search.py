@@ -28,8 +28,6 @@ from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, planner_settings
 
-_IMAGES = ('camera/image_raw', 'camera/image_raw/compressed')
-_POSES = ('state', 'pose', 'odom')
 # Where a robot was, and what it saw there.
 Measured = tuple[StampedPose, AgentMeasurement]
 
@@ -71,9 +69,14 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Meas
         sensor=robot.sensor,
         camera=robot.camera,
     )
-    space, poses = _topics(bag, name, alone=len(scenario.robots) == 1)
+    with BagReader(bag) as reader:
+        there = any(topic.startswith(f'/{name}/') for topic in reader.types)
+    # A robot that is alone in its scenario may have any namespace, or none.
+    space = name if there or len(scenario.robots) > 1 else None
     try:
-        recorded = RecordedRobot(bag, settings, space, 'images', poses)
+        recorded = RecordedRobot(bag, settings, space, 'images')
+        if not recorded.records('/camera/camera_info'):
+            print(f'{name}: no camera_info is recorded, its camera is that of the scenario')
         detector, sensor = recorded.detector(), robot.sensor.build(name, scenario.dimension)
         found: list[Measured] = []
         for place, image in recorded.images(robot.sensor.period):
@@ -92,33 +95,6 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Meas
         )
     print(f'{name}: {len(found)} images at poses of {recorded.poses}, {recorded.left_out} left out')
     return found
-
-
-def _topics(bag: Path, name: str, alone: bool) -> tuple[str, str]:
-    """Return the namespace of a robot in a recording, and the topic of its poses.
-
-    A robot that is alone in its scenario may have any namespace, or none.
-    """
-    with BagReader(bag) as reader:
-        counts = {topic: number for topic, number in reader.counts.items() if number}
-    starts = [f'/{name}/']
-    if alone:
-        starts += [topic.rpartition(image)[0] for topic in counts for image in _IMAGES]
-    start = next((start for start in starts if _recorded(counts, start, _IMAGES)), starts[0])
-    for topics in (_IMAGES, _POSES):
-        if not _recorded(counts, start, topics):
-            raise BagError(
-                f'{bag}: {name}: holds no messages of {start}{topics[-1]}, allowed are '
-                f'{" or ".join(start + topic for topic in topics)}; '
-                f'recorded are {", ".join(sorted(counts)) or "none"}'
-            )
-    if f'{start}camera/camera_info' not in counts:
-        print(f'{name}: no {start}camera/camera_info, its camera is that of the scenario')
-    return start.strip('/'), _recorded(counts, start, _POSES)[0]
-
-
-def _recorded(counts: dict[str, int], start: str, topics: tuple[str, ...]) -> list[str]:
-    return [start + topic for topic in topics if start and start + topic in counts]
 
 
 def search_measurements(
