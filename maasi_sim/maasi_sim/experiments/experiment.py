@@ -170,10 +170,10 @@ class Experiment:
     `run` runs a case once, from its settings and the seed of the map, the same for every case.
     `quantities` are the columns of the table. `draw` draws a figure in the form of the paper's.
     `published` are the paper's numbers, `comparisons` paired differences, `claims` what the paper
-    says of them, and `choices` open points of the paper. `causes` of differences from the paper are
-    likely ones, `tested` are those that were tested. `runs` are the maps in the paper, `seconds`
-    the approximate time of a run on one core. Experiments with the same `maps` have the same maps;
-    None: maps of its own. `compared`: searches are compared, and the seed is the number of the map.
+    says of them, and `choices` open points of the paper. `tested` are causes of differences from
+    the paper that runs have shown. `runs` are the maps in the paper, `seconds` the approximate time
+    of a run on one core. Experiments with the same `maps` have the same maps; None: maps of its
+    own. `compared`: searches are compared, and the seed is the number of the map.
     """
 
     name: str
@@ -186,7 +186,6 @@ class Experiment:
     comparisons: Sequence[Comparison] = ()
     claims: Sequence[Claim] = ()
     choices: Sequence[OpenPoint] = ()
-    causes: str = ''
     tested: str = ''
     runs: int = 10
     seconds: float = 2.0

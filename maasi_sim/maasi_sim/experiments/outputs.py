@@ -81,8 +81,6 @@ def _described(
 ) -> list[str]:
     """Return tables, note and causes in Markdown."""
     parts = [*beside_paper(cases, pairs), experiment.note and f'{experiment.note}\n']
-    if experiment.causes:
-        parts.append(f'Likely causes of differences, not tested: {experiment.causes}\n')
     if experiment.tested:
         parts.append(f'Causes of differences, tested: {experiment.tested}\n')
     return parts
