@@ -12,7 +12,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_sim import search as search_module
-from maasi_sim.run.bag import BagWriter, load_types
+from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.run_scenario import main
 from maasi_sim.scenario.loading import load_scenario
 
@@ -129,8 +129,6 @@ def test_the_same_targets_are_found_again(searched, tmp_path, capsys, kind):
 
 def without(folder, target, lacking):
     """Copy a recording without the messages of some topics."""
-    from maasi_sim.run.bag import Bag
-
     with Bag(folder) as bag, BagWriter(target, load_types(), images='raw') as writer:
         for topic, name in bag.types.items():
             writer.add_topic(topic, name)
