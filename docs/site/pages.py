@@ -81,6 +81,21 @@ HOME = """# MAASI
 A team of robots finds an unknown number of targets: a suite for ROS 2 Jazzy in Python, and a
 library without ROS.
 
+![The page of a run: where robots go, and why](view.png)
+
+Two commands, in a clone and without any ROS ([what they need](README.md#two-commands)). Two
+simulated robots find twelve markers, on the page above:
+
+```sh
+./scripts/demo --view
+```
+
+All tests:
+
+```sh
+./scripts/test
+```
+
 New here: [the first search](first_search.md), then the tutorial that fits. Something particular to
 do: *How to*. A name or a number to look up: *Reference*. Why it is as it is: *Explanation*.
 """
