@@ -4,12 +4,17 @@ The API reference is left out here, as it takes minutes: ./scripts/docs builds i
 """
 
 import re
+import runpy
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from browsers import chromium, needs_chromium
+
+from maasi_sim.run.buildings.scenario import load_cuboid_scenario
+from maasi_sim.scenario.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / 'docs' / 'site'
@@ -44,7 +49,6 @@ def test_every_page_is_in_the_contents_and_needs_no_network(site: Path) -> None:
 @pytest.mark.parametrize(
     ('page', 'words'),
     [
-        ('scenario', ['robots.NAME.sensor.detection.probability', 'limits.time', 'needed']),
         ('parameters', ['planner_node', 'robot.NAME.candidates.grid', 'at least 1']),
         ('messages', ['PlanDecision', 'share of the environment that is explored']),
         ('commands', ['--lockstep', 'a node died or hung', 'reproduce']),
@@ -55,6 +59,40 @@ def test_reference_is_made_from_the_code(site: Path, page: str, words: list[str]
     text = re.sub(r'<[^>]+>', '', html)
     for word in words:
         assert word in text
+
+
+def keys(value: object, path: str) -> Iterator[str]:
+    """Yield the keys of a scenario as the page of keys writes them."""
+    if isinstance(value, dict) and not path.endswith(('.parameters', '.settings')):
+        for key, part in value.items():
+            yield from keys(
+                part, f'{path}.NAME' if path == 'robots' else f'{path}.{key}'.strip('.')
+            )
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        yield from keys(value[0], f'{path}[]')
+    else:
+        yield path
+
+
+def test_page_of_keys_is_that_of_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(SITE)
+    module = runpy.run_path(str(SITE / 'scenario_keys.py'))
+    page = module['PAGE'].read_text(encoding='utf-8')
+    assert module['page']() == page, 'call ./scripts/docs --write'
+    assert '\n| `time` | number [s] | `600.0` | above 0 | Simulated time |\n' in page
+    written, place = set(), ''
+    for line in page.splitlines():
+        if line.startswith('#'):
+            place = line.removesuffix(' of buildings').partition('### ')[2]
+        elif found := re.match(r'\| `(\w+)` ', line):
+            written.add(f'{place}.{found[1]}'.strip('.'))
+    folder = ROOT / 'config' / 'scenarios'
+    for scenario in (
+        load_scenario('mambo_turtlebot_obstacles'),
+        load_cuboid_scenario(folder / 'buildings_four.yaml'),
+    ):
+        asked = set(keys(scenario.content(), ''))
+        assert len(asked) > 50 and asked <= written, asked - written
 
 
 @needs_chromium
