@@ -76,6 +76,22 @@ def test_help_says_what_a_command_is_before_anything_is_set_up(name):
     assert result.stdout.startswith(f'usage: {name}')
 
 
+def test_the_build_of_the_site_says_how_far_it_is_and_fails_as_sphinx_does():
+    # Without Sphinx, and without touching a site that was built.
+    stubs = 'for name in rm mkdir cp python sphinx-apidoc; do eval "$name() { :; }"; done\n'
+    stubs += (
+        'sphinx-build() { sleep 3; echo "reading sources... [ 12%] a .. b"; return $STATUS; }\n'
+    )
+    for status in (0, 2):
+        script = f'STATUS={status}; {stubs} source scripts/docs'
+        result = call('bash', '-c', script)
+        assert result.stderr.splitlines()[-1] == 'docs: reading pages, 12 %'
+        assert result.returncode == status
+        assert result.stdout.endswith('docs/index.html\n') == (status == 0)
+    result = call(SCRIPTS / 'docs', '--wrote', PYTHON='no_such_python')
+    assert (result.returncode, result.stderr) == (2, 'error: read --wrote, allowed is --write\n')
+
+
 def test_property_tests_draw_the_same_examples_each_time(tmp_path):
     file = tmp_path / 'test_draws.py'
     file.write_text(

@@ -10,11 +10,17 @@ from pydantic import BaseModel
 project = 'MAASI'
 author = 'The MAASI developers'
 version = release = '0.1.0'
-extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'myst_parser']
+extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'myst_parser', 'sphinx_copybutton']
 # Anchors of headings, as on GitHub.
 myst_heading_anchors = 4
 highlight_language = 'text'
-html_theme = 'alabaster'
+html_theme = 'furo'
+html_title = project
+html_show_copyright = False
+html_copy_source = False
+html_static_path = html_css_files = ['site.css']
+# They would be fetched page by page, which a browser refuses to a page from a file.
+html_show_search_summary = False
 # Backticks in docstrings name code, as in Markdown.
 default_role = 'code'
 
@@ -62,7 +68,15 @@ def plain_words(app: Any, what: str, name: str, found: Any, options: Any, lines:
         lines[number] = ''.join(parts)
 
 
+def short_contents(app: Any, page: str, template: str, context: Any, doctree: Any) -> None:
+    """List the modules of the API beside its own pages only; beside all they take minutes."""
+    whole = context.get('toctree')
+    if whole:
+        context['toctree'] = lambda **options: whole(**{**options, 'collapse': True})
+
+
 def setup(app: Any) -> None:
-    """Connect to autodoc, after napoleon."""
+    """Connect to autodoc, after napoleon, and to the theme, before it."""
+    app.connect('html-page-context', short_contents, priority=400)
     app.connect('autodoc-process-docstring', plain_words, priority=800)
     app.connect('autodoc-process-docstring', add_settings, priority=900)

@@ -10,18 +10,12 @@ import os
 import re
 import shutil
 import sys
-import typing
-from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-from pydantic import BaseModel
-from pydantic_core import PydanticUndefined
+from page_tables import code, table
 
-from maasi_filter.ros.parameters import ParameterField, choices, parameters_of
-from maasi_sim.run.buildings.scenario import CuboidScenario
+from maasi_filter.ros.parameters import parameters_of
 from maasi_sim.run.ending import EXIT_CODES
-from maasi_sim.scenario.schema import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / 'docs'
@@ -36,7 +30,8 @@ PARTS = {
         *('plugins', 'compare', 'view', 'robots', 'robots_mambo', 'robots_mavlink'),
     ],
     'Reference': [
-        *(f'reference/{name}' for name in ('scenario', 'parameters', 'messages', 'commands')),
+        'scenario_keys',
+        *(f'reference/{name}' for name in ('parameters', 'messages', 'commands')),
         *('report', 'parameters', 'messages', 'measurement_feed', 'filter_presets', 'api/api'),
     ],
     'Explanation': [
@@ -68,18 +63,25 @@ PARSERS = [
     'maasi_sim.simulation.emulators.mambo.fake_mambo',
     'maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle',
 ]
-KINDS = {
-    bool: 'true or false',
-    int: 'whole number',
-    float: 'number',
-    str: 'text',
-    list: 'list',
-    dict: 'mapping',
-}
 HOME = """# MAASI
 
 A team of robots finds an unknown number of targets: a suite for ROS 2 Jazzy in Python, and a
 library without ROS.
+
+![The page of a run: where robots go, and why](view.png)
+
+Two commands, in a clone and without any ROS ([what they need](README.md#two-commands)). Two
+simulated robots find twelve markers, on the page above:
+
+```sh
+./scripts/demo --view
+```
+
+All tests:
+
+```sh
+./scripts/test
+```
 
 New here: [the first search](first_search.md), then the tutorial that fits. Something particular to
 do: *How to*. A name or a number to look up: *Reference*. Why it is as it is: *Explanation*.
@@ -142,64 +144,6 @@ def home(names: set[str]) -> str:
     return '\n'.join(text)
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = ['| ' + ' | '.join(head) + ' |', '|---' * len(head) + '|']
-    for row in rows:
-        lines.append('| ' + ' | '.join(cell.replace('|', r'\|') for cell in row) + ' |')
-    return '\n'.join(lines) + '\n'
-
-
-def code(value: Any) -> str:
-    text = str(value).lower() if isinstance(value, bool) else str(value)
-    return f'`{text}`' if text else "`''`"
-
-
-def settings_rows(model: type[BaseModel], prefix: str = '') -> Iterator[tuple[str, str, str, str]]:
-    """Yield key, what is allowed, default and description of settings and of those inside."""
-    for name, info in model.model_fields.items():
-        key = prefix + (info.alias or name)
-        kinds, inner = [], []
-        for choice in choices(info.annotation):
-            origin = typing.get_origin(choice) or choice
-            element = typing.get_args(choice)[-1:] if origin in (list, dict) else (choice,)
-            models = [kind for part in element for kind in choices(part) if is_model(kind)]
-            inner += [(kind, {list: '[]', dict: '.NAME'}.get(origin, '')) for kind in models]
-            kinds += [KINDS[origin]] if origin in KINDS and not models else []
-        allowed = ParameterField('', (), info).constraints
-        if not allowed.startswith('one of'):
-            allowed = ' '.join(filter(None, [' or '.join(dict.fromkeys(kinds)), allowed]))
-        default = info.default
-        if info.is_required():
-            shown = 'needed'
-        elif default is PydanticUndefined or isinstance(default, BaseModel):
-            shown = ''
-        else:
-            shown = 'none' if default is None else code(default)
-        yield code(key), allowed, shown, info.description or ''
-        for kind, step in inner:
-            yield from settings_rows(kind, f'{key}{step}.')
-
-
-def is_model(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
-
-
-def scenario_page() -> str:
-    head = ('key', 'allowed', 'default', 'meaning [unit]')
-    return '\n'.join(
-        [
-            '# Keys of a scenario file\n',
-            'A robot takes what it does not say from its type, a file in `config/robots`. NAME '
-            'stands for the name of a robot, `[]` for each entry of a list.\n',
-            '## Search for targets\n',
-            table(head, settings_rows(Scenario)),
-            '## Search of buildings\n',
-            'With `planner: {name: cuboid_mpc}`.\n',
-            table(head, settings_rows(CuboidScenario)),
-        ]
-    )
-
-
 def parameters_page() -> str:
     text = [
         '# Parameters of the nodes\n',
@@ -252,7 +196,6 @@ def commands_page() -> str:
 
 
 REFERENCE = {
-    'scenario': scenario_page,
     'parameters': parameters_page,
     'messages': messages_page,
     'commands': commands_page,

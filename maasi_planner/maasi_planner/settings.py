@@ -57,7 +57,7 @@ class CandidateSettings(Settings):
         default=None,
         min_length=2,
         max_length=3,
-        description='First waypoint of the grid [m, map]; left out, the grid is centred',
+        description='First waypoint of the grid; left out, the grid is centred [m, map]',
     )
     ring: Literal[4, 6, 8] | None = Field(
         default=None,

@@ -23,6 +23,7 @@ from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import Planner
 from maasi_planner.settings import PlannerSettings
+from maasi_sim.compiling import compiling_said
 from maasi_sim.run.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.run.targets.tally import numbered
 from maasi_sim.run.view.event_maker import EventMaker
@@ -76,10 +77,11 @@ def search(
             raise ValueError('planner: ' + '; '.join(map(str, reasons))) from None
         scenario = scenario.model_copy(update={'planner': renamed})
         planner = None
-    running = _Search(scenario, seed, planner)
-    if view:
-        running.trace.show()
-    result = running.run(most_measurements)
+    with compiling_said():
+        running = _Search(scenario, seed, planner)
+        if view:
+            running.trace.show()
+        result = running.run(most_measurements)
     running.trace.end(result.end_reason)
     return result
 

@@ -1,8 +1,18 @@
 """Progress on the terminal, and where there is none."""
 
 import io
+import os
+import subprocess
+import sys
 
+from numba import njit
+from small_field import SMALL_FIELD
+
+from maasi_planner.planners import make_planner
+from maasi_sim import compiling
 from maasi_sim.run.progress import ProgressDisplay
+from maasi_sim.scenario.loading import scenario_from_values
+from maasi_sim.search import search
 
 
 class Terminal(io.StringIO):
@@ -40,3 +50,32 @@ def test_the_share_of_what_is_done_comes_now_and_then():
         for share in (0.0, 0.5):
             display.share('replay', share)
         assert stream.getvalue().splitlines() == said
+
+
+def test_compiling_is_said_and_loading_from_the_cache_is_not(tmp_path):
+    (tmp_path / 'kernel.py').write_text(
+        'from numba import njit\n@njit(cache=True)\ndef double(number): return 2 * number\n'
+    )
+    words = 'import kernel; from maasi_sim import compiling; compiling.PATIENCE = 0.0\n'
+    words += 'with compiling.compiling_said(): print(kernel.double(2))'
+    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}
+    said = []
+    for _ in range(2):
+        command = [sys.executable, '-c', words]
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
+        assert done.stdout == '4\n'
+        said.append(done.stderr.splitlines())
+    assert said == [['compiling, once: a minute or two (0 of about 80)'], []]
+
+
+def test_a_search_says_that_it_compiles(monkeypatch, capsys):
+    monkeypatch.setattr(compiling, 'PATIENCE', 0.0)
+
+    def planner(settings, missing):
+        njit(lambda number: 2 * number)(2)
+        return make_planner(settings.name, settings)
+
+    search(scenario_from_values(SMALL_FIELD, 'field'), 1, 1, planner)
+    assert capsys.readouterr().err.startswith('compiling, once: a minute or two (0 of about ')

@@ -49,8 +49,8 @@ class LimitSettings(Settings):
 class OriginSettings(Settings):
     """Where x = y = z = 0 of the map lies, on WGS 84; x points east, y north, z up."""
 
-    latitude: float = Field(ge=-90.0, le=90.0, description='[degrees]')
-    longitude: float = Field(ge=-180.0, le=180.0, description='[degrees]')
+    latitude: float = Field(ge=-90.0, le=90.0, description='North of the equator [degrees]')
+    longitude: float = Field(ge=-180.0, le=180.0, description='East of Greenwich [degrees]')
     altitude: Finite = Field(default=0.0, description='Over the ellipsoid [m]')
 
 
