@@ -199,10 +199,7 @@ class TeamGoals:
             return
         sent.status, sent.reason = int(answer.status), str(answer.result.reason)
         sent.ended_at = time.monotonic()
-        if sent.status == GoalStatus.STATUS_ABORTED and self._sent.get(name) is sent:
-            text = f'{name}: goal {sent.number} was aborted: {sent.reason}'
-            # The states of the robot say that it takes part no more.
-            if sent.reason == _DRIVER_STOPS:
-                self._logger.info(text)
-            else:
-                self._logger.warning(text)
+        aborted = sent.status == GoalStatus.STATUS_ABORTED and self._sent.get(name) is sent
+        # Of a driver that ends the states of the robot say that it takes part no more.
+        if aborted and sent.reason != _DRIVER_STOPS:
+            self._logger.warning(f'{name}: goal {sent.number} was aborted: {sent.reason}')
