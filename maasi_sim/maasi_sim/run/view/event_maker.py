@@ -77,6 +77,7 @@ class EventMaker:
         # Last time, place and battery of each robot.
         self._heard: dict[str, tuple[float, list[float], float]] = {}
         self._activity: dict[str, str] = {}
+        self._modes: dict[str, str] = {}
         self._measured: set[tuple[str, str, int]] = set()
         #: Latest time of an event [s].
         self.latest = 0.0
@@ -120,8 +121,20 @@ class EventMaker:
         if name in self._heard:
             self._set_status(time, name, LEFT, '')
 
-    def end(self) -> None:
-        """Add that the run has ended: nobody is on the way any more."""
+    def starting(self, ready: int, total: int) -> None:
+        """Add how many nodes are ready before the first step."""
+        self._put(0.0, 'start', '', ready, total)
+
+    def modes(self, time: float, node: str, words: str) -> None:
+        """Add the modes of the robots of a planner node, as it describes them."""
+        if self._modes.get(node) != words:
+            self._modes[node] = words
+            self._put(time, 'mode', node, words)
+
+    def end(self, reason: str = '', text: str = '') -> None:
+        """Add that the run has ended, and why: nobody is on the way any more."""
+        if reason:
+            self._put(self.latest, 'end', '', reason, text)
         for name in self._heard:
             if self._status[name] < UNAVAILABLE:
                 self._set_status(self.latest, name, ENDED, '')

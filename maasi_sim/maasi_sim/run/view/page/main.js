@@ -2,16 +2,18 @@
 
 import { Camera } from './camera.js';
 import { Curve } from './curve.js';
-import { follow, showControls } from './live.js';
+import { follow, showControls, updateControls } from './live.js';
 import { MapView } from './map.js';
 import { showLegend, showLog, showNumbers, showRobots } from './panels.js';
 import { RunLog, unpack } from './run_log.js';
 import { element } from './text.js';
 import { showWhy } from './why.js';
+import { hasEnded, headline, showCard, showHeadline } from './words.js';
 
 const $ = (id) => document.getElementById(id);
 // Pictures of a live run per second: the search needs the processor more.
 const LIVE_RATE = 3;
+const reducedMotion = window.matchMedia('(prefers-reduced-motion: reduce)');
 
 class Page {
   constructor() {
@@ -20,6 +22,7 @@ class Page {
     this.playing = false;
     this.following = false;
     this.isLive = false;
+    this.connection = '';
     this.selected = null;
     this.marked = null;
     this.drawn = 0;
@@ -40,14 +43,23 @@ class Page {
         this.setLog(log);
         this.seek(0);
         document.body.dataset.ready = 'yes';
+        this.playByItself();
       }).catch((error) => {
         $('source').textContent = `the run in this file cannot be read: ${error.message}`;
       });
     } else this.followRun();
   }
 
+  // Play a replay once it is seen, unless its reader has begun to look around.
+  playByItself() {
+    if (reducedMotion.matches || this.time > 0) return;
+    if (document.visibilityState === 'visible') this.setPlaying(true);
+    else document.addEventListener('visibilitychange', () => this.playByItself(), { once: true });
+  }
+
   followRun() {
     this.isLive = true;
+    this.connection = 'live';
     $('live').hidden = false;
     this.setFollowing(true);
     follow(
@@ -61,8 +73,14 @@ class Page {
       (state) => {
         $('source').textContent = state;
         document.body.dataset.connection = state;
-        // Nobody is left who would follow.
-        if (state === 'ended') $('controls').hidden = true;
+        this.connection = state;
+        this.request();
+        if (state !== 'ended') return;
+        // Nobody is left who would follow: it is a replay from now on.
+        if (this.following) this.time = this.log.duration;
+        this.setFollowing(false);
+        this.isLive = false;
+        for (const id of ['controls', 'live']) $(id).hidden = true;
       },
     );
   }
@@ -84,6 +102,7 @@ class Page {
     $('curve_title').textContent = log.isOfBuildings ? 'Cuboids visited' : `Found and ${log.knowsExpected ? 'expected' : 'potential'}`;
     this.fitted = false;
     this.changed = true;
+    this.cardClosed = false;
     this.request();
   }
 
@@ -243,6 +262,7 @@ class Page {
     if (playing && this.following) this.setFollowing(false);
     this.playing = playing;
     $('play').textContent = playing ? '⏸' : '▶';
+    $('play').setAttribute('aria-label', playing ? 'Pause' : 'Play');
     this.request();
   }
 
@@ -275,8 +295,33 @@ class Page {
     if (this.playing) this.request();
   }
 
+  // The headline, the card at the end, and which buttons work.
+  tell() {
+    const { log, time } = this;
+    const wait = showHeadline($('headline'), headline(log, time, this.connection), performance.now());
+    if (wait > 0 && !this.waiting) {
+      this.waiting = setTimeout(() => {
+        this.waiting = undefined;
+        this.request();
+      }, wait);
+    }
+    const shown = hasEnded(log, time) && !this.cardClosed;
+    if ($('card').hidden === shown) {
+      $('card').hidden = !shown;
+      this.fitted = false;
+    }
+    if (shown) {
+      showCard($('card'), log, time, () => {
+        this.cardClosed = true;
+        this.request();
+      });
+    }
+    if (!$('controls').hidden) updateControls($('controls'), log, this.selected);
+  }
+
   draw() {
     const { log, time } = this;
+    this.tell();
     this.map.resize();
     if (!this.fitted) {
       if (log.isSpatial && !this.camera.chosen) {

@@ -2,8 +2,8 @@
 
 import { FOUND, POTENTIAL, SEEN, OPEN, VISITED, robotColour } from './colours.js';
 import { element, number } from './text.js';
+import { stateOf } from './words.js';
 
-const STATES = ['no goal', 'on the way', 'goal reached', 'goal cancelled', 'goal given up', 'cannot go on', 'left', 'silent', 'run ended'];
 const SIGNS = { found: '●', decision: '→', team: '◇', warning: '!', fault: '✖' };
 // Lines of the log that are shown.
 const MOST_LINES = 60;
@@ -52,7 +52,6 @@ export function showRobots(body, log, time, selected, onSelect) {
   body.replaceChildren(
     ...names.map((name) => {
       const event = log.at('robot', name, time);
-      const cuboid = log.at('cuboid', name, time);
       const row = element('tr', name === selected ? 'selected' : '');
       row.tabIndex = 0;
       row.dataset.robot = name;
@@ -63,9 +62,6 @@ export function showRobots(body, log, time, selected, onSelect) {
       swatch.style.background = robotColour(names, name);
       first.append(swatch, name);
       first.title = (log.scene.robots[name] || {}).description || '';
-      let state = event ? STATES[event[5]] || 'unknown' : 'not heard';
-      if (cuboid) state = cuboid[3];
-      if (event && event[6]) state += `: ${event[6]}`;
       const battery = element('td', '');
       if (event && event[4] >= 0) {
         const bar = element('span', 'bar');
@@ -74,7 +70,7 @@ export function showRobots(body, log, time, selected, onSelect) {
         bar.append(level);
         battery.append(bar, `${Math.round(100 * event[4])} %`);
       } else battery.append('unknown');
-      row.append(first, element('td', 'text', state), battery);
+      row.append(first, element('td', 'text', stateOf(log, name, time)), battery);
       return row;
     }),
   );
