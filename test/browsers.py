@@ -67,9 +67,9 @@ def chromium(width=1280, height=720, reduced_motion='reduce', **options):
         browser = player.chromium.launch(executable_path=CHROMIUM, args=arguments)
         try:
             viewport = {'width': width, 'height': height}
-            shown = Page(browser.new_page(
-                viewport=viewport, reduced_motion=reduced_motion, **options
-            ))
+            shown = Page(
+                browser.new_page(viewport=viewport, reduced_motion=reduced_motion, **options)
+            )
             yield shown
             assert shown.errors == []
             hosts = [urlsplit(address).hostname for address in shown.requests]

@@ -54,7 +54,7 @@ class Options:
         words += ['--lockstep'] if self.lockstep else []
         given = {'--rate': self.rate, '--planner': self.planner, '--time-limit': self.time_limit}
         for name, value in given.items():
-            words += [] if value is None else [name, f'{value:g}' if name != '--planner' else value]
+            words += [] if value is None else [name, str(value)]
         return shlex.join(words)
 
 

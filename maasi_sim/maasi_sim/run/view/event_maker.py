@@ -47,7 +47,7 @@ def _upper(covariance: ArrayLike) -> list[float]:
 
 
 def _words(place: Sequence[float]) -> str:
-    return f'({", ".join(f"{value:g}" for value in place)})'
+    return f'({", ".join(f"{value:.3g}" for value in place)})'
 
 
 def _explored(values: FloatArray) -> float:
@@ -78,6 +78,7 @@ class EventMaker:
         self._heard: dict[str, tuple[float, list[float], float]] = {}
         self._activity: dict[str, str] = {}
         self._modes: dict[str, str] = {}
+        self._planned: dict[str, list[int]] = {}
         self._measured: set[tuple[str, str, int]] = set()
         #: Latest time of an event [s].
         self.latest = 0.0
@@ -290,7 +291,12 @@ class EventMaker:
         before, self._activity[robot] = self._activity.get(robot, activity), activity
         if before != activity:
             self.message(time, robot, 'team', activity)
-        lists = list(message.heard), [int(item) for item in message.planned], shots
+        planned = [int(item) for item in message.planned]
+        if self._planned.get(robot, []) != planned:
+            self._planned[robot] = planned
+            words = f'cuboids {", ".join(map(str, planned))}' if planned else 'no cuboid'
+            self.message(time, robot, 'decision', f'plans to visit {words}')
+        lists = list(message.heard), planned, shots
         target = self._place(point(message.target))
         self._put(time, 'cuboid', robot, activity, message.how, target, *lists, bool(message.done))
 

@@ -4,9 +4,12 @@ import { Camera } from './camera.js';
 import { Curve } from './curve.js';
 import { follow, showControls, updateControls } from './live.js';
 import { MapView } from './map.js';
-import { showLegend, showLog, showNumbers, showRobots } from './panels.js';
+import { showLegend } from './legend.js';
+import { drawMarks } from './marks.js';
+import { showLog, showNumbers, showRobots } from './panels.js';
 import { RunLog, unpack } from './run_log.js';
 import { element } from './text.js';
+import { showTip, tipAt } from './tips.js';
 import { showWhy } from './why.js';
 import { hasEnded, headline, showCard, showHeadline } from './words.js';
 
@@ -193,7 +196,11 @@ class Page {
     });
     canvas.addEventListener('pointermove', (event) => {
       const before = held.get(event.pointerId);
-      if (!before) return;
+      if (!before) {
+        this.point(event.offsetX, event.offsetY);
+        return;
+      }
+      showTip($('tip'), '');
       const now = [event.offsetX, event.offsetY];
       moved += Math.hypot(now[0] - before[0], now[1] - before[1]);
       if (held.size === 2) {
@@ -211,6 +218,8 @@ class Page {
     };
     canvas.addEventListener('pointerup', release);
     canvas.addEventListener('pointercancel', release);
+    // A finger leaves when it is lifted: what it tapped stays.
+    canvas.addEventListener('pointerleave', (event) => event.pointerType === 'mouse' && showTip($('tip'), ''));
     canvas.addEventListener('wheel', (event) => {
       event.preventDefault();
       this.camera.zoom(Math.exp(-0.0015 * event.deltaY), event.offsetX, event.offsetY);
@@ -223,10 +232,12 @@ class Page {
     if (!hit) this.select(null);
     else if (hit.robot) this.select(hit.robot);
     else if (hit.candidate !== undefined) this.mark(hit.candidate);
-    else if (hit.found) {
-      const [number, , , , , robot, when] = hit.found;
-      $('source').textContent = `target ${number}: found by ${robot} at ${when.toFixed(1)} s`;
-    }
+    this.point(x, y);
+  }
+
+  // Say what is at a point of the map.
+  point(x, y) {
+    showTip($('tip'), tipAt(this.map, this.log, this.time, this.selected, x, y), x, y);
   }
 
   select(name) {
@@ -322,6 +333,8 @@ class Page {
   draw() {
     const { log, time } = this;
     this.tell();
+    // It may take room from the map.
+    showLegend($('legend'), log, this.selected);
     this.map.resize();
     if (!this.fitted) {
       if (log.isSpatial && !this.camera.chosen) {
@@ -333,6 +346,7 @@ class Page {
       this.fitted = Boolean(log.scene.bounds) || !this.isLive;
     }
     this.map.marked = this.marked;
+    this.map.pulses = !reducedMotion.matches;
     this.map.draw(log, time, this.selected);
     this.curve.draw(log, time);
     showNumbers($('numbers'), log, time);
@@ -342,7 +356,7 @@ class Page {
       if (log.slots.has(`decision/${event[4]}`)) this.select(event[4]);
       this.seek(event[0]);
     });
-    showLegend($('legend'), log);
+    drawMarks($('marks'), log);
     $('time').max = log.duration;
     $('time').value = time;
     $('clock').textContent = `${time.toFixed(1)} / ${log.duration.toFixed(1)} s`;

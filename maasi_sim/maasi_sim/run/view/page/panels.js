@@ -1,6 +1,7 @@
 // The panels beside the map: numbers, robots, log.
 
-import { FOUND, POTENTIAL, SEEN, OPEN, VISITED, robotColour } from './colours.js';
+import { robotColour, themed } from './colours.js';
+import { isAway } from './run_log.js';
 import { element, number } from './text.js';
 import { stateOf } from './words.js';
 
@@ -49,8 +50,16 @@ function shots(log, time) {
 
 export function showRobots(body, log, time, selected, onSelect) {
   const names = log.robots();
+  const shown = names.map((name) => {
+    const event = log.at('robot', name, time);
+    return [name, stateOf(log, name, time), event && event[4]];
+  });
+  // Rows that are made again lose the focus of the keyboard.
+  const key = JSON.stringify([shown, selected, document.documentElement.dataset.theme]);
+  if (body.dataset.key === key) return;
+  body.dataset.key = key;
   body.replaceChildren(
-    ...names.map((name) => {
+    ...shown.map(([name, state]) => {
       const event = log.at('robot', name, time);
       const row = element('tr', name === selected ? 'selected' : '');
       row.tabIndex = 0;
@@ -59,7 +68,7 @@ export function showRobots(body, log, time, selected, onSelect) {
       row.onkeydown = (key) => key.key === 'Enter' && onSelect(name);
       const first = element('td', '');
       const swatch = element('span', 'swatch');
-      swatch.style.background = robotColour(names, name);
+      swatch.style.background = event && isAway(event) ? themed('--away') : robotColour(names, name);
       first.append(swatch, name);
       first.title = (log.scene.robots[name] || {}).description || '';
       const battery = element('td', '');
@@ -70,7 +79,7 @@ export function showRobots(body, log, time, selected, onSelect) {
         bar.append(level);
         battery.append(bar, `${Math.round(100 * event[4])} %`);
       } else battery.append('unknown');
-      row.append(first, element('td', 'text', stateOf(log, name, time)), battery);
+      row.append(first, element('td', 'text', state), battery);
       return row;
     }),
   );
@@ -94,23 +103,4 @@ export function showLog(list, log, time, onChoose) {
       return line;
     }),
   );
-}
-
-export function showLegend(parent, log) {
-  const entries = log.isOfBuildings
-    ? [['cuboid visited', VISITED], ['to visit (planned: as its robot)', OPEN]]
-    : [['found (3 sigma)', FOUND], ['potential (mass)', POTENTIAL], ['detection', SEEN]];
-  parent.replaceChildren(
-    ...entries.map(([text, colour]) => {
-      const entry = element('span', '');
-      const mark = element('i', '');
-      mark.style.borderColor = colour;
-      entry.append(mark, text);
-      return entry;
-    }),
-  );
-  if (log.isOfBuildings) parent.append(element('span', '', '┈ radio link'));
-  else parent.append(element('span', '', '✕ true target'), element('span', '', '□ waypoint'));
-  if (Object.values(log.scene.robots).some((robot) => robot.fence)) parent.append(element('span', '', '-·- geofence'));
-  if (log.scene.thinned) parent.append(element('span', '', `thinned: one state per ${log.scene.thinned} s`));
 }

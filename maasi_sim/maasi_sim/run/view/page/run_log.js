@@ -131,8 +131,11 @@ export class RunLog {
         this.slot('decision', robot[0]).add(time, decision);
       }
     } else if (kind === 'cuboid') {
-      this.slot('decision', owner).add(time, { time, cuboid: event, name: owner });
-      if (event[8].length) this.decisions.add(time, { time, cuboid: event, name: owner });
+      const decision = { time, cuboid: event, name: owner };
+      const before = this.slot('decision', owner).at(time);
+      this.slot('decision', owner).add(time, decision);
+      // One at each step; those that count have another plan.
+      if (!before || String(before.cuboid[7]) !== String(event[7])) this.decisions.add(time, decision);
       for (const shot of event[8]) {
         if (this.visited.has(shot[0])) continue;
         this.visited.add(shot[0]);

@@ -7,10 +7,12 @@ export function element(tag, className, text) {
   return made;
 }
 
-export function number(value) {
+// Return a number with three significant digits; padded, also where the last ones are 0.
+export function number(value, padded = false) {
   if (value === null || value === undefined || Number.isNaN(value)) return '-';
   if (Number.isInteger(value)) return String(value);
   const size = Math.abs(value);
-  if (size !== 0 && (size < 1e-3 || size >= 1e5)) return value.toExponential(1);
-  return String(Number(size >= 100 ? value.toFixed(1) : value.toPrecision(3)));
+  if (size < 1e-3 || size >= 1e5) return value.toExponential(2);
+  const digits = value.toPrecision(3);
+  return padded && !digits.includes('e') ? digits : String(Number(digits));
 }

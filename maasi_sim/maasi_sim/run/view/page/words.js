@@ -72,6 +72,7 @@ function intention(log, time) {
     const { name, robot, cuboid } = events[index];
     const state = log.at('robot', name, time);
     if (!state || state[5] !== MOVING || log.at('decision', name, time) !== events[index]) continue;
+    if (cuboid && cuboid[7].length) return `${name} goes to ${cuboid[7].length > 1 ? 'cuboids' : 'cuboid'} ${cuboid[7].join(', ')}${regionOf(log.bounds, cuboid[5])[1]}`;
     if (cuboid) return `${name} goes to ${destination(log, time, cuboid[5])}`;
     if (robot[2] >= 0) return `${name} goes to ${destination(log, time, robot[3])}`;
   }
