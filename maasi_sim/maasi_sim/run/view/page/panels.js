@@ -2,7 +2,7 @@
 
 import { robotColour, themed } from './colours.js';
 import { isAway } from './run_log.js';
-import { element, number } from './text.js';
+import { element, number, pressable } from './text.js';
 import { stateOf } from './words.js';
 
 const SIGNS = { found: '●', decision: '→', team: '◇', warning: '!', fault: '✖' };
@@ -62,10 +62,8 @@ export function showRobots(body, log, time, selected, onSelect) {
     ...shown.map(([name, state]) => {
       const event = log.at('robot', name, time);
       const row = element('tr', name === selected ? 'selected' : '');
-      row.tabIndex = 0;
       row.dataset.robot = name;
-      row.onclick = () => onSelect(name);
-      row.onkeydown = (key) => key.key === 'Enter' && onSelect(name);
+      pressable(row, () => onSelect(name));
       const first = element('td', '');
       const swatch = element('span', 'swatch');
       swatch.style.background = event && isAway(event) ? themed('--away') : robotColour(names, name);
@@ -95,10 +93,8 @@ export function showLog(list, log, time, onChoose) {
     ...lines.map((event) => {
       const [when, , , level, source, text] = event;
       const line = element('li', level);
-      line.tabIndex = 0;
       line.dataset.level = level;
-      line.onclick = () => onChoose(event);
-      line.onkeydown = (pressed) => pressed.key === 'Enter' && onChoose(event);
+      pressable(line, () => onChoose(event));
       line.append(element('time', '', `${when.toFixed(1)} s`), element('b', '', SIGNS[level] || ''), element('span', '', `${source}: ${text}`));
       return line;
     }),

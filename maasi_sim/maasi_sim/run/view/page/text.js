@@ -16,3 +16,13 @@ export function number(value, padded = false) {
   const digits = value.toPrecision(3);
   return padded && !digits.includes('e') ? digits : String(Number(digits));
 }
+
+// Have something done by a click, or by Enter.
+export function pressable(part, action) {
+  part.tabIndex = 0;
+  part.onclick = action;
+  // A handler that returns false, as a comparison may, would hold the focus.
+  part.addEventListener('keydown', (event) => {
+    if (event.key === 'Enter') action();
+  });
+}

@@ -2,7 +2,7 @@
 
 import { scaleColour } from './colours.js';
 import { LEFT } from './run_log.js';
-import { element, number } from './text.js';
+import { element, number, pressable } from './text.js';
 
 const COLUMNS = [
   ['x', 0, 'm'], ['y', 1, 'm'], ['z', 2, 'm'], ['J', 6, ''], ['C', 3, ''], ['T', 4, ''], ['E', 5, ''], ['K', 7, 'steps'], ['M', 8, ''],
@@ -83,13 +83,6 @@ export function showWhy(parent, log, time, selected, marked, onMark) {
   }
   if (decision.cuboid) showCuboid(parent, decision);
   else showCandidates(parent, log, decision, marked, onMark, isOpen);
-}
-
-// Have something done by a click, or by Enter.
-function pressable(part, action) {
-  part.tabIndex = 0;
-  part.onclick = action;
-  part.onkeydown = (event) => event.key === 'Enter' && action();
 }
 
 function showCuboid(parent, { time, cuboid, name }) {
