@@ -294,8 +294,8 @@ class EventMaker:
         planned = [int(item) for item in message.planned]
         if self._planned.get(robot, []) != planned:
             self._planned[robot] = planned
-            words = f'cuboids {", ".join(map(str, planned))}' if planned else 'no cuboid'
-            self.message(time, robot, 'decision', f'plans to visit {words}')
+            words = ', '.join(map(str, planned)) or 'none'
+            self.message(time, robot, 'decision', f'cuboids that it plans to visit: {words}')
         lists = list(message.heard), planned, shots
         target = self._place(point(message.target))
         self._put(time, 'cuboid', robot, activity, message.how, target, *lists, bool(message.done))

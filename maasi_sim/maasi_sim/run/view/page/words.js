@@ -29,6 +29,8 @@ export function stateOf(log, name, time) {
   const event = log.at('robot', name, time);
   if (!event) return 'not heard';
   const [status, reason] = [event[5], event[6]];
+  // Its reason may say what it was about to do.
+  if (status === 5 && hasEnded(log, time)) return 'run ended; it could not go on';
   if (isStopped(event)) return 'stopped, until it is released';
   const cuboid = log.at('cuboid', name, time);
   const mode = modeOf(log, name, time);
@@ -90,7 +92,13 @@ function endWords(log, time) {
   const score = log.at('score', '', time);
   const complete = reason === 'all_found' || (score ? score[4] === 0 : log.found(time) >= log.total);
   const after = `after ${Math.round(time)} s`;
-  if (log.total && complete) return `All ${log.total} ${log.isOfBuildings ? 'cuboids visited' : 'found'} ${after}`;
+  if (log.total && complete) {
+    // A planner may search on after the last one.
+    const { totals, visits } = log;
+    const last = log.isOfBuildings ? visits.times[log.total - 1] : totals.times[totals.events.findIndex((count) => count >= log.total)];
+    const when = reason === 'all_found' ? time : Math.min(last ?? time, time);
+    return `All ${log.total} ${log.isOfBuildings ? 'cuboids visited' : 'found'} after ${Math.round(when)} s`;
+  }
   const why = text.replace(/^\//, '') || reason.replaceAll('_', ' ');
   return `Ended: ${why ? `${why}; ` : ''}${harvest(log, time)} ${after}`;
 }
