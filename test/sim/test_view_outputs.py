@@ -129,6 +129,7 @@ def test_a_robot_that_left_goes_nowhere_on_the_page(departing, tmp_path):
         assert shown.page.inner_text('#headline') == words
         assert words in shown.page.inner_text('#card')
         shown.page.click('#card button')
+        shown.settle()
         assert shown.page.is_hidden('#card')
 
 
