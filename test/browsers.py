@@ -56,15 +56,20 @@ class Page:
 
 
 @contextlib.contextmanager
-def chromium(width=1280, height=720, **options):
-    """Yield a page of a browser of its own; it complains of nothing, and asks no other host."""
+def chromium(width=1280, height=720, reduced_motion='reduce', **options):
+    """Yield a page of a browser of its own; it complains of nothing, and asks no other host.
+
+    With reduced motion a replay stands at its beginning until it is played.
+    """
     with sync_playwright() as player:
         # Root, as in containers, has no sandbox.
         arguments = ['--no-sandbox'] if os.geteuid() == 0 else []
         browser = player.chromium.launch(executable_path=CHROMIUM, args=arguments)
         try:
             viewport = {'width': width, 'height': height}
-            shown = Page(browser.new_page(viewport=viewport, **options))
+            shown = Page(
+                browser.new_page(viewport=viewport, reduced_motion=reduced_motion, **options)
+            )
             yield shown
             assert shown.errors == []
             hosts = [urlsplit(address).hostname for address in shown.requests]

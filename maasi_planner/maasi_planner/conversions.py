@@ -23,7 +23,7 @@ from maasi_filter.ros.conversions import (
     FASTEST,
     bounded,
     cluster_from_ros,
-    colour,
+    colour_of,
     point_to_ros,
     pose_from_ros,
 )
@@ -126,15 +126,19 @@ def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyG
 
 
 def planner_markers(
-    robots: dict[str, tuple[FloatArray, FloatArray, FloatArray]], header: Header, size: float
+    robots: dict[str, tuple[FloatArray, FloatArray, FloatArray]],
+    tints: dict[str, str],
+    header: Header,
+    size: float,
 ) -> MarkerArray:
-    """Return markers of robots (blue), waypoints (pink) and planned paths (green)."""
+    """Return markers of robots, waypoints and planned paths, in the colour of each robot."""
     markers = []
     for number, name in enumerate(sorted(robots)):
         position, waypoint, path = robots[name]
-        for namespace, place, tint, shape in (
-            ('robots', position, colour(0.1, 0.3, 0.9), Marker.SPHERE),
-            ('waypoints', waypoint, colour(0.95, 0.3, 0.7), Marker.CUBE),
+        tint = colour_of(tints[name])
+        for namespace, place, shape in (
+            ('robots', position, Marker.SPHERE),
+            ('waypoints', waypoint, Marker.CUBE),
         ):
             marker = Marker(header=header, ns=namespace, id=number, type=shape)
             marker.pose.position = point_to_ros(place)
@@ -145,7 +149,7 @@ def planner_markers(
         line = Marker(header=header, ns='ways', id=number, type=Marker.LINE_STRIP)
         line.pose.orientation.w = 1.0
         line.scale.x = 0.2 * size
-        line.color = colour(0.1, 0.7, 0.2)
+        line.color = tint
         thinned = path[:: max(1, len(path) // 50)]
         line.points = [point_to_ros(point) for point in thinned]
         line.action = Marker.ADD if len(line.points) > 1 else Marker.DELETE

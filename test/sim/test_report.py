@@ -172,8 +172,8 @@ def test_report_of_a_complete_run(run, tmp_path):
     assert json.loads((tmp_path / 'report.json').read_text()) == report
     picture = cv2.imread(str(tmp_path / 'report.png')).astype(int)
     assert picture.shape[0] > 600 and picture.shape[1] > 1000
-    # Something of every kind of mark is there: found (red) and false (violet).
-    for colour in ((0x28, 0x27, 0xD6), (0x94, 0x32, 0x7B)):
+    # Something of every kind of mark is there: found (green) and false (pink).
+    for colour in ((0x73, 0x9E, 0x00), (0x7E, 0x00, 0xE6)):
         assert (np.abs(picture - colour).max(axis=2) < 12).sum() > 20
     text = target_summary(report)
     for words in ('3 of 3 targets found, 1 false', 'all targets found', '3.0 times real time'):
@@ -381,7 +381,7 @@ def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(ru
     drawn = [patch for patch in world.patches if 'Ell' in repr(patch)]
     small, large = sorted(drawn, key=lambda patch: patch.width)
     colours = [to_hex(patch.get_edgecolor()) for patch in (small, large)]
-    assert colours == ['#d62728', '#7b3294']
+    assert colours == ['#009e73', '#e6007e']
     assert small.width == pytest.approx(2 * 0.012 * 2.0)
     # Its axis is a principal one of the covariance.
     axis = np.array([math.cos(math.radians(large.angle)), math.sin(math.radians(large.angle))])

@@ -7,8 +7,10 @@ import math
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseArray
 from nav_msgs.msg import OccupancyGrid
+from std_msgs.msg import String
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs import msg
@@ -98,6 +100,20 @@ def test_what_comes_before_the_first_step_is_taken_at_its_time(taken):
         taken.take('/lockstep/step', step(seconds, 'rover'))
         taken.take('/rover/state', state(seconds))
     assert [event[0] for event in taken.of('robot')] == [0.0, 0.5]
+
+
+def test_modes_of_robots_and_the_ending_are_events_and_said_once(taken):
+    status = DiagnosticStatus(name='/team/planner_node', message='active')
+    status.values = [KeyValue(key='search', value='rover paused, walker searching')]
+    for _ in range(2):
+        taken.take('/diagnostics', DiagnosticArray(status=[status]))
+    assert taken.of('mode') == [[0.0, 'mode', '/team/planner_node', status.values[0].value]]
+    taken.take('/rover/state', state(0.0, goal_status=msg.AgentState.MOVING))
+    taken.take('/ending', String(data='node_died\n/filter_node exited with 1'))
+    # At the end of a recording.
+    taken.maker.end()
+    assert taken.of('end') == [[0.0, 'end', '', 'node_died', '/filter_node exited with 1']]
+    assert [event[5] for event in taken.of('robot')] == [1, ENDED]
 
 
 def test_candidates_that_are_not_allowed_have_no_objective(taken):

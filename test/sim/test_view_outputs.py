@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from browsers import chromium, needs_chromium
 
+from maasi_filter import colours
 from maasi_sim.run.bag import load_types
-from maasi_sim.run.buildings.picture import NAMED
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.rviz_view import shown_topics
-from maasi_sim.run.view import video
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.page_file import FOLDER, write_replay
@@ -98,7 +97,8 @@ def departing():
     maker.way(0.0, 'mambo', [(0.5, 0.5, 1.0), (2.0, 2.0, 1.0)])
     maker.robot(1.0, 'mambo', (0.6, 0.6, 1.0, 0.0))
     maker.leave(2.0, 'mambo')
-    maker.message(3.0, 'team', 'team', 'goes on')
+    maker.message(3.0, 'team', 'team', 'continues')
+    maker.end('node_died', '/filter_node was killed by SIGKILL')
     return EventLog(maker.scene, events)
 
 
@@ -115,20 +115,166 @@ def test_a_robot_that_left_goes_nowhere_on_the_page(departing, tmp_path):
         pixels = []
         for seconds, text in ((1.5, 'on the way'), (2.5, 'left')):
             shown.seek(seconds)
+            assert shown.page.is_hidden('#card')
             assert shown.page.inner_text('#robots tr[data-robot=mambo] td.text') == text
             address = shown.page.evaluate("document.getElementById('map').toDataURL()")
             data = np.frombuffer(base64.b64decode(address.partition(',')[2]), np.uint8)
             pixels.append(bluish(cv2.imdecode(data, cv2.IMREAD_COLOR)).sum())
-        assert pixels[1] < 0.5 * pixels[0]
+        assert pixels[1] < 0.1 * pixels[0]
+        shown.page.click('#robots tr[data-robot=mambo]')
+        assert shown.page.inner_text('#why_body') == 'mambo has left.'
+        shown.seek(9.0)
+        shown.until("document.querySelector('#headline').textContent.startsWith('Ended')")
+        words = 'Ended: filter_node was killed by SIGKILL; 0 of 12 found after 3 s'
+        assert shown.page.inner_text('#headline') == words
+        assert words in shown.page.inner_text('#card')
+        shown.page.click('#card button')
+        shown.settle()
+        assert shown.page.is_hidden('#card')
+
+
+@pytest.fixture(scope='module')
+def searched(tmp_path_factory):
+    """Return the replay of a search with a robot that leaves, and its log."""
+    scenario = load_mission('mambo_turtlebot').scenario
+    content = {**scenario.content(), 'events': [{'at': 8.0, 'robot': 'mambo', 'do': 'leave'}]}
+    log = search(type(scenario).model_validate(content), 901, 120).trace.log('search')
+    log.scene['command'] = './scripts/run_scenario mambo_turtlebot --seed 901'
+    path = tmp_path_factory.mktemp('searched') / 'page.html'
+    write_replay(log, path)
+    return path, log
+
+
+@needs_chromium
+def test_a_replay_plays_by_itself_and_says_what_happens_to_its_end(searched):
+    path, log = searched
+    with chromium(reduced_motion='no-preference') as shown:
+        shown.open(path.as_uri())
+        shown.until('maasi.playing && maasi.time > 0.5')
+        # No headline is read aloud before the one before it was heard.
+        shown.page.evaluate(
+            'window.changes = []; const heading = document.querySelector("#headline");'
+            'new MutationObserver(() => changes.push(Number(heading.dataset.since)))'
+            '.observe(heading, {childList: true})'
+        )
+        shown.until('!maasi.playing')
+        shown.until("document.querySelector('#headline').textContent.startsWith('Ended')")
+        changes = shown.page.evaluate('changes')
+        assert len(changes) > 1 and np.diff(changes).min() >= 1000
+        assert 'of 12 found after' in shown.page.inner_text('#headline')
+        assert log.scene['command'] in shown.page.inner_text('#card')
+        states = shown.page.locator('#robots td.text').all_inner_texts()
+        assert states == ['left', 'run ended']
+
+
+@needs_chromium
+def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(searched):
+    path, log = searched
+    decision = next(event for event in log.events if event[1] == 'plan')[7][0]
+    name, _, chosen, waypoint, candidates, _ = decision
+    with chromium() as shown:
+        page = shown.page
+        shown.open(path.as_uri())
+        assert page.evaluate('maasi.time') == 0.0 and not page.evaluate('maasi.playing')
+        heading = page.inner_text('#headline')
+        assert heading.startswith('Searching: 0 of 12 found, ') and ' goes to the ' in heading
+        page.click(f'#robots tr[data-robot={name}]')
+        shown.settle()
+        assert f'expects {candidates[chosen][5]:.3g} new targets' in page.inner_text('.expects')
+        assert not page.is_visible('#why table')
+        page.click('#why summary')
+        sides = 'Array.from(document.querySelectorAll("#why {}")).map(c => Math.round('
+        sides += 'c.getBoundingClientRect().right - parseFloat(getComputedStyle(c).paddingRight)))'
+        heads, cells = (page.evaluate(sides.format(part)) for part in ('th', 'tr.chosen td'))
+        assert heads == cells
+
+        def tip(place):
+            x, y = page.evaluate(f'maasi.camera.project({list(place)})')[:2]
+            box = page.locator('#map').bounding_box()
+            page.mouse.move(box['x'] + x, box['y'] + y)
+            return page.inner_text('#tip')
+
+        assert tip(waypoint).startswith(f'candidate {chosen} at (')
+        assert tip(page.evaluate('maasi.log.at("robot", "mambo", 0)[3]')).startswith(
+            'mambo: on the'
+        )
+        page.keyboard.press('Escape')
+        assert tip((-0.25, 2.35)) == 'unexplored 100 % at (-0.25, 2.35) m'
+        found = next(event for event in log.events if event[1] == 'found' and event[3])
+        shown.seek(found[0])
+        number, x, y, *_ = found[3][0]
+        assert tip((x, y)).startswith(f'target {number}: found by ')
+
+
+@needs_chromium
+def test_the_legend_is_whole_and_beside_the_map_on_a_phone_and_play_comes_before_candidates(
+    searched,
+):
+    with chromium(390, 844) as shown:
+        page = shown.page
+        shown.open(searched[0].as_uri())
+        page.evaluate('maasi.select("turtlebot")')
+        shown.settle()
+        text = page.inner_text('#legend')
+        for entry in ('unexplored', 'planned way', 'way so far', 'waypoint', 'found', 'candidate'):
+            assert entry in text
+        map_, legend = (page.locator(part).bounding_box() for part in ('#map', '#legend'))
+        assert legend['y'] >= map_['y'] + map_['height'] and legend['height'] > 20
+        order = []
+        page.click('#why summary')
+        page.locator('#theme').focus()
+        while 'candidate' not in order and len(order) < 40:
+            page.keyboard.press('Tab')
+            order.append(
+                page.evaluate(
+                    'document.activeElement.closest("#why table") ? "candidate" :'
+                    ' document.activeElement.id'
+                )
+            )
+        assert order.index('play') < order.index('candidate')
+
+
+def contrast(*colours):
+    """Return the contrast of two colours of three numbers up to 255, as WCAG 2 has it."""
+    shares = np.array(colours, dtype=float) / 255.0
+    linear = np.where(shares <= 0.03928, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    dark, bright = np.sort(linear @ (0.2126, 0.7152, 0.0722))
+    return (bright + 0.05) / (dark + 0.05)
+
+
+@needs_chromium
+@pytest.mark.parametrize('theme', ['light', 'dark'])
+def test_texts_and_robots_stand_out(searched, theme):
+    style = 'getComputedStyle(document.documentElement).getPropertyValue("--{}").trim()'
+    swatches = '[...document.querySelectorAll("#robots .swatch")].map((s) => s.style.background)'
+    with chromium(color_scheme=theme) as shown:
+        shown.open(searched[0].as_uri())
+
+        def of(name):
+            text = shown.page.evaluate(style.format(name))
+            digits = re.findall(r'\d+', text) if ',' in text else bytes.fromhex(text[1:])
+            return np.array([int(value) for value in digits])
+
+        for text in ('text', 'quiet', 'fault', 'warning'):
+            for ground in ('back', 'panel'):
+                assert contrast(of(text), of(ground)) >= 4.5, (text, ground)
+        # As opaque as a cell that is wholly unexplored.
+        grey = of('floor') + 135 / 255 * (of('unseen') - of('floor'))
+        tints = shown.page.evaluate(swatches)
+        assert len(tints) == 2
+        for tint in tints:
+            assert contrast([int(value) for value in re.findall(r'\d+', tint)], grey) >= 3.0
 
 
 def test_robots_have_the_colours_of_the_page():
     text = (FOLDER / 'colours.js').read_text()
     robots = re.search(r'const ROBOTS = (\[.*\]);', text).group(1)
-    assert tuple(re.findall(r'#\w+', robots.upper())) == video._ROBOTS
+    assert tuple(re.findall(r'#\w+', robots.upper())) == colours.ROBOTS
     named = re.search(r'const NAMED = (\{.*\});', text).group(1)
-    colours = {name: colour.upper() for name, colour in re.findall(r"(\w+): '(#\w+)'", named)}
-    assert colours == NAMED
+    pairs = re.findall(r"(\w+): '(#\w+)'", named)
+    assert {name: colour.upper() for name, colour in pairs} == colours.NAMED
+    for name in ('FOUND', 'POTENTIAL', 'SEEN'):
+        assert f"{name} = '{getattr(colours, name).lower()}'" in text
 
 
 def test_a_video_of_another_kind_is_refused(tmp_path, capsys):

@@ -206,7 +206,7 @@ def test_commands_are_carried_out_with_the_token_and_wrong_ones_refused():
     for length, status in (('', 411), ('-1', 411), ('99999999999', 413)):
         assert command('', content_length=length)[0] == status
     assert calls == []
-    names = ('pause', 'resume', 'home', 'stop', 'release')
+    names = ('start', 'pause', 'resume', 'home', 'stop', 'release')
     words = [(word, robot) for word in names for robot in ('rover', None)]
     for word, robot in words:
         status, text = command(json.dumps({'command': word, 'robot': robot}))

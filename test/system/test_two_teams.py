@@ -55,7 +55,7 @@ def test_a_recording_holds_its_own_team_from_its_first_measurement_on(teams, tea
         asked = {item.message.batch_id for item in bag.messages([f'/{team}/mambo/detections'])}
         steps = [item.message for item in bag.messages([f'/{team}/lockstep/step'])]
         clock = [stamp_from_ros(item.message.clock) for item in bag.messages(['/clock'])]
-    shared = {'/clock', '/diagnostics', '/rosout', '/scenario'}
+    shared = {'/clock', '/diagnostics', '/rosout', '/scenario', '/ending'}
     assert {topic for topic in counts if not topic.startswith(f'/{team}/')} == shared
     assert names and all(name.startswith(f'/{team}/') for name in names)
     assert loggers and all(name.startswith(f'{team}.') for name in loggers)

@@ -37,7 +37,16 @@ def watch(run, address):
         shown.settle()
         run.found = shown.number()
         run.decisions = shown.page.evaluate('maasi.log.decisions.times.length')
-        run.controls = shown.page.is_visible('#controls')
+        run.controls = shown.page.is_visible('#controls') or shown.page.is_visible('#live')
+        shown.until("document.querySelector('#headline').textContent.startsWith('Ended')")
+        run.headline = shown.page.inner_text('#headline')
+        run.card = shown.page.inner_text('#card')
+        events = (
+            '(kind) => maasi.log.owners(kind).flatMap((name) => maasi.log.slot(kind, name).events)'
+        )
+        run.starts = shown.page.evaluate(events, 'start')
+        run.modes = [event[3] for event in shown.page.evaluate(events, 'mode')]
+        run.states = shown.page.locator('#robots td.text').all_inner_texts()
 
 
 @pytest.fixture(scope='module')
@@ -66,6 +75,13 @@ def test_a_browser_saw_the_run_while_it_went_on(run):
     assert run.answer == 'pause: turtlebot'
     # Nobody follows after the end.
     assert not run.controls
+    assert run.headline == f'Ended: time limit; {run.found} of 12 found after 30 s'
+    assert './scripts/run_scenario mambo_turtlebot --seed 1 --lockstep' in run.card
+    assert str(REPLAY) in run.card
+    # Each number of nodes that were ready, up to all.
+    assert run.starts[-1][3:] == [run.starts[-1][4]] * 2 and len(run.starts) > 1
+    assert 'mambo searching, turtlebot paused' in run.modes
+    assert run.states == ['run ended', 'run ended']
 
 
 @needs_chromium
@@ -82,6 +98,7 @@ def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run):
         page.keyboard.press('End')
         replay.settle()
         assert replay.number() == len(run.report['found'])
+        replay.until("document.querySelector('#headline').textContent.startsWith('Ended: time')")
         last = page.screenshot()
         replay.seek(10.0)
         assert page.screenshot() != last
@@ -104,11 +121,12 @@ def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run):
         first = decisions[0]['robots'][0]
         page.click(f'#log li.decision:has-text("{first["robot"]}: decision 0")')
         replay.settle()
+        page.click('#why summary')
         rows = page.locator('#why tbody tr')
         assert rows.count() == len(first['candidates'])
         assert int(page.inner_text('#why tr.chosen td')) == first['chosen']
         assert 'admissible' in page.inner_text('#why .reason')
-        assert page.inner_text('#why .formula') == 'J = (-1.0e-6 C + 0.5 T + 1 E) / K'
+        assert page.inner_text('#why .formula') == 'J = (-1.00e-6 C + 0.5 T + 1 E) / K'
         # Sorted by the objective, and by another column where that is clicked.
         for heading, term in (('', 'objective'), ('E', 'exploration')):
             if heading:

@@ -15,6 +15,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.colours import FOUND, POTENTIAL
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor, is_covariance
 from maasi_filter.records import UNLABELLED, AgentMeasurement, Cluster, FoundTarget, Label
@@ -280,6 +281,12 @@ def particles_to_ros(positions: FloatArray, weights: FloatArray, header: Header)
     )
 
 
+def colour_of(text: str, alpha: float = 1.0) -> ColorRGBA:
+    """Return a colour given as #RRGGBB."""
+    red, green, blue = (value / 255.0 for value in bytes.fromhex(text[1:]))
+    return colour(red, green, blue, alpha)
+
+
 def colour(red: float, green: float, blue: float, alpha: float = 1.0) -> ColorRGBA:
     """Return a colour."""
     return ColorRGBA(r=red, g=green, b=blue, a=alpha)
@@ -308,7 +315,7 @@ def filter_markers(
     found: Iterable[FoundTarget],
     size: float,
 ) -> MarkerArray:
-    """Return markers of clusters (orange, scaled by their width) and found targets (red)."""
+    """Return markers of clusters (orange, scaled by their width) and found targets (green)."""
     markers = [
         sphere_marker(
             header,
@@ -316,12 +323,12 @@ def filter_markers(
             number,
             cluster.position,
             max(2.0 * cluster.radius, 0.5 * size),
-            colour(1.0, 0.6, 0.0, 0.2 + 0.6 * min(cluster.mass, 1.0)),
+            colour_of(POTENTIAL, 0.2 + 0.6 * min(cluster.mass, 1.0)),
         )
         for number, cluster in enumerate(clusters, start=1)
     ]
-    red = colour(0.8, 0.0, 0.1)
-    markers += [sphere_marker(header, 'found', t.id, t.position, size, red) for t in found]
+    tint = colour_of(FOUND)
+    markers += [sphere_marker(header, 'found', t.id, t.position, size, tint) for t in found]
     return MarkerArray(markers=markers)
 
 

@@ -8,11 +8,13 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.colours import robot_colours
 from maasi_filter.ros.conversions import (
     FARTHEST,
     FASTEST,
     bounded,
     colour,
+    colour_of,
     point_from_ros,
     point_to_ros,
 )
@@ -141,15 +143,16 @@ def mission_markers(mission: CoveragePlan, header: Header) -> MarkerArray:
 def agent_markers(agent: SearchAgent, plan: Plan, header: Header) -> MarkerArray:
     """Return markers of a robot, its plan, its search map, and its camera direction."""
     name = agent.name
+    tint_of_robot = colour_of(robot_colours([name])[name])
     markers = []
     for number, box in enumerate(agent.mission.boxes):
         visited = bool(agent.visited[number])
         tint = colour(0.3, 0.7, 0.9, 0.1) if visited else colour(0.85, 0.4, 0.0, 0.35)
         markers.append(_box(header, f'{name}/cuboids', number, box, tint))
-    robot = _marker(header, f'{name}/robot', Marker.SPHERE, colour(0.1, 0.3, 0.9))
+    robot = _marker(header, f'{name}/robot', Marker.SPHERE, tint_of_robot)
     robot.pose.position = point_to_ros(agent.position)
     robot.scale = vector_to_ros(np.full(3, 4.0))
-    line = _marker(header, f'{name}/plan', Marker.LINE_STRIP, colour(0.1, 0.7, 0.2))
+    line = _marker(header, f'{name}/plan', Marker.LINE_STRIP, tint_of_robot)
     line.scale.x = 0.8
     line.points = [point_to_ros(point) for point in plan.positions]
     arrow = _marker(header, f'{name}/camera', Marker.ARROW, colour(0.9, 0.1, 0.1))

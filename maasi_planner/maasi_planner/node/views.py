@@ -10,6 +10,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from maasi_filter.colours import robot_colours
 from maasi_filter.ros.conversions import MarkerBoard, particles_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED
@@ -59,4 +60,5 @@ class PlannerViews:
             path = coordinator.plans[name].positions
             place = np.asarray(robot.state.pose.position)
             shown[name] = (place, path[-1] if len(path) else place, path)
-        self._markers.publish(self._board.replace(planner_markers(shown, header, self._size)))
+        markers = planner_markers(shown, robot_colours(coordinator.names), header, self._size)
+        self._markers.publish(self._board.replace(markers))

@@ -36,6 +36,8 @@ __all__ = ['Bag', 'BagError', 'BagWriteError', 'BagWriter', 'load_types', 'topic
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 SCENARIO_TOPIC = '/scenario'
+# Reason in one word, then a line in words.
+ENDING_TOPIC = '/ending'
 
 ImageFormat = Literal['jpeg', 'png', 'raw']
 
@@ -174,11 +176,15 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
 
     def write_scenario(self, text: str, facts: Mapping[str, str]) -> None:
         """Store the scenario: latched on topic `/scenario`, and as custom data of the recording."""
-        string = self._types.types['std_msgs/msg/String']
-        self.add_topic(SCENARIO_TOPIC, 'std_msgs/msg/String', topic_qos(latched=True, depth=1))
         for key, value in facts.items():
             self._writer.set_custom_data(key, value)
-        self.write_message(SCENARIO_TOPIC, 0, string(data=text))
+        self.write_text(SCENARIO_TOPIC, 0, text)
+
+    def write_text(self, topic: str, time: int, text: str) -> None:
+        """Store a text on a latched topic of its own, at `time` [ns]."""
+        string = self._types.types['std_msgs/msg/String']
+        self.add_topic(topic, 'std_msgs/msg/String', topic_qos(latched=True, depth=1))
+        self.write_message(topic, time, string(data=text))
 
     @property
     def failed(self) -> bool:

@@ -21,8 +21,6 @@ from numpy.typing import ArrayLike
 from maasi_filter.arrays import FloatArray
 from maasi_sim.run.mission import RunRecord
 
-# Palette for colour-blind readers (Okabe and Ito).
-COLOURS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#8C564B')
 PALE, GRID, UNSEEN = '#9A9A9A', '#E6E6E6', '#CFCFCF'
 # Of axes to the right of the last value, or a step at the end cannot be seen.
 MARGIN = 1.015

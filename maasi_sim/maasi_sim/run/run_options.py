@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -46,6 +47,15 @@ class Options:
     follow_clock: bool = False
     replay: Path | None = None
     view: ViewOptions | None = None
+
+    def command(self, seed: int) -> str:
+        """Return the command that runs the same again."""
+        words = ['./scripts/run_scenario', self.scenario, '--seed', str(seed)]
+        words += ['--lockstep'] if self.lockstep else []
+        given = {'--rate': self.rate, '--planner': self.planner, '--time-limit': self.time_limit}
+        for name, value in given.items():
+            words += [] if value is None else [name, str(value)]
+        return shlex.join(words)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from maasi_sim.run.bag import BagError, BagWriter, load_types
+from maasi_sim.run.bag import ENDING_TOPIC, BagError, BagWriter, load_types
 from maasi_sim.run.domain import Domain
 from maasi_sim.run.ending import (
     DONE,
@@ -33,6 +33,7 @@ from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
+from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.live_view import RunPage
 from maasi_sim.run.view.messages import read_events
 from maasi_sim.run.view.page_file import REPLAY, write_replay
@@ -75,6 +76,7 @@ class ScenarioRun:
         # Whether its time is that of others.
         self._follows = options.follow_clock or self.mission.scenario.external_clock
         self._bag: BagWriter | None = None
+        self._page: RunPage | None = None
         #: Errors of writing.
         self.unwritten: list[str] = []
         # Wall time when all nodes were ready, and of the first step.
@@ -112,12 +114,13 @@ class ScenarioRun:
             )
             if self._bag is not None:
                 self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
-            page = self._page(domain.number)
-            if page is not None:
-                ends.callback(page.end)
-                self.recorder.listener = page.put_message
+            self._page = self._serve(domain.number)
+            if self._page is not None:
+                ends.callback(self._page.end)
+                self.recorder.listener = self._page.put_message
             ends.callback(stop, processes)
             self._monitor()
+            self._note_ending()
             self._close_bag()
             followed = self._is_followed()
             if not followed:
@@ -137,6 +140,7 @@ class ScenarioRun:
         facts = {
             'name': self.mission.name,
             'seed': self._scenario.seed,
+            'command': options.command(self._scenario.seed),
             'lockstep': options.lockstep,
             'rate': options.rate,
             'namespace': options.namespace,
@@ -153,19 +157,32 @@ class ScenarioRun:
         }
         return to_yaml(facts)
 
-    def _page(self, domain: int) -> RunPage | None:
+    def _serve(self, domain: int) -> RunPage | None:
         """Serve the page of the run, if it is asked for; an error does not end the run."""
         options = self.options.view
         if options is None:
             return None
         try:
             scene = scene_of(self.mission.name, self._scenario)
+            scene['command'] = self.options.command(self._scenario.seed)
+            if self.options.record:
+                scene['replay'] = short(self.folder / REPLAY)
             page = RunPage(scene, options, domain, self.options.namespace)
         except OSError as error:
             self._warn(f'no view: {options.host}: {error.strerror or error}')
             return None
         page.announce(self.display.say)
         return page
+
+    def _note_ending(self) -> None:
+        """Tell the recording and the page how the run ended."""
+        reason, text = self.ending.reason, self.ending.text
+        if self._bag is not None:
+            # An error is reported where the recording is closed.
+            with contextlib.suppress(BagError):
+                self._bag.write_text(ENDING_TOPIC, self.recorder.time, f'{reason}\n{text}')
+        if self._page is not None:
+            self._page.put(EventMaker.end, reason, text)
 
     def _warn(self, *texts: str) -> None:
         for text in filter(None, texts):
@@ -220,7 +237,10 @@ class ScenarioRun:
         # Nodes report last, so that all topics of one that has reported are discovered.
         ready = set(recorder.take_ready())
         recorder.discover()
-        if late := [name for name in expected if name not in ready]:
+        late = [name for name in expected if name not in ready]
+        if self._page is not None:
+            self._page.starting(len(expected) - len(late), len(expected))
+        if late:
             return dict.fromkeys(late, 'is not ready')
         self._complete = self._complete or time.monotonic()
         unmatched = recorder.unmatched()

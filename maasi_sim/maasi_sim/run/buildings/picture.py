@@ -9,22 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.colours import robot_colours
 from maasi_planner.buildings.preplanning import CoveragePlan
 
-# Palette for colour-blind readers (Okabe and Ito).
-COLOURS = ('#CC79A7', '#D62728', '#009E73', '#0072B2', '#E69F00', '#56B4E9', '#8C564B')
-# Of robots that are called by a colour.
-NAMED = {'purple': '#7B3294', 'red': '#D62728', 'green': '#2CA02C', 'blue': '#0072B2'}
 OBJECT, OBSTACLE, OPEN, VISITED = '#B9B9C9', '#8A8478', '#D55E00', '#56B4E9'
 _SIDES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
-
-
-def colours_of(names: Collection[str]) -> dict[str, str]:
-    """Return a colour for each robot; one that is called by a colour has that."""
-    return {
-        name: NAMED.get(name, COLOURS[index % len(COLOURS)])
-        for index, name in enumerate(sorted(names))
-    }
 
 
 def draw_mission(
@@ -49,7 +38,7 @@ def draw_mission(
             0.12 if done else 0.35,
             'cuboid, visited' if done else 'cuboid, not visited',
         )
-    for name, colour in colours_of(paths).items():
+    for name, colour in robot_colours(paths).items():
         path = np.asarray(paths[name], dtype=float).reshape(-1, 3)
         axes.plot(*path.T, '-', color=colour, lw=1.4, label=name)
         axes.plot(*path.T, 'D', color=colour, ms=2.2)

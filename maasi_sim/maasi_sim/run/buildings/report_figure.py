@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.colours import robot_colours
 from maasi_sim.run.buildings.observer import CuboidRecord
-from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, colours_of
+from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED
 from maasi_sim.run.buildings.report import build_cuboid_report
 from maasi_sim.run.report_files import reason_of_end
 from maasi_sim.run.report_panels import MARGIN, MapView, draw_report
@@ -21,7 +22,7 @@ def plot_cuboid_report(record: CuboidRecord) -> Figure:
     visited = {shot['cuboid'] for shot in record.snapshots}
     return draw_report(
         record,
-        colours_of(record.scenario.names()),
+        robot_colours(record.scenario.names()),
         _area(record),
         lambda view: _draw_mission(view, record, visited),
         [

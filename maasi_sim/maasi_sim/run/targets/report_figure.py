@@ -12,15 +12,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.colours import FOUND, robot_colours
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import reason_of_end
-from maasi_sim.run.report_panels import COLOURS, MARGIN, PALE, UNSEEN, MapView, draw_report, ellipse
+from maasi_sim.run.report_panels import MARGIN, PALE, UNSEEN, MapView, draw_report, ellipse
 from maasi_sim.run.targets.report import build_report, to_find_all
 from maasi_sim.run.targets.tally import TargetRecord
 
-_TRUE, _FOUND, _MISSED, _FALSE = '#222222', '#D62728', '#D55E00', '#7B3294'
+_TRUE, _MISSED, _FALSE = '#222222', '#D62728', '#E6007E'
 _SIGMAS = 3.0
 # Of the longest side: half axes of an ellipse are drawn at least so long.
 _LEAST = {2: 0.012, 3: 0.022}
@@ -32,7 +33,7 @@ def plot_report(record: TargetRecord) -> Figure:
     """Return a figure: the search from above, in 3D also from the sides, and its progress."""
     scenario = record.scenario
     bounds = scenario.environment.array()
-    colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(scenario.names())}
+    colours = robot_colours(scenario.names())
     detections = {
         name: scenario.robots[name].sensor.build(name, scenario.dimension).detection
         for name in colours
@@ -131,13 +132,13 @@ def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> No
         covariance = target.covariance[np.ix_(view.plane, view.plane)]
         enlarged |= _SIGMAS * math.sqrt(max(np.linalg.eigvalsh(covariance)[0], 0.0)) < least
         place = (target.position[view.plane[0]], target.position[view.plane[1]])
-        style: dict[str, Any] = {'ec': _FALSE if number in wrong else _FOUND, 'lw': 1.3}
+        style: dict[str, Any] = {'ec': _FALSE if number in wrong else FOUND, 'lw': 1.3}
         axes.add_patch(ellipse(place, covariance, _SIGMAS, least, zorder=5, **style))
     sigmas = f'{_SIGMAS:g} sigma' + (f', drawn at least {least:.2g} m' if enlarged else '')
     marks: tuple[tuple[FloatArray, str, dict[str, Any], str], ...] = (
         (truth, 'D', {'mfc': 'none', 'mec': _TRUE, 'ms': 11, 'mew': 1.2}, 'true target'),
-        (positions[right], 'D', {'color': _FOUND, 'ms': 3.5}, 'found target'),
-        (positions[:0], 'o', {'mfc': 'none', 'mec': _FOUND, 'ms': 9}, sigmas),
+        (positions[right], 'D', {'color': FOUND, 'ms': 3.5}, 'found target'),
+        (positions[:0], 'o', {'mfc': 'none', 'mec': FOUND, 'ms': 9}, sigmas),
         (truth[missed], 'o', {'mfc': 'none', 'mec': _MISSED, 'ms': 20, 'mew': 3}, 'missed'),
         (positions[wrong], 'X', {'color': _FALSE, 'ms': 14, 'mec': 'white'}, 'false target'),
     )
@@ -157,7 +158,7 @@ def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
         places, right, every = [*places, record.end_time], [*right, right[-1]], [*every, every[-1]]
     if any(found > true for found, true in zip(every, right)):
         axes.step(places, every, where='post', color=_FALSE, lw=1.0, label='with false ones')
-    axes.step(places, right, where='post', color=_FOUND, lw=2.0, label='found')
+    axes.step(places, right, where='post', color=FOUND, lw=2.0, label='found')
     axes.axhline(number, color=_TRUE, lw=1.0, ls='--', label='true targets')
     axes.set_xlim(0.0, MARGIN * max(places[-1], 1.0))
     axes.set_ylim(0.0, max(number, max(every), 1) * 1.08)

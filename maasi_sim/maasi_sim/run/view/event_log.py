@@ -21,6 +21,9 @@ score       true targets found, missed, false, RMSE or null [m], GOSPA [m]
 cuboid      activity, how, target, robots heard, cuboids planned, snapshots [cuboid, x, y, z, p_d],
             whether it knows that all are visited
 log         level, source, text
+start       nodes that are ready, nodes that there are
+mode        the modes of the robots of a planner node, in words
+end         reason, text
 scene       a part of the scene that became known later
 ==========  ======================================================================================
 

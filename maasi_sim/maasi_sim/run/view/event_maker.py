@@ -47,7 +47,7 @@ def _upper(covariance: ArrayLike) -> list[float]:
 
 
 def _words(place: Sequence[float]) -> str:
-    return f'({", ".join(f"{value:g}" for value in place)})'
+    return f'({", ".join(f"{value:.3g}" for value in place)})'
 
 
 def _explored(values: FloatArray) -> float:
@@ -77,6 +77,8 @@ class EventMaker:
         # Last time, place and battery of each robot.
         self._heard: dict[str, tuple[float, list[float], float]] = {}
         self._activity: dict[str, str] = {}
+        self._modes: dict[str, str] = {}
+        self._planned: dict[str, list[int]] = {}
         self._measured: set[tuple[str, str, int]] = set()
         #: Latest time of an event [s].
         self.latest = 0.0
@@ -120,8 +122,20 @@ class EventMaker:
         if name in self._heard:
             self._set_status(time, name, LEFT, '')
 
-    def end(self) -> None:
-        """Add that the run has ended: nobody is on the way any more."""
+    def starting(self, ready: int, total: int) -> None:
+        """Add how many nodes are ready before the first step."""
+        self._put(0.0, 'start', '', ready, total)
+
+    def modes(self, time: float, node: str, words: str) -> None:
+        """Add the modes of the robots of a planner node, as it describes them."""
+        if self._modes.get(node) != words:
+            self._modes[node] = words
+            self._put(time, 'mode', node, words)
+
+    def end(self, reason: str = '', text: str = '') -> None:
+        """Add that the run has ended, and why: nobody is on the way any more."""
+        if reason:
+            self._put(self.latest, 'end', '', reason, text)
         for name in self._heard:
             if self._status[name] < UNAVAILABLE:
                 self._set_status(self.latest, name, ENDED, '')
@@ -277,7 +291,12 @@ class EventMaker:
         before, self._activity[robot] = self._activity.get(robot, activity), activity
         if before != activity:
             self.message(time, robot, 'team', activity)
-        lists = list(message.heard), [int(item) for item in message.planned], shots
+        planned = [int(item) for item in message.planned]
+        if self._planned.get(robot, []) != planned:
+            self._planned[robot] = planned
+            words = ', '.join(map(str, planned)) or 'none'
+            self.message(time, robot, 'decision', f'cuboids that it plans to visit: {words}')
+        lists = list(message.heard), planned, shots
         target = self._place(point(message.target))
         self._put(time, 'cuboid', robot, activity, message.how, target, *lists, bool(message.done))
 

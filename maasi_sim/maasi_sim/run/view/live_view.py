@@ -127,6 +127,7 @@ class RunPage(LiveView):
         super().__init__(scene, options.port, options.host, self._control)
         self._types = load_types()
         self._waits = waits
+        self._ready = -1
         self._known = 'bounds' in scene
         self._messages = MessageEvents(self.maker, waits, None if waits else self.restart)
 
@@ -135,6 +136,12 @@ class RunPage(LiveView):
         if not (self._known and type_name == MARKERS):
             decode, take = self._types.deserialize_cdr, self._messages.take
             self.put(lambda _: take(topic, type_name, decode(data, type_name)))
+
+    def starting(self, ready: int, total: int) -> None:
+        """Show how many nodes are ready."""
+        if self._ready != ready:
+            self._ready = ready
+            self.put(EventMaker.starting, ready, total)
 
     def end(self) -> None:
         """Show the queued messages, and stop serving."""
@@ -174,8 +181,8 @@ class SearchTrace:
 
     def end(self, reason: str) -> None:
         """Stop serving the page; what was gathered stays."""
+        self.add(EventMaker.end, reason)
         if self._live is not None:
-            self._live.put(EventMaker.end)
             self._live.close(f'ended: {reason}')
 
     def robots(self, time: float, states: Mapping[str, RobotState]) -> None:

@@ -56,6 +56,7 @@ TOPICS: dict[str, tuple[str, ...]] = {
     'nav_msgs/msg/OccupancyGrid': ('_take_grid', 'exploration'),
     'sensor_msgs/msg/PointCloud2': ('_take_cloud', 'exploration'),
     'geometry_msgs/msg/PoseArray': ('_take_truth', 'ground_truth/targets'),
+    'std_msgs/msg/String': ('_take_end', 'ending'),
     MARKERS: ('_take_markers', 'ground_truth/markers', 'search_area', 'markers'),
     'rcl_interfaces/msg/Log': ('_take_log', 'rosout'),
     'diagnostic_msgs/msg/DiagnosticArray': ('_take_diagnostics', 'diagnostics'),
@@ -267,6 +268,13 @@ class MessageEvents:
                 word = 'fault' if level > 1 else 'warning' if level else 'team'
                 text = f'{_DIAGNOSTIC_WORDS[level]}: {status.message}'
                 self.maker.message(self.maker.latest, status.name, word, text)
+            for item in status.values:
+                if item.key == 'search':
+                    self.maker.modes(self.maker.latest, status.name, item.value)
+
+    def _take_end(self, _: str, message: Any) -> None:
+        reason, _, text = message.data.partition('\n')
+        self.maker.end(reason, text)
 
 
 def _space(topic: str) -> str:

@@ -16,7 +16,10 @@ from maasi_sim.run.view.event_log import LARGEST, EventLog
 FOLDER = Path(__file__).with_name('page')
 REPLAY = 'replay.html'
 # Each uses only what is before it.
-_MODULES = 'run_log camera colours text shapes buildings map why panels curve live main'
+_MODULES = (
+    'run_log camera colours text words shapes labels robots buildings map why panels legend marks '
+    'tips curve live main'
+)
 
 
 def empty_page() -> str:

@@ -59,7 +59,9 @@ def scene_of_facts(facts: Mapping[str, Any]) -> Scene:
     content = facts['scenario']
     buildings = content.get('planner', {}).get('name') == BUILDINGS
     model: type[BaseScenario] = CuboidScenario if buildings else Scenario
-    return scene_of(str(facts.get('name', '')), model.model_validate(content), facts.get('seed'))
+    known = {'command': facts['command']} if 'command' in facts else {}
+    name, seed = str(facts.get('name', '')), facts.get('seed')
+    return scene_of(name, model.model_validate(content), seed) | known
 
 
 def rounded(values: ArrayLike) -> list[Any]:

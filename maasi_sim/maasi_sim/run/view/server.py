@@ -31,7 +31,7 @@ PORT = 8420
 _MORE_PORTS = 20
 # Takes a command and a robot (None: all); returns whether it was followed, and an answer.
 Commander = Callable[[str, 'str | None'], 'tuple[bool, str]']
-COMMANDS = ('pause', 'resume', 'home', 'stop', 'release')
+COMMANDS = ('start', 'pause', 'resume', 'home', 'stop', 'release')
 # Browsers at once; further ones are refused.
 MOST_BROWSERS = 32
 # Other connections at once; beyond them the oldest is closed.

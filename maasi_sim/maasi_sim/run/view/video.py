@@ -16,7 +16,8 @@ from matplotlib.patches import Circle, Ellipse, Polygon, Rectangle
 from matplotlib.path import Path as Outline
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_sim.run.buildings.picture import NAMED, OBJECT, OBSTACLE, OPEN, VISITED, draw_box
+from maasi_filter.colours import AWAY, FOUND, POTENTIAL, SEEN, robot_colours
+from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, draw_box
 from maasi_sim.run.report_panels import ellipse
 from maasi_sim.run.run_folder import write_whole
 from maasi_sim.run.view.event_log import Event, EventLog, Scene
@@ -25,9 +26,6 @@ from maasi_sim.run.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 # Pictures per second, and size [in] at a resolution [px/in].
 RATE = 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80
-_FOUND, _POTENTIAL, _SEEN = '#009E73', '#E69F00', '#CC79A7'
-# Of robots, as on the page.
-_ROBOTS = ('#0072B2', '#D55E00', '#8C564B', '#56B4E9', '#7F7F7F', '#CC79A7')
 # The last picture is shown for so long [s].
 _HOLD = 2.0
 # Detections are shown for so long [s].
@@ -147,9 +145,9 @@ def _draw(axes: Any, now: Moments, bounds: NDArray[np.float64]) -> None:
         axes.set_aspect('equal')
         _draw_floor(axes, now)
     _draw_targets(axes, now, size)
-    for index, name in enumerate(now.robots):
+    for name, colour in robot_colours(now.robots).items():
         if name in now.last['robot']:
-            _draw_robot(axes, now, name, NAMED.get(name, _ROBOTS[index % len(_ROBOTS)]), bounds)
+            _draw_robot(axes, now, name, colour, bounds)
     axes.set_title(now.title())
 
 
@@ -191,16 +189,16 @@ def _draw_targets(axes: Any, now: Moments, size: int) -> None:
         _plot(axes, event[3], size, 'x', color='0.2', ms=6)
     for event in now.last['filter'].values():
         for x, y, z, mass, *covariance in event[4]:
-            _mark(axes, (x, y, z)[:size], covariance, 2.0, _POTENTIAL, min(0.3 + mass, 1.0))
+            _mark(axes, (x, y, z)[:size], covariance, 2.0, POTENTIAL, min(0.3 + mass, 1.0))
     for event in now.last['found'].values():
         for number, x, y, z, covariance, *_ in event[3]:
-            _mark(axes, (x, y, z)[:size], covariance, 3.0, _FOUND, 1.0)
+            _mark(axes, (x, y, z)[:size], covariance, 3.0, FOUND, 1.0)
             axes.text(*(x, y, z)[:size], f'  {number}', fontsize=8)
     for *_, place, detections in now.seen:
         for reach, bearing, elevation, *_ in detections:
             level = math.cos(elevation)
             ray = level * math.cos(bearing), level * math.sin(bearing), math.sin(elevation)
-            _plot(axes, np.add(place, np.multiply(reach, ray)), size, '+', color=_SEEN, ms=6)
+            _plot(axes, np.add(place, np.multiply(reach, ray)), size, '+', color=SEEN, ms=6)
 
 
 def _mark(
@@ -224,12 +222,14 @@ def _draw_robot(
 ) -> None:
     size, robot = len(bounds), now.scene.get('robots', {}).get(name, {})
     (*place, yaw), _, status = now.last['robot'][name][3:6]
-    _plot(axes, now.ways[name], size, '-', color=colour, lw=1.3)
+    away = status in (UNAVAILABLE, LEFT, SILENT)
+    if status != LEFT:
+        _plot(axes, now.ways[name], size, '-', color=colour, lw=1.3)
+    colour = AWAY if away else colour
     if status == MOVING:
         _plot(axes, now.last['way'].get(name, [[]])[-1], size, '--', color=colour, lw=1.3)
         waypoint = now.waypoints.get(name) or []
         _plot(axes, waypoint, size, 's', color=colour, ms=8, mfc='none')
-    away = status in (UNAVAILABLE, LEFT, SILENT)
     if size == 3 and not away:
         # How high it is.
         x, y, z = place
@@ -239,9 +239,9 @@ def _draw_robot(
     # From above it points ahead.
     arrow = [[1.4, 0.0], [-0.9, 0.8], [-0.5, 0.0], [-0.9, -0.8], [1.4, 0.0]]
     marker: Any = 'D' if size == 3 else Outline(arrow @ _turn(yaw))
-    style = {'ms': 8 if size == 3 else 16, 'alpha': 0.35 if away else 1.0}
-    _plot(axes, place, size, '', marker=marker, color=colour, **style)
-    axes.text(*place[:size], f'   {name}', fontsize=9, weight='bold')
+    _plot(axes, place, size, '', marker=marker, color=colour, ms=8 if size == 3 else 16)
+    label = f'   {name}' + (' (left)' if status == LEFT else '')
+    axes.text(*place[:size], label, fontsize=9, weight='bold')
     if 'fence' in robot:
         (left, right), (low, high), _ = robot['fence']
         if size == 3:

@@ -12,12 +12,14 @@ export function drawBuildings(view, log, time) {
   const planned = new Map();
   for (const name of log.owners('cuboid')) {
     const event = log.at('cuboid', name, time);
-    if (event) for (const cuboid of event[7]) planned.set(cuboid, name);
+    const here = log.at('robot', name, time);
+    // Who is not on the way carries out no plan.
+    if (event && here && here[5] === MOVING) for (const cuboid of event[7]) planned.set(cuboid, name);
   }
   const boxes = [
     ...(log.scene.objects || []).map((sides) => ({ sides, fill: 'rgba(140, 140, 160, .75)', stroke: themed('--quiet') })),
     ...(log.scene.blocks || []).map((sides) => ({ sides, fill: 'rgba(110, 100, 85, .85)', stroke: themed('--text') })),
-    ...(log.scene.cuboids || []).map((sides, cuboid) => ({ sides, ...look(cuboid) })),
+    ...(log.scene.cuboids || []).map((sides, cuboid) => ({ sides, cuboid, ...look(cuboid) })),
   ];
   function look(cuboid) {
     if (visited.has(cuboid)) return { fill: 'rgba(86, 180, 233, .16)', stroke: VISITED };
@@ -27,7 +29,11 @@ export function drawBuildings(view, log, time) {
     return { fill: 'rgba(213, 94, 0, .28)', stroke: OPEN };
   }
   const middle = ([x, y, z]) => camera.project([(x[0] + x[1]) / 2, (y[0] + y[1]) / 2, (z[0] + z[1]) / 2]);
-  for (const item of boxes) item.depth = middle(item.sides)[2];
+  for (const item of boxes) {
+    const [x, y, depth] = middle(item.sides);
+    item.depth = depth;
+    if (item.cuboid !== undefined) view.targets.push({ x, y, cuboid: item.cuboid });
+  }
   boxes.sort((a, b) => b.depth - a.depth);
   for (const item of boxes) {
     context.lineWidth = item.wide ? 2.5 : 1;

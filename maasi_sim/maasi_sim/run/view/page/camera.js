@@ -17,7 +17,7 @@ export class Camera {
     const size = bounds.map(([low, high]) => high - low);
     this.centre = [0, 1, 2].map((axis) => (bounds[axis] ? (bounds[axis][0] + bounds[axis][1]) / 2 : 0));
     this.distance = 3 * Math.hypot(...size);
-    const [wide, high] = [this.width - 30, this.height - 90];
+    const [wide, high] = [this.width - 40, this.height - 50];
     if (this.spatial) {
       this.update();
       this.scale = 1;
@@ -49,7 +49,7 @@ export class Camera {
   project(place) {
     const x = place[0] - this.centre[0];
     const y = place[1] - this.centre[1];
-    if (!this.spatial) return [this.width / 2 + x * this.scale, this.height / 2 - y * this.scale + 10, 0];
+    if (!this.spatial) return [this.width / 2 + x * this.scale, this.height / 2 - y * this.scale, 0];
     const z = (place[2] || 0) - this.centre[2];
     const right = x * this.cosTurn - y * this.sinTurn;
     const away = x * this.sinTurn + y * this.cosTurn;
@@ -82,7 +82,7 @@ export class Camera {
   place(x, y) {
     return [
       this.centre[0] + (x - this.width / 2) / this.scale,
-      this.centre[1] - (y - 10 - this.height / 2) / this.scale,
+      this.centre[1] - (y - this.height / 2) / this.scale,
     ];
   }
 

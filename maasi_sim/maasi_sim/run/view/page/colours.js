@@ -5,16 +5,20 @@ export const POTENTIAL = '#e69f00';
 export const SEEN = '#cc79a7';
 export const VISITED = '#56b4e9';
 export const OPEN = '#d55e00';
-// The last is also that of detections.
-const ROBOTS = ['#0072b2', '#d55e00', '#8c564b', '#56b4e9', '#7f7f7f', '#cc79a7'];
-const NAMED = { purple: '#7b3294', red: '#d62728', green: '#2ca02c', blue: '#0072b2' };
+// Of robots, also on what is unexplored; brighter in the dark.
+const ROBOTS = ['#0072b2', '#b54800', '#6a3d9a', '#7a4a00', '#00707f', '#a02c6d'];
+const NAMED = { purple: '#7b3294', red: '#d62728', green: '#1f7a1f', blue: '#0072b2' };
+const BRIGHT = ['#6cc0f5', '#ff9a5c', '#c9a6f0', '#d0ad7a', '#5fd3dd', '#f29ac8'];
+const BRIGHT_NAMED = { purple: '#cf9be6', red: '#ff8a8a', green: '#7bd67b', blue: '#6cc0f5' };
 const CIVIDIS = [
   [0, 34, 78], [18, 53, 112], [59, 73, 108], [87, 93, 109], [112, 113, 115],
   [138, 134, 120], [165, 156, 116], [195, 179, 105], [225, 204, 85], [254, 232, 56],
 ];
 
 export function robotColour(names, name) {
-  return NAMED[name] || ROBOTS[Math.max(names.indexOf(name), 0) % ROBOTS.length];
+  const isDark = document.documentElement.dataset.theme === 'dark';
+  const [named, others] = isDark ? [BRIGHT_NAMED, BRIGHT] : [NAMED, ROBOTS];
+  return named[name] || others[Math.max(names.indexOf(name), 0) % others.length];
 }
 
 // Return the colour of a share, 0 to 1.

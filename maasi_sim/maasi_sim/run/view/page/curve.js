@@ -61,12 +61,21 @@ export class Curve {
     context.fillText('0', left - 3, top + high);
     context.fillText(`${log.duration.toFixed(0)} s`, left + wide, height - 6);
     context.textAlign = 'left';
-    context.fillStyle = FOUND;
-    context.fillText(log.isOfBuildings ? 'visited' : 'found', left, height - 6);
-    if (other.times.length) {
-      context.fillStyle = POTENTIAL;
-      context.fillText(title, left + 50, height - 6);
-    }
+    // A piece of the line, then its name: orange letters on white cannot be read.
+    const entry = (colour, dash, text, from) => {
+      context.strokeStyle = colour;
+      context.lineWidth = 2;
+      context.setLineDash(dash);
+      context.beginPath();
+      context.moveTo(from, height - 9);
+      context.lineTo(from + 16, height - 9);
+      context.stroke();
+      context.setLineDash([]);
+      context.fillText(text, from + 20, height - 6);
+    };
+    context.fillStyle = themed('--text');
+    entry(FOUND, [], log.isOfBuildings ? 'visited' : 'found', left);
+    if (other.times.length) entry(POTENTIAL, [4, 3], title, left + 66);
     const steps = (points, colour, dash) => {
       context.strokeStyle = colour;
       context.setLineDash(dash);

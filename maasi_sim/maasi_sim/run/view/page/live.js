@@ -1,7 +1,8 @@
 // A run that goes on: its events as they come, and its controls where they are allowed.
 
-import { RunLog } from './run_log.js';
+import { isStopped, RunLog } from './run_log.js';
 import { element } from './text.js';
+import { modeOf } from './words.js';
 
 export function follow(onLog, onEvents, onState) {
   const source = new EventSource(`events${window.location.search}`);
@@ -17,11 +18,33 @@ export function follow(onLog, onEvents, onState) {
   source.onerror = () => onState('connection lost');
 }
 
-const COMMANDS = [['pause', 'Pause'], ['resume', 'Resume'], ['home', 'Send home'], ['stop', 'Stop'], ['release', 'Release']];
+const COMMANDS = [['start', 'Start'], ['pause', 'Pause'], ['resume', 'Resume'], ['home', 'Send home'], ['stop', 'Stop'], ['release', 'Release']];
 const HINTS = {
   stop: 'The selected robot, or all where none is selected, until they are released',
   release: 'The selected robot, or all where none is selected, take goals again after a stop',
 };
+// Modes of a robot in which a command changes something; of the others it always may.
+const USEFUL = {
+  start: ['waiting for start', 'stopped'],
+  pause: ['searching', 'sent home'],
+  resume: ['paused', 'sent home'],
+  home: ['waiting for start', 'searching', 'paused', 'stopped'],
+};
+
+// Switch off the buttons that cannot work; where no mode is known, none.
+export function updateControls(parent, log, selected) {
+  const names = selected ? [selected] : log.robots();
+  for (const button of parent.querySelectorAll('[data-command]')) {
+    const { command } = button.dataset;
+    const modes = names.map((name) => modeOf(log, name, Infinity));
+    let useful = !USEFUL[command] || modes.length === 0 || modes.some((mode) => !mode || USEFUL[command].includes(mode));
+    if (command === 'home' && log.isOfBuildings) useful = false;
+    if (command === 'release' && names.length) {
+      useful = names.map((name) => log.at('robot', name, Infinity)).some((event) => event && isStopped(event));
+    }
+    button.disabled = !useful;
+  }
+}
 
 // Show the controls; the token is in the address.
 export function showControls(parent, selectedRobot) {
@@ -53,7 +76,6 @@ export function showControls(parent, selectedRobot) {
         const { message } = result;
         const complete = message.startsWith(`${command}: `);
         answer.textContent = complete ? message : `${command} ${robot || 'all'}: ${message}`;
-        answer.title = answer.textContent;
       } catch (error) {
         if (!request.abort.signal.aborted) answer.textContent = `${command}: no answer`;
       } finally {

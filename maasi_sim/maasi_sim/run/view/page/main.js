@@ -2,16 +2,21 @@
 
 import { Camera } from './camera.js';
 import { Curve } from './curve.js';
-import { follow, showControls } from './live.js';
+import { follow, showControls, updateControls } from './live.js';
 import { MapView } from './map.js';
-import { showLegend, showLog, showNumbers, showRobots } from './panels.js';
+import { showLegend } from './legend.js';
+import { drawMarks } from './marks.js';
+import { showLog, showNumbers, showRobots } from './panels.js';
 import { RunLog, unpack } from './run_log.js';
 import { element } from './text.js';
+import { showTip, tipAt } from './tips.js';
 import { showWhy } from './why.js';
+import { hasEnded, headline, showCard, showHeadline } from './words.js';
 
 const $ = (id) => document.getElementById(id);
 // Pictures of a live run per second: the search needs the processor more.
 const LIVE_RATE = 3;
+const reducedMotion = window.matchMedia('(prefers-reduced-motion: reduce)');
 
 class Page {
   constructor() {
@@ -20,6 +25,7 @@ class Page {
     this.playing = false;
     this.following = false;
     this.isLive = false;
+    this.connection = '';
     this.selected = null;
     this.marked = null;
     this.drawn = 0;
@@ -40,14 +46,23 @@ class Page {
         this.setLog(log);
         this.seek(0);
         document.body.dataset.ready = 'yes';
+        this.playByItself();
       }).catch((error) => {
         $('source').textContent = `the run in this file cannot be read: ${error.message}`;
       });
     } else this.followRun();
   }
 
+  // Play a replay once it is seen, unless its reader has begun to look around.
+  playByItself() {
+    if (reducedMotion.matches || this.time > 0) return;
+    if (document.visibilityState === 'visible') this.setPlaying(true);
+    else document.addEventListener('visibilitychange', () => this.playByItself(), { once: true });
+  }
+
   followRun() {
     this.isLive = true;
+    this.connection = 'live';
     $('live').hidden = false;
     this.setFollowing(true);
     follow(
@@ -61,8 +76,14 @@ class Page {
       (state) => {
         $('source').textContent = state;
         document.body.dataset.connection = state;
-        // Nobody is left who would follow.
-        if (state === 'ended') $('controls').hidden = true;
+        this.connection = state;
+        this.request();
+        if (state !== 'ended') return;
+        // Nobody is left who would follow: it is a replay from now on.
+        if (this.following) this.time = this.log.duration;
+        this.setFollowing(false);
+        this.isLive = false;
+        for (const id of ['controls', 'live']) $(id).hidden = true;
       },
     );
   }
@@ -84,6 +105,7 @@ class Page {
     $('curve_title').textContent = log.isOfBuildings ? 'Cuboids visited' : `Found and ${log.knowsExpected ? 'expected' : 'potential'}`;
     this.fitted = false;
     this.changed = true;
+    this.cardClosed = false;
     this.request();
   }
 
@@ -174,7 +196,11 @@ class Page {
     });
     canvas.addEventListener('pointermove', (event) => {
       const before = held.get(event.pointerId);
-      if (!before) return;
+      if (!before) {
+        this.point(event.offsetX, event.offsetY);
+        return;
+      }
+      showTip($('tip'), '');
       const now = [event.offsetX, event.offsetY];
       moved += Math.hypot(now[0] - before[0], now[1] - before[1]);
       if (held.size === 2) {
@@ -192,6 +218,8 @@ class Page {
     };
     canvas.addEventListener('pointerup', release);
     canvas.addEventListener('pointercancel', release);
+    // A finger leaves when it is lifted: what it tapped stays.
+    canvas.addEventListener('pointerleave', (event) => event.pointerType === 'mouse' && showTip($('tip'), ''));
     canvas.addEventListener('wheel', (event) => {
       event.preventDefault();
       this.camera.zoom(Math.exp(-0.0015 * event.deltaY), event.offsetX, event.offsetY);
@@ -204,10 +232,12 @@ class Page {
     if (!hit) this.select(null);
     else if (hit.robot) this.select(hit.robot);
     else if (hit.candidate !== undefined) this.mark(hit.candidate);
-    else if (hit.found) {
-      const [number, , , , , robot, when] = hit.found;
-      $('source').textContent = `target ${number}: found by ${robot} at ${when.toFixed(1)} s`;
-    }
+    this.point(x, y);
+  }
+
+  // Say what is at a point of the map.
+  point(x, y) {
+    showTip($('tip'), tipAt(this.map, this.log, this.time, this.selected, x, y), x, y);
   }
 
   select(name) {
@@ -243,6 +273,7 @@ class Page {
     if (playing && this.following) this.setFollowing(false);
     this.playing = playing;
     $('play').textContent = playing ? '⏸' : '▶';
+    $('play').setAttribute('aria-label', playing ? 'Pause' : 'Play');
     this.request();
   }
 
@@ -275,8 +306,35 @@ class Page {
     if (this.playing) this.request();
   }
 
+  // The headline, the card at the end, and which buttons work.
+  tell() {
+    const { log, time } = this;
+    const wait = showHeadline($('headline'), headline(log, time, this.connection), performance.now());
+    if (wait > 0 && !this.waiting) {
+      this.waiting = setTimeout(() => {
+        this.waiting = undefined;
+        this.request();
+      }, wait);
+    }
+    const shown = hasEnded(log, time) && !this.cardClosed;
+    if ($('card').hidden === shown) {
+      $('card').hidden = !shown;
+      this.fitted = false;
+    }
+    if (shown) {
+      showCard($('card'), log, time, () => {
+        this.cardClosed = true;
+        this.request();
+      });
+    }
+    if (!$('controls').hidden) updateControls($('controls'), log, this.selected);
+  }
+
   draw() {
     const { log, time } = this;
+    this.tell();
+    // It may take room from the map.
+    showLegend($('legend'), log, this.selected);
     this.map.resize();
     if (!this.fitted) {
       if (log.isSpatial && !this.camera.chosen) {
@@ -288,6 +346,7 @@ class Page {
       this.fitted = Boolean(log.scene.bounds) || !this.isLive;
     }
     this.map.marked = this.marked;
+    this.map.pulses = !reducedMotion.matches;
     this.map.draw(log, time, this.selected);
     this.curve.draw(log, time);
     showNumbers($('numbers'), log, time);
@@ -297,7 +356,7 @@ class Page {
       if (log.slots.has(`decision/${event[4]}`)) this.select(event[4]);
       this.seek(event[0]);
     });
-    showLegend($('legend'), log);
+    drawMarks($('marks'), log);
     $('time').max = log.duration;
     $('time').value = time;
     $('clock').textContent = `${time.toFixed(1)} / ${log.duration.toFixed(1)} s`;

@@ -1,14 +1,18 @@
 // Draws a search for targets at a time.
 
 import { FOUND, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colours.js';
-import { isAway, MOVING } from './run_log.js';
+import { Labels } from './labels.js';
+import { drawRobot, drawWays } from './robots.js';
+import { LEFT } from './run_log.js';
 import { circle, cross, dropLine, ellipse, matrix, path } from './shapes.js';
+import { number } from './text.js';
 import { drawBuildings } from './buildings.js';
 
 // Detections are shown for this time [s].
 const FADE = 1.5;
-// Points of a way that are drawn.
-const MOST_POINTS = 600;
+// A ring runs out from what was found for this time [s], so far [px].
+const PULSE = 4;
+const PULSE_REACH = 40;
 
 export class MapView {
   constructor(canvas, camera) {
@@ -17,6 +21,8 @@ export class MapView {
     this.camera = camera;
     this.layers = { truth: true, unseen: true, view: true, ways: true, clusters: true, detections: true };
     this.marked = null;
+    // Whether a ring runs out from what is found.
+    this.pulses = true;
     this.shading = { event: null, canvas: document.createElement('canvas') };
     // Where robots and candidates were drawn, for clicks.
     this.targets = [];
@@ -36,6 +42,7 @@ export class MapView {
   draw(log, time, selected) {
     const { context, camera } = this;
     this.targets = [];
+    this.labels = new Labels();
     this.names = log.robots();
     this.floor = log.isSpatial ? log.bounds[2][0] : 0;
     context.globalAlpha = 1;
@@ -47,13 +54,14 @@ export class MapView {
     this.drawObstacles(log);
     this.drawFences(log);
     if (log.isOfBuildings || log.scene.objects) drawBuildings(this, log, time);
-    if (this.layers.ways) this.drawWays(log, time);
+    if (this.layers.ways) drawWays(this, log, time);
     if (this.layers.clusters) this.drawClusters(log, time);
     if (this.layers.detections) this.drawDetections(log, time);
     this.drawFound(log, time);
     if (this.layers.truth) this.drawTruth(log, time);
     if (selected) this.drawCandidates(log, time, selected);
-    for (const name of this.names) this.drawRobot(log, time, name, name === selected);
+    for (const name of this.names) drawRobot(this, log, time, name, name === selected);
+    this.labels.draw(context, camera.width, camera.height);
   }
 
   drawGround(log) {
@@ -89,7 +97,7 @@ export class MapView {
     context.fillStyle = themed('--quiet');
     context.font = '11px system-ui, sans-serif';
     context.textAlign = 'right';
-    context.fillText(`grid ${Number(step.toPrecision(2))} m`, camera.width - 10, camera.height - 12);
+    context.fillText(`grid ${Number(step.toPrecision(2))} m`, camera.width - 10, camera.height - 6);
     context.textAlign = 'left';
   }
 
@@ -160,7 +168,7 @@ export class MapView {
           const value = digits.charCodeAt((i * ny + j) * nz + k) - 48;
           if (value < 1) continue;
           const [x, y] = camera.project([corner[0] + i * step[0], corner[1] + j * step[1], corner[2] + k * step[2]]);
-          context.fillStyle = `rgba(${colour}, ${0.05 * value})`;
+          context.fillStyle = `rgba(${colour}, ${0.09 * value})`;
           context.fillRect(x - 2, y - 2, 4, 4);
         }
       }
@@ -224,51 +232,13 @@ export class MapView {
     context.globalAlpha = 1;
   }
 
-  drawWays(log, time) {
-    const { context, camera } = this;
-    for (const name of this.names) {
-      const slot = log.slot('robot', name);
-      const count = slot.count(time);
-      if (!count) continue;
-      context.strokeStyle = robotColour(this.names, name);
-      const stride = Math.ceil(count / MOST_POINTS);
-      const points = [];
-      for (let index = 0; index < count; index += stride) points.push(slot.events[index][3]);
-      points.push(slot.events[count - 1][3]);
-      context.lineWidth = 1.6;
-      context.globalAlpha = 0.75;
-      path(context, camera, points);
-      context.stroke();
-      if (slot.events[count - 1][5] !== MOVING) continue;
-      const way = log.at('way', name, time);
-      const decision = log.at('decision', name, time);
-      context.lineWidth = 2;
-      context.globalAlpha = 1;
-      context.setLineDash([6, 5]);
-      if (way) {
-        path(context, camera, way[3]);
-        context.stroke();
-      } else if (decision && decision.robot && decision.robot[2] >= 0) {
-        path(context, camera, [slot.events[count - 1][3], decision.robot[3]]);
-        context.stroke();
-      }
-      context.setLineDash([]);
-      if (decision && decision.robot && decision.robot[2] >= 0) {
-        const [x, y] = camera.project(decision.robot[3]);
-        context.strokeRect(x - 5, y - 5, 10, 10);
-        dropLine(context, camera, decision.robot[3], this.floor);
-      }
-    }
-    context.lineWidth = 1;
-  }
-
   drawClusters(log, time) {
     const { context, camera } = this;
-    context.font = '11px system-ui, sans-serif';
     for (const space of log.owners('filter')) {
       const event = log.at('filter', space, time);
       if (!event) continue;
-      for (const [x, y, z, mass, ...covariance] of event[4]) {
+      for (const cluster of event[4]) {
+        const [x, y, z, mass, ...covariance] = cluster;
         const share = Math.min(mass, 1);
         ellipse(context, camera, [x, y, z], matrix(covariance), 2, 3);
         context.fillStyle = POTENTIAL;
@@ -280,11 +250,9 @@ export class MapView {
         context.stroke();
         dropLine(context, camera, [x, y, z], this.floor);
         context.globalAlpha = 1;
-        if (mass >= 0.05) {
-          const [px, py] = camera.project([x, y, z]);
-          context.fillStyle = themed('--text');
-          context.fillText(mass.toFixed(2), px + 6, py - 6);
-        }
+        const [px, py] = camera.project([x, y, z]);
+        if (mass >= 0.05) this.labels.add(number(mass), px, py);
+        this.targets.push({ x: px, y: py, cluster });
       }
     }
   }
@@ -320,11 +288,11 @@ export class MapView {
 
   drawFound(log, time) {
     const { context, camera } = this;
-    context.font = '12px system-ui, sans-serif';
     for (const space of log.owners('found')) {
       const event = log.at('found', space, time);
       if (!event) continue;
-      for (const [number, x, y, z, covariance] of event[3]) {
+      for (const found of event[3]) {
+        const [id, x, y, z, covariance, , when] = found;
         context.strokeStyle = FOUND;
         context.fillStyle = FOUND;
         context.lineWidth = 2;
@@ -335,9 +303,17 @@ export class MapView {
         context.arc(px, py, 3, 0, 2 * Math.PI);
         context.fill();
         dropLine(context, camera, [x, y, z], this.floor);
-        context.fillStyle = themed('--text');
-        context.fillText(String(number), px + 8, py + 12);
-        this.targets.push({ x: px, y: py, found: event[3].find((item) => item[0] === number) });
+        if (this.pulses && time - when < PULSE) {
+          const age = Math.max(0, (time - when) / PULSE);
+          context.globalAlpha = 1 - age;
+          context.lineWidth = 3;
+          context.beginPath();
+          context.arc(px, py, 6 + PULSE_REACH * age, 0, 2 * Math.PI);
+          context.stroke();
+          context.globalAlpha = 1;
+        }
+        this.labels.add(String(id), px, py, { font: '12px system-ui, sans-serif', away: 8 });
+        this.targets.push({ x: px, y: py, found });
       }
     }
     context.lineWidth = 1;
@@ -352,6 +328,7 @@ export class MapView {
     for (const place of event[3]) {
       const [x, y] = camera.project(place);
       cross(context, x, y, 5);
+      this.targets.push({ x, y, truth: place });
       dropLine(context, camera, place, this.floor);
     }
     context.lineWidth = 1;
@@ -359,7 +336,8 @@ export class MapView {
 
   drawCandidates(log, time, name) {
     const decision = log.at('decision', name, time);
-    if (!decision || !decision.robot) return;
+    const state = log.at('robot', name, time);
+    if (!decision || !decision.robot || (state && state[5] === LEFT)) return;
     const { context, camera } = this;
     const [, , chosen, , candidates] = decision.robot;
     const values = candidates.map((item) => item[6]).filter((value) => value !== null);
@@ -381,75 +359,19 @@ export class MapView {
     context.lineWidth = 1;
   }
 
-  drawRobot(log, time, name, selected) {
-    const event = log.at('robot', name, time);
-    if (!event) return;
-    const { context, camera } = this;
-    const [x, y, z, yaw] = event[3];
-    const robot = log.scene.robots[name] || {};
-    const colour = robotColour(this.names, name);
-    context.strokeStyle = colour;
-    context.fillStyle = colour;
-    if (this.layers.view && robot.view && !isAway(event)) this.drawFieldOfView(robot.view, event[3], log.isSpatial);
-    if (log.isSpatial || z > 0) dropLine(context, camera, [x, y, z], this.floor);
-    const nose = 9 / camera.scale;
-    const size = Math.max(robot.radius || 0, nose);
-    const outline = [[1.4, 0], [-0.9, 0.8], [-0.5, 0], [-0.9, -0.8]].map(([ahead, left]) => [
-      x + size * (ahead * Math.cos(yaw) - left * Math.sin(yaw)),
-      y + size * (ahead * Math.sin(yaw) + left * Math.cos(yaw)),
-      z,
-    ]);
-    path(context, camera, outline, true);
-    context.globalAlpha = isAway(event) ? 0.35 : 1;
-    context.fill();
-    context.globalAlpha = 1;
-    context.strokeStyle = selected ? themed('--text') : themed('--back');
-    context.lineWidth = selected ? 2.5 : 1;
-    context.stroke();
-    context.lineWidth = 1;
-    const [px, py] = camera.project([x, y, z]);
-    context.fillStyle = themed('--text');
-    context.font = '600 12px system-ui, sans-serif';
-    const isFarRight = px + 14 + context.measureText(name).width > camera.width;
-    context.textAlign = isFarRight ? 'right' : 'left';
-    context.fillText(name, isFarRight ? px - 12 : px + 12, py - 10);
-    context.textAlign = 'left';
-    this.targets.push({ x: px, y: py, robot: name });
-  }
-
-  drawFieldOfView(view, [x, y, z, yaw], isSpatial) {
-    const { context, camera } = this;
-    context.globalAlpha = 0.9;
-    context.setLineDash([2, 2]);
-    if (view.kind === 'box') {
-      const [cos, sin] = view.turns ? [Math.cos(yaw), Math.sin(yaw)] : [1, 0];
-      const heights = isSpatial && view.lower.length === 3 ? [z + view.lower[2], z + view.upper[2]] : [0];
-      for (const height of heights) {
-        const corners = [[view.lower[0], view.lower[1]], [view.upper[0], view.lower[1]], [view.upper[0], view.upper[1]], [view.lower[0], view.upper[1]]];
-        path(context, camera, corners.map(([ahead, left]) => [x + ahead * cos - left * sin, y + ahead * sin + left * cos, height]), true);
-        context.stroke();
-        context.save();
-        context.globalAlpha = 0.12;
-        context.fill();
-        context.restore();
-      }
-    } else {
-      const [a, b, c = 0] = view.size;
-      ellipse(context, camera, [x, y, z], matrix([a * a, 0, 0, b * b, 0, c * c]), 1);
-      context.stroke();
-    }
-    context.setLineDash([]);
-    context.globalAlpha = 1;
-  }
-
-  // Return what is at a point of the canvas: robots before candidates before found targets.
+  // Return what is at a point of the canvas: robots before what is nearer, true targets last.
   hit(x, y) {
     const near = this.targets
       .map((item) => ({ ...item, distance: Math.hypot(item.x - x, item.y - y) }))
       .filter((item) => item.distance < 16)
-      .sort((a, b) => (b.robot !== undefined) - (a.robot !== undefined) || a.distance - b.distance);
+      .sort((a, b) => rank(a) - rank(b) || a.distance - b.distance);
     return near[0];
   }
+}
+
+function rank(item) {
+  if (item.robot !== undefined) return 0;
+  return item.truth ? 2 : 1;
 }
 
 // Return a step of 1, 2 or 5 times a power of ten near a length.

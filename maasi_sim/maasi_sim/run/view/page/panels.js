@@ -1,9 +1,10 @@
 // The panels beside the map: numbers, robots, log.
 
-import { FOUND, POTENTIAL, SEEN, OPEN, VISITED, robotColour } from './colours.js';
-import { element, number } from './text.js';
+import { robotColour, themed } from './colours.js';
+import { isAway } from './run_log.js';
+import { element, number, pressable } from './text.js';
+import { stateOf } from './words.js';
 
-const STATES = ['no goal', 'on the way', 'goal reached', 'goal cancelled', 'goal given up', 'cannot go on', 'left', 'silent', 'run ended'];
 const SIGNS = { found: '●', decision: '→', team: '◇', warning: '!', fault: '✖' };
 // Lines of the log that are shown.
 const MOST_LINES = 60;
@@ -49,23 +50,25 @@ function shots(log, time) {
 
 export function showRobots(body, log, time, selected, onSelect) {
   const names = log.robots();
+  const shown = names.map((name) => {
+    const event = log.at('robot', name, time);
+    return [name, stateOf(log, name, time), event && event[4]];
+  });
+  // Rows that are made again lose the focus of the keyboard.
+  const key = JSON.stringify([shown, selected, document.documentElement.dataset.theme]);
+  if (body.dataset.key === key) return;
+  body.dataset.key = key;
   body.replaceChildren(
-    ...names.map((name) => {
+    ...shown.map(([name, state]) => {
       const event = log.at('robot', name, time);
-      const cuboid = log.at('cuboid', name, time);
       const row = element('tr', name === selected ? 'selected' : '');
-      row.tabIndex = 0;
       row.dataset.robot = name;
-      row.onclick = () => onSelect(name);
-      row.onkeydown = (key) => key.key === 'Enter' && onSelect(name);
+      pressable(row, () => onSelect(name));
       const first = element('td', '');
       const swatch = element('span', 'swatch');
-      swatch.style.background = robotColour(names, name);
+      swatch.style.background = event && isAway(event) ? themed('--away') : robotColour(names, name);
       first.append(swatch, name);
       first.title = (log.scene.robots[name] || {}).description || '';
-      let state = event ? STATES[event[5]] || 'unknown' : 'not heard';
-      if (cuboid) state = cuboid[3];
-      if (event && event[6]) state += `: ${event[6]}`;
       const battery = element('td', '');
       if (event && event[4] >= 0) {
         const bar = element('span', 'bar');
@@ -90,31 +93,10 @@ export function showLog(list, log, time, onChoose) {
     ...lines.map((event) => {
       const [when, , , level, source, text] = event;
       const line = element('li', level);
-      line.tabIndex = 0;
       line.dataset.level = level;
-      line.onclick = () => onChoose(event);
-      line.onkeydown = (pressed) => pressed.key === 'Enter' && onChoose(event);
+      pressable(line, () => onChoose(event));
       line.append(element('time', '', `${when.toFixed(1)} s`), element('b', '', SIGNS[level] || ''), element('span', '', `${source}: ${text}`));
       return line;
     }),
   );
-}
-
-export function showLegend(parent, log) {
-  const entries = log.isOfBuildings
-    ? [['cuboid visited', VISITED], ['to visit (planned: as its robot)', OPEN]]
-    : [['found (3 sigma)', FOUND], ['potential (mass)', POTENTIAL], ['detection', SEEN]];
-  parent.replaceChildren(
-    ...entries.map(([text, colour]) => {
-      const entry = element('span', '');
-      const mark = element('i', '');
-      mark.style.borderColor = colour;
-      entry.append(mark, text);
-      return entry;
-    }),
-  );
-  if (log.isOfBuildings) parent.append(element('span', '', '┈ radio link'));
-  else parent.append(element('span', '', '✕ true target'), element('span', '', '□ waypoint'));
-  if (Object.values(log.scene.robots).some((robot) => robot.fence)) parent.append(element('span', '', '-·- geofence'));
-  if (log.scene.thinned) parent.append(element('span', '', `thinned: one state per ${log.scene.thinned} s`));
 }

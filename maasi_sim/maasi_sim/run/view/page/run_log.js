@@ -1,11 +1,19 @@
 // The events of a run, by kind and owner, so that what holds at a time is found by binary search.
 
-// Statuses of a robot: on the way; and those in which it takes no part (cannot go on, left, silent).
+// Statuses of a robot: on the way, left, the run has ended; and those in which it takes no part
+// (cannot go on, left, silent).
 export const MOVING = 1;
+export const LEFT = 6;
+export const ENDED = 8;
 const AWAY = [5, 6, 7];
 
 export function isAway(robotEvent) {
   return AWAY.includes(robotEvent[5]);
+}
+
+// Whether the service stop holds a robot.
+export function isStopped(robotEvent) {
+  return robotEvent[5] === 5 && robotEvent[6].includes('stopped by the service stop');
 }
 
 export class Slot {
@@ -123,8 +131,11 @@ export class RunLog {
         this.slot('decision', robot[0]).add(time, decision);
       }
     } else if (kind === 'cuboid') {
-      this.slot('decision', owner).add(time, { time, cuboid: event, name: owner });
-      if (event[8].length) this.decisions.add(time, { time, cuboid: event, name: owner });
+      const decision = { time, cuboid: event, name: owner };
+      const before = this.slot('decision', owner).at(time);
+      this.slot('decision', owner).add(time, decision);
+      // One at each step; those that count have another plan.
+      if (!before || String(before.cuboid[7]) !== String(event[7])) this.decisions.add(time, decision);
       for (const shot of event[8]) {
         if (this.visited.has(shot[0])) continue;
         this.visited.add(shot[0]);
@@ -160,6 +171,19 @@ export class RunLog {
 
   get total() {
     return this.isOfBuildings ? this.scene.cuboids.length : this.scene.targets;
+  }
+
+  // The unexplored share at a place, from above the mean of its column; undefined outside.
+  unexplored(time, place) {
+    const [space] = this.owners('map');
+    const event = space !== undefined && this.at('map', space, time);
+    if (!event) return undefined;
+    const [corner, step, shape, digits] = event.slice(3);
+    const [i, j, k] = [0, 1, 2].map((axis) => Math.round((place[axis] - corner[axis]) / (step[axis] || 1)));
+    if (!(i >= 0 && j >= 0 && i < shape[0] && j < shape[1])) return undefined;
+    const column = digits.substr((i * shape[1] + j) * shape[2], shape[2]);
+    const cells = column[k] === undefined || shape[2] === 1 ? [...column] : [column[k]];
+    return cells.reduce((sum, digit) => sum + Number(digit) / 9, 0) / cells.length;
   }
 
   measurements(time) {

@@ -7,10 +7,22 @@ export function element(tag, className, text) {
   return made;
 }
 
-export function number(value) {
+// Return a number with three significant digits; padded, also where the last ones are 0.
+export function number(value, padded = false) {
   if (value === null || value === undefined || Number.isNaN(value)) return '-';
   if (Number.isInteger(value)) return String(value);
   const size = Math.abs(value);
-  if (size !== 0 && (size < 1e-3 || size >= 1e5)) return value.toExponential(1);
-  return String(Number(size >= 100 ? value.toFixed(1) : value.toPrecision(3)));
+  if (size < 1e-3 || size >= 1e5) return value.toExponential(2);
+  const digits = value.toPrecision(3);
+  return padded && !digits.includes('e') ? digits : String(Number(digits));
+}
+
+// Have something done by a click, or by Enter.
+export function pressable(part, action) {
+  part.tabIndex = 0;
+  part.onclick = action;
+  // A handler that returns false, as a comparison may, would hold the focus.
+  part.addEventListener('keydown', (event) => {
+    if (event.key === 'Enter') action();
+  });
 }

@@ -1,7 +1,8 @@
 // The panel that says why a robot goes where it goes.
 
 import { scaleColour } from './colours.js';
-import { element, number } from './text.js';
+import { LEFT } from './run_log.js';
+import { element, number, pressable } from './text.js';
 
 const COLUMNS = [
   ['x', 0, 'm'], ['y', 1, 'm'], ['z', 2, 'm'], ['J', 6, ''], ['C', 3, ''], ['T', 4, ''], ['E', 5, ''], ['K', 7, 'steps'], ['M', 8, ''],
@@ -23,7 +24,8 @@ export function reasonOf(decision) {
   const { robot, event } = decision;
   const [, , chosen, , candidates, own] = robot;
   const given = own || event[6];
-  if (given) return given;
+  // The planner's own words have its own digits.
+  if (given) return given.replace(/\d*\.\d+(e[-+]?\d+)?/g, (digits) => number(Number(digits)));
   if (chosen < 0) return 'stays: no candidate is worth going to';
   const values = candidates.map((item) => item[6]).filter((value) => value !== null);
   const best = candidates[chosen] && candidates[chosen][6];
@@ -44,63 +46,96 @@ export function gains(candidates, chosen) {
   return { next, C: a[3] - b[3], T: a[4] - b[4], E: a[5] - b[5], J: a[6] - b[6], K: a[7] - b[7] };
 }
 
+// Return what the planner expects of the chosen way, and of the next best, in a sentence.
+export function expectation(log, candidates, chosen) {
+  const gain = gains(candidates, chosen);
+  if (!gain || gain.J === 0) return '';
+  const [own, other] = [candidates[chosen], candidates[gain.next]];
+  const { objective, weights } = log.scene;
+  if (objective !== 'information' || !weights) {
+    return `has the ${gain.J > 0 ? 'larger' : 'smaller'} objective: J ${number(own[6])}, next best ${number(other[6])}`;
+  }
+  // What it is mostly chosen for.
+  const explores = weights.beta * own[5] >= weights.alpha * own[4];
+  const [term, what] = explores ? [5, 'new targets'] : [4, 'nat of information on potential targets'];
+  // J is per step: a larger number on a longer way may be worth less.
+  const [here, there] = own[7] === other[7] ? ['', ''] : [` of ${own[7]} steps`, ` on ${other[7]} steps`];
+  return `expects ${number(own[term])} ${what} on this way${here}, next best ${number(other[term])}${there}`;
+}
+
 export function showWhy(parent, log, time, selected, marked, onMark) {
   const decision = selected && log.at('decision', selected, time);
-  const key = decision ? `${selected} ${decision.time} ${order} ${marked} ${log.scene.name}` : `none ${selected}`;
+  const state = selected && log.at('robot', selected, time);
+  const hasLeft = state && state[5] === LEFT;
+  const key = hasLeft ? `left ${selected}` : decision ? `${selected} ${decision.time} ${order} ${marked} ${log.scene.name}` : `none ${selected}`;
   if (parent.dataset.key === key) return;
   parent.dataset.key = key;
+  // A fold that is open stays open.
+  const isOpen = Boolean(parent.querySelector('details[open]'));
   parent.replaceChildren();
+  if (hasLeft) {
+    parent.append(`${selected} has left.`);
+    return;
+  }
   if (!decision) {
     parent.append(selected ? `${selected} has not decided yet.` : 'Click a robot or a decision.');
     return;
   }
   if (decision.cuboid) showCuboid(parent, decision);
-  else showCandidates(parent, log, decision, marked, onMark);
+  else showCandidates(parent, log, decision, marked, onMark, isOpen);
 }
 
 function showCuboid(parent, { time, cuboid, name }) {
   const [, , , activity, how, target, heard, planned, shots] = cuboid;
   const place = target.map((value) => number(value)).join(', ');
   parent.append(
-    element('p', '', `${name} at ${time.toFixed(1)} s: ${activity}; plan: ${how.replace('_', ' ')}`),
+    element('p', 'expects', planned.length
+      ? `${name} plans to visit ${planned.length === 1 ? 'cuboid' : 'cuboids'} ${planned.join(', ')} within its horizon.`
+      : `${name} reaches no new cuboid within its horizon: it is drawn to the nearest one left.`),
+    element('p', 'quiet', `${name} at ${time.toFixed(1)} s: ${activity}; plan: ${how.replace('_', ' ')}`),
     element('p', '', `drawn to (${place}) m`),
-    element('p', '', `plans to visit cuboids ${planned.join(', ') || 'none'}`),
     element('p', '', `hears ${heard.join(', ') || 'nobody'}`),
     element('p', '', shots.length ? `takes snapshots of ${shots.map((shot) => shot[0]).join(', ')}` : 'no snapshot now'),
   );
 }
 
-function showCandidates(parent, log, decision, marked, onMark) {
+function showCandidates(parent, log, decision, marked, onMark, isOpen) {
   const [name, index, chosen, waypoint, candidates] = decision.robot;
   const unit = units(log);
   const place = waypoint.map((value) => number(value)).join(', ');
+  const expects = expectation(log, candidates, chosen);
+  if (expects) parent.append(element('p', 'expects', `${name} ${expects}.`));
   parent.append(
-    element('p', '', `${name}, decision ${index} at ${decision.time.toFixed(2)} s: ${chosen < 0 ? 'stays at' : 'goes to'} (${place}) m`),
     element('p', 'reason', reasonOf(decision)),
+    element('p', 'quiet', `${name}, decision ${index} at ${decision.time.toFixed(2)} s: ${chosen < 0 ? 'stays at' : 'goes to'} (${place}) m`),
   );
+  const fold = element('details', '');
+  fold.open = isOpen;
+  fold.append(element('summary', '', `All ${candidates.length} candidates in numbers`));
+  parent.append(fold);
   const gain = gains(candidates, chosen);
   if (gain && gain.J !== 0) {
     const part = (term) => `${term} ${gain[term] >= 0 ? '+' : ''}${number(gain[term])} ${unit[term]}`.trim();
     const steps = `K ${gain.K >= 0 ? '+' : ''}${gain.K} steps`;
-    parent.append(element('p', 'gain', `Over the next best (candidate ${gain.next}): ${['J', 'C', 'T', 'E'].map(part).join(', ')}, ${steps}`));
+    fold.append(element('p', 'gain', `Over the next best (candidate ${gain.next}): ${['J', 'C', 'T', 'E'].map(part).join(', ')}, ${steps}`));
   }
   const { weights } = log.scene;
   if (weights) {
     const { control, alpha, beta } = weights;
     const terms = `-${number(control)} C + ${number(alpha)} T + ${number(beta)} E`;
-    parent.append(element('p', 'formula quiet', `J = (${terms}) / ${weights.per_distance ? 'metres of the way' : 'K'}`));
+    fold.append(element('p', 'formula quiet', `J = (${terms}) / ${weights.per_distance ? 'metres of the way' : 'K'}`));
   }
   const table = element('table', '');
   const head = table.createTHead().insertRow();
   head.append(element('th', '', '#'));
   const columns = COLUMNS.filter(([title]) => title !== 'z' || candidates.some((item) => item[2] !== candidates[0][2]));
   for (const [title, column, columnUnit] of columns) {
-    const cell = element('th', '', title + (order === column ? ' ▾' : ''));
+    const cell = element('th', '', (order === column ? '▾ ' : '') + title);
     cell.title = [TITLES[title], unit[title] || columnUnit].filter(Boolean).join(' ');
-    cell.onclick = () => {
+    pressable(cell, () => {
       order = column;
       onMark(marked);
-    };
+    });
     head.append(cell);
   }
   const values = candidates.map((item) => item[6]).filter((value) => value !== null);
@@ -111,15 +146,15 @@ function showCandidates(parent, log, decision, marked, onMark) {
   for (const [row, item] of rows) {
     const line = body.insertRow();
     line.className = `${row === chosen ? 'chosen' : ''} ${row === marked ? 'marked' : ''}`;
-    line.onclick = () => onMark(row);
+    pressable(line, () => onMark(row));
     const first = element('td', '');
     const swatch = element('span', 'swatch');
     if (item[6] !== null) swatch.style.background = scaleColour(high > low ? (item[6] - low) / (high - low) : 1);
     first.append(swatch, String(row));
     line.append(first);
-    for (const [, column] of columns) line.append(element('td', '', item[column] === null ? 'not allowed' : number(item[column])));
+    for (const [, column] of columns) line.append(element('td', '', item[column] === null ? 'not allowed' : number(item[column], true)));
   }
   const rowsBox = element('div', 'rows');
   rowsBox.append(table);
-  parent.append(rowsBox);
+  fold.append(rowsBox);
 }

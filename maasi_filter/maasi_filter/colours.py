@@ -1,0 +1,18 @@
+"""One colour for one thing: on the page (`colours.js` has the same), in pictures and in RViz."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+FOUND, POTENTIAL, SEEN, AWAY = '#009E73', '#E69F00', '#CC79A7', '#8B929B'
+# Of robots in the order of their names, and of those that are called by a colour.
+ROBOTS = ('#0072B2', '#B54800', '#6A3D9A', '#7A4A00', '#00707F', '#A02C6D')
+NAMED = {'purple': '#7B3294', 'red': '#D62728', 'green': '#1F7A1F', 'blue': '#0072B2'}
+
+
+def robot_colours(names: Iterable[str]) -> dict[str, str]:
+    """Return a colour for each robot of a team; one that is called by a colour has that."""
+    return {
+        name: NAMED.get(name, ROBOTS[index % len(ROBOTS)])
+        for index, name in enumerate(sorted(names))
+    }

@@ -1,0 +1,62 @@
+// What the marks on the map mean.
+
+import { FOUND, OPEN, POTENTIAL, SEEN, VISITED, scaleColour } from './colours.js';
+import { element } from './text.js';
+
+// Return the entries: class of the mark, its colour, text, and what else is in the mark.
+function entries(log, selected) {
+  const robots = Object.values(log.scene.robots);
+  const cividis = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(scaleColour).join(', ')})`;
+  const of = (...list) => list.filter(Boolean);
+  const ways = of(
+    ['text', '', 'robot, in its colour', '➤'],
+    ['text', 'var(--away)', 'robot that left or cannot go on', '➤'],
+    ['line', '', 'way so far'],
+  );
+  if (log.isOfBuildings) {
+    return of(
+      ...ways,
+      ['box', OPEN, 'cuboid to visit'],
+      ['box', 'var(--text)', 'planned, in the colour of its robot'],
+      ['box', VISITED, 'cuboid visited'],
+      ['area', 'rgba(140, 140, 160, .75)', 'building'],
+      (log.scene.blocks || []).length && ['area', 'rgb(110, 100, 85)', 'obstacle'],
+      ['dot', '', 'radio link, or where a robot is drawn to'],
+    );
+  }
+  return of(
+    ['area', 'rgba(var(--unseen), .53)', 'unexplored'],
+    ...ways,
+    ['dash', '', 'planned way'],
+    ['box', '', 'its waypoint'],
+    robots.some((robot) => robot.view) && ['dotbox', '', 'field of view'],
+    ['ring', FOUND, 'found (3 sigma)'],
+    ['ring', POTENTIAL, 'potential target (its mass)'],
+    ['text', SEEN, 'detection', '✕'],
+    ['text', '', 'true target', '✕'],
+    (log.scene.obstacles || []).length && ['area', 'var(--quiet)', 'obstacle'],
+    (log.scene.obstacles || []).length && ['dash', 'var(--text)', 'distance kept from it'],
+    robots.some((robot) => robot.fence) && ['dash', '', 'geofence (dash and dot)'],
+    selected && ['area', cividis, 'candidate of the selected robot: J from low to high'],
+    selected && ['ring', 'var(--text)', 'candidate that is not allowed'],
+  );
+}
+
+export function showLegend(parent, log, selected) {
+  const shown = entries(log, selected);
+  if (log.scene.thinned) shown.push(['text', '', `thinned: one state per ${log.scene.thinned} s`]);
+  const key = JSON.stringify(shown);
+  if (parent.dataset.key === key) return;
+  parent.dataset.key = key;
+  parent.replaceChildren(
+    ...shown.map(([kind, colour, text, sign]) => {
+      const entry = element('span', '');
+      const mark = element('i', kind, sign);
+      mark.setAttribute('aria-hidden', 'true');
+      if (kind === 'area') mark.style.background = colour;
+      else if (colour) mark.style.color = colour;
+      entry.append(mark, text);
+      return entry;
+    }),
+  );
+}

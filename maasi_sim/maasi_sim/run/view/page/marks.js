@@ -1,0 +1,31 @@
+// Marks above the time line: where something was found, and where robots left or failed.
+
+import { FOUND, themed } from './colours.js';
+
+// Of the line of the input, from the middle of its knob at the left [px].
+const KNOB = 8;
+
+export function drawMarks(canvas, log) {
+  const ratio = window.devicePixelRatio || 1;
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  const key = [width, ratio, log.scene.name, log.size, document.documentElement.dataset.theme].join(' ');
+  if (canvas.dataset.key === key) return;
+  canvas.dataset.key = key;
+  [canvas.width, canvas.height] = [width * ratio, height * ratio];
+  const context = canvas.getContext('2d');
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  for (const [time, , , level, , text] of log.lines.events) {
+    const x = KNOB + ((width - 2 * KNOB) * time) / (log.duration || 1);
+    if (level === 'found') {
+      context.fillStyle = FOUND;
+      context.fillRect(x - 1, 0, 2.5, height);
+    } else if (level === 'fault' || (level === 'team' && text === 'left')) {
+      context.fillStyle = themed('--fault');
+      context.beginPath();
+      context.moveTo(x - 4, 0);
+      context.lineTo(x + 4, 0);
+      context.lineTo(x, height);
+      context.fill();
+    }
+  }
+}
