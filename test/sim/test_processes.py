@@ -170,7 +170,7 @@ def test_a_dead_server_is_started_again(tmp_path):
     server = int(stat(process.pid)[1])
     assert os.getsid(server) == server
     os.kill(server, signal.SIGKILL)
-    wait_until(lambda: not process.is_alive() and not alive(process.pid))
+    wait_until(lambda: not (process.is_alive() or alive(process.pid) or alive(server)))
     assert ended(python(tmp_path, 'print(1)')).exitcode == 0
 
 

@@ -1,7 +1,5 @@
 """A recording of a robot's camera and poses, without decisions, is searched again."""
 
-import shutil
-
 import numpy as np
 import pytest
 import yaml
@@ -104,17 +102,13 @@ def searched(tmp_path_factory):
     return folder, result
 
 
-def found_in(folder):
-    rows = np.genfromtxt(folder / 'found_targets.csv', delimiter=',', names=True, dtype=None)
-    return np.stack([rows['x'], rows['y']], axis=1)
-
-
 @pytest.mark.parametrize('kind', ['odom', 'pose'])
 def test_the_same_targets_are_found_again(searched, tmp_path, capsys, kind):
     folder, result = searched
     words = [str(folder / 'field.yaml'), '--replay', str(folder / kind), '--out', str(tmp_path)]
     assert main(words) == 0
-    again = found_in(tmp_path)
+    rows = np.genfromtxt(tmp_path / 'found_targets.csv', delimiter=',', names=True, dtype=None)
+    again = np.stack([rows['x'], rows['y']], axis=1)
     before = np.array([target.position for target in result.found_targets])
     assert len(again) == len(before)
     distances = np.linalg.norm(again[:, None] - before, axis=2)
@@ -148,8 +142,7 @@ def without(folder, target, lacking):
 def test_a_topic_that_lacks_is_named(searched, tmp_path, capsys, lacking, words):
     folder, _ = searched
     bag = without(folder / 'odom', tmp_path / 'bag', lacking)
-    scenario = shutil.copy(folder / 'field.yaml', tmp_path)
-    assert main([str(scenario), '--replay', str(bag)]) == 2
+    assert main([str(folder / 'field.yaml'), '--replay', str(bag)]) == 2
     said = capsys.readouterr().err
     assert all(word in said for word in words), said
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from operator import getitem
@@ -236,7 +237,7 @@ def draw_table(
     """
     measured = results.experiment.quantity(quantity)
     rows = axes[0]
-    columns = axes[1] if len(axes) > 1 else [measured.label]
+    columns = axes[1] if len(axes) > 1 else [textwrap.fill(measured.label, 20)]
     figure.set_size_inches(1.3 + 1.45 * len(columns), 0.8 + 0.62 * len(rows))
     plot = figure.add_subplot()
     plot.axis('off')
