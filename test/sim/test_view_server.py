@@ -1,11 +1,17 @@
 """The server of a live page: what browsers get, what is refused, and that none slows a run."""
 
+import contextlib
 import http.client
 import json
+import os
+import pty
 import re
 import socket
+import subprocess
+import sys
 import threading
 import time
+import urllib.request
 from urllib.parse import urlsplit
 
 import pytest
@@ -168,6 +174,40 @@ def test_where_a_port_is_in_use_the_next_one_is_taken_and_said(server, capsys):
     assert server.port < view.server.port <= server.port + 20
     said = capsys.readouterr().out
     assert f'port {server.port} is in use: the page is at {view.server.port}' in said
+
+
+STAYING = """
+from maasi_sim.run.view.live_view import LiveView
+page = LiveView({'name': 'test', 'robots': {}}, 0)
+page.announce(print, browser=False)
+page.finish('the run has ended')
+page.wait_for_reader(print)
+page.close()
+print('gone')
+"""
+
+
+def test_a_finished_page_stays_in_a_terminal_until_enter_and_not_without_one():
+    command = [sys.executable, '-c', STAYING]
+    said = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True).stdout
+    assert 'stays' not in said and said.endswith('gone\n')
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(command[0], command)
+    with open(terminal, 'r+b', buffering=0) as shown, contextlib.suppress(OSError):
+        said = b''
+        while b'Enter' not in said:
+            said += shown.read(1000)
+        address = re.search(rb'view: (http\S+)', said).group(1).decode()
+        for _ in range(2):
+            with urllib.request.urlopen(f'{address}events', timeout=PATIENCE) as stream:
+                text = stream.read().decode()
+            assert 'the run has ended' in text and 'event: end' in text
+        shown.write(b'\n')
+        while True:
+            said += shown.read(1000)
+    assert said.endswith(b'gone\r\n')
+    assert os.waitpid(child, 0)[1] == 0
 
 
 def test_the_page_is_served_and_nothing_else(server):

@@ -257,3 +257,4 @@ def test_the_view_node_shows_a_bag_that_is_played_and_begins_again_with_it(run, 
         node.destroy_node()
         player.destroy_node()
         view.end()
+        view.close()

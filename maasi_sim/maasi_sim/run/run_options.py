@@ -60,11 +60,12 @@ class Options:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Where the page of a run is served, and whether it may command robots."""
+    """Where the page of a run is served and opened, and whether it may command robots."""
 
     port: int | None = None
     host: str = '127.0.0.1'
     control: bool = False
+    browser: bool = True
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -147,6 +148,9 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='let the page pause, resume, send home and stop; its address has a token',
     )
+    parser.add_argument(
+        '--no-browser', dest='browser', action='store_false', help='do not open the page'
+    )
 
 
 def _namespace(text: str) -> str:
@@ -164,8 +168,8 @@ def parse(arguments: list[str] | None) -> Options:
     parser = build_parser()
     given = vars(parser.parse_args(arguments))
     view = ViewOptions(*(given.pop(field.name) for field in fields(ViewOptions)))
-    if not given['view'] and (view.port is not None or view.control):
-        parser.error('--port and --control need --view')
+    if not given['view'] and (view.port is not None or view.control or not view.browser):
+        parser.error('--port, --control and --no-browser need --view')
     given |= {'namespace': given['namespace'] or '', 'view': view if given['view'] else None}
     options = Options(**given)
     if options.replay is None and not options.scenario:

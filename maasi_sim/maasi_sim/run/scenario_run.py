@@ -84,7 +84,15 @@ class ScenarioRun:
         self._begun: float | None = None
 
     def execute(self) -> int:
-        """Run it and return the exit code."""
+        """Run it and return the exit code; in a terminal its page stays until it is read."""
+        with contextlib.ExitStack() as served:
+            code = self._execute(served)
+            if self._page is not None and not self.interruption:
+                with self.interruption.at_once():
+                    self._page.wait_for_reader(self.display.say)
+            return code
+
+    def _execute(self, served: contextlib.ExitStack) -> int:
         options = self.options
         number, team, shared = options.domain_id, options.namespace, options.follow_clock
         with Domain(number, team=team, shared=shared) as domain, contextlib.ExitStack() as ends:
@@ -116,6 +124,7 @@ class ScenarioRun:
                 self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
             self._page = self._serve(domain.number)
             if self._page is not None:
+                served.callback(self._page.close)
                 ends.callback(self._page.end)
                 self.recorder.listener = self._page.put_message
             ends.callback(stop, processes)
@@ -171,7 +180,7 @@ class ScenarioRun:
         except OSError as error:
             self._warn(f'no view: {options.host}: {error.strerror or error}')
             return None
-        page.announce(self.display.say)
+        page.announce(self.display.say, options.browser)
         return page
 
     def _note_ending(self) -> None:

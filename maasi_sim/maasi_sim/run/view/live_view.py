@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
 import threading
 import time
 from collections import deque
@@ -60,7 +62,7 @@ class LiveView:
         self._feed = threading.Thread(target=self._work, name='view feed', daemon=True)
         self._feed.start()
 
-    def announce(self, say: Callable[[str], object]) -> None:
+    def announce(self, say: Callable[[str], object], browser: bool = True) -> None:
         """Say where the page is, and open it where there is a browser."""
         server = self.server
         if server.wanted_port not in (0, server.port):
@@ -68,7 +70,8 @@ class LiveView:
         say(f'view: {server.address}')
         if not server.is_private:
             say('view: other machines see it, by this whole link only')
-        open_browser(server.address)
+        if browser:
+            open_browser(server.address)
 
     def put(self, function: Callable[..., object], *arguments: Any) -> None:
         """Have a function called with the maker of events and further arguments; never wait.
@@ -96,12 +99,25 @@ class LiveView:
         self.maker = EventMaker(dict(self._scene), self.hub.put)
         return self.maker
 
-    def close(self, text: str = 'closed') -> None:
-        """Show what waits, say how the run ended, let browsers take the rest, and stop serving."""
+    def finish(self, text: str) -> None:
+        """Show what waits, and say how the run ended; browsers that come now get all of it."""
+        if self._ended.is_set():
+            return
         self._ended.set()
         self._feed.join(_PATIENCE)
         self.maker.message(self.maker.latest, 'run', 'team', text)
         self.hub.close()
+
+    def wait_for_reader(self, say: Callable[[str], object]) -> None:
+        """Keep the page, in a terminal, until Enter is pressed; it is finished."""
+        with contextlib.suppress(OSError, ValueError):
+            if os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp():
+                say(f'the page stays at {self.server.address} (Enter or Ctrl-C ends it)')
+                sys.stdin.readline()
+
+    def close(self) -> None:
+        """Finish, let browsers take the rest, and stop serving."""
+        self.finish('closed')
         deadline = time.monotonic() + _FAREWELL
         while self.server.browsers and time.monotonic() < deadline:
             time.sleep(0.02)
@@ -144,10 +160,10 @@ class RunPage(LiveView):
             self.put(EventMaker.starting, ready, total)
 
     def end(self) -> None:
-        """Show the queued messages, and stop serving."""
+        """Show the queued messages; no command is carried out any more."""
         if self._waits:
             self.put(EventMaker.end)
-        self.close('the run has ended' if self._waits else 'the view was closed')
+        self.finish('the run has ended' if self._waits else 'the view was closed')
         if self._control is not None:
             self._control.close()
 
@@ -183,7 +199,8 @@ class SearchTrace:
         """Stop serving the page; what was gathered stays."""
         self.add(EventMaker.end, reason)
         if self._live is not None:
-            self._live.close(f'ended: {reason}')
+            self._live.finish(f'ended: {reason}')
+            self._live.close()
 
     def robots(self, time: float, states: Mapping[str, RobotState]) -> None:
         """Add where robots are; no more often than is shown."""

@@ -99,7 +99,7 @@ def main(arguments: list[str] | None = None) -> int:
         rclpy.try_shutdown()
         return WRONG_INPUT
     node = ViewNode(page.put_message)
-    page.announce(partial(print, flush=True))
+    page.announce(partial(print, flush=True), options.browser)
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -107,6 +107,7 @@ def main(arguments: list[str] | None = None) -> int:
     finally:
         node.destroy_node()
         page.end()
+        page.close()
         rclpy.try_shutdown()
     return DONE
 
