@@ -255,6 +255,7 @@ def test_nav2_does_not_drive_a_robot_whose_pose_is_not_known(nav2, with_nav2, pr
     team.connect()
     while 'Nav2 is not there' in (reason := team.refused([0.7, 0.8, 0.0])):
         pass
+    # Targets are placed in the frame in which Nav2 drives.
     assert reason == 'no pose on tf yet'
     assert said.empty()
 
