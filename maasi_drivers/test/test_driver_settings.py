@@ -1,5 +1,7 @@
 """Settings of drivers, and calibrations of cameras."""
 
+import math
+
 import pytest
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
@@ -73,22 +75,6 @@ def test_a_wrong_calibration_file_is_named(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    'values',
-    [
-        {'focal_length': [260.0]},
-        {'distortion': [0.1, 0.2, 0.3]},
-        {'segmentation': {'rule': 'magic'}},
-        {'segmentation': {'threshold': float('nan')}},
-        {'segmentation': {'peak_saturation': 0.1}},
-        {'segmentation': {'maximum_diameter': 0.5}},
-    ],
-)
-def test_wrong_settings_of_a_camera_are_refused(values):
-    with pytest.raises(ValidationError):
-        CameraSettings.model_validate(values)
-
-
-@pytest.mark.parametrize(
     ('values', 'message'),
     [
         ({'lockstep': True, 'command_type': 'twist'}, 'command_type: got'),
@@ -107,22 +93,15 @@ def test_wrong_settings_of_a_camera_are_refused(values):
         ({'mambo': {'geofence': [[0.0, 1.0], [1.0, 0.0], [0.0, 1.0]]}}, 'lowest below a highest'),
         ({'mavlink': {'geofence': [[0.0, 1.0], [0.0, 0.0], [0.0, 1.0]]}}, 'lowest below a highest'),
         ({'mavlink': {'system': 9, 'own_system': 9}}, 'own_system: got'),
+        ({'mavlink': {'lead': math.nan}}, 'mavlink.lead'),
+        ({'camera': {'focal_length': [260.0]}}, 'camera.focal_length'),
+        ({'camera': {'distortion': [0.1, 0.2, 0.3]}}, 'distortion: got'),
+        ({'camera': {'segmentation': {'rule': 'magic'}}}, 'segmentation.rule'),
+        ({'camera': {'segmentation': {'threshold': math.nan}}}, 'segmentation.threshold'),
+        ({'camera': {'segmentation': {'peak_saturation': 0.1}}}, 'peak_saturation: got'),
+        ({'camera': {'segmentation': {'maximum_diameter': 0.5}}}, 'maximum_diameter: got'),
     ],
 )
-def test_what_does_not_go_together_is_refused(values, message):
+def test_what_is_wrong_or_does_not_go_together_is_refused(values, message):
     with pytest.raises(ValidationError, match=message):
         DriverSettings.model_validate({'environment': {'bounds': [[0, 2], [0, 2]]}} | values)
-
-
-@pytest.mark.parametrize(
-    ('values', 'source'),
-    [
-        ({}, 'odometry'),
-        # Targets are placed in the frame in which Nav2 drives.
-        ({'navigation': 'nav2'}, 'tf'),
-        ({'navigation': 'nav2', 'pose_source': 'odometry'}, 'odometry'),
-    ],
-)
-def test_where_poses_come_from(values, source):
-    values |= {'environment': {'bounds': [[0, 2], [0, 2]]}}
-    assert DriverSettings.model_validate(values).poses == source

@@ -13,9 +13,8 @@ from maasi_drivers.vision.images import COLOUR_ENCODINGS, image_to_array
 CHANNELS = {'rgb8': 'RGB', 'bgr8': 'BGR', 'rgba8': 'RGBA', 'bgra8': 'BGRA'}
 # A smooth picture: what subsampling loses is little.
 ROWS, COLUMNS = np.mgrid[:24, :32]
-SMOOTH = np.stack([40 + 4 * ROWS, 200 - 3 * COLUMNS, 60 + 2 * ROWS + 2 * COLUMNS], axis=2).astype(
-    np.uint8
-)
+SMOOTH = np.stack([40 + 4 * ROWS, 200 - 3 * COLUMNS, 60 + 2 * ROWS + 2 * COLUMNS], axis=2)
+SMOOTH = SMOOTH.astype(np.uint8)
 
 
 def message(encoding, height, width, step, data):

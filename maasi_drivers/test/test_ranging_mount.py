@@ -58,9 +58,8 @@ def test_covariances_are_those_of_many_sweeps(dimension, attitude):
         values = []
         for _ in range(1000):
             # The sensor is turned a little more than its pose says.
-            error = Rotation.from_euler(
-                'xyz', attitude * AXES * generator.normal(size=3)
-            ).as_matrix()
+            angles = attitude * AXES * generator.normal(size=3)
+            error = Rotation.from_euler('xyz', angles).as_matrix()
             turned = POSE.position + (TARGETS[[index]] - POSE.position) @ error
             noisy = sweep_of(turned) + generator.normal(size=(20, 3)) * sigma
             values.append(mounted.measurements(noisy, stamped())[0])

@@ -85,15 +85,11 @@ _BUILDINGS = {
 
 @dataclass(frozen=True)
 class Case:
-    """A run with a fault of some nodes at the same time.
-
-    Faults are SIGKILL; SIGSTOP and SIGCONT after three seconds (pause); SIGSTOP (hang). They come
-    as soon as the nodes' processes exist, or once a target is found (a cell is visited). What runs
-    is a search by two robots under topics, by a drone under MAVLink, or of buildings.
-    """
+    """A run, and the fault of some of its nodes at the same time: kill, pause or hang."""
 
     fault: str
     nodes: tuple[str, ...]
+    # Or 'start': as soon as the processes exist. 'middle': once a target is found, a cell visited.
     when: str = 'middle'
     lockstep: bool = False
     respawn: bool = False

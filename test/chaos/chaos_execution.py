@@ -22,10 +22,7 @@ FOUND = re.compile(r'(\d+) (?:found|visited)')
 
 @dataclass
 class Outcome:
-    """Result of a run.
-
-    The code is None if it did not end; `left` are command lines of processes that still ran then.
-    """
+    """Result of a run: no code if it did not end, and the command lines that were left then."""
 
     folder: Path
     code: int | None

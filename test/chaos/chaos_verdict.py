@@ -113,11 +113,9 @@ def judge_gaps(case, bag, robots):
 
 
 def signs_of_driver(bag, robot):
-    """Return the stamps of a driver's states, and the times at which its guard heard it again.
-
-    A restarted driver may move its robot before the recorder has discovered it. The recorder's own
-    times are no measure: on a busy machine a restart keeps it from taking messages for seconds.
-    """
+    """Return the stamps of a driver's states, and the times at which its guard heard it again."""
+    # A restarted driver may move its robot before the recorder has discovered it; the recorder's
+    # own times are no measure: on a busy machine it takes no messages for seconds then.
     states = [stamp_of(item.message) for item in bag.messages([f'/{robot}/state'])]
     heard = [
         item.time * 1e-9
@@ -128,10 +126,7 @@ def signs_of_driver(bag, robot):
 
 
 def silences_of_filter(bag, end):
-    """Return from when to when there was no update, though a batch waited for one.
-
-    No batch is published while no robot takes part.
-    """
+    """Return from when to when there was no update, though a batch waited for one."""
     asked = [(item.message.id, item.time * 1e-9) for item in bag.messages(['/measurement_batch'])]
     answers = [
         (item.message.batch_id, item.time * 1e-9) for item in bag.messages(['/filter_update'])
@@ -145,11 +140,9 @@ def silences_of_filter(bag, end):
 
 
 def judge_autopilot(bag, robot):
-    """Check that a vehicle flies no farther than its last set-point without its driver.
-
-    Only its driver reports it: the first state after a silence tells what it did.
-    """
+    """Check that a vehicle flies no farther than its last set-point without its driver."""
     problems = []
+    # Only its driver reports it: the first state after a silence tells what it did.
     before = None
     for item in bag.messages([f'/{robot}/state']):
         state = item.message
@@ -181,11 +174,9 @@ def stamp_of(message):
 
 
 def speeds_of(bag, robot):
-    """Return time [s] and speed [m/s] of a robot, (n, 2).
-
-    From its odometry, or, where it has none, its state; that of an autopilot may land it.
-    """
+    """Return time [s] and speed [m/s] of a robot, (n, 2), from its odometry or else its state."""
     rows = []
+    # An autopilot, which has no odometry, may land it.
     for topic, up in ((f'/{robot}/odom', 1.0), (f'/{robot}/state', 0.0)):
         for item in () if rows else bag.messages([topic]):
             twist = item.message.twist

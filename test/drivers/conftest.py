@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-from contextlib import ExitStack, closing
-from types import SimpleNamespace
+from contextlib import ExitStack
 
 import pytest
 import yaml
-from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from robot_team import KINDS, TURTLEBOT, Team, parameters_of
@@ -18,25 +16,6 @@ from robot_team import KINDS, TURTLEBOT, Team, parameters_of
 from maasi_drivers.guard_node import GuardNode
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.parameters import flatten
-
-
-@pytest.fixture
-def set_back(monkeypatch):
-    """Return a function that sets the clock of a node back by a time [s]."""
-
-    def change(node, seconds):
-        clock, behind = node.get_clock(), Duration(seconds=seconds)
-        late = SimpleNamespace(now=lambda: clock.now() - behind)
-        monkeypatch.setattr(node, 'get_clock', lambda: late)
-
-    return change
-
-
-@pytest.fixture
-def flights():
-    """Return a function that takes what is to be closed at the end."""
-    with ExitStack() as stack:
-        yield lambda flight: stack.enter_context(closing(flight))
 
 
 @pytest.fixture

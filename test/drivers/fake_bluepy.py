@@ -1,10 +1,4 @@
-"""A Mambo behind pyparrot's own Bluetooth connection, in place of bluepy and a radio.
-
-What pyparrot writes to the characteristics that it finds (0a, 0b, 0c and 1e), and what it is
-notified of by others (0e and 1b), are those of pyparrot 1.5.20, `networking/bleConnection.py`. Of
-events the drone sends flying state and battery alone: no speed, altitude, orientation or position,
-which are \"wifi only\" or late (pyparrot, docs/minidronecommands.rst).
-"""
+"""A Mambo behind pyparrot's own Bluetooth connection, in place of bluepy and a radio."""
 
 import queue
 import sys
@@ -22,6 +16,7 @@ from maasi_sim.simulation.emulators.mambo.fake_mambo import (
     free_address,
 )
 
+# Characteristics that pyparrot 1.5.20 writes to, `networking/bleConnection.py`.
 _BUFFERS = {
     '0a': COMMANDS,
     '0b': ACKED_COMMANDS,
@@ -31,10 +26,7 @@ _BUFFERS = {
 
 
 class BluetoothMambo(FakeMambo):
-    """A fake Mambo with the radio that pyparrot reaches it by, in place of its network.
-
-    While it is cut nothing gets through; a write without response then still succeeds.
-    """
+    """A fake Mambo with the radio that pyparrot reaches it by, in place of its network."""
 
     def __init__(self, monkeypatch, firmware):
         # Without it, as it will be for the next test.
@@ -75,6 +67,7 @@ class BluetoothMambo(FakeMambo):
         return True
 
     def _send_sensors(self, elapsed):
+        # They are "wifi only" or late (pyparrot, docs/minidronecommands.rst).
         pass
 
     def _transmit(self, frame):
@@ -83,6 +76,7 @@ class BluetoothMambo(FakeMambo):
             self._waiting.put((name, bytes([frame.kind, frame.sequence]) + frame.payload))
 
     def _write(self, buffer, data):
+        # One without response succeeds all the same.
         if not self.cut_up:
             with self._lock:
                 self._take(Frame(data[0], buffer, data[1], data[2:]))

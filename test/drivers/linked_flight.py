@@ -7,7 +7,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from onboard_program import OnboardProgram
 from rclpy.executors import SingleThreadedExecutor
-from robot_team import MAMBO, STEP, Team, parameters_of
+from robot_team import MAMBO, RANGING, Team, parameters_of, stamped
 
 from maasi_drivers.drivers import (
     MamboDriver,
@@ -16,7 +16,7 @@ from maasi_drivers.drivers import (
     MavlinkDriver,
 )
 from maasi_filter.models.pose import Pose, compose
-from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
+from maasi_filter.ros.conversions import pose_to_ros
 from maasi_msgs.msg import AgentState
 from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.simulation.emulators.mambo.firmware import FirmwareSettings, MamboFirmware
@@ -33,25 +33,18 @@ FLYING = MAMBO | {
     'odometry_timeout': 0.5,
     'battery_minimum': 0.0,
 }
-COPTER = {
-    'step': STEP,
+COPTER = RANGING | {
     'environment': {'bounds': [[-8.0, 8.0], [-8.0, 8.0], [-5.0, 5.0]]},
     'radius': 0.3,
-    # The machine may be busy, and most tests have no sweeps.
+    # The machine may be busy.
     'odometry_timeout': 5.0,
-    'sensor_timeout': 0.0,
     'motion': {'speed': 1.0, 'acceleration': 1.0, 'tolerance': 0.25},
-    'sensor': {'detection': {'kind': 'box', 'lower': [-4, -4, -6], 'upper': [4, 4, 6]}},
     'link': 'mavlink',
 }
 
 
 class LinkedFlight:
-    """What all have in common; the drone has `state`, `cut` and `close`.
-
-    `doing` is 'ground', 'air' or 'landing', whatever the driver knows of it, `inside` what counts
-    its take-offs.
-    """
+    """What all have in common; `doing` is 'ground', 'air' or 'landing' of the drone itself."""
 
     program, make = 'mambo_driver', MamboDriver
     start, far = FLYING['start'], [2.3, -0.2, 0.5]
@@ -63,6 +56,7 @@ class LinkedFlight:
         self.context = context
         self.drone = drone
         self.settings = settings
+        # What counts its take-offs.
         self.driver, self.inside = None, drone
         self.executor = SingleThreadedExecutor(context=context)
         self.team = team = Team(context, settings, self.executor, deaf=True)
@@ -175,8 +169,7 @@ class LinkedFlight:
             pose = state.pose if place is None else compose(place, state.pose)
             message = PoseStamped(pose=pose_to_ros(pose))
             message.header.frame_id = 'map'
-            message.header.stamp = stamp_to_ros(stamp)
-            publisher.publish(message)
+            publisher.publish(stamped(message, stamp))
 
         return team.create_timer(0.04, say)
 

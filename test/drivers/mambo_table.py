@@ -1,7 +1,4 @@
-"""Prints how a Mambo flies over the field for each drag and delay, as its driver measured it.
-
-python test/drivers/mambo_table.py
-"""
+"""Prints how a Mambo flies over the field for each drag and delay, as its driver measured it."""
 
 from simulated_mambo import full_speed, measure_and_fly
 

@@ -69,10 +69,7 @@ def one_image(settings: CameraSettings, targets, pose: Pose, floor=None) -> np.n
 def sequence(
     settings: CameraSettings, floor: RenderSettings, seed: int, images: int
 ) -> Iterator[tuple[np.ndarray, Pose, np.ndarray, np.ndarray]]:
-    """Yield images of a drone that darts over a floor with 30 markers.
-
-    With each its pose, the markers that are in it as a whole, and all markers.
-    """
+    """Yield images of 30 markers, with the pose, the markers as a whole in it, and all markers."""
     world = World.from_settings(
         EnvironmentSettings(bounds=[[-0.3, 2.4], [-0.3, 2.4]]),
         TargetSettings(count=30, separation=0.15, margin=0.1),

@@ -1,9 +1,4 @@
-"""A drone whose own program segments its images, flies, and takes waypoints by UDP, in real time.
-
-Stands in for the Simulink program of 001, section 7: segmentation and controllers run on board,
-waypoints come by UDP. Packs and unpacks what docs/measurement_feed.md says by itself; flies as a
-double integrator under a position controller (`FlightModel`).
-"""
+"""A drone with a program of its own, as in 001, section 7: it takes waypoints by UDP."""
 
 import math
 import socket
@@ -23,16 +18,15 @@ GROUND, AIR, LANDING = range(3)
 
 
 class OnboardProgram:
-    """The drone; `place` is where it stands in the map, with its heading.
-
-    `blobs` are those of the next images, as the feed has them; `kinds` the orders that it has
-    heard; `patience` is how long it flies without one [s].
-    """
+    """The drone, in real time; `place` is where it stands in the map, with its heading."""
 
     def __init__(self, address, feed, place):
+        # How long it flies without an order [s].
         self.place, self.patience = place, 3.0
         self.charge = 1.0
+        # Of the next images, as the feed has them.
         self.blobs, self.count = b'', 0
+        # Orders that it has heard.
         self.kinds, self.take_offs = [], 0
         self.doing = GROUND
         # Up from where it stands, x forward, y left.
@@ -79,6 +73,7 @@ class OnboardProgram:
                 data = self._socket.recv(2048)
             except BlockingIOError:
                 return
+            # As docs/measurement_feed.md says, not by the code under test.
             magic, version, kind, _, sequence, *numbers = struct.unpack('<4sBBHI4f', data[:28])
             good = data[28:] == struct.pack('<I', zlib.crc32(data[:28])) and version == 1
             if magic != b'MSWO' or not good or sequence == self._last:

@@ -1,11 +1,4 @@
-"""
-Plays Nav2's `navigate_to_pose`, and prints a line for each goal and what becomes of it.
-
-As Nav2 does, it gives feedback all the time that it has a goal, and aborts it for a new one.
-
-A goal with x below 0.5 is reached, one below 1 goes on until it is cancelled, one below 1.5 is
-given up with an error, one beyond is refused.
-"""
+"""Plays Nav2's `navigate_to_pose`, and prints a line for each goal and what becomes of it."""
 
 import contextlib
 import json
@@ -31,6 +24,8 @@ LATE = 0.95
 present = []
 
 
+# With x below 0.5 it is reached, below 1 it goes on until it is cancelled or, as by Nav2, aborted
+# for a new one, below 1.5 it is given up with an error; `judge` refuses one beyond.
 def execute(handle):
     pose = handle.request.pose
     present[:] = [handle]

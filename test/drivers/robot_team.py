@@ -7,9 +7,9 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist, TwistStamped
 from marker_view import one_image
 from nav_msgs.msg import Odometry
+from player import parameters
 from rclpy.action import ActionClient
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState, CameraInfo, Image
 from std_srvs.srv import Trigger
 from waiting import wait_until
@@ -17,8 +17,7 @@ from waiting import wait_until
 from maasi_drivers.drivers import MamboDriver, RangingDriver, TurtlebotDriver
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.models.pose import Pose, compose, inverse
-from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_to_ros
-from maasi_filter.ros.parameters import flatten
+from maasi_filter.ros.conversions import point_to_ros, pose_from_ros, pose_to_ros, stamp_to_ros
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import (
@@ -32,6 +31,8 @@ from maasi_msgs.msg import (
 )
 from maasi_planner.motion import RobotState, make_motion
 
+# After a fault a robot has been stopped, and the planner has heard why, by then [s].
+LATEST = 1.5
 STEP = 0.05
 NANOSECONDS = round(STEP * 1e9)
 TURTLEBOT = {
@@ -190,8 +191,7 @@ class Team(Node):
     def goal(self, position, number=1, frame='map', tolerance=0.0, step=0):
         goal = GoToWaypoint.Goal(goal_id=number, step=step, tolerance=tolerance)
         goal.waypoint.header.frame_id = frame
-        point = goal.waypoint.pose.position
-        point.x, point.y, point.z = (float(value) for value in position)
+        goal.waypoint.pose.position = point_to_ros(position)
         return goal
 
     def send(self, *arguments, live=lambda: None, **options):
@@ -263,10 +263,7 @@ def numbers(message):
 
 
 def parameters_of(settings):
-    return [
-        Parameter(name, value=value)
-        for name, value in flatten(DriverSettings.model_validate(settings)).items()
-    ]
+    return parameters(DriverSettings.model_validate(settings))
 
 
 def rendered(team, targets, pose):

@@ -146,11 +146,8 @@ WAYPOINTS = [[2.2, 2.2], [-0.1, 2.2], [2.2, -0.1], [-0.1, -0.1], [1.05, 1.05], [
 
 
 def measure_and_fly(drag, delay):
-    """Return how a Mambo flies over the field with what its measuring flight says.
-
-    Farthest from its place in legs of 1 m, beyond a waypoint and outside the field, way flown and
-    from waypoint to waypoint [m].
-    """
+    """Return how a Mambo flies over the field with what its measuring flight says."""
+    # Farthest from its place in legs of 1 m, beyond a waypoint, outside the field, and ways [m].
     flown = SimpleNamespace(far=0.0, overshoot=0.0, outside=-math.inf, way=0.0, straight=0.0)
     flight = Flight(drag=drag, firmware_delay=delay, arm=False)
     measuring = MeasuringFlight(flight, 1.0, 6, lambda: flight.time)

@@ -1,7 +1,4 @@
-"""Flying robots behind links, over real sockets and topics: what all drivers promise, and each.
-
-What a pilot does about faults, step by step, is in test_mambo_pilot.py and test_mavlink_vehicle.py.
-"""
+"""Flying robots behind links, over real sockets and topics: what all drivers promise, and each."""
 
 import math
 import os
@@ -9,8 +6,10 @@ import signal
 import socket
 import struct
 import time
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -20,7 +19,8 @@ from fake_bluepy import BluetoothMambo
 from linked_flight import KINDS, YAW, LinkedFlight, mambo_firmware
 from marker_view import one_image
 from numpy.testing import assert_allclose
-from robot_team import MAMBO, parameters_of, rendered, stamped
+from rclpy.duration import Duration
+from robot_team import LATEST, MAMBO, parameters_of, rendered, stamped
 from waiting import wait_until
 
 from maasi_drivers.agent import watchdog
@@ -40,19 +40,18 @@ from maasi_msgs.msg import AgentState
 from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.simulation.emulators.mambo.firmware import FirmwareSettings
 
-# After a fault the robot has stopped, and the planner has heard why, by then [s].
-LATEST = 1.5
-
 
 @pytest.fixture
-def fly(context, flights, monkeypatch, tmp_path):
+def fly(context, monkeypatch, tmp_path):
     """Return a function that starts a robot of a kind, with its driver and its team."""
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    with ExitStack() as stack:
 
-    def start(kind, own=(), process=None, **changes):
-        return flights(KINDS[kind](context, own=own, **changes)).begin(process)
+        def start(kind, own=(), process=None, **changes):
+            flight = stack.enter_context(closing(KINDS[kind](context, own=own, **changes)))
+            return flight.begin(process)
 
-    return start
+        yield start
 
 
 def of_kinds(*kinds):
@@ -131,10 +130,12 @@ def test_a_stop_ends_a_take_off(fly, kind):
 
 
 @of_kinds('mambo', 'vehicle')
-def test_a_clock_that_jumps_back_stops_it_until_the_next_goal(fly, set_back, kind):
+def test_a_clock_that_jumps_back_stops_it_until_the_next_goal(fly, monkeypatch, kind):
     flight = fly(kind, odometry_timeout=0.5).up()
     _, result = flight.on_its_way()
-    set_back(flight.driver, 1000.0)
+    clock, behind = flight.driver.get_clock(), Duration(seconds=1000.0)
+    late = SimpleNamespace(now=lambda: clock.now() - behind)
+    monkeypatch.setattr(flight.driver, 'get_clock', lambda: late)
     assert flight.team.aborted(result) == 'the time jumped back'
     flight.until(lambda: flight.speed < 0.1)
     flight.ready().reaches(flight.start)
@@ -220,15 +221,14 @@ def test_a_drone_that_is_not_there_is_said_and_awaited(fly):
         (MamboDriver, {'motion': {'model': 'unicycle'}}, False, "motion.model: read 'unicycle'"),
     ],
 )
-def test_a_link_that_cannot_be_is_said(context, monkeypatch, kind, changes, bluetooth, text):
+def test_a_link_that_cannot_be_is_said(start_node, monkeypatch, kind, changes, bluetooth, text):
     from pyparrot import Minidrone
 
     monkeypatch.setattr(Minidrone, 'BLEAvailable', bluetooth)
     settings = MAMBO | {'link': 'mambo_wifi', 'mambo': {'port': free_port()}} | changes
-    node = kind(context=context, namespace='/rover', parameter_overrides=parameters_of(settings))
+    node = start_node(kind, parameter_overrides=parameters_of(settings))
     assert node.trigger_configure().name == 'FAILURE'
     assert text in node.problem
-    node.destroy_node()
 
 
 def test_markers_in_a_video_are_placed_where_the_drone_was(play, tmp_path):

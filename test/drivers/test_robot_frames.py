@@ -49,13 +49,9 @@ class Listener:
         made = TransformBuffer()
         for item in (item for message in self.static + self.moving for item in message.transforms):
             place, turn = item.transform.translation, item.transform.rotation
-            made.add(
-                item.header.frame_id,
-                item.child_frame_id,
-                Pose([place.x, place.y, place.z], [turn.w, turn.x, turn.y, turn.z]),
-                stamp_from_ros(item.header.stamp),
-                static=item.child_frame_id != BASE,
-            )
+            pose = Pose([place.x, place.y, place.z], [turn.w, turn.x, turn.y, turn.z])
+            child, stamp = item.child_frame_id, stamp_from_ros(item.header.stamp)
+            made.add(item.header.frame_id, child, pose, stamp, static=child != BASE)
         return made
 
 

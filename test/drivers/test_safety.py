@@ -12,7 +12,7 @@ import pytest
 from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import Twist
 from numpy.testing import assert_array_equal
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, image_message, numbers, stamped
+from robot_team import LATEST, NANOSECONDS, STEP, TURTLEBOT, image_message, numbers, stamped
 from sensor_msgs.msg import BatteryState
 
 from maasi_drivers.agent.agent_driver import STOPPED
@@ -22,9 +22,6 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE
 from maasi_msgs.msg import AgentState
-
-# After a fault the robot has been stopped by then [s].
-LATEST = 1.5
 
 
 def gives_up(team, result, reason):

@@ -42,9 +42,8 @@ def observations_of(target, deviations, number, seed, sensor, spread=0.2, height
         place[2] += height
         pose = Pose.from_yaw(place, generator.uniform(-3.0, 3.0))
         exact = sensor.measurement.measure(np.atleast_2d(target), pose)
-        observations.append(
-            Observation(pose, exact + generator.normal(0.0, deviations, exact.shape))
-        )
+        noise = generator.normal(0.0, deviations, exact.shape)
+        observations.append(Observation(pose, exact + noise))
     return observations
 
 

@@ -1,7 +1,4 @@
-"""The flight that measures how fast a Mambo flies at its largest tilt, over the fake's firmware.
-
-What it measures is compared with the truth in test_mambo_pilot.py.
-"""
+"""The flight that measures how fast a Mambo flies at its largest tilt, over a fake."""
 
 import math
 import signal
@@ -11,15 +8,12 @@ import sys
 import pytest
 from numpy.testing import assert_allclose
 from simulated_mambo import TILT, Flight, full_speed
-from waiting import wait_until
+from waiting import PATIENCE, wait_until
 
 from maasi_drivers.measure_mambo import Leg, MeasurementError, MeasuringFlight, fit_speed, main
 from maasi_filter.models.pose import Pose
 from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.simulation.emulators.mambo.firmware import FlyingState, MamboFirmware
-
-# Longest wait for anything; the machine may be busy.
-LIMIT = 60.0
 
 
 @pytest.mark.parametrize(
@@ -73,7 +67,7 @@ def test_the_command_measures_through_pyparrot_and_lands(ends):
         if not ends:
             wait_until(lambda: firmware.flying_state == FlyingState.HOVERING)
             process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=LIMIT)
+        output, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == (0 if ends else 1), output
     assert firmware.flying_state == FlyingState.LANDED and firmware.take_offs == 1
     fake.close()

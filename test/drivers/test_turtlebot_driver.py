@@ -22,6 +22,7 @@ from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState
 from maasi_sim.simulation.sensors import LaserScanner, LaserSettings
+from maasi_sim.simulation.sim_topics import scan_message
 
 HERE = Path(__file__).parent
 SCANNING = {'scan': {'timeout': 1.0, 'blocked_timeout': 3.0}}
@@ -41,13 +42,8 @@ class Scanned:
     def message(self):
         step = max(self.team.step, 0)
         ranges = self.scanner.scan(self.team.body.robot_state().pose, step)
-        message = LaserScan(
-            angle_max=2.0 * math.pi,
-            angle_increment=2.0 * math.pi / len(ranges),
-            range_min=0.12,
-            range_max=3.5,
-            ranges=ranges.tolist(),
-        )
+        message = scan_message(self.scanner.settings, 'rover/base_scan')
+        message.ranges = ranges.tolist()
         return stamped(message, step * NANOSECONDS)
 
     def move(self, scan=True):
@@ -255,6 +251,7 @@ def test_nav2_does_not_drive_a_robot_whose_pose_is_not_known(nav2, with_nav2, pr
     team.connect()
     while 'Nav2 is not there' in (reason := team.refused([0.7, 0.8, 0.0])):
         pass
+    # Targets are placed in the frame in which Nav2 drives.
     assert reason == 'no pose on tf yet'
     assert said.empty()
 
