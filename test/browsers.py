@@ -57,10 +57,7 @@ class Page:
 
 @contextlib.contextmanager
 def chromium(width=1280, height=720, reduced_motion='reduce', **options):
-    """Yield a page of a browser of its own; it complains of nothing, and asks no other host.
-
-    With reduced motion a replay stands at its beginning until it is played.
-    """
+    """Yield a page that complains of nothing and asks no other host; no replay plays by itself."""
     with sync_playwright() as player:
         # Root, as in containers, has no sandbox.
         arguments = ['--no-sandbox'] if os.geteuid() == 0 else []

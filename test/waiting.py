@@ -7,10 +7,7 @@ PATIENCE = 120.0
 
 
 def wait_until(condition, turn=lambda: time.sleep(0.01), what='nothing came of it', limit=PATIENCE):
-    """Take turns until a condition is true, and return its value.
-
-    After `limit` seconds the test fails with `what`, which may be a function that says it.
-    """
+    """Return a condition's value once it is true; after `limit` s fail with `what` or its value."""
     end = time.monotonic() + limit
     while not (value := condition()):
         if time.monotonic() >= end:

@@ -7,7 +7,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
 from maasi_planner.motion import RobotState
-from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import SimulatedSettings
 from maasi_sim.search import search
@@ -96,16 +95,3 @@ def test_a_scenario_plays_it_in_the_simulation_that_nodes_use_and_in_the_search(
     # Targets are counted where they are in the end.
     result = search(changed, 1, 5)
     assert_array_equal(result.truth, changed.world(1).targets_at(result.steps - 1))
-
-
-@pytest.mark.parametrize(
-    ('name', 'key', 'value', 'text'),
-    [
-        ('ranging_drone_3d', 'robots.drone.simulated.noise_factor', 0.0, 'noise_factor'),
-        ('mambo', 'targets.walk', 0.1, 'targets.walk is 0.1'),
-        ('mambo', 'robots.mambo.simulated.clutter_per_scan', 1.0, 'of a ranging sensor'),
-    ],
-)
-def test_what_cannot_be_played_is_refused(name, key, value, text):
-    with pytest.raises(ScenarioError, match=text):
-        load_scenario(name, {'--set': (tuple(key.split('.')), value)})

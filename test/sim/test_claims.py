@@ -4,22 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from test_experiments import ERROR, STEPS
 
-from maasi_sim.experiments import claims, papers, tables
+from maasi_sim.experiments import claims, tables
 from maasi_sim.experiments.claims import Finding
-from maasi_sim.experiments.experiment import (
-    Case,
-    Claim,
-    Experiment,
-    Published,
-    Quantity,
-    Results,
-    Run,
-)
+from maasi_sim.experiments.experiment import Case, Claim, Experiment, Published, Results, Run
 from maasi_sim.experiments.searches import lane_share
 
-STEPS = Quantity('steps', 'steps', '', 'restricted')
-ERROR = Quantity('error', 'error', 'm')
 LIMIT = 200
 
 
@@ -152,23 +143,6 @@ def test_page_and_summary_have_each_claim_of_each_experiment():
     assert new == f'before\n{claims.BEGIN}\ntable\n\n{claims.END}after\n'
     assert claims.with_summary(new, 'table\n') == new
     assert claims.with_summary('no marks\n', 'table\n') == 'no marks\n'
-
-
-def test_claims_name_cases_quantities_and_numbers_that_are_there():
-    for name, experiment in papers.experiments().items():
-        cases = {case.name for case in experiment.cases(False)}
-        known = {item.name for item in experiment.quantities}
-        printed = {(item.case, item.quantity) for item in experiment.published}
-        words = [claim.says for claim in experiment.claims]
-        assert len(words) == len(set(words)), name
-        for claim in experiment.claims:
-            where = f'{name}: {claim.says}'
-            assert claim.quantity in known, where
-            assert (claim.expects == 'number') == bool(claim.case), where
-            if claim.case:
-                assert claim.case in cases and (claim.case, claim.quantity) in printed, where
-            else:
-                assert {claim.first, claim.second} <= cases, where
 
 
 def test_lanes_are_long_straight_and_along_an_axis():

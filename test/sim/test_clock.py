@@ -59,10 +59,7 @@ class World(Operator):
         self.clock.publish(Clock(clock=stamp_to_ros(nanoseconds)))
 
     def seen_at(self, nanoseconds, nodes):
-        """Publish a time until all nodes, name to process, have diagnostics of that time.
-
-        A sim stamps its diagnostics with the time that it publishes itself.
-        """
+        """Publish a time until all nodes, name to process, have diagnostics of that time."""
         stamp = stamp_to_ros(nanoseconds)
 
         def stamped():
@@ -70,6 +67,7 @@ class World(Operator):
             self.tell(nanoseconds)
             for name, process in nodes.items():
                 assert process.poll() is None, f'{name} ended with {process.returncode}'
+            # A sim stamps its own with the time that it publishes itself.
             return all(self.stamps.get(name) == stamp for name in nodes if 'sim' not in name)
 
         self.until(stamped, f'diagnostics at {nanoseconds}')
@@ -155,16 +153,14 @@ class Rover:
         world.until(self.move)
 
     def move(self, step=0.0):
-        """Go on in time and place; return whether the driver has answered.
-
-        A driver that a busy machine keeps waiting is waited for: hardly any time passes.
-        """
+        """Go on in time and place; return whether the driver has answered."""
         states = self.world.states
         if states and stamp_from_ros(states[-1].header.stamp) >= self.step:
             self.now += SECOND // 20
             self.step = self.now
             self.position += step
         else:
+            # It is waited for.
             self.now += 1000
         message = Odometry()
         message.header.stamp = stamp_to_ros(self.now)

@@ -154,10 +154,8 @@ def test_filters_are_compared_with_each_planner(scenario):
 )
 def test_bad_input(scenario, monkeypatch, arguments, words, capsys):
     monkeypatch.chdir(scenario.parent)
-    try:
-        code = compare.main([*arguments, '--workers', '1'])
-    except SystemExit as exit_:
-        code = exit_.code
-    assert code == 2
+    with pytest.raises(SystemExit) as ended:
+        raise SystemExit(compare.main([*arguments, '--workers', '1']))
+    assert ended.value.code == 2
     assert words in capsys.readouterr().err
     assert not (scenario.parent / 'runs').exists()

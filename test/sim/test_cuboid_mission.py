@@ -1,5 +1,7 @@
 """Whole searches of buildings in one process (004)."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -91,29 +93,22 @@ def test_what_is_put_off_is_discounted_more(monkeypatch):
     assert not make_mission(starts, **options).run(200).complete
 
 
-def cases_of(name):
-    return {case.name: case.settings['mission'] for case in find(name).cases(False)}
-
-
 def test_condition_13_as_printed_lets_robots_drop_and_take_up_the_same_cuboids_for_ever():
     starts = {'a': [59.0, 237.0, 33.0], 'b': [220.0, 269.0, 30.0], 'c': [83.0, 78.0, 41.0]}
-    rows = cases_of('004-fig8')
+    rows = {case.name: case.settings['mission'] for case in find('004-fig8').cases(False)}
     printed, other = (
         make_mission(starts, **rows[f'distributed, 3 agents, as printed{what}'])
         for what in ('', ' except (13)')
     )
     plans = {}
 
-    def noting(agent, decide):
-        def wrapped(*arguments):
-            plan = decide(*arguments)
-            plans.setdefault(agent.step, []).append({n for _, n in plan.visits})
-            return plan
-
-        return wrapped
+    def noting(agent, decide, *arguments):
+        plan = decide(*arguments)
+        plans.setdefault(agent.step, []).append({n for _, n in plan.visits})
+        return plan
 
     for agent in printed.agents.values():
-        agent.decide = noting(agent, agent.decide)
+        agent.decide = partial(noting, agent, agent.decide)
     record = printed.run(100)
     assert not record.complete and set(record.how) == {'optimal'}
     assert plans[99] == plans[97] and plans[98] == plans[96]
@@ -126,18 +121,15 @@ def test_what_is_planned_for_the_next_step_is_visited():
     mission = make_mission(discount=1.0)
     due, met = {}, []
 
-    def noting(agent, decide):
-        def wrapped(*arguments):
-            met.extend(due.get(agent.name, []))
-            assert agent.visited[due.get(agent.name, [])].all()
-            plan = decide(*arguments)
-            due[agent.name] = [n for k, n in plan.visits if k == 1]
-            return plan
-
-        return wrapped
+    def noting(agent, decide, *arguments):
+        met.extend(due.get(agent.name, []))
+        assert agent.visited[due.get(agent.name, [])].all()
+        plan = decide(*arguments)
+        due[agent.name] = [n for k, n in plan.visits if k == 1]
+        return plan
 
     for agent in mission.agents.values():
-        agent.decide = noting(agent, agent.decide)
+        agent.decide = partial(noting, agent, agent.decide)
     check_complete(mission.run(200))
     # Not the last, which ends the mission.
     assert len(met) >= 10

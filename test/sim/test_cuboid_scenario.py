@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from report_check import check_report
+from test_node_plan import read_back
+from test_scenario import changed
 
-from maasi_filter.ros.parameters import unflatten
 from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_sim.run.buildings.building_mission import BuildingMission
@@ -21,11 +21,11 @@ from maasi_sim.scenario.layering import Layer
 from maasi_sim.scenario.schema import ScenarioError
 
 NAMES = ['buildings_four', 'buildings_obstacles', 'buildings_one']
+ONE = load_cuboid_scenario('buildings_one').content()
 
 
-def scenario_with(change):
-    content = load_cuboid_scenario('buildings_one').content()
-    change(content)
+def scenario_with(*changes):
+    content = changed(*changes, content=ONE)
     return check_cuboid_scenario(Layer(content, {(): 'test'}))
 
 
@@ -51,9 +51,8 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     # A guard must not take a decision of a step's length for a fault.
     assert all(plan.parameters['lease'] >= scenario.step for plan in plans[2::2])
     for plan in plans[1::2]:
-        flat = yaml.safe_load(plan.parameter_text())['/**']['ros__parameters']
-        assert flat.pop('use_sim_time')
-        read = CuboidPlannerSettings.model_validate(unflatten(CuboidPlannerSettings, flat))
+        read, simulated = read_back(plan, CuboidPlannerSettings)
+        assert simulated
         robot = scenario.robots[plan.namespace]
         for key in ('start', 'yaw', 'dynamics', 'hazard'):
             assert getattr(read, key) == getattr(robot, key)
@@ -68,55 +67,43 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
         assert [item.faces for item in ours.objects] == [item.faces for item in theirs.objects]
 
 
-def placed(**changes):
-    return lambda content: content['robots']['red'].update(changes)
-
-
-def bounded(*bounds):
-    return lambda content: content['environment'].update(bounds=[list(pair) for pair in bounds])
-
-
-def planned(**changes):
-    return lambda content: content['planner'].update(changes)
-
-
 @pytest.mark.parametrize(
-    ('change', 'words'),
+    ('key', 'value', 'words'),
     [
         (
-            lambda content: content['planner']['objects'][0].update(centre=[295.0, 130.0]),
+            'planner.objects.0.centre',
+            [295, 130],
             r'planner\.objects\[0\]: read centre .*inside the area',
         ),
         (
-            lambda content: content['robots']['red']['dynamics'].update(mass=4.0),
+            'robots.red.dynamics.mass',
+            4.0,
             r'robots\.red\.dynamics: force: got 35.0 N, which cannot lift.*39\.24 N',
         ),
-        (placed(start=[175.0, 130.0, 10.0]), r'robots\.red\.start: read .*inside an object'),
-        (bounded((0.0, 300.0), (0.0, 300.0)), r'environment\.bounds: read 2 axes'),
+        ('robots.red.start', [175, 130, 10], r'robots\.red\.start: read .*inside an object'),
+        ('environment.bounds', [[0, 300], [0, 300]], r'environment\.bounds: read 2 axes'),
         (
-            bounded((144.0, 206.0), (99.0, 161.0), (0.0, 80.0)),
+            'environment.bounds',
+            [[144, 206], [99, 161], [0, 80]],
             r'planner\.objects: no cuboid can be reached .*outside the area',
         ),
-        (planned(objects=[]), r'planner\.objects: got none'),
-        (planned(hoizon=5), r'planner\.hoizon'),
-        (planned(visit_depth=0.5), r'planner\.visit_depth: .*0\.5.*less than 0\.5'),
-        (planned(visit_depth=-1e-3), r'planner\.visit_depth: .*-0\.001.*0'),
-        (planned(brake_at_end='late'), r"planner\.brake_at_end: .*'late'.*(true|bool)"),
-        (
-            lambda content: content['events'].append({'at': 5.0, 'robot': 'rad', 'do': 'leave'}),
-            r"events\[0\]\.robot: .*'rad'",
-        ),
-        (lambda content: content['robots'].update(Red=content['robots']['red']), r'lower case'),
+        ('planner.objects', [], r'planner\.objects: got none'),
+        ('planner.hoizon', 5, r'planner\.hoizon'),
+        ('planner.visit_depth', 0.5, r'planner\.visit_depth: .*0\.5.*less than 0\.5'),
+        ('planner.visit_depth', -1e-3, r'planner\.visit_depth: .*-0\.001.*0'),
+        ('planner.brake_at_end', 'late', r"planner\.brake_at_end: .*'late'.*(true|bool)"),
+        ('events', [{'at': 5.0, 'robot': 'rad', 'do': 'leave'}], r"events\[0\]\.robot: .*'rad'"),
+        ('robots.Red', ONE['robots']['red'], r'lower case'),
     ],
 )
-def test_wrong_files_are_refused_with_their_key(change, words):
+def test_wrong_files_are_refused_with_their_key(key, value, words):
     with pytest.raises(ScenarioError, match=words):
-        scenario_with(change)
+        scenario_with((key, value))
 
 
 def test_a_robot_flies_the_velocity_that_a_plan_leads_to_and_brakes_without_one():
     dynamics = Dynamics()
-    scenario = scenario_with(placed(start=[50.0, 50.0, 20.0], yaw=1.0))
+    scenario = scenario_with(('robots.red.start', [50.0, 50.0, 20.0]), ('robots.red.yaw', 1.0))
     simulation = CuboidSimulation(scenario, 1)
     robot = simulation.robots['red']
     place, speed = robot.state.pose.position, robot.state.velocity

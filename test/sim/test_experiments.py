@@ -280,15 +280,13 @@ def test_page_says_what_was_run_and_keeps_what_was_not_run_again(toy, tmp_path):
     ],
 )
 def test_wrong_arguments_end_with_2(arguments, words, capsys):
-    try:
-        code = reproduce.main(arguments)
-    except SystemExit as ended:
-        code = ended.code
-    assert code == 2
+    with pytest.raises(SystemExit) as ended:
+        raise SystemExit(reproduce.main(arguments))
+    assert ended.value.code == 2
     assert words in capsys.readouterr().err
 
 
-def test_names_are_unique_and_listed(capsys):
+def test_names_are_unique_and_listed_and_what_is_named_is_there(capsys):
     assert reproduce.main(['--list']) == 0
     listed = capsys.readouterr().out
     for name, experiment in papers.experiments().items():
@@ -297,10 +295,19 @@ def test_names_are_unique_and_listed(capsys):
         names = [case.name for case in cases]
         assert len(names) == len(set(names)) == len({case.slug for case in cases})
         known = {item.name for item in experiment.quantities}
-        for item in experiment.published:
-            assert item.case in names and item.quantity in known
-        for pair in experiment.comparisons:
-            assert {pair.first, pair.second} <= set(names) and pair.quantity in known
+        printed = {(item.case, item.quantity) for item in experiment.published}
+        for case, quantity in printed:
+            assert case in names and quantity in known
+        for pair in (*experiment.comparisons, *experiment.claims):
+            assert pair.quantity in known, pair
+        words = [claim.says for claim in experiment.claims]
+        assert len(words) == len(set(words)), name
+        for claim in experiment.claims:
+            assert (claim.expects == 'number') == bool(claim.case), claim
+            assert not claim.case or (claim.case, claim.quantity) in printed, claim
+        pairs = [claim for claim in experiment.claims if not claim.case]
+        for pair in (*experiment.comparisons, *pairs):
+            assert {pair.first, pair.second} <= set(names), pair
 
 
 def test_cluster_that_does_not_answer_is_said(monkeypatch, capsys, tmp_path, toy):

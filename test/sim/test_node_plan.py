@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from test_scenario import SCENARIOS
 
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
@@ -13,15 +14,9 @@ from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import find_executable
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
-from maasi_sim.scenario.loading import config_folder, load_scenario
+from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import ScenarioError
 from maasi_sim.simulation.sim_node import SimNodeSettings
-
-SCENARIOS = sorted(
-    path.stem
-    for path in (config_folder() / 'scenarios').glob('*.yaml')
-    if 'cuboid_mpc' not in path.read_text()
-)
 
 
 def plans_of(scenario, **changes):
@@ -37,7 +32,7 @@ def read_back(plan, model):
     return model.model_validate(unflatten(model, flat)), simulated
 
 
-@pytest.mark.parametrize('name', SCENARIOS)
+@pytest.mark.parametrize('name', [path.stem for path in SCENARIOS])
 def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     scenario = load_scenario(name, {'--seed': (('seed',), 4)})
     # A link of a robot's own runs in real time.

@@ -7,6 +7,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image
+from test_scenario import PLAIN
 
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_sim import search as search_module
@@ -17,19 +18,12 @@ from maasi_sim.scenario.loading import load_scenario
 SEED = 900
 # Stamps of a real robot are those of the wall clock [ns].
 BEGIN = 1_760_000_000_000_000_000
-SCENARIO = {
-    'version': 1,
+CANDIDATES = {'grid': [4, 4], 'spacing': 0.3, 'corner': [-0.15, -0.15]}
+SCENARIO = PLAIN | {
     'seed': SEED,
     'environment': {'bounds': [[-0.3, 0.9], [-0.3, 0.9]]},
-    'step': 0.05,
-    'targets': {'count': 4, 'distribution': 'uniform', 'separation': 0.2, 'margin': 0.1},
-    'robots': {
-        'mambo': {
-            'type': 'mambo',
-            'start': [0.0, 0.0, 1.0],
-            'candidates': {'grid': [4, 4], 'spacing': 0.3, 'corner': [-0.15, -0.15]},
-        }
-    },
+    'targets': {'count': 4, 'separation': 0.2, 'margin': 0.1},
+    'robots': {'mambo': {'type': 'mambo', 'start': [0.0, 0.0, 1.0], 'candidates': CANDIDATES}},
     'filter': {
         'preset': 'paper_000',
         'found_radius': 0.02,

@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
+from small_field import SMALL_FIELD
 from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
@@ -23,19 +24,7 @@ from maasi_sim.run.missions import load_mission
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.topics import STEP
 
-SCENARIO = {
-    'version': 1,
-    'step': 0.1,
-    'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
-    'targets': {'positions': [[0.5, 0.5]]},
-    'robots': {
-        'rover': {
-            'type': 'turtlebot3_burger',
-            'start': [0.5, 0.5, 0.0],
-            'candidates': {'grid': [6, 6], 'spacing': 0.34},
-        }
-    },
-}
+SCENARIO = SMALL_FIELD | {'robots': {'rover': SMALL_FIELD['robots']['drone']}}
 
 
 class Session:

@@ -12,6 +12,7 @@ from geometry_msgs.msg import Point
 from matplotlib.colors import to_hex
 from rclpy.serialization import serialize_message
 from report_check import check_report
+from test_scenario import PLAIN
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs import msg
@@ -27,6 +28,7 @@ from maasi_sim.run.topics import within
 from maasi_sim.scenario.loading import load_scenario
 
 TYPES = load_types()
+ROBOT = PLAIN['robots']['mambo']
 
 
 def write(record, folder):
@@ -111,22 +113,14 @@ def point(position):
 
 
 def scenario_of(tmp_path, targets, **changes):
-    robot = {'type': 'mambo', 'candidates': {'grid': [6, 6], 'spacing': 0.34}}
-    content = {
-        'version': 1,
-        'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
-        'step': 0.05,
+    content = PLAIN | {
         'targets': {'positions': targets} if targets else {'count': 0},
-        'robots': {
-            'mambo': {**robot, 'start': [0.5, 0.5, 1.0]},
-            'second': {**robot, 'start': [1.5, 1.5, 1.0]},
-        },
+        'robots': PLAIN['robots'] | {'second': ROBOT | {'start': [1.5, 1.5, 1.0]}},
         'filter': {'removal_distance': 0.05},
         'stop': 'all_found' if targets else 'planner_done',
     }
-    content.update(changes)
     path = tmp_path / 'hand.yaml'
-    path.write_text(yaml.safe_dump(content))
+    path.write_text(yaml.safe_dump(content | changes))
     return load_scenario(path)
 
 
@@ -392,12 +386,11 @@ def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(ru
 
 
 def test_legend_of_many_robots_and_obstacles_is_whole(tmp_path):
-    robot = {'type': 'mambo', 'radius': 0.05, 'candidates': {'grid': [6, 6], 'spacing': 0.34}}
     robots = {
-        f'a_robot_with_a_long_name_{n}': {**robot, 'start': [0.1 + 0.18 * n, 0.5, 1.0]}
+        f'a_robot_with_a_long_name_{n}': ROBOT | {'radius': 0.05, 'start': [0.1 + 0.18 * n, 0.5, 1]}
         for n in range(10)
     }
     obstacles = [{'centre': [1.0, 1.0], 'radius': 0.1}]
-    environment = {'bounds': [[0.0, 2.0], [0.0, 2.0]], 'obstacles': obstacles}
+    environment = PLAIN['environment'] | {'obstacles': obstacles}
     run = Run(scenario_of(tmp_path, TARGETS, robots=robots, environment=environment))
     assert {*robots, 'obstacle'} <= labels_of(plot_report(run.record()))

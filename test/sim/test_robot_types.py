@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from test_scenario import changed
 
 from maasi_drivers.vision.camera_model import Camera, box_view_margin
 from maasi_sim.scenario.loading import scenario_from_values
@@ -16,19 +17,9 @@ TURTLEBOTS = {
 
 
 def scenario(kind, height=0.0):
-    robot = {
-        'type': kind,
-        'start': [0.0, 0.0, height],
-        'candidates': {'grid': [8, 8], 'spacing': 0.24, 'corner': [-0.2, -0.2]},
-    }
-    values = {
-        'version': 1,
-        'environment': {'bounds': [[-0.2, 1.5], [-0.2, 1.5]]},
-        'filter': {'method': 'pmb'},
-        'targets': {'count': 4, 'separation': 0.2, 'margin': 0.1},
-        'robots': {'rover': robot},
-        'limits': {'time': 400.0},
-    }
+    robot = ('robots', {'rover': {'type': kind, 'start': [0.5, 0.5, height]}})
+    targets = ('targets', {'count': 4, 'separation': 0.2, 'margin': 0.1})
+    values = changed(robot, targets, ('filter.method', 'pmb'), ('limits.time', 400.0))
     return scenario_from_values(values, 'test')
 
 

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -40,9 +41,9 @@ PLAIN = {
 }
 
 
-def changed(*changes):
-    """Return the plain scenario with values put in (or taken out: None) at dotted keys."""
-    content = yaml.safe_load(yaml.safe_dump(PLAIN))
+def changed(*changes, content=PLAIN):
+    """Return a scenario with values put in (or taken out: None) at dotted keys."""
+    content = deepcopy(content)
     for key, value in changes:
         inner = content
         *above, last = [int(step) if step.isdigit() else step for step in key.split('.')]
@@ -97,6 +98,7 @@ def test_types_beside_the_scenario_win_and_are_named_with_their_line(tmp_path, l
 
 LEAVES = {'at': 5.0, 'robot': 'mambo', 'do': 'leave'}
 GRID, DISCS = 'robots.mambo.candidates', 'environment.obstacles'
+TRUE = 'robots.mambo.simulated'
 WRONG = [
     # What is changed, the key in the message, and words that it must hold.
     ([('plannr', {'name': 'asi'})], 'plannr', ["did you mean 'planner'", 'known are']),
@@ -143,6 +145,9 @@ WRONG = [
     ([('robots.mambo.sensor.detection', {'lower': [0.0, 0.0, 0.0], 'upper': [1.0, 1.0]})],
      'robots.mambo.sensor.detection', ['2 or 3 numbers each']),
     ([('robots.mambo.driver', 'ranging_driver')], 'robots.mambo.camera', ['has none']),
+    ([('targets.walk', 0.1)], 'robots.mambo.camera', ['targets.walk is 0.1']),
+    ([(f'{TRUE}.clutter_per_scan', 1.0)], f'{TRUE}.clutter_per_scan', ['of a ranging sensor']),
+    ([(f'{TRUE}.noise_factor', 0.0)], f'{TRUE}.noise_factor', ['read 0', 'greater than 0']),
     ([('events', [LEAVES | {'robot': 'mamba'}])], 'events[0].robot', ["'mambo'"]),
     ([('events', [LEAVES | {'do': 'back'}])], 'events[0].do', ['is there']),
     ([('events', [LEAVES | {'do': 'go'}])], 'events[0].do', ['leave, back']),

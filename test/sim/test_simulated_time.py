@@ -5,27 +5,22 @@ from contextlib import closing
 
 import pytest
 from node_kinds import KINDS
-from rclpy.node import Node
+from player import Player
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
-from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE, UPDATES
-from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.msg import AgentState, BatchMember, FilterUpdate, MeasurementBatch
 
 SECOND = 1_000_000_000
 TIMEOUT = 0.3
 
 
-class World:
+class World(Player):
     def __init__(self, context, kind, **changes):
-        self.node = Node('world', context=context)
-        self.tested = KINDS[kind].make(context, **changes)
-        self.executors = [executor_of(node, context) for node in (self.node, self.tested)]
-        assert self.tested.trigger_configure().name == 'SUCCESS', self.tested.problem
-        assert self.tested.trigger_activate().name == 'SUCCESS'
+        super().__init__(context, 'world')
+        self.start(KINDS[kind].made, KINDS[kind].settings.model_copy(update=changes))
         (changed,) = self.tested.set_parameters([Parameter('use_sim_time', value=True)])
         assert changed.successful
         self.clock = self.publisher(Clock, '/clock')
@@ -40,24 +35,10 @@ class World:
         self.clock.publish(Clock(clock=stamp_to_ros(nanoseconds)))
         self.until(lambda: self.tested.get_clock().now().nanoseconds == nanoseconds)
 
-    def until(self, condition):
-        wait_until(condition, self.turn)
-
-    def turn(self):
-        for executor in self.executors:
-            executor.spin_once(0.005)
-
     def wait_in_vain(self):
         """Let much more wall time pass than a timeout."""
         end = time.monotonic() + 4.0 * TIMEOUT
-        while time.monotonic() < end:
-            self.turn()
-
-    def close(self):
-        for executor in self.executors:
-            executor.shutdown()
-        self.tested.destroy_node()
-        self.node.destroy_node()
+        self.until(lambda: time.monotonic() > end)
 
 
 @pytest.fixture
@@ -68,8 +49,7 @@ def world(context, request):
 
 @pytest.mark.parametrize('world', [{'kind': 'filter', 'batch_timeout': TIMEOUT}], indirect=True)
 def test_a_batch_is_given_up_in_simulated_time(world):
-    updates = []
-    world.node.create_subscription(FilterUpdate, '/filter_update', updates.append, UPDATES)
+    updates = world.hear(FilterUpdate, '/filter_update', UPDATES)
     world.until(lambda: world.node.count_publishers('/filter_update'))
     # Its robot never answers.
     members = [BatchMember(robot='rover', measurement=1)]

@@ -1,6 +1,7 @@
 """The commands of a page: none waits for another one; the command line of the view node."""
 
 import threading
+from contextlib import closing
 from functools import partial
 
 import rclpy
@@ -92,7 +93,7 @@ def test_a_stop_of_all_passes_what_waits_in_the_browser():
 def test_buttons_that_change_nothing_are_off_and_states_and_answers_are_whole():
     answer = 'pause: rover; ' + 'a long story, ' * 20 + 'whose end is read'
     hub = Hub({'name': 'test', 'robots': {}, 'bounds': [[0, 1], [0, 1]], 'control': True})
-    server = ViewServer(hub, 0, commander=lambda command, robot: (True, answer))
+    made = ViewServer(hub, 0, commander=lambda command, robot: (True, answer))
     stopped = 'stopped by the service stop, until the service release is called'
     words = ('start', 'pause', 'resume', 'home', 'stop', 'release')
     steps = [
@@ -104,32 +105,25 @@ def test_buttons_that_change_nothing_are_off_and_states_and_answers_are_whole():
         ('stopped', 0, '', 'search stopped', {'start', 'home', 'stop'}),
     ]
     headlines = []
-    try:
-        with chromium() as shown:
-            hub.put([0.0, 'start', '', 5, 7])
-            shown.open(server.address)
-            shown.until("document.querySelector('#headline').textContent.startsWith('Starting: 5')")
-            for time, (mode, status, reason, state, useful) in enumerate(steps):
-                hub.put([float(time), 'mode', '/planner_node', mode])
-                hub.put([float(time), 'robot', 'rover', [0.5, 0.5, 0.0, 0.0], 1.0, status, reason])
-                text = "document.querySelector('#robots td.text')?.textContent.includes('{}')"
-                shown.until(text.format(state))
-                on = {
-                    word for word in words if shown.page.is_enabled(f'button[data-command={word}]')
-                }
-                assert on == useful, mode
-                shown.page.wait_for_timeout(1100)
-                headlines.append(shown.page.inner_text('#headline').split(':')[0])
-            shown.page.click('button[data-command=stop]')
-            heard = shown.page.locator('#controls [role=status]')
-            shown.until(
-                "document.querySelector('#controls [role=status]').innerText.endsWith('read')"
-            )
-            assert heard.inner_text() == f'stop all: {answer}'
-            # Nothing of it is cut.
-            assert heard.evaluate('(part) => part.scrollWidth <= part.clientWidth + 1')
-    finally:
-        server.close()
+    with closing(made) as server, chromium() as shown:
+        hub.put([0.0, 'start', '', 5, 7])
+        shown.open(server.address)
+        shown.until("document.querySelector('#headline').textContent.startsWith('Starting: 5')")
+        for time, (mode, status, reason, state, useful) in enumerate(steps):
+            hub.put([float(time), 'mode', '/planner_node', mode])
+            hub.put([float(time), 'robot', 'rover', [0.5, 0.5, 0.0, 0.0], 1.0, status, reason])
+            text = "document.querySelector('#robots td.text')?.textContent.includes('{}')"
+            shown.until(text.format(state))
+            on = {word for word in words if shown.page.is_enabled(f'button[data-command={word}]')}
+            assert on == useful, mode
+            shown.page.wait_for_timeout(1100)
+            headlines.append(shown.page.inner_text('#headline').split(':')[0])
+        shown.page.click('button[data-command=stop]')
+        heard = shown.page.locator('#controls [role=status]')
+        shown.until("document.querySelector('#controls [role=status]').innerText.endsWith('read')")
+        assert heard.inner_text() == f'stop all: {answer}'
+        # Nothing of it is cut.
+        assert heard.evaluate('(part) => part.scrollWidth <= part.clientWidth + 1')
     expected = ['Waiting for start', 'Searching', 'Paused', 'Sent home', 'Stopped', 'Stopped']
     assert headlines == expected
 

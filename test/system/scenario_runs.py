@@ -170,10 +170,7 @@ class Operator:
 
 @contextmanager
 def reserved_domain():
-    """Reserve a domain for a run that gets its number, and locks it itself.
-
-    It is one of the last, so that no run that takes the first free one gets it.
-    """
+    """Reserve one of the last domains, which no run takes that takes the first free one."""
     for number in reversed(DOMAINS):
         with suppress(DomainError):
             domain = Domain(number, 'reserved for a test')

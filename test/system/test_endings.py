@@ -206,7 +206,6 @@ def test_wrong_input_is_told_before_anything_starts(tmp_path):
     'options, words',
     [
         (['--domain-id', '-1'], '--domain-id'),
-        (['--seed', '1.5'], '--seed'),
         (['--rate', '0'], '--rate'),
         (['--time-limit', 'nan'], '--time-limit'),
         (['--lokstep'], 'unknown: --lokstep (did you mean --lockstep?)'),

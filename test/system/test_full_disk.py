@@ -1,8 +1,4 @@
-"""Runs whose disk fills in the middle, and a run that is killed: what is left of them.
-
-A write beyond RLIMIT_FSIZE fails (EFBIG, setrlimit(2)), and so does each write to `/dev/full`
-(ENOSPC, full(4)). Neither needs a disk of its own, nor rights.
-"""
+"""Runs whose disk fills in the middle, and a run that is killed: what is left of them."""
 
 import resource
 import signal

@@ -1,7 +1,4 @@
-"""`ros2 launch maasi_sim scenario.launch.py`: does what run_scenario does, and ends with it.
-
-Where `launch` is not installed, the process that the launch file starts is run by itself.
-"""
+"""`ros2 launch maasi_sim scenario.launch.py`: does what run_scenario does, and ends with it."""
 
 import importlib.util
 import os
@@ -50,6 +47,7 @@ def launch(tmp_path):
             given = [f'{name}:={value}' for name, value in arguments.items()]
             command = [sys.executable, '-c', LAUNCH, str(LAUNCH_FILE), *given]
         else:
+            # The process that the launch file starts.
             options = scenario_options({**DEFAULTS, **arguments})[:-1]
             executable = str(find_executable('maasi_sim', 'run_scenario'))
             command = [executable, *options, f'--domain-id={domain.number}']

@@ -15,10 +15,7 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture(scope='module')
 def repeated(tmp_path_factory):
-    """Return the same scenario and seed twice: the second time not alone on the machine.
-
-    Beside it is another run, a core is busy, and libraries have another number of threads.
-    """
+    """Return the same run twice: then beside another, on a busy core, with other threads."""
     folder = tmp_path_factory.mktemp('repeated')
     options = ('--seed', 3, '--lockstep', '--time-limit', 20)
     first = run_scenario('mambo_turtlebot', folder / 'first', *options)

@@ -15,10 +15,7 @@ STEP = 0.05
 
 @pytest.fixture(scope='module')
 def teams(tmp_path_factory):
-    """Return the runs of two teams, by namespace; the first one's clock is that of both.
-
-    The first is paused until the second measures: it would have found all before.
-    """
+    """Return the runs of two teams, by namespace; the first one's clock is that of both."""
     folder = tmp_path_factory.mktemp('teams')
     first = write_scenario(folder / 'first.yaml', [[0.3, 0.4]])
     second = write_scenario(folder / 'second.yaml', [[0.6, 0.6]], (0.3, 0.3, 1.0))
@@ -27,6 +24,7 @@ def teams(tmp_path_factory):
         with start(first, folder / 'team_a', *options, 'team_a') as leading:
             # A robot that does not take part yet is not paused.
             leading.wait_for('measurements')
+            # It would find all before the second one measures.
             operator.call('/team_a/search/pause')
             options += ['team_b', '--follow-clock']
             with start(second, folder / 'team_b', *options) as following:

@@ -159,26 +159,6 @@ def test_a_search_in_space_from_above_is_shaded_by_its_columns(tmp_path):
         assert shades == [90, 0, 90, 90]
 
 
-@needs_chromium
-def test_it_plays_by_the_space_bar_also_on_a_phone_in_space_and_in_the_dark(run):
-    with chromium(390, 844, color_scheme='dark', has_touch=True) as shown:
-        page = shown.page
-        shown.open((run.folder / REPLAY).as_uri())
-        assert page.get_attribute('html', 'data-theme') == 'dark'
-        page.select_option('#speed', '20')
-        page.locator('#map').focus()
-        page.keyboard.press(' ')
-        shown.until('maasi.time > 1.0')
-        page.keyboard.press(' ')
-        shown.settle()
-        flat = page.locator('#map').screenshot()
-        page.tap('#space')
-        shown.settle()
-        assert page.locator('#map').screenshot() != flat
-        # Nothing is wider than the phone.
-        assert page.evaluate('document.documentElement.scrollWidth') <= 390
-
-
 def test_a_run_leaves_its_page_which_is_made_again_of_its_bag_or_of_the_newest_run(
     run, tmp_path, monkeypatch, capsys
 ):
