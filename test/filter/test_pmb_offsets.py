@@ -22,9 +22,9 @@ def scan(generator, robot, error, way=0.0):
     return AgentMeasurement(robot, Pose(true + error), sensor, values)
 
 
-def new_filter(seed=0, **offset):
+def new_filter(**offset):
     settings = FilterSettings(method='pmb', pmb={'offset': offset})
-    return PmbFilter(settings, CUBE, np.random.default_rng(seed))
+    return PmbFilter(settings, CUBE, np.random.default_rng(0))
 
 
 def looked(search, errors, steps=12, seed=1):
