@@ -1,7 +1,5 @@
 """Small searches in one process that the tests share."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import multivariate_normal
 

@@ -1,7 +1,5 @@
 """Run the golden runs and print what moved; store them anew with --write."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import lzma

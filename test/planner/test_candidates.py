@@ -1,7 +1,5 @@
 """Candidate sets, and the parts that nothing can be seen of."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

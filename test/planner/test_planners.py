@@ -1,7 +1,5 @@
 """Every planner: against brute force on small cases, and in whole searches."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
