@@ -1,5 +1,6 @@
 """Classes of a user's own: by entry point, by module:Class, with settings of their own."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -55,7 +56,7 @@ step: 0.1
 targets: {positions: [[1.5, 0.5]]}
 robots:
   rover:
-    type: ranging_drone_2d
+    type: scout
     start: [1.0, 1.0, 0.0]
     candidates: {grid: [2, 2], spacing: 1.0}
 filter: {method: pmb}
@@ -64,15 +65,7 @@ planner:
   settings: {stride: 3}
 limits: {time: 5.0}
 """
-ROBOT = """
-driver: ranging_driver
-motion: {model: constant_speed, speed: 0.5, tolerance: 0.05}
-sensor:
-  detection: {kind: exponential, probability: 0.98, size: [1.0, 1.0]}
-  noise: {range: 0.05, bearing: 0.05}
-  period: 0.5
-camera: null
-"""
+ROBOTS = Path(__file__).resolve().parents[1] / 'examples' / 'robots'
 
 
 @pytest.fixture
@@ -83,8 +76,7 @@ def folder(tmp_path, monkeypatch):
     known = set(sys.modules)
     (tmp_path / 'one_by_one.py').write_text(ONE_BY_ONE)
     (tmp_path / 'search.yaml').write_text(SCENARIO)
-    (tmp_path / 'robots').mkdir()
-    (tmp_path / 'robots' / 'ranging_drone_2d.yaml').write_text(ROBOT)
+    (tmp_path / 'robots').symlink_to(ROBOTS)
     yield tmp_path
     for name in set(sys.modules) - known:
         if str(tmp_path) in str(getattr(sys.modules[name], '__file__', '')):
@@ -185,10 +177,7 @@ def test_bad_settings_have_file_and_line(folder, before, after, message):
 
 def test_two_modules_of_one_name_are_refused(folder, tmp_path_factory):
     load_scenario(folder / 'search.yaml')
-    other = tmp_path_factory.mktemp('other')
-    (other / 'one_by_one.py').write_text(ONE_BY_ONE)
-    (other / 'robots').symlink_to(folder / 'robots')
-    (other / 'search.yaml').write_text(SCENARIO)
+    other = shutil.copytree(folder, tmp_path_factory.mktemp('other') / 'copy')
     with pytest.raises(ScenarioError, match='give it another name'):
         load_scenario(other / 'search.yaml')
 
