@@ -42,8 +42,7 @@ class OneByOne(Planner):
             if isinstance(option, str):
                 decision.robots[name] = stay(team.robots[name], option)
                 continue
-            self.last = getattr(self, 'last', -self.own.stride) + self.own.stride
-            chosen = self.last % len(option.points)
+            chosen = self.own.stride % len(option.points)
             while not option.allowed[chosen]:
                 chosen = (chosen + 1) % len(option.points)
             decision.robots[name] = single_choice(option.points, option.prediction, chosen, 'next')
@@ -97,7 +96,7 @@ def chosen(result) -> list[int]:
 def test_planner_beside_the_scenario(folder, tmp_path_factory):
     scenario = load_scenario(folder / 'search.yaml')
     assert scenario.planner.settings.stride == 3
-    assert chosen(search(scenario, 1, most_measurements=5)) == [0]
+    assert chosen(search(scenario, 1, most_measurements=5)) == [3]
     # Its text names the folder, for a copy elsewhere.
     copy = tmp_path_factory.mktemp('run') / 'scenario.yaml'
     copy.write_text(scenario.text())
