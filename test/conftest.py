@@ -36,12 +36,9 @@ def context(domain):
     # rclpy starts threads when it is imported, and some tests fork.
     import rclpy
     from rclpy.context import Context
-    from rclpy.signals import SignalHandlerOptions
 
     made = Context()
-    rclpy.init(
-        context=made, domain_id=domain.number, signal_handler_options=SignalHandlerOptions.NO
-    )
+    rclpy.init(context=made, domain_id=domain.number)
     yield made
     rclpy.try_shutdown(context=made)
 

@@ -1,8 +1,4 @@
-"""Code blocks of the documents: Python is run, YAML is validated, options of commands exist.
-
-A block that cannot be run here has `<!-- not run: REASON -->` before it; one that is no code is
-fenced as text.
-"""
+"""Code blocks of the documents: Python is run, YAML is validated, options of commands exist."""
 
 import importlib
 import re

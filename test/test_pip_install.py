@@ -4,10 +4,10 @@ import os
 import shutil
 import subprocess
 import sys
-from itertools import takewhile
 from pathlib import Path
 
 import pytest
+from test_code_blocks import BLOCKS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('config', 'maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
@@ -53,10 +53,8 @@ def run(folder, path, *arguments):
 
 def without_ros():
     """Return the program in README's section about using the libraries without ROS."""
-    section = (ROOT / 'README.md').read_text().split('## Without ROS\n')[1].split('\n## ')[0]
-    block = section.split('\n\n    from ')[1]
-    lines = takewhile(lambda line: not line or line.startswith('    '), block.splitlines()[1:])
-    return '\n'.join(['from ' + block.splitlines()[0], *(line[4:] for line in lines)])
+    programs = [item for item in BLOCKS if item.language == 'python']
+    return next(item.text for item in programs if item.place.startswith('README'))
 
 
 def test_pip_installs_every_file(prefix):

@@ -1,5 +1,6 @@
 """Classes of a user's own: by entry point, by module:Class, with settings of their own."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -41,8 +42,7 @@ class OneByOne(Planner):
             if isinstance(option, str):
                 decision.robots[name] = stay(team.robots[name], option)
                 continue
-            self.last = getattr(self, 'last', -self.own.stride) + self.own.stride
-            chosen = self.last % len(option.points)
+            chosen = self.own.stride % len(option.points)
             while not option.allowed[chosen]:
                 chosen = (chosen + 1) % len(option.points)
             decision.robots[name] = single_choice(option.points, option.prediction, chosen, 'next')
@@ -55,7 +55,7 @@ step: 0.1
 targets: {positions: [[1.5, 0.5]]}
 robots:
   rover:
-    type: ranging_drone_2d
+    type: scout
     start: [1.0, 1.0, 0.0]
     candidates: {grid: [2, 2], spacing: 1.0}
 filter: {method: pmb}
@@ -64,15 +64,7 @@ planner:
   settings: {stride: 3}
 limits: {time: 5.0}
 """
-ROBOT = """
-driver: ranging_driver
-motion: {model: constant_speed, speed: 0.5, tolerance: 0.05}
-sensor:
-  detection: {kind: exponential, probability: 0.98, size: [1.0, 1.0]}
-  noise: {range: 0.05, bearing: 0.05}
-  period: 0.5
-camera: null
-"""
+ROBOTS = Path(__file__).resolve().parents[1] / 'examples' / 'robots'
 
 
 @pytest.fixture
@@ -83,8 +75,7 @@ def folder(tmp_path, monkeypatch):
     known = set(sys.modules)
     (tmp_path / 'one_by_one.py').write_text(ONE_BY_ONE)
     (tmp_path / 'search.yaml').write_text(SCENARIO)
-    (tmp_path / 'robots').mkdir()
-    (tmp_path / 'robots' / 'ranging_drone_2d.yaml').write_text(ROBOT)
+    (tmp_path / 'robots').symlink_to(ROBOTS)
     yield tmp_path
     for name in set(sys.modules) - known:
         if str(tmp_path) in str(getattr(sys.modules[name], '__file__', '')):
@@ -105,7 +96,7 @@ def chosen(result) -> list[int]:
 def test_planner_beside_the_scenario(folder, tmp_path_factory):
     scenario = load_scenario(folder / 'search.yaml')
     assert scenario.planner.settings.stride == 3
-    assert chosen(search(scenario, 1, most_measurements=5)) == [0]
+    assert chosen(search(scenario, 1, most_measurements=2)) == [3]
     # Its text names the folder, for a copy elsewhere.
     copy = tmp_path_factory.mktemp('run') / 'scenario.yaml'
     copy.write_text(scenario.text())
@@ -113,9 +104,9 @@ def test_planner_beside_the_scenario(folder, tmp_path_factory):
     assert load_scenario(copy).planner.settings.stride == 3
     # Another one instead of it: by name, and as a class.
     (folder / 'second.py').write_text(ONE_BY_ONE.replace('OneByOne', 'Second'))
-    for planner, word in (('lawnmower', 'lane'), ('second:Second', 'next')):
+    for planner, why in (('lawnmower', 'next point of the lawnmower'), ('second:Second', 'next')):
         other = search(scenario, 1, most_measurements=5, planner=planner)
-        assert word in other.decisions[0].robots['rover'].reason
+        assert other.decisions[0].robots['rover'].reason == why
     assert search(scenario, 1, most_measurements=5, planner=sys.modules['second'].Second).decisions
     with pytest.raises(ValueError, match=r"^planner: unknown planner 'third'"):
         search(scenario, 1, planner='third')
@@ -185,10 +176,7 @@ def test_bad_settings_have_file_and_line(folder, before, after, message):
 
 def test_two_modules_of_one_name_are_refused(folder, tmp_path_factory):
     load_scenario(folder / 'search.yaml')
-    other = tmp_path_factory.mktemp('other')
-    (other / 'one_by_one.py').write_text(ONE_BY_ONE)
-    (other / 'robots').symlink_to(folder / 'robots')
-    (other / 'search.yaml').write_text(SCENARIO)
+    other = shutil.copytree(folder, tmp_path_factory.mktemp('other') / 'copy')
     with pytest.raises(ScenarioError, match='give it another name'):
         load_scenario(other / 'search.yaml')
 

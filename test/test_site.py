@@ -1,7 +1,4 @@
-"""The documentation site: built without a warning, complete, and without the network.
-
-The API reference is left out here, as it takes minutes: ./scripts/docs builds it too.
-"""
+"""The documentation site, without the API reference: no warning, complete, and no network."""
 
 import re
 import runpy

@@ -13,6 +13,7 @@ from maasi_filter import (
     Pose,
     RangeBearing,
     RangeBearingElevation,
+    Sensor,
     compose,
     detection_probability_at,
     inverse,
@@ -116,11 +117,12 @@ def test_noise_says_what_its_numbers_are():
     degrees = NoiseSettings(**numbers, as_='variance', angles='degrees')
     expected = np.sqrt([1.5, 0.175, 0.295]) * [1.0, np.pi / 180, np.pi / 180]
     np.testing.assert_allclose(np.sqrt(np.diag(degrees.covariance(3))), expected)
-    assert degrees.covariance(2).shape == (2, 2)
     assert NoiseSettings.model_validate({**numbers, 'as': 'variance'}).as_ == 'variance'
 
 
 # Probability of detection.
+
+BOX = BoxDetection([-0.2, -0.2], [0.2, 0.2], 0.9)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +145,7 @@ def test_box_off_centre_turns_with_the_robot(frame, seen):
 
 
 def test_a_ramp_falls_linearly_across_the_edge():
-    box = BoxDetection([-0.2, -0.2], [0.2, 0.2], 0.9).softened(0.02)
+    box = BOX.softened(0.02)
     positions = [[0.17, 0.0], [0.19, 0.0], [0.2, 0.0], [0.21, 0.0], [0.23, 0.0]]
     values = box.probability(positions, Pose([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(values, [0.9, 0.675, 0.45, 0.225, 0.0], atol=1e-12)
@@ -181,6 +183,8 @@ def test_the_kernel_agrees_with_the_model(model):
         (lambda: GaussianDetection(1.5, [25.0, 25.0]), 'probability'),
         (lambda: BoxDetection([0.2, -0.2], [-0.2, 0.2]), 'lower, upper'),
         (lambda: BoxDetection([-0.2, -0.2], [0.2, 0.2], frame='camera'), 'frame'),
+        (lambda: Sensor('bad', BOX, RangeBearing(), np.zeros((2, 2))), 'positive definite'),
+        (lambda: Sensor('bad', BOX, RangeBearing(), np.eye(2), clutter=np.nan), 'clutter'),
         (lambda: Pose([np.nan, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]), 'position'),
         (lambda: Pose([0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]), 'position'),
         (lambda: Pose([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]), 'orientation'),

@@ -53,20 +53,16 @@ def test_diffusion_spreads_a_peak_by_its_variance():
 
 
 @pytest.mark.parametrize(
-    ('bounds', 'spacing', 'word'),
+    ('make', 'word'),
     [
-        ([[0.0, 1.0]], 0.1, 'bounds'),
-        ([[1.0, 0.0], [0.0, 1.0]], 0.1, 'bounds'),
-        ([[0.0, np.nan], [0.0, 1.0]], 0.1, 'bounds'),
-        ([[0.0, 1.0], [0.0, 1.0]], 0.0, 'spacing'),
-        ([[0.0, 1e6], [0.0, 1e6]], 0.1, 'nodes'),
+        (lambda: UnexploredMap([[0.0, 1.0]], 0.1), 'bounds'),
+        (lambda: UnexploredMap([[1.0, 0.0], [0.0, 1.0]], 0.1), 'bounds'),
+        (lambda: UnexploredMap([[0.0, np.nan], [0.0, 1.0]], 0.1), 'bounds'),
+        (lambda: UnexploredMap([[0.0, 1.0], [0.0, 1.0]], 0.0), 'spacing'),
+        (lambda: UnexploredMap([[0.0, 1e6], [0.0, 1e6]], 0.1), 'nodes'),
+        (lambda: UnexploredMap(BOUNDS, 12.0).at([[0.0, np.nan, 0.0]]), 'finite'),
     ],
 )
-def test_bad_grids_are_refused(bounds, spacing, word):
+def test_bad_grids_and_positions_are_refused(make, word):
     with pytest.raises(ValueError, match=word):
-        UnexploredMap(bounds, spacing)
-
-
-def test_positions_that_are_not_finite_are_refused():
-    with pytest.raises(ValueError, match='finite'):
-        UnexploredMap(BOUNDS, 12.0).at([[0.0, np.nan, 0.0]])
+        make()

@@ -1,7 +1,5 @@
 """Motion models: one closed loop for prediction, driver and simulator, and its limits."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

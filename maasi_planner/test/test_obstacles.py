@@ -1,7 +1,5 @@
 """Ways around obstacles: nothing is ever touched, and everything is reached."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,9 +1,4 @@
-"""Reference for experiments: a planner that knows the positions of the targets.
-
-Its robots still have to find them with sensors and filter; the regret of another planner is its
-additional time. A target counts as found with its second detection, and the routes minimise the
-expected time until all are found, by local search. Available in the search in one process only.
-"""
+"""Reference for experiments: a planner that knows the positions of the targets."""
 
 from dataclasses import replace
 from functools import partial
@@ -39,10 +34,7 @@ class _Robots(NamedTuple):
 
 @njit(cache=True)
 def _expected_end(robots, routes, targets, detected, dimension):
-    """Return the expected time to find all on `routes` (R, n), -1 after the last, in ticks.
-
-    And the places (R, 3) where each robot leaves for its second target.
-    """
+    """Return the ticks to find all on `routes` (R, n) of targets or -1, and (R, 3) first stops."""
     number, size = routes.shape
     # Probabilities of no detection and of exactly one.
     none, one = np.where(detected, 0.0, 1.0), np.where(detected, 1.0, 0.0)

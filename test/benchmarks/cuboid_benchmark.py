@@ -1,9 +1,4 @@
-"""Time of the search of buildings (004): `run()` yields figures.
-
-The instances are problems that robots meet in missions of figure 4 with N = 32 cuboids and the
-paper's undiscounted rewards. SCIP gets the same instances in the same run, as the tight
-formulation of `MixedProblem`, to an absolute gap of 1e-4, and at most 20 s each.
-"""
+"""Time of the search of buildings (004), on problems that robots meet in missions of figure 4."""
 
 from functools import partial
 
@@ -12,6 +7,7 @@ from timing import entry, few, times_of
 
 from maasi_planner.buildings.centralized import solve_jointly
 
+# Of SCIP: absolute gap, and time of an instance [s].
 GAP, LIMIT = 1e-4, 20.0
 
 

@@ -1,7 +1,4 @@
-"""Speed of the filter: medians of repeated steps in one process.
-
-The state before each step of `ic_phd` is the same; restoring it is not timed.
-"""
+"""Speed of the filter: medians of repeated steps, those of `ic_phd` from the same state."""
 
 import time
 

@@ -1,8 +1,4 @@
-"""Median times of whole decisions, predicted trajectories included: `run()` yields figures.
-
-The baseline is measured in the same run: the same objective with e updated on the whole grid, as
-(21) is written.
-"""
+"""Median times of whole decisions, predicted trajectories included."""
 
 import numpy as np
 from timing import entry, few, median_time
@@ -57,12 +53,9 @@ def team_of(robots, step, bounds, spacing, rng, deviation):
 
 
 def drones(number, model='constant_speed'):
-    """Return ranging drones in the papers' cube, 27 candidates each.
-
-    They measure every 12 m, as in 000, section 5.1; the first one stands in the middle.
-    """
+    """Return ranging drones in the papers' cube, 27 candidates each."""
     rng = np.random.default_rng(1)
-    # 12 m/s, a measurement each second; the Mambo at 4 m/s every 3 s.
+    # 12 m/s, a measurement each second, as in 000, section 5.1; the Mambo at 4 m/s every 3 s.
     speed, period = (12.0, 10) if model == 'constant_speed' else (4.0, 30)
     motion = {'model': model, 'speed': speed, 'tolerance': 1.0}
     grid = [3, 3, 3], 120.0, [10.0] * 3

@@ -47,12 +47,7 @@ def prepared(condition, method, seed, settings=None):
 
 
 def run_one(key, settings=None):
-    """Run a search of a condition, method and seed; return what it came to.
-
-    `found` are true targets that were found, of `targets`; `squares` and `normalised` are sums of
-    their squared errors [m^2], and of the same normalised with their covariances; `step` is the
-    mean wall time of a filter step [s].
-    """
+    """Run a search of a condition, method and seed; return counts, sums of errors and times."""
     condition, method, seed = key
     scenario = prepared(condition, method, seed, settings)
     measure = RangingSensor.measure
@@ -80,11 +75,7 @@ def run_one(key, settings=None):
 
 
 def row(runs, others):
-    """Return the cells of a row, with 95 % intervals; `others` are those of the reference.
-
-    Complete runs: Clopper and Pearson. False found targets: Poisson. Measurements: Student, as all
-    runs that did not find all reached the cap; their difference is paired by seed.
-    """
+    """Return the cells of a row, with 95 % intervals; `others` are those of the reference."""
     number = len(runs)
     values = {name: np.array([run[name] for run in runs]) for name in runs[0]}
     complete = int((values['found'] == values['targets']).sum())

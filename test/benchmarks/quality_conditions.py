@@ -30,11 +30,7 @@ SPACE = SIDE * math.sqrt(3.0) * 2.0 * math.pi * math.pi
 
 
 def changed(name, changes, seed=None):
-    """Return a scenario whose planner ends no search, with changes on top.
-
-    Each is a layer over the content of the scenario, its `every_robot` over each robot, or a
-    function that makes other content of it and the seed.
-    """
+    """Return a scenario whose planner ends no search, with layers over it, or functions of it."""
     content = load_scenario(name).model_dump(by_alias=True, exclude_unset=True)
     never_done = {'planner': {'explored_threshold': 1.0, 'gain_threshold': 0.0}}
     for change in (never_done, *changes):

@@ -26,23 +26,17 @@ NEAR_3D, NEAR_FLOOR = {'ring': 6, 'distance': 30.0}, {'ring': 8, 'distance': 0.3
 
 
 class Regime(NamedTuple):
-    """A kind of search; a run that does not find all counts with `limit` [s].
-
-    `neighbours` are candidates of planners that measure at waypoints only.
-    """
+    """A kind of search; a run that does not find all counts with `limit` [s]."""
 
     scenario: str
     limit: float
+    # Candidates of planners that measure at waypoints only.
     neighbours: dict[str, Any]
     changes: Sequence[Any] = ()
 
 
 class Kind(NamedTuple):
-    """A planner as it is compared: its settings, and most seeds, fewer where runs take long.
-
-    `neighbours`: it chooses among a regime's; `maker` makes the planner, as of `search`, in place
-    of the scenario's.
-    """
+    """A planner as it is compared: its settings, and most seeds, fewer where runs take long."""
 
     planner: dict[str, Any]
     runs: int = 64

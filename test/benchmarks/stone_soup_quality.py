@@ -1,12 +1,4 @@
-"""The multi-Bernoulli filter beside Stone Soup's JPDA tracker, on the same recorded detections.
-
-    ./scripts/quality --stone-soup [CONDITION ...] [--seeds BLOCK] [--runs N]
-
-A search is run once with `pmb`; its detections, poses and times go to both. GOSPA (c = 10 m,
-p = 2) is taken after each measurement and averaged over time. Estimates of `pmb` are found targets
-and clusters with a mass above 1/2; those of the JPDA tracker are its tracks, from their second
-detection on. It is told pi at each track, as a constant would delete tracks out of view.
-"""
+"""The multi-Bernoulli filter beside Stone Soup's JPDA tracker, on the same recorded detections."""
 
 import datetime
 import time
@@ -57,7 +49,7 @@ def probability(scan, state):
 
 
 class ViewedHypothesiser(PDAHypothesiser):
-    """Probabilistic data association that is told pi at each track."""
+    """Data association that is told pi at each track: a constant deletes tracks out of view."""
 
     scan: Any = Property(doc='The scan that is processed')
 
@@ -79,11 +71,7 @@ class MissedDeleter(Deleter):
 
 
 class StoneSoup:
-    """A JPDA tracker with extended Kalman filters.
-
-    `scan` is the first one, `bounds` (3, 2) those of the environment [m], `walk` the deviation of
-    the targets' walk [m/sqrt(s)].
-    """
+    """A JPDA tracker with extended Kalman filters; `walk` is that of the targets [m/sqrt(s)]."""
 
     def __init__(self, scan, bounds, walk):
         walks = [RandomWalk(max(walk**2, LEAST_WALK))] * 3

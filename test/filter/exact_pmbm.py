@@ -1,8 +1,4 @@
-"""Exact Poisson multi-Bernoulli mixture on a grid by enumeration, for tiny problems.
-
-García-Fernández, Williams, Granström and Svensson (2018): after each scan a weighted set of global
-hypotheses, each with a list of Bernoulli components. Densities are numbers at the nodes of a grid.
-"""
+"""Exact Poisson multi-Bernoulli mixture (García-Fernández et al., 2018), enumerated on a grid."""
 
 from itertools import product
 from math import prod

@@ -1,7 +1,5 @@
 """Small searches in one process that the tests share."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import multivariate_normal
 
@@ -14,6 +12,7 @@ from maasi_filter import (
     SensorSettings,
     wrap_angle,
 )
+from maasi_filter.measurement_check import check_measurements
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.state_file import pack
 
@@ -123,6 +122,12 @@ def measured(sensor, position, values, step=0, robot='robot'):
     d = sensor.dimension
     pose = Pose(np.asarray(position, float))
     return AgentMeasurement(robot, pose, sensor, np.reshape(values, (-1, d)), None, step)
+
+
+def checked(measurement):
+    """Return a measurement as a filter takes it."""
+    settings = FilterSettings(method='pmb').resolved()
+    return check_measurements([measurement], 1, 0.0, settings, measurement.sensor.dimension)[0]
 
 
 def cells():

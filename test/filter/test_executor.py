@@ -24,12 +24,12 @@ class Pair:
         self.executor = executor_of(self.listener, context)
         self.answers = executor_of(self.talker, context)
 
-    def until(self, condition, turn=lambda: None, executor=None):
+    def until(self, condition, turn=lambda: None):
         """Let both spin; what the talker waits for must be there, not be waited for."""
 
         def spin():
             turn()
-            (executor or self.executor).spin_once(0.05)
+            self.executor.spin_once(0.05)
             self.answers.spin_once(0.0)
 
         wait_until(condition, spin)

@@ -21,7 +21,6 @@ from maasi_filter import (
     IcPhdFilter,
     NoiseSettings,
     Pose,
-    Sensor,
     SensorSettings,
     make_filter,
     match_targets,
@@ -39,14 +38,12 @@ def drone(values, position=(100.0, 100.0, 100.0), name='drone', sensor=None, **o
     )
 
 
-def visit(search, targets, poses, generator, sensors=None):
+def visit(search, targets, poses, generator):
     """Step the filter through what robots see at rows of poses."""
-    sensors = sensors or [cube_sensor()] * len(poses[0])
+    sensor = cube_sensor()
     for step, row in enumerate(poses):
         members = [
-            AgentMeasurement(
-                f'robot_{r}', Pose(p), sensors[r], observe(generator, sensors[r], targets, Pose(p))
-            )
+            drone(observe(generator, sensor, targets, Pose(p)), p, f'robot_{r}', sensor)
             for r, p in enumerate(row)
         ]
         search.step(members, 1, float(step))
@@ -157,14 +154,6 @@ def test_a_target_right_below_the_robot_is_found():
         search.step([drone(values, [1.0, 1.0, 1.0], sensor=floor_sensor())], 1, step)
     assert len(search.found_targets) == 1
     np.testing.assert_allclose(search.found_targets[0].position, [1.0, 1.0], atol=0.02)
-
-
-def test_bad_sensors_are_refused():
-    good = cube_sensor()
-    with pytest.raises(ValueError, match='positive definite'):
-        Sensor('bad', good.detection, good.measurement, np.zeros((3, 3)))
-    with pytest.raises(ValueError, match='clutter'):
-        Sensor('bad', good.detection, good.measurement, np.eye(3), clutter=np.nan)
 
 
 @settings(max_examples=25, deadline=None)

@@ -13,7 +13,7 @@ PAIR = np.array([[50.0, 50.0], [51.0, 50.0]])
 NAMES = ('left', 'right')
 
 
-def pair_scans(number, identified=True):
+def pair_scans(number):
     """Return scans of two targets 1 m apart, with an error of 1.5 m, from all around."""
     generator = np.random.default_rng(8)
     sensor = plane_sensor(probability=0.99, range_noise=1.5, bearing=0.04)
@@ -25,7 +25,7 @@ def pair_scans(number, identified=True):
         for target, name in zip(PAIR, NAMES):
             values = observe(generator, sensor, target[None], pose)
             rows.append(values)
-            labels += [Label('ball', 0.8, name if identified else '')] * len(values)
+            labels += [Label('ball', 0.8, name)] * len(values)
         scans.append(
             AgentMeasurement('robot', pose, sensor, np.concatenate(rows), None, step, labels=labels)
         )

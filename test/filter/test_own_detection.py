@@ -1,7 +1,5 @@
 """Detection models of a user's own: the same numbers as those of the suite, everywhere."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from functools import cache

@@ -53,10 +53,9 @@ def test_bounds_that_are_none_are_named(bounds, problem):
         unflatten(FilterNodeSettings, flat)
 
 
-def test_help_of_a_node_names_topics_and_parameters(capsys):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('sys.argv', ['filter_node', '--help'])
-        assert main() == 0
+def test_help_of_a_node_names_topics_and_parameters(capsys, monkeypatch):
+    monkeypatch.setattr('sys.argv', ['filter_node', '--help'])
+    assert main() == 0
     text = capsys.readouterr().out
     assert text.startswith('usage: filter_node')
     assert '`measurement_batch` (maasi_msgs/MeasurementBatch)' in text

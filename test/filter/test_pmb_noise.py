@@ -3,20 +3,13 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2, norm
-from searches import CUBE, DEGREES, RADIANS, cube_sensor, observe
+from searches import CUBE, DEGREES, RADIANS, checked, cube_sensor, observe
 
 from maasi_filter import AgentMeasurement, FilterSettings, PmbFilter, Pose
-from maasi_filter.measurement_check import check_measurements
 from maasi_filter.pmb.learnt import BOUND, MOST_FACTOR, Learnt, excess, innovations
 
 TARGET = np.array([[130.0, 130.0, 130.0]])
 POSE = Pose([112.0, 120.0, 125.0])
-
-
-def checked(values, **changes):
-    measurement = AgentMeasurement('drone', POSE, cube_sensor(), values, **changes)
-    settings = FilterSettings(method='pmb').resolved()
-    return check_measurements([measurement], 1, 0.0, settings, 3)[0]
 
 
 def drawn(generator, factor, number):
@@ -33,8 +26,8 @@ def test_errors_of_the_position_that_are_told_are_no_noise():
         true = Pose(POSE.position + generator.normal(size=3))
         noise = generator.multivariate_normal(np.zeros(3), sensor.covariance)
         values = sensor.measurement.measure(TARGET, true) + noise
-        member = checked(values, position_covariance=np.eye(3))
-        squares.append(innovations(member, TARGET, np.zeros((1, 3, 3)))[3][0, 0] / 3.0)
+        told = AgentMeasurement('drone', POSE, sensor, values, position_covariance=np.eye(3))
+        squares.append(innovations(checked(told), TARGET, np.zeros((1, 3, 3)))[3][0, 0] / 3.0)
     assert np.mean(squares) == pytest.approx(1.0, rel=0.1)
 
 
@@ -90,7 +83,8 @@ def test_errors_of_positions_that_nobody_tells_of_are_learnt(seed):
 
 def test_a_scan_that_an_error_of_the_position_explains_does_not_tell_the_noise():
     search, _ = searched(0, scans=30)
-    member = checked(drawn(np.random.default_rng(1), 1.0, 1))
+    values = drawn(np.random.default_rng(1), 1.0, 1)
+    member = checked(AgentMeasurement('drone', POSE, cube_sensor(), values))
     caused = np.array([[float(item.target is not None)] for item in search.components])
     for blurred in (True, False):
         learnt = Learnt()

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from searches import CUBE, cube_sensor
+from searches import CUBE, checked, cube_sensor
 
 from maasi_filter import AgentMeasurement, FilterSettings, PmbFilter, Pose
-from maasi_filter.measurement_check import check_measurements
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.settings import OffsetSettings
 
@@ -22,9 +21,9 @@ def scan(generator, robot, error, way=0.0):
     return AgentMeasurement(robot, Pose(true + error), sensor, values)
 
 
-def new_filter(seed=0, **offset):
+def new_filter(**offset):
     settings = FilterSettings(method='pmb', pmb={'offset': offset})
-    return PmbFilter(settings, CUBE, np.random.default_rng(seed))
+    return PmbFilter(settings, CUBE, np.random.default_rng(0))
 
 
 def looked(search, errors, steps=12, seed=1):
@@ -83,16 +82,11 @@ def test_update_is_the_exact_one_of_two_robots_and_a_target_known_exactly():
     offsets = Offsets(OffsetSettings(deviation=2.0), 3)
     search = looked(new_filter(), {'a': np.zeros(3)})
     generator = np.random.default_rng(3)
-    settings = FilterSettings(method='pmb').resolved()
-
-    def members(robot):
-        return check_measurements([scan(generator, robot, np.zeros(3))], 1, 0.0, settings, 3)
-
-    offsets.localise(members('a')[0], [], 1e-9, 1e-9)
+    offsets.localise(checked(scan(generator, 'a', np.zeros(3))), [], 1e-9, 1e-9)
     item = next(item for item in search.components if item.target is not None)
     offsets.find('a', item.target.id)
     assert offsets.covariance[:3, 3:] == pytest.approx(4.0 * np.eye(3))
-    member = members('b')[0]
+    member = checked(scan(generator, 'b', np.zeros(3)))
     density, pose = item.density, member.pose
     jacobian = member.sensor.measurement.jacobian(density.mean[None], pose)[0]
     noise = jacobian @ density.covariance @ jacobian.T + member.sensor.covariance
@@ -114,9 +108,8 @@ def test_targets_that_are_withdrawn_are_marginalised():
 
 def test_what_a_robot_reports_of_its_error_is_not_counted_twice():
     offsets = Offsets(OffsetSettings(deviation=2.0), 3)
-    settings = FilterSettings(method='pmb').resolved()
     measurement = scan(np.random.default_rng(0), 'a', np.zeros(3))
     measurement.position_covariance = 5.0 * np.eye(3)
-    (member,) = check_measurements([measurement], 1, 0.0, settings, 3)
+    member = checked(measurement)
     assert member.pose_error == pytest.approx(np.sqrt(5.0))
     assert offsets.localise(member, [], 1e-9, 1e-9).pose_error == pytest.approx(1.0)

@@ -17,7 +17,7 @@ OFFSETS = FilterSettings(
 )
 
 
-def searched(settings=PHD, steps=25, generator=None, labels=False):
+def searched(settings=PHD, steps=25, labels=False):
     """Return a filter in the middle of a search, and the measurements to come."""
     noise = np.random.default_rng(3)
     targets = noise.uniform(90.0, 170.0, (6, 3))
@@ -30,7 +30,7 @@ def searched(settings=PHD, steps=25, generator=None, labels=False):
         measurements.append(
             AgentMeasurement('ab'[step % 2], pose, sensor, values, None, step, labels=names)
         )
-    search = make_filter(settings, CUBE, generator or np.random.default_rng(1))
+    search = make_filter(settings, CUBE, np.random.default_rng(1))
     play(search, measurements[:steps])
     return search, measurements[steps:]
 

@@ -1,7 +1,5 @@
 """Runs whose decisions, filter updates and found targets are stored, and what is noted of each."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager

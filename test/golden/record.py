@@ -1,7 +1,5 @@
 """Run the golden runs and print what moved; store them anew with --write."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import lzma
@@ -78,10 +76,7 @@ def _rows(recording: Recording, kind: str) -> list[tuple[int | None, dict[str, A
 
 
 def differences(stored: Recording, now: Recording, tolerance: float) -> list[str]:
-    """Return what differs between two recordings of a run: of each quantity the first place.
-
-    A tolerance of 0 compares to the bit.
-    """
+    """Return what differs between two recordings of a run: of each quantity the first place."""
     found: dict[str, tuple[float, str]] = {}
     for kind in dict.fromkeys([*stored, *now]):
         first, second = _rows(stored, kind), _rows(now, kind)
@@ -104,10 +99,7 @@ def differences(stored: Recording, now: Recording, tolerance: float) -> list[str
 
 
 def _moved(before: Any, after: Any, scale: float | None, tolerance: float) -> str:
-    """Return in words by how much two values, or lists of them, differ; '' if they do not.
-
-    `scale` is that of lengths [m], None of other numbers.
-    """
+    """Return in words by how much two values, or lists of them, differ; '' if they do not."""
     if isinstance(before, list) and isinstance(after, list):
         if len(before) != len(after):
             return f'{len(before)} before, {len(after)} now'

@@ -1,7 +1,5 @@
 """Problems of one robot as missions meet them, and others drawn at random."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maasi_planner.buildings.agent import inflated

@@ -1,9 +1,4 @@
-"""P2 of 004 as a mixed-integer problem for SCIP: the oracle of tests, and a baseline of speed.
-
-One binary for a visit, and only where the cuboid meets what extreme forces reach; faces of
-obstacles only where they can matter; big M as small as what can be reached allows. What the lean
-problem adds (segments that keep away from obstacles, a way to brake) is added here as rows, too.
-"""
+"""P2 of 004 as a mixed-integer problem for SCIP: the oracle of tests, and a baseline of speed."""
 
 import time
 
@@ -16,13 +11,11 @@ BIG = 1000.0
 
 
 class MixedProblem:
-    """Columns and rows of P2; `squares` are (weight, columns, coefficients, constant).
-
-    apart: whether no two cuboids can be visited at one step.
-    """
+    """Columns and rows of P2; `squares` are (weight, columns, coefficients, constant)."""
 
     def __init__(self, solver, problem, apart=False):
         self.dynamics, self.settings, self.problem = solver.dynamics, solver.settings, problem
+        # Whether no two cuboids can be visited at one step.
         self.apart = apart
         self.lower, self.upper, self.integer, self.cost = [], [], [], []
         self.rows = []

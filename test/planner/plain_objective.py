@@ -1,7 +1,5 @@
 """The objective straight from the formulas, whole grid and all: slow, to compare with."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Random teams in all situations."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection, GaussianDetection

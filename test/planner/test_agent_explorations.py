@@ -1,7 +1,5 @@
 """002, equations (12) to (16): each agent's exploration has its own measurements only."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

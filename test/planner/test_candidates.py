@@ -1,7 +1,5 @@
 """Candidate sets, and the parts that nothing can be seen of."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -45,7 +43,6 @@ ORIGIN = np.zeros(3)
             [-0.3, 1, 0.7],
             [2.4, 0.5, 0.7],
         ),
-        ({'points': [[0.0, 1.0], [2.0, 0.5]]}, FLOOR, 0.7, 2, [0.0, 1.0, 0.7], [2.0, 0.5, 0.7]),
     ],
 )
 def test_grids_and_lists(settings, bounds, height, number, first, last):

@@ -3,7 +3,6 @@
 import pytest
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
-from own_context import own_context
 from player import Player
 
 from maasi_filter.ros.conversions import stamp_to_ros
@@ -79,11 +78,10 @@ class Flight(Player):
 
 
 @pytest.fixture
-def flight():
-    with own_context() as context:
-        flight = Flight(context)
-        yield flight
-        flight.close()
+def flight(context):
+    flight = Flight(context)
+    yield flight
+    flight.close()
 
 
 def test_a_robot_among_buildings_moves_only_while_it_searches(flight):

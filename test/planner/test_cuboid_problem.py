@@ -136,14 +136,13 @@ def test_a_given_visit_counts_despite_rounding(x, due):
 @pytest.mark.parametrize('beyond', [0.0, 1e-6, 5e-5])
 def test_start_at_a_bound_or_a_rounding_beyond(beyond):
     solver = solver_for(5)
-    for position, velocity, target in (
-        ([50, -beyond, -beyond], [0, 0, 0], [50, 20, 20]),
-        ([100 + beyond, 50, 100 + beyond], [0, 0, 0], [0, 50, 50]),
-        ([20, 50, 50], [15 + beyond, 0, 0], [90, 50, 50]),
+    for position, velocity, target, obstacles in (
+        ([50, -beyond, -beyond], [0, 0, 0], [50, 20, 20], []),
+        ([100 + beyond, 50, 100 + beyond], [0, 0, 0], [0, 50, 50], []),
+        ([20, 50, 50], [15 + beyond, 0, 0], [90, 50, 50], []),
+        ([40 + beyond, 50, 10], [0, 0, 0], [20, 50, 10], [CUBE]),
     ):
-        assert solver.solve(problem_at(position, velocity, target)) is not None
-    face = problem_at([40 + beyond, 50, 10], [0, 0, 0], [20, 50, 10], obstacles=[CUBE])
-    assert solver.solve(face) is not None
+        assert solver.solve(problem_at(position, velocity, target, (), obstacles)) is not None
 
 
 def test_limits_return_the_best_plan_so_far(monkeypatch):

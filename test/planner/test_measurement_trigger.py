@@ -1,7 +1,5 @@
 """The trigger (24), (33)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from planner_helpers import random_team

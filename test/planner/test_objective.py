@@ -1,7 +1,5 @@
 """The clever objective against the plain one, and the joint search against enumeration."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
