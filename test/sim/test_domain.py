@@ -62,17 +62,21 @@ def started():
         process.stdout.close()
 
 
+def made(files):
+    """Return what a node made, whose locks it holds; not ports and segments that it only opened."""
+    locks = {path for path in files if re.fullmatch(r'fastrtps_[0-9a-f]{16}_el', path.name)}
+    return locks | {path.with_name(path.name.removesuffix('_el')) for path in locks}
+
+
 def test_files_of_a_killed_node_go_and_those_of_a_live_one_stay(domain):
     with started() as (_, files):
-        # What it made, whose locks it holds; not ports and segments that it only opened.
-        locks = {path for path in files if re.fullmatch(r'fastrtps_[0-9a-f]{16}_el', path.name)}
-        left = locks | {path.with_name(path.name.removesuffix('_el')) for path in locks}
+        left = made(files)
     assert left
     # Another process that looks at the same moment has the files open, or removes them.
     wait_until(lambda: not any(path.exists() for path in left), remove_dead)
     with started() as (live, used):
         remove_dead()
-        assert used and all(path.exists() for path in used)
+        assert made(used) and all(path.exists() for path in made(used))
         assert 'heard\n' in iter(live.stdout.readline, '')
         # A port is known by its mark.
         ports = [path for path in used if re.fullmatch(r'fastrtps_port\d+', path.name)]

@@ -129,7 +129,7 @@ def without(folder, target, lacking):
 @pytest.mark.parametrize(
     ('lacking', 'words'),
     [
-        ('/mambo/camera/image_raw', ['found none named mambo with camera/', 'recorded are']),
+        ('/mambo/camera/image_raw', ['robot: found none with camera/image_raw', 'recorded are']),
         ('/mambo/odom', ['/mambo/odom is not recorded', '/mambo/state, /mambo/pose, /mambo/odom']),
     ],
 )

@@ -12,7 +12,7 @@ import numpy as np
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.calibration.bag_reader import BagError, BagReader
-from maasi_drivers.calibration.recorded_robot import RecordedRobot
+from maasi_drivers.calibration.recorded_robot import USED, RecordedRobot
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.marker_detector import read_markers
 from maasi_filter.make_filter import make_filter
@@ -70,7 +70,7 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Meas
         camera=robot.camera,
     )
     with BagReader(bag) as reader:
-        there = any(topic.startswith(f'/{name}/') for topic in reader.types)
+        there = any(reader.counts.get(f'/{name}{image}') for image in USED['images'])
     # A robot that is alone in its scenario may have any namespace, or none.
     space = name if there or len(scenario.robots) > 1 else None
     try:

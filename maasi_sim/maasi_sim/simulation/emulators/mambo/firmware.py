@@ -2,8 +2,9 @@
 
 Stands in for Parrot's firmware, which is not public. A piloting command "executes once and goes
 back to hovering without new commands coming in" (pyparrot, `Minidrone.fly_direct`). When the
-connection is lost it hovers on, says pyparrot's author (amymcgovern/pyparrot, issue 165), and
-Parrot's manual that it lands: a setting here, as the times are.
+connection is lost it hovers on, says pyparrot's author
+(https://github.com/amymcgovern/pyparrot/issues/165), and Parrot's manual that it lands: a setting
+here, as the times are.
 
 Roll and pitch of a piloting command are shares of the largest tilt, not of a speed (pyparrot,
 docs/minidronecommands.rst, `fly_direct`; Parrot's minidrone.xml, PCMD and MaxTilt). At level
