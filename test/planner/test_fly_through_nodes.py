@@ -97,8 +97,9 @@ def test_robots_that_refuse_every_goal_are_an_error(world, monkeypatch):
 
 
 def test_a_driver_that_is_ended_is_no_warning(world):
-    infos, warnings = [], []
-    world.planner._goals._logger = SimpleNamespace(info=infos.append, warning=warnings.append)
+    goals, warnings = world.planner._goals, []
+    goals._logger = SimpleNamespace(warning=warnings.append)
+    sent = goals._sent['a']
     assert world.drivers[0].trigger_deactivate().name == 'SUCCESS'
-    world.until(lambda: any(text.endswith('the driver stops') for text in infos + warnings))
+    world.until(lambda: sent.reason == 'the driver stops')
     assert warnings == []
