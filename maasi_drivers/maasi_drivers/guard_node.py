@@ -11,7 +11,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 
 from maasi_drivers.links.topic_link import CommandPublisher
-from maasi_drivers.settings.driver import LOCKSTEP_LEASE, GuardSettings
+from maasi_drivers.settings.driver import GuardSettings
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import liveliness_reader
 from maasi_filter.ros.run_node import run
@@ -53,12 +53,10 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
 
     def set_up(self) -> None:
         """Connect."""
-        self._publisher = CommandPublisher(
-            self, 'cmd_vel', self.settings.command_type, self.settings.lockstep
-        )
+        self._publisher = CommandPublisher(self, 'cmd_vel', self.settings.command_type)
         self._nav2 = self.create_client(CancelGoal, 'navigate_to_pose/_action/cancel_goal')
         self.create_wall_timer(_REFRESH_PERIOD, self._refresh)
-        self._lease = lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
+        self._lease = lease = self.settings.lease
         quality = liveliness_reader(lease)
         # Until then it would not notice that the driver is lost.
         self.expect(lambda: self._heard)

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 from nav_msgs.msg import Path
+from rclpy.publisher import Publisher
 from std_msgs.msg import Header
 
 from maasi_filter.arrays import FloatArray
@@ -16,7 +17,7 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE
 from maasi_filter.ros.run_node import run
 from maasi_msgs.action import SearchTargets
-from maasi_msgs.msg import AgentState, LockstepStep, PlanDecision
+from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, PlanDecision
 from maasi_planner import warm_up
 from maasi_planner.conversions import checked_state, decision_to_ros, path_to_ros
 from maasi_planner.coordinator import Coordinator, PresentRobot
@@ -61,6 +62,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     `decisions` (maasi_msgs/PlanDecision): every candidate with its terms;
     `<robot>/plan` (nav_msgs/Path); `exploration` (latched; 2D: nav_msgs/OccupancyGrid, 3D:
     sensor_msgs/PointCloud2); `markers` (visualization_msgs/MarkerArray);
+    `lockstep/done` (maasi_msgs/LockstepDone), in lockstep, once all batches have their updates;
     `<robot>/destination` (geometry_msgs/PointStamped), each step, where others plan for themselves
 
     Actions
@@ -109,6 +111,12 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         """Compile and connect."""
         warm_up()
         names = self.coordinator.names
+        self._done_publisher: Publisher | None = None
+        if self.settings.lockstep:
+            self._done_publisher = self.create_publisher(
+                LockstepDone, self.team_topic('lockstep/done'), RELIABLE
+            )
+            self.expect_subscribers(self._done_publisher)
         # Before the publisher of batches: a filter with batches must discover the kept targets.
         self._keeper = FoundKeeper(self)
         self._batches.set_up()
@@ -431,13 +439,15 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     def _try_done(self) -> None:
         if (
-            self.settings.lockstep
+            self._done_publisher is not None
             and self._expected is None
             and self._taken_step >= 0
             and not self._goals.waiting
             and not self._batches.waiting
         ):
-            self.done(self._taken_step)
+            self._done_publisher.publish(
+                LockstepDone(node=self.get_fully_qualified_name(), step=self._taken_step)
+            )
 
 
 def main(arguments: list[str] | None = None) -> int:

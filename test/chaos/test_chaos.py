@@ -77,7 +77,7 @@ def test_wrong_arguments_are_refused(tmp_path, capsys):
     names = capsys.readouterr().out.split()
     assert 'buildings-lockstep-end-kill-middle-sim_node' in names
     assert {name.partition('-')[0] for name in names} == {'buildings', 'mavlink'}
-    assert len(all_cases()) == len({case.name for case in all_cases()}) == 193
+    assert len(all_cases()) == len({case.name for case in all_cases()}) == 171
 
 
 KILLED = Case('kill', ('/filter_node',), 'middle', False, False)

@@ -88,13 +88,12 @@ class Team(Node):
         self.deaf = deaf
         self.odometry_frame = 'odom'
         self.states, self.commands, self.detections = [], [], []
-        self.ready, self.done = [], []
+        self.ready = []
         kind = wants or (Twist if settings.command_type == 'twist' else TwistStamped)
         self.create_subscription(AgentState, 'state', self.states.append, RELIABLE)
         self.create_subscription(kind, 'cmd_vel', self.commands.append, RELIABLE)
         self.create_subscription(DetectionArray, 'detections', self.detections.append, RELIABLE)
         self.create_subscription(LockstepDone, '/lockstep/ready', self.ready.append, LATCHED_ALL)
-        self.create_subscription(LockstepDone, '/lockstep/done', self.done.append, RELIABLE)
         self.odometry = self.create_publisher(Odometry, 'odom', RELIABLE)
         self.battery = self.create_publisher(BatteryState, 'battery_state', RELIABLE)
         self.batches = self.create_publisher(MeasurementBatch, '/measurement_batch', RELIABLE)
@@ -114,7 +113,7 @@ class Team(Node):
 
     def until_done(self, steps):
         self.until(
-            lambda: all(len(heard) == steps for heard in (self.done, self.states, self.commands)),
+            lambda: all(len(heard) == steps for heard in (self.states, self.commands)),
             'a step has no end',
         )
 

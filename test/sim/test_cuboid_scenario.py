@@ -43,7 +43,12 @@ def test_our_scenarios_load_and_are_read_back(name, tmp_path):
 @pytest.mark.parametrize('name', NAMES)
 def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     scenario = load_cuboid_scenario(name)
-    plans = BuildingMission(name, scenario).plan_nodes(Options(lockstep=True), Path('/s.yaml'))
+    mission, file = BuildingMission(name, scenario), Path('/s.yaml')
+    planners = [f'/{robot}/cuboid_planner' for robot in scenario.names()]
+    # Nothing moves in lockstep while a planner hangs.
+    waiting = mission.plan_nodes(Options(lockstep=True), file)
+    assert [plan.full_name for plan in waiting] == ['/sim_node', *planners]
+    plans = mission.plan_nodes(Options(lockstep=False), file)
     assert [plan.full_name for plan in plans] == [
         '/sim_node',
         *(f'/{robot}/{node}' for robot in scenario.names() for node in ('cuboid_planner', 'guard')),

@@ -44,6 +44,8 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     assert search.environment == scenario.environment.of_nodes()
     # With what the preset stands for.
     assert search.filter == scenario.filter.resolved()
+    # Nothing moves in lockstep while a driver hangs.
+    assert not (lockstep and any(plan.role == 'guard' for plan in plans.values()))
     planner, simulated = read_back(plans['/planner_node'], PlannerNodeSettings)
     assert simulated
     assert planner.environment == scenario.environment.of_nodes()

@@ -282,7 +282,6 @@ class AgentDriver(RobotNode):
         else:
             return
         self._awaited, self._answered = None, stamp
-        self.done(self.step)
         self._responder.serve()
 
     # ---- the services stop and release -------------------------------------------------------

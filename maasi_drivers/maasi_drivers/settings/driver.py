@@ -28,10 +28,6 @@ CommandType = Annotated[
         'is stamped in lockstep'
     ),
 ]
-# The same in lockstep, where robots wait for their drivers: a busy machine may delay
-# a driver, and zeros in between would change the run [s].
-LOCKSTEP_LEASE = 20.0
-
 
 DRIVERS = PluginGroup(
     'maasi.drivers',
@@ -300,8 +296,8 @@ class GuardSettings(NodeSettings):
         default=LIVELINESS_LEASE,
         ge=LIVELINESS_LEASE,
         le=60.0,
-        description='Time without an assertion of liveliness after which the driver is dead; not '
-        'in lockstep [s of wall time]',
+        description='Time without an assertion of liveliness after which the driver is dead '
+        '[s of wall time]',
     )
 
     command_type: CommandType = 'auto'

@@ -46,7 +46,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     Publishes
     ---------
     `/diagnostics` (diagnostic_msgs/DiagnosticArray), each second;
-    `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone)
+    `lockstep/ready` (maasi_msgs/LockstepDone)
 
     Subscribes
     ----------
@@ -91,7 +91,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         # When to say what nobody publishes [s of wall time].
         self._notice_at = math.inf
         self._ready_publisher: Publisher | None = None
-        self._done_publisher: Publisher | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._endpoints = Endpoints(self)
         self._clock_watch = ClockWatch(self, self.warn_throttled, self._on_restart)
@@ -161,10 +160,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._prepared = True
         self.prepare()
         if self.settings.lockstep and self._lockstep_member:
-            self._done_publisher = self.create_publisher(
-                LockstepDone, self.team_topic('lockstep/done'), RELIABLE
-            )
-            self.expect_subscribers(self._done_publisher)
             self.create_subscription(
                 LockstepStep, self.team_topic('lockstep/step'), self._hear_step, RELIABLE
             )
@@ -231,7 +226,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.configured = False
         self._peers.clear()
         self._entities_made.clear()
-        self._ready_publisher = self._done_publisher = None
+        self._ready_publisher = None
         self._peers_timer = None
         self._parameters_read.release()
 
@@ -305,15 +300,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.on_step(message)
 
     def on_step(self, message: LockstepStep) -> None:
-        """Process a step in lockstep, and call `done` when finished."""
-        self.done(message.step)
-
-    def done(self, step: int) -> None:
-        """Report that the node has finished a step."""
-        if self._done_publisher is not None:
-            self._done_publisher.publish(
-                LockstepDone(node=self.get_fully_qualified_name(), step=step)
-            )
+        """Process a step in lockstep."""
 
     # ---- time --------------------------------------------------------------------------------
 

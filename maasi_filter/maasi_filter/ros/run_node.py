@@ -16,6 +16,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from rclpy.utilities import get_default_context
 
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
@@ -104,7 +105,8 @@ def run(
         gc.collect()
         gc.freeze()
         while rclpy.ok() and not asked:
-            executor.spin_once(_SIGNAL_PERIOD)
+            # Returns only to look for signals; `spin_once` would after each callback.
+            executor.spin_until_future_complete(Future(), _SIGNAL_PERIOD)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

@@ -286,7 +286,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             if self._link is not None and self._command is not None:
                 self._link_publisher.publish(self._link)
                 self._command_publisher.publish(self._command)
-                self.done(step)
             return
         if self._decided_step != step and self._heard is not None and self._heard.step == step:
             self._decide(self._decoded(self._heard))
@@ -349,7 +348,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._command.header.frame_id = f'{self.name}/base_link'
         self._command.twist.linear = vector_to_ros(self._state[1].rotation().T @ velocity)
         self._command_publisher.publish(self._command)
-        self.done(step)
 
     def _publish_state(self, step: int, header: Header) -> None:
         assert self._state is not None

@@ -97,6 +97,14 @@ class Observer(ABC):
         elif topic == STEP and self.completed is None:
             self._note_step(self.decode(data, 'LockstepStep'))
 
+    def last_steps(self) -> dict[str, int]:
+        """Return the step of the last state of each robot that has sent one."""
+        return {
+            name: int(self.decode(states[-1], 'AgentState').step)
+            for name, states in zip(self.scenario.names(), self._states.values())
+            if states
+        }
+
     def settle(self) -> None:  # noqa: B027 - missions that evaluate at the end need none
         """Evaluate the messages added since the last call."""
 
@@ -133,7 +141,9 @@ class Observer(ABC):
     def _complete(self, record: RunRecord, end: RunEnd) -> None:
         """Add how the run ended, ways and events to a record; the time of its end is set."""
         record.end_reason, record.wall_time = end.reason, end.wall_time
-        events = [*record.events, *self._events]
+        # Several steps after the end may have been taken.
+        own = [event for event in self._events if event['time'] <= record.end_time]
+        events = [*record.events, *own]
         for name, messages in zip(self.scenario.names(), self._states.values()):
             way, away = [], False
             for state in self._until('AgentState', messages, record.end_time):

@@ -33,8 +33,8 @@ class NodePlan:
     name: str
     namespace: str = ''
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    #: A clock publishes the time. A driver commands a robot, which is stopped when the node dies. A
-    #: guard is not awaited in lockstep, where nothing moves while a step waits.
+    #: A clock publishes the time. A driver commands a robot, which is stopped when the node dies.
+    #: There are no guards in lockstep, where nothing moves while a step waits.
     role: Literal['clock', 'driver', 'guard', 'other'] = 'other'
     remaps: Mapping[str, str] = field(default_factory=dict)
     #: Parameters on the command line, as the file must not start a search on real robots.

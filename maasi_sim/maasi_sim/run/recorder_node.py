@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import struct
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import cache
+from operator import itemgetter
 from typing import Any
 
 import rclpy
@@ -17,7 +19,6 @@ from rcl_interfaces.msg import Log
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -44,8 +45,7 @@ _SKIPPED = ('/parameter_events', READY)
 _KEPT = '/found_targets/kept'
 # Topics still recorded during shutdown.
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
-# The clock may come after messages of its time: they are logged at their stamp, so that no stamp is
-# later than its log time. A larger lead is assumed to be of another clock [ns].
+# The clock may come after messages of its time; a larger lead is of another clock [ns].
 _LARGEST_LEAD = 10**9
 # Between two calls to take off [s].
 _ARMING_PERIOD = 2.0
@@ -57,7 +57,7 @@ class Recorder:
     """
     A node that takes serialised messages from all topics that it discovers.
 
-    It has no executor: `wait` and `drain` take messages without callbacks, at a fifth of the cost.
+    It has no executor: `drain` takes messages without callbacks, at a fifth of the cost.
     Without a bag it takes only what the observer needs. Topics of the observer are relative to the
     namespace `team`, which has no slashes at its ends.
 
@@ -128,6 +128,8 @@ class Recorder:
         self._asked_with = 0
         self._finished = False
         self._last_step = -1
+        # Time of the end of the search [ns].
+        self._end: float = math.inf
         self._complaints: list[str] = []
         #: Called with topic, type and content of each message that a page shows.
         self.listener: Callable[[str, str, bytes], None] | None = None
@@ -144,7 +146,6 @@ class Recorder:
         self._done_publisher = self.node.create_publisher(
             LockstepDone, within(team, DONE), RELIABLE
         )
-        self._wait_set = rclpy_implementation.WaitSet(2, 0, 0, 0, 0, 0, self.context.handle)
 
     def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> Subscription:
         # Messages are taken without callbacks.
@@ -242,24 +243,14 @@ class Recorder:
         """Report that the recorder is done with a step."""
         self._done_publisher.publish(LockstepDone(node=self.name, step=step))
 
-    def wait(self, timeout: float) -> None:
-        """Return when there is a new step (free running: after the time) [s]."""
-        waiting = [self._ready_subscription]
-        if STEP in self._subscriptions:
-            waiting.append(self._subscriptions[STEP])
-        self._wait_set.clear_entities()
-        for subscription in waiting:
-            self._wait_set.add_subscription(subscription.handle)
-        self._wait_set.wait(round(timeout * 1e9))
-
     def drain(self, limit: int | None = None) -> None:
         """Pass all received messages to the observer and the recording.
 
         A run ends at a step, the last one at `limit`, simulated time after the first [ns]: later
         messages are dropped, so that equal runs give equal recordings.
         """
-        # Messages left in the queue would end each wait at once.
         self.take_ready()
+        before = self.time
         # Messages that an update refers to precede it: take updates first, add them last.
         updates = self._take(self.observer.update_topics)
         steps = self._take([STEP])
@@ -269,19 +260,23 @@ class Recorder:
             if self._begun is None:
                 self._begun = time_at(data, 12)
                 self.robots = deserialize_message(data, LockstepStep).robots
-        taken = self._take([CLOCK])
-        for _, data in taken:
+        clocks = self._take([CLOCK])
+        for _, data in clocks:
             self.time = max(self.time, time_at(data, 4))
         others = self._take([topic for topic in self._subscriptions if topic not in self._in_order])
-        taken += [item for item in others if self._is_own(*item)]
-        taken += updates + steps
+        others = [item for item in others if self._is_own(*item)]
         if limit is not None and self.step is not None and not self._finished:
             # Messages of the step at the limit may come before that step.
-            end = limit + (self._begun or 0)
-            if stamp_of_step(self.step + 1, self._step_length) >= end:
-                past = stamp_of_step(self.step, self._step_length) >= end
-                self._last_step = self.step - past
-        taken = self._until_last_step(taken)
+            end, length = limit + (self._begun or 0), self._step_length
+            if stamp_of_step(self.step + 1, length) >= end:
+                self._last_step = self.step
+                while self._last_step and stamp_of_step(self._last_step, length) >= end:
+                    self._last_step -= 1
+                self._end = stamp_of_step(self._last_step + 1, length)
+        taken = self._until_last_step(clocks + others + updates + steps)
+        # In the order of their times, as several steps may be taken at once.
+        timed = [(self._logged(before, *item), item) for item in taken]
+        taken = [item for _, item in sorted(timed, key=itemgetter(0))]
         now = time.monotonic()
         for topic, data in taken:
             self.last_seen[topic] = now
@@ -298,8 +293,18 @@ class Recorder:
         self.observer.settle()
         if self.observer.end_step is not None and not self._finished:
             self._last_step = self.observer.end_step
+            self._end = stamp_of_step(self._last_step, self._step_length)
             taken = self._until_last_step(taken)
-        self._record(taken)
+        self._record(before, taken)
+
+    def _logged(self, before: int, topic: str, data: bytes) -> int:
+        """Return the time under which a message is recorded [ns], from the last drain on.
+
+        It is that of its stamp, so that no stamp is later, unless it has none of this clock.
+        """
+        stamp = stamp_of(topic, self._subscriptions[topic].msg_type, data)
+        known = 0 < stamp <= self.time + _LARGEST_LEAD
+        return max(stamp, before) if known else self.time
 
     def _note_planner(self, status: DiagnosticStatus) -> None:
         """Note what a planner says between its decisions: its error, and the exploration."""
@@ -317,8 +322,8 @@ class Recorder:
 
     @property
     def elapsed(self) -> float:
-        """Simulated time since the first step [s]."""
-        return 0.0 if self._begun is None else (self.time - self._begun) / 1e9
+        """Simulated time since the first step, up to the end of the search [s]."""
+        return 0.0 if self._begun is None else (min(self.time, self._end) - self._begun) / 1e9
 
     def _is_own(self, topic: str, data: bytes) -> bool:
         """Return whether a message on a topic shared by all teams is the team's own."""
@@ -330,14 +335,13 @@ class Recorder:
             return bool(deserialize_message(data, Log).name.startswith(logger))
         return True
 
-    def _record(self, taken: list[tuple[str, bytes]]) -> None:
+    def _record(self, before: int, taken: list[tuple[str, bytes]]) -> None:
         # A failed bag ends the run: see `bag.failed`.
         if self.bag is None or self.bag.failed:
             return
         try:
             for topic, data in taken:
-                lead = stamp_of(topic, self._subscriptions[topic].msg_type, data) - self.time
-                logged = self.time + (lead if 0 < lead <= _LARGEST_LEAD else 0)
+                logged = self._logged(before, topic, data)
                 self.bag.write(self._full(topic), logged, data)
                 self.first.setdefault(topic, logged)
         except BagError:

@@ -40,8 +40,8 @@ from maasi_sim.run.view.page_file import REPLAY, write_replay
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning, to_yaml
 
-# Longest wall time between two checks of processes and topics [s].
-_POLL = 0.02
+# Between two checks of processes and topics; while the nodes start, and while they run [s].
+_START_POLL, _POLL = 0.02, 0.05
 # Between two checks for runs that follow the clock [s].
 _FOLLOWERS_PERIOD = 0.5
 # Longest wait for a publisher of others, which may not fit the recorder [s].
@@ -139,7 +139,7 @@ class ScenarioRun:
                 teams = ', '.join(self.recorder.followers())
                 self.display.say(f'the clock keeps running for {teams} (Ctrl-C ends it)')
                 while self._is_followed():
-                    self.recorder.wait(_FOLLOWERS_PERIOD)
+                    time.sleep(_FOLLOWERS_PERIOD)
                     self.recorder.drain()
             return code
 
@@ -215,9 +215,7 @@ class ScenarioRun:
 
     def _wait_until_ready(self) -> Ending | None:
         """Wait until every node is ready, the recorder last; return an ending if one is not."""
-        nodes = self.supervisor.nodes('clock', 'driver', 'other')
-        if not self.options.lockstep:
-            nodes += self.supervisor.nodes('guard')
+        nodes = list(self.supervisor.processes.values())
         expected = [node.name for node in nodes]
         begin, patience = time.monotonic(), _START_PATIENCE
         while (ending := self._turn()) is None and (lacks := self._lacks(expected)):
@@ -287,7 +285,7 @@ class ScenarioRun:
     def _turn(self) -> Ending | None:
         """Take what nodes have sent; return an ending if the run is over, or a node has failed."""
         recorder, observer, limit = self.recorder, self.observer, self._limits.time
-        recorder.wait(_POLL)
+        time.sleep(_POLL if self.supervisor.running else _START_POLL)
         recorder.drain(round(limit * 1e9))
         recorder.arm(name for name, robot in self._scenario.robots.items() if robot.takes_off)
         if self.interruption:

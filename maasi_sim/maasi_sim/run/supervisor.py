@@ -94,7 +94,7 @@ class Supervisor:
                 return None
             text = f'{name} not ready {limits.start:g} s after the start'
             return Ending('not_ready', NODE_FAILED, text, [name])
-        elif self._options.lockstep and plan.role != 'guard':
+        elif self._options.lockstep:
             # A step may take long: `limits.silence` applies to awaited nodes.
             return None
         elif process.hangs(now, limits.heartbeat):
@@ -137,10 +137,16 @@ class Supervisor:
         if step is None:
             return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
         steps = self._recorder.done_steps()
+        reached = self._recorder.observer.last_steps()
+        steps |= {
+            name: reached.get(plan.namespace, -1)
+            for name, plan in self.plans.items()
+            if plan.role == 'driver'
+        }
         nodes = self.nodes('driver', 'other')
         # One that is late may wait for one that hangs after its own part of the step.
         hung = [n.name for n in nodes if n.hangs(now, self._scenario.limits.heartbeat)]
-        late = hung or [n.name for n in nodes if steps.get(n.name, -1) < step]
+        late = hung or [n.name for n in nodes if steps.get(n.name, step) < step]
         who = ', '.join(late) or self.nodes('clock')[0].name
         return Ending('node_hung', NODE_FAILED, f'step {step}: nothing from {who} {silence}', late)
 
@@ -156,7 +162,7 @@ class Supervisor:
         recorder.stop_robots(robots)
         stubborn = stop(self.nodes('driver', 'guard'))
         recorder.stop_robots(robots)
-        recorder.wait(_LAST_MESSAGES)
+        time.sleep(_LAST_MESSAGES)
         recorder.drain()
         stubborn += stop(self.nodes('other') if keep_clock else self.nodes('other', 'clock'))
         recorder.drain()

@@ -35,6 +35,10 @@ _LOOK_PERIOD = 0.02
 _PATIENCE, _REMINDER = 3.0, 15.0
 # Longest wait for the subscriptions of a node that reports ready [s].
 _CONNECTION_PATIENCE = 5.0
+# Most steps from the recorder to the simulation.
+_MOST_AHEAD = 100
+# Period of the clock in lockstep [s].
+_CLOCK_PERIOD = 0.25
 # At shutdown: how long linked robots stay reachable for drivers that stop them [s].
 _FAREWELL = 1.0
 
@@ -74,9 +78,10 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     Simulates the robots of a scenario, and publishes the time.
 
     The time starts when the driver of each robot, the filter, the planner and, with parameter
-    `recorder`, the recorder have reported that they are ready. In lockstep a step ends when all of
-    them have reported that they are done with it and each robot has its command. The step is
-    republished for a restarted node that reports ready, so that a step can be received twice.
+    `recorder`, the recorder have reported that they are ready. In lockstep a step ends when each
+    robot has its command, every planner has reported that it is done, and the recorder is not too
+    far behind. The step is republished for a restarted node that reports ready, so that a step can
+    be received twice.
 
     With `follow_clock`, or where another program moves a robot, the time is that of a `/clock`
     published elsewhere: the robots stand until all nodes are ready, and the first step is that of
@@ -89,7 +94,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     `<robot>/camera/image_raw` (sensor_msgs/Image), `<robot>/camera/camera_info`
     (sensor_msgs/CameraInfo), `<robot>/scan` (sensor_msgs/LaserScan), `<robot>/ranges`
     (maasi_msgs/RangeArray): those that the robot has;
-    `/clock` (rosgraph_msgs/Clock), unless it follows one; `lockstep/step`
+    `/clock` (rosgraph_msgs/Clock), unless it follows one, in lockstep four times a second;
+    `lockstep/step`
     (maasi_msgs/LockstepStep);
     `ground_truth/targets` (geometry_msgs/PoseArray), `ground_truth/markers`
     (visualization_msgs/MarkerArray): latched, only for scoring and for the eye
@@ -143,6 +149,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._ready_since: float | None = None
         # In lockstep: nodes that are not done, and command topics without a message yet.
         self._waiting: set[str] = set()
+        # Last step that the recorder has taken.
+        self._recorded = 0
         self._last_command: dict[str, int] = {}
         self._due = 0.0
         self._said, self._said_at = '', 0.0
@@ -173,11 +181,14 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._driver_of[name]: [*step_topics, *topics.needed]
             for name, topics in self._robots.items()
         }
+        self._planners = set()
         for namespace in self.scenario.namespaces():
             for node in ('filter_node', 'planner_node'):
                 self._expected[self.team_topic(f'{namespace}/{node}'.strip('/'))] = step_topics
+            self._planners.add(self.team_topic(f'{namespace}/planner_node'.strip('/')))
+        self._recorder = self.team_topic(RECORDER)
         if self.settings.recorder:
-            self._expected[self.team_topic(RECORDER)] = step_topics
+            self._expected[self._recorder] = step_topics
         self._connections = Connections(self, self._expected)
         publish_truth(self, self.simulation.world, self.settings.frame)
         for name, topics in self._robots.items():
@@ -259,7 +270,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         if node not in self._expected:
             return
         restarted = self.step >= 0 and self.settings.lockstep and node in self._ready
-        if restarted and self._await(node):
+        if restarted and self._robot_of.get(node) not in self.simulation.away:
+            self._await(node)
             self.get_logger().info(f'{node} was restarted: step {self.step} is republished')
             self._returned[node] = time.monotonic()
             if self.active:
@@ -282,7 +294,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         missing = self._missing()
         if missing:
             # The recorder comes last: it waits for all others.
-            if now - self._wall_start > _PATIENCE and missing != self.team_topic(RECORDER):
+            if now - self._wall_start > _PATIENCE and missing != self._recorder:
                 self._say_waiting(f'waits for {missing}', now)
             return
         if self._ready_since is None:
@@ -334,15 +346,14 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
 
     # ---- the steps ---------------------------------------------------------------------------
 
-    def _await(self, node: str) -> bool:
-        """Wait for a node, and for the command of its robot, unless that is away."""
+    def _await(self, node: str) -> None:
+        """Wait for the answer of a node to this step: a robot's command, or that it is done."""
         robot = self._robot_of.get(node)
-        if robot in self.simulation.away:
-            return False
-        self._waiting.add(node)
-        if robot is not None:
+        if robot is not None and robot not in self.simulation.away:
             self._waiting.add(f'{robot}/cmd_vel')
-        return True
+        late = node == self._recorder and self.step - self._recorded > _MOST_AHEAD
+        if node in self._planners or late:
+            self._waiting.add(node)
 
     def _begin_step(self) -> None:
         """Publish the current step of the simulation."""
@@ -364,7 +375,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         stamp = stamp_to_ros(self._stamp)
         for name in robots:
             self._robots[name].publish(stamp)
-        if self._clock_publisher is not None:
+        # In lockstep the step is the time of the nodes: a clock for each would cost a tenth more.
+        if self._clock_publisher is not None and self._is_time_due():
             self._clock_publisher.publish(Clock(clock=stamp))
         self._step_publisher.publish(
             LockstepStep(
@@ -375,12 +387,21 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             )
         )
 
+    def _is_time_due(self) -> bool:
+        every = max(round(_CLOCK_PERIOD / self._length), 1) if self.settings.lockstep else 1
+        return self.step % every == 0
+
     def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
         """Pass every message: commands are compared with the step, and zeros always stop."""
         callback(message)
 
     def _on_done(self, message: LockstepDone) -> None:
-        if message.step == self.step and message.node in self._waiting:
+        if message.node == self._recorder:
+            self._recorded = message.step
+            done = self.step - self._recorded <= _MOST_AHEAD
+        else:
+            done = message.step == self.step
+        if done and message.node in self._waiting:
             # A restarted node is awaited until it has received the step.
             if message.node in self._returned:
                 return

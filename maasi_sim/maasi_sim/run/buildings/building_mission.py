@@ -36,14 +36,15 @@ class BuildingMission(Mission[CuboidRecord]):
         self.scenario = scenario
 
     def plan_nodes(self, options: Options, file: Path) -> list[NodePlan]:
-        """Return the simulation, and for each robot a planner and a guard."""
+        """Return the simulation, and for each robot a planner and a guard: not in lockstep."""
         scenario = self.scenario
         common = common_parameters(scenario, options)
         plans = [sim_plan('cuboid_sim_node', scenario, options, file)]
         for name in scenario.names():
             plans.append(_planner_plan(name, scenario, common))
-            # It plans once per step, and a command is valid for one step.
-            plans.append(guard_plan(name, common, scenario.step))
+            if not options.lockstep:
+                # It plans once per step, and a command is valid for one step.
+                plans.append(guard_plan(name, common, scenario.step))
         return plans
 
     def observer(self, types: Typestore) -> CuboidObserver:

@@ -34,6 +34,8 @@ from maasi_sim.simulation.emulators.linked_robots import with_addresses
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Of the robots' frames in lockstep, where each message counts [Hz].
+_LOCKSTEP_TF_RATE = 4.0
 # Settings of a robot that its driver has as well.
 _OF_THE_DRIVER = ['start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'battery_unit', 'link']
 
@@ -150,12 +152,13 @@ def _plugin(name: str, driver: str, scenario: Scenario) -> tuple[str, ...]:
 def _robot_plans(
     name: str, robot: RobotSettings, scenario: Scenario, common: dict[str, Any]
 ) -> list[NodePlan]:
-    """Return a robot's driver, and its guard if it has one."""
+    """Return a robot's driver, and its guard if it has one: not in lockstep."""
     settings = DriverSettings.model_validate(
         {
             **common,
             'environment': scenario.environment.of_nodes(),
             **{name: getattr(robot, name) for name in _OF_THE_DRIVER},
+            **({'tf_rate': _LOCKSTEP_TF_RATE} if common['lockstep'] else {}),
             'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,
             'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
         }
@@ -175,6 +178,6 @@ def _robot_plans(
         )
     ]
     guarded = robot.link == 'topics' if robot.guard is None else robot.guard
-    if guarded:
+    if guarded and not common['lockstep']:
         plans.append(guard_plan(name, common, 0.0))
     return plans
