@@ -327,19 +327,6 @@ def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(start_gua
     is_stopped(team)
 
 
-def test_in_lockstep_the_guard_waits_for_a_driver_that_is_slow(start_guard, process, team):
-    guard = start_guard(lockstep=True)
-    driver = process()
-    team.connect()
-    team.awaken()
-    team.until(lambda: guard._last and not guard.status()['stopping'])
-    driver.send_signal(signal.SIGSTOP)
-    end = time.monotonic() + 3.0
-    team.until(lambda: time.monotonic() > end or guard.status()['stopping'])
-    driver.send_signal(signal.SIGCONT)
-    assert time.monotonic() > end
-
-
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_driver_that_is_told_to_end_leaves_zeros(process, team, number):
     driver = process()

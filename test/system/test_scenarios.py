@@ -43,7 +43,6 @@ def test_the_demo_finds_all_targets(tmp_path):
     assert report['end_reason'] == 'all_found'
     assert (run.folder / 'report.png').stat().st_size > 10_000
     nodes = {'sim_node', 'mambo_driver', 'turtlebot_driver', 'filter_node', 'planner_node'}
-    nodes |= {'mambo_guard', 'turtlebot_guard'}
     assert {path.stem for path in run.folder.glob('*.log')} == nodes
     assert {path.stem for path in run.folder.glob('parameters/*.yaml')} == nodes
     assert run.processes() == []

@@ -273,12 +273,15 @@ class Recorder:
                 while self._last_step and stamp_of_step(self._last_step, length) >= end:
                     self._last_step -= 1
                 self._end = stamp_of_step(self._last_step + 1, length)
-        taken = self._until_last_step(clocks + others + updates + steps)
         # In the order of their times, as several steps may be taken at once.
-        timed = [(self._logged(before, *item), item) for item in taken]
-        taken = [item for _, item in sorted(timed, key=itemgetter(0))]
+        taken = [
+            (self._logged(before, topic, data), topic, data)
+            for topic, data in clocks + others + updates + steps
+            if self._belongs(topic, data)
+        ]
+        taken.sort(key=itemgetter(0))
         now = time.monotonic()
-        for topic, data in taken:
+        for _, topic, data in taken:
             self.last_seen[topic] = now
             if topic == DONE:
                 self._last_done.append(data)
@@ -294,8 +297,8 @@ class Recorder:
         if self.observer.end_step is not None and not self._finished:
             self._last_step = self.observer.end_step
             self._end = stamp_of_step(self._last_step, self._step_length)
-            taken = self._until_last_step(taken)
-        self._record(before, taken)
+            taken = [item for item in taken if self._belongs(*item[1:])]
+        self._record(taken)
 
     def _logged(self, before: int, topic: str, data: bytes) -> int:
         """Return the time under which a message is recorded [ns], from the last drain on.
@@ -335,13 +338,12 @@ class Recorder:
             return bool(deserialize_message(data, Log).name.startswith(logger))
         return True
 
-    def _record(self, before: int, taken: list[tuple[str, bytes]]) -> None:
+    def _record(self, taken: list[tuple[int, str, bytes]]) -> None:
         # A failed bag ends the run: see `bag.failed`.
         if self.bag is None or self.bag.failed:
             return
         try:
-            for topic, data in taken:
-                logged = self._logged(before, topic, data)
+            for logged, topic, data in taken:
                 self.bag.write(self._full(topic), logged, data)
                 self.first.setdefault(topic, logged)
         except BagError:
@@ -372,11 +374,10 @@ class Recorder:
         if self._last_step < 0 and self.step is not None:
             self._last_step = self.step
 
-    def _until_last_step(self, taken: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-        """Return the messages up to the last step; those without step or stamp are kept."""
-        return taken if self._last_step < 0 else [item for item in taken if self._is_before(*item)]
-
-    def _is_before(self, topic: str, data: bytes) -> bool:
+    def _belongs(self, topic: str, data: bytes) -> bool:
+        """Return whether a message is not of a step after the last one."""
+        if self._last_step < 0:
+            return True
         kind = self._subscriptions[topic].msg_type
         if self._finished and topic.rpartition('/')[2] in _AT_THE_END:
             return True

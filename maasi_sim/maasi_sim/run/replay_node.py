@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 
-from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
+from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, UPDATES
 from maasi_msgs.msg import (
     DetectionArray,
     FilterUpdate,
@@ -155,7 +155,7 @@ class ReplayNode:
         }
         for name in namespaces:
             self.node.create_subscription(
-                FilterUpdate, within(name, UPDATE), self.updates.append, RELIABLE
+                FilterUpdate, within(name, UPDATE), self.updates.append, UPDATES
             )
             keep = partial(self.found.__setitem__, name)
             self.node.create_subscription(FoundTargetArray, within(name, FOUND), keep, LATCHED_ALL)
