@@ -40,7 +40,9 @@ class CheckedMeasurement:
     labels: tuple[Label, ...] = ()  # Of each detection; empty: none has one
 
     def only(self, keep: BoolArray) -> CheckedMeasurement:
-        """Return a copy with some of the detections."""
+        """Return a copy with some of the detections, or the measurement if that is all of them."""
+        if keep.all():
+            return self
         labels = tuple(label for label, kept in zip(self.labels, keep.tolist()) if kept)
         return replace(
             self, values=self.values[keep], covariances=self.covariances[keep], labels=labels
@@ -88,7 +90,7 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
         raise ValueError(f'{name}: values: got shape {values.shape}, allowed is (m, {d})')
     if not np.isfinite(values).all():
         raise ValueError(f'{name}: values: got {values.tolist()}, allowed are finite numbers')
-    covariances = np.tile(sensor.covariance, (len(values), 1, 1))
+    covariances = np.repeat(sensor.covariance[None], len(values), axis=0)
     given = measurement.covariances if settings.use_detection_covariances else None
     own = given is not None
     if given is not None:
@@ -173,8 +175,6 @@ def count_dropped(dropped: dict[str, int], reason: str, number: int) -> None:
 def within_range(member: CheckedMeasurement, dropped: dict[str, int]) -> CheckedMeasurement:
     """Return a measurement without detections beyond the range of its sensor."""
     reach = member.values[:, 0] <= member.sensor.maximum_range
-    if reach.all():
-        return member
     count_dropped(dropped, 'range', int((~reach).sum()))
     return member.only(reach)
 
@@ -198,7 +198,7 @@ def without_repeats(member: CheckedMeasurement, dropped: dict[str, int]) -> Chec
             same &= [member.labels[i].identity == member.labels[j].identity for i in others]
         keep[j] = not same.any()
     count_dropped(dropped, REPEATED, int((~keep).sum()))
-    return member if keep.all() else member.only(keep)
+    return member.only(keep)
 
 
 def count_unexplained(centres: FloatArray, bounds: FloatArray, dropped: dict[str, int]) -> None:

@@ -135,7 +135,7 @@ def test_kmeans_separates_clouds_and_keeps_a_warm_start():
     np.testing.assert_array_equal(found, label)
     _, cold_means = kmeans(particles, weights, 3, generator, np.empty((0, 2)))
     np.testing.assert_allclose(np.sort(cold_means, axis=0), np.sort(means, axis=0), atol=0.1)
-    clusters = clusters_of(particles, weights, found, 3)
+    clusters = clusters_of(particles, weights, found, means)
     assert list(clusters) == [0, 1, 2]
     for c, cluster in clusters.items():
         member = particles[label == c]
@@ -144,10 +144,30 @@ def test_kmeans_separates_clouds_and_keeps_a_warm_start():
         assert cluster.radius == pytest.approx(np.sqrt(np.trace(np.cov(member.T, bias=True))))
 
 
+@pytest.mark.parametrize('in_order', [True, False])
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_kmeans_compares_all_particles_with_all_centres(dimension, in_order):
+    """As plain loops do: parts of particles that are left out have the same nearest centre."""
+    generator = np.random.default_rng(0)
+    cloud = generator.integers(0, 5, 3000)
+    cloud = np.sort(cloud) if in_order else cloud
+    particles = 9.0 * generator.random((5, dimension))[cloud]
+    particles += generator.normal(size=particles.shape)
+    weights, expected = generator.random(3000), particles[generator.choice(3000, 7)]
+    label, centres = kmeans(particles, weights, 7, generator, expected, 12)
+    for _ in range(12):
+        nearest = np.square(particles[:, None] - expected).sum(axis=2).argmin(axis=1)
+        groups = [nearest == g for g in range(7)]
+        means = [np.average(particles[g], axis=0, weights=weights[g]) for g in groups]
+        expected = np.array(means)
+    np.testing.assert_array_equal(label, nearest)
+    np.testing.assert_allclose(centres, expected, rtol=1e-12)
+
+
 def test_kmeans_of_one_point_many_times_over_ends():
     particles = np.ones((50, 3))
     label, centres = kmeans(particles, np.ones(50), 4, np.random.default_rng(0), np.empty((0, 3)))
-    clusters = clusters_of(particles, np.ones(50), label, len(centres))
+    clusters = clusters_of(particles, np.ones(50), label, centres)
     assert sum(cluster.mass for cluster in clusters.values()) == pytest.approx(50.0)
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.measurement_check import CheckedMeasurement
@@ -34,8 +35,9 @@ def measurement_births(
     # Exclude draws with negative range, or elevation beyond +-90 degrees.
     level = z[:, 0] * (np.cos(z[:, 2]) if d == 3 else 1.0)
     jacobian = level * z[:, 0] if d == 3 else level
-    inside = ((particles >= bounds[:, 0]) & (particles <= bounds[:, 1])).all(axis=1)
-    inside &= (z[:, 0] > 0.0) & (level > 0.0)
+    inside = (z[:, 0] > 0.0) & (level > 0.0)
+    for place, (low, high) in zip(particles.T, bounds):
+        inside &= (place >= low) & (place <= high)
     volume = float(np.prod(bounds[:, 1] - bounds[:, 0]))
     intensity = (expected_targets / volume / number) * jacobian
     intensity *= sensor.detection.probability(particles, pose)
@@ -93,13 +95,41 @@ def noise_in_space(member: CheckedMeasurement) -> FloatArray:
     return np.asarray(spreads.mean(axis=0))
 
 
+@njit(cache=True, error_model='numpy')
+def _drawn(weights, gaps):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return the index of the particle at each of the points with these gaps, by weight."""
+    cumulative, points = np.cumsum(weights), np.cumsum(gaps)
+    scale = cumulative[-1] / points[-1]
+    cumulative[-1] = np.inf
+    index = np.empty(len(gaps) - 1, np.int64)
+    i = j = 0
+    # Without a branch: processors would guess every other one wrong.
+    while i < len(index):
+        index[i] = j
+        below = np.int64(cumulative[j] <= points[i] * scale)
+        j += below
+        i += 1 - below
+    return index
+
+
 def resample(weights: FloatArray, number: int, generator: np.random.Generator) -> IntArray:
     """Return indices (number,) of particles, drawn with replacement by weight; they increase."""
     # Uniform points in order, from exponential gaps.
-    gaps = np.cumsum(generator.standard_exponential(number + 1))
-    cumulative = np.cumsum(weights)
-    index = np.searchsorted(cumulative, gaps[:-1] * (cumulative[-1] / gaps[-1]), 'right')
-    return np.minimum(index, len(weights) - 1)
+    return np.asarray(_drawn(weights, generator.standard_exponential(number + 1)))
+
+
+@njit(cache=True, error_model='numpy')
+def _moved(particles, index, noise, bounds):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return drawn particles; a copy of the one before is moved by the next row of the noise."""
+    moved = np.empty((len(index), particles.shape[1]))
+    copies = 0
+    for i in range(len(index)):
+        copy = i > 0 and index[i] == index[i - 1]
+        for a in range(particles.shape[1]):
+            place = particles[index[i], a] + (noise[copies, a] if copy else 0.0)
+            moved[i, a] = min(max(place, bounds[a, 0]), bounds[a, 1]) if copy else place
+        copies += copy
+    return moved
 
 
 def jittered(
@@ -114,8 +144,6 @@ def jittered(
     A deviation from the papers: targets stand still, so that without it ever fewer different
     particles are left.
     """
-    moved = particles[index]
-    copies = np.flatnonzero(index[1:] == index[:-1]) + 1
-    noise = deviation * generator.standard_normal((len(copies), particles.shape[1]))
-    moved[copies] = np.clip(moved[copies] + noise, bounds[:, 0], bounds[:, 1])
-    return moved
+    copies = np.count_nonzero(index[1:] == index[:-1])
+    noise = deviation * generator.standard_normal((copies, particles.shape[1]))
+    return np.asarray(_moved(particles, index, noise, bounds))

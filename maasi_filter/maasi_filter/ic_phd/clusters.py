@@ -2,66 +2,105 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.records import Cluster
 
-# Particles that are compared with all centres at a time.
-PART = 256
+# Particles of a part: resampling keeps copies together, so that most lie in a small box.
+PART = 128
+# Columns of a covariance's entries in sums of products.
+SQUARES = np.array([[1, 2, 4], [2, 3, 5], [4, 5, 6]])
 
 
 @njit(cache=True, error_model='numpy')
-def _assign(particles, centres, label):  # type: ignore[no-untyped-def]
-    """Fill the nearest centre of each particle; return how many changed."""
+def _assign(particles, low, high, centres, label, owner, changed):  # type: ignore[no-untyped-def]
+    """Fill the nearest centre of each particle, and which centres got or lost one, (k + 1,).
+
+    A centre is not compared with a part if all of the part's box, from `low` to `high` (parts, d),
+    is nearer to another one (Kanungo et al. 2002). `owner` (parts,) is the only one left, or -1.
+    """
     d = particles.shape[1]
-    least = np.empty(PART)
-    nearest = np.empty(PART)
-    changed = 0
-    for first in range(0, len(particles), PART):
+    least, nearest, gaps = np.empty(PART), np.empty(PART), np.empty(len(centres))
+    changed[:] = False
+    for part in range(len(owner)):
+        reach = np.inf
+        for c in range(len(centres)):
+            gaps[c] = farthest = 0.0
+            for a in range(d):
+                below = low[part, a] - centres[c, a]
+                above = centres[c, a] - high[part, a]
+                gaps[c] += max(below, above, 0.0) ** 2
+                farthest += min(below, above) ** 2
+            reach = min(reach, farthest)
+        one, count = -1, 0
+        for c in range(len(centres)):
+            if gaps[c] <= reach:
+                one, count = c, count + 1
+        if count == 1 and one == owner[part]:
+            continue
+        owner[part] = one if count == 1 else -1
+        first = part * PART
         number = min(PART, len(particles) - first)
-        part = particles[first : first + number]
+        some = particles[first : first + number]
         least[:] = np.inf
         for c in range(len(centres)):
-            for i in range(number):
-                x = part[i, 0] - centres[c, 0]
-                y = part[i, 1] - centres[c, 1]
-                z = part[i, 2] - centres[c, 2] if d == 3 else 0.0
+            for i in range(number if gaps[c] <= reach else 0):
+                x = some[i, 0] - centres[c, 0]
+                y = some[i, 1] - centres[c, 1]
+                z = some[i, 2] - centres[c, 2] if d == 3 else 0.0
                 square = x * x + y * y + z * z
                 nearest[i] = float(c) if square < least[i] else nearest[i]
                 least[i] = min(square, least[i])
         for i in range(number):
-            if label[first + i] != np.int64(nearest[i]):
-                label[first + i] = np.int64(nearest[i])
-                changed += 1
-    return changed
+            before, now = label[first + i], np.int64(nearest[i])
+            if before != now:
+                changed[before] = changed[now] = True
+                label[first + i] = now
 
 
 @njit(cache=True, error_model='numpy')
-def _sum_by_label(particles, weights, label, mass, sums):  # type: ignore[no-untyped-def]
-    """Fill mass (k,) and weighted sums (k, d) of the particles of each label."""
-    mass[:] = 0.0
-    sums[:] = 0.0
-    for i in range(len(particles)):
-        mass[label[i]] += weights[i]
-        for a in range(particles.shape[1]):
-            sums[label[i], a] += weights[i] * particles[i, a]
+def _move_centres(particles, weights, label, owner, changed, centres):  # type: ignore[no-untyped-def]
+    """Move the centres that changed to the weighted means; an empty one stays where it was."""
+    mass, sums = np.zeros(len(centres)), np.zeros(centres.shape)
+    for part in range(len(owner)):
+        if owner[part] < 0 or changed[owner[part]]:
+            for i in range(part * PART, min((part + 1) * PART, len(label))):
+                g = label[i]
+                if changed[g]:
+                    mass[g] += weights[i]
+                    for a in range(particles.shape[1]):
+                        sums[g, a] += weights[i] * particles[i, a]
+    for c in range(len(centres)):
+        for a in range(particles.shape[1] if mass[c] > 0.0 else 0):
+            centres[c, a] = sums[c, a] / mass[c]
 
 
 @njit(cache=True, error_model='numpy')
-def _add_squares(particles, weights, label, means, covariances):  # type: ignore[no-untyped-def]
-    """Add the weighted outer products of the offsets from the means to (k, d, d)."""
-    d = particles.shape[1]
+def _iterate(particles, weights, low, high, centres, iterations):  # type: ignore[no-untyped-def]
+    """Move the centres until no particle changes its own; return the label of each particle."""
+    label, owner = np.full(len(particles), -1), np.full(len(low), -1)
+    # The last one is of label -1.
+    changed = np.empty(len(centres) + 1, np.bool_)
+    for _ in range(iterations):
+        _assign(particles, low, high, centres, label, owner, changed)
+        if not changed.any():
+            break
+        _move_centres(particles, weights, label, owner, changed, centres)
+    return label
+
+
+@njit(cache=True, error_model='numpy')
+def _add_moments(particles, weights, label, means, sums):  # type: ignore[no-untyped-def]
+    """Add mass, and the weighted products of SQUARES of the offsets from the means, to (k, 7)."""
     for i in range(len(particles)):
         g = label[i]
-        for a in range(d):
-            for b in range(a + 1):
-                offset = (particles[i, a] - means[g, a]) * (particles[i, b] - means[g, b])
-                covariances[g, a, b] += weights[i] * offset
-                covariances[g, b, a] = covariances[g, a, b]
+        x = particles[i, 0] - means[g, 0]
+        y = particles[i, 1] - means[g, 1]
+        z = particles[i, 2] - means[g, 2] if particles.shape[1] == 3 else 0.0
+        for column, value in enumerate((1.0, x * x, y * x, y * y, z * x, z * y, z * z)):
+            sums[g, column] += weights[i] * value
 
 
 @njit(cache=True, error_model='numpy')
@@ -85,7 +124,7 @@ def _starting_centres(
     """Return starting centres: the given ones first, then K-means++."""
     centres = start[:number]
     least = np.full(len(particles), np.inf)
-    for centre in centres:
+    for centre in centres if len(centres) < number else ():
         _keep_least(particles, centre, least)
     while len(centres) < number:
         chance = np.cumsum(weights * least if len(centres) else weights)
@@ -111,33 +150,21 @@ def kmeans(
     `start` (s, d) are the centres of the step before; K-means++ adds what is missing of `number`.
     """
     centres = _starting_centres(particles, weights, number, start, generator)
-    label = np.full(len(particles), -1, np.int64)
-    mass = np.empty(len(centres))
-    sums = np.empty_like(centres)
-    for _ in range(iterations):
-        if _assign(particles, centres, label) == 0:
-            break
-        _sum_by_label(particles, weights, label, mass, sums)
-        # An empty cluster stays where it was.
-        full = mass > 0.0
-        centres[full] = sums[full] / mass[full, None]
-    return label, centres
+    starts = np.arange(0, len(particles), PART)
+    low, high = np.minimum.reduceat(particles, starts), np.maximum.reduceat(particles, starts)
+    return _iterate(particles, weights, low, high, centres, iterations), centres
 
 
 def clusters_of(
-    particles: FloatArray, weights: FloatArray, label: IntArray, number: int
+    particles: FloatArray, weights: FloatArray, label: IntArray, means: FloatArray
 ) -> dict[int, Cluster]:
     """Return the clusters that have mass, by label; the radius is the weighted rms distance."""
-    d = particles.shape[1]
-    mass, sums = np.empty(number), np.empty((number, d))
-    _sum_by_label(particles, weights, label, mass, sums)
-    means = sums / np.maximum(mass, 1e-300)[:, None]
-    covariances = np.zeros((number, d, d))
-    _add_squares(particles, weights, label, means, covariances)
-    covariances /= np.maximum(mass, 1e-300)[:, None, None]
+    sums, d = np.zeros((len(means), 7)), means.shape[1]
+    _add_moments(particles, weights, label, means, sums)
+    mass = sums[:, 0]
+    covariances = sums.take(SQUARES[:d, :d], axis=1) / np.maximum(mass, 1e-300)[:, None, None]
+    radii = np.sqrt(covariances.trace(axis1=1, axis2=2))
     return {
-        g: Cluster(
-            means[g], covariances[g], math.sqrt(float(np.trace(covariances[g]))), float(mass[g])
-        )
+        g: Cluster(means[g], covariances[g], float(radii[g]), float(mass[g]))
         for g in np.flatnonzero(mass > 0.0).tolist()
     }

@@ -7,7 +7,6 @@ not depend on the number of threads.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
@@ -128,32 +127,6 @@ def _explain_chunks(particles, weights, scan, probability, psi, sums, first, las
             )
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def _add_chunks(psi, normaliser, factor, first, last):  # type: ignore[no-untyped-def]
-    """Add psi_z / C(z) of each detection to the factor (n,) of chunks."""
-    for chunk in range(first, last):
-        begin = chunk * CHUNK
-        end = min(len(factor), begin + CHUNK)
-        for m in range(len(normaliser)):
-            share = 1.0 / normaliser[m]
-            for i in range(begin, end):
-                factor[i] += share * psi[m, i]
-
-
-def run_chunks(
-    function: Callable[[int, int], None], number: int, pool: ThreadPoolExecutor | None
-) -> None:
-    """Call `function(first, last)` for ranges of chunks of `number` particles, in threads."""
-    count = max(1, -(-number // CHUNK))
-    if pool is None:
-        function(0, count)
-        return
-    part = max(4, -(-count // 8))
-    ranges = [(first, min(first + part, count)) for first in range(0, count, part)]
-    for future in [pool.submit(function, *item) for item in ranges]:
-        future.result()
-
-
 def phd_correct(
     particles: FloatArray,
     weights: FloatArray,
@@ -166,12 +139,17 @@ def phd_correct(
     The factor is 1 - pi + sum over z of psi_z / C(z), with C(z) = background + <psi_z, D>, where
     `background` (m,) are the intensities of clutter and of births at each detection, above 0.
     """
-    number, count = len(weights), len(scan.values)
-    psi, sums = np.empty((count, number)), np.empty((max(1, -(-number // CHUNK)), count))
+    number, count, chunks = len(weights), len(scan.values), max(1, -(-len(weights) // CHUNK))
+    psi, sums = np.empty((count, number)), np.empty((chunks, count))
     probability = np.empty(number)
     explain = partial(_explain_chunks, particles, weights, scan, probability, psi, sums)
-    run_chunks(explain, number, pool)
+    part = chunks if pool is None else max(4, -(-chunks // 8))
+    firsts = range(0, chunks, part)
+    lasts = [min(first + part, chunks) for first in firsts]
+    # A list, so that all of them are done.
+    list((map if pool is None else pool.map)(explain, firsts, lasts))
     factor = 1.0 - probability
     normaliser = background + sums.cumsum(axis=0)[-1]
-    run_chunks(partial(_add_chunks, psi, normaliser, factor), number, pool)
+    for share, row in zip(1.0 / normaliser, psi):
+        factor += share * row
     return factor, normaliser

@@ -199,7 +199,7 @@ class IcPhdFilter(SearchFilter):
             self._centres,
             numbers.kmeans_iterations,
         )
-        clusters = clusters_of(self.particles, self.weights, label, len(centres))
+        clusters = clusters_of(self.particles, self.weights, label, centres)
         narrow = {
             g
             for g, cluster in clusters.items()
@@ -217,8 +217,9 @@ class IcPhdFilter(SearchFilter):
             target = FoundTarget(number, position, covariance, robot, index, time, label=label_of)
             self._found.targets.append(target)
             newly_found.append(target)
-        alive = ~np.isin(label, list(narrow))
-        self.particles, self.weights = self.particles[alive], self.weights[alive]
+        if narrow:
+            alive = ~np.isin(label, list(narrow))
+            self.particles, self.weights = self.particles[alive], self.weights[alive]
         remaining = [g for g in clusters if g not in narrow]
         self._centres = centres[remaining]
         self.clusters = sorted((clusters[g] for g in remaining), key=lambda item: -item.mass)

@@ -61,16 +61,16 @@ class MeasurementModel:
 
         A negative range, which noise can produce, points the opposite way.
         """
-        values = self._array('z', z)
+        values, origin = self._array('z', z), pose.position
         distance, bearing = values[:, 0], values[:, 1]
         positions = np.empty(values.shape)
         direction: FloatArray | float = 1.0
         if self.dimension == 3:
             direction = np.cos(values[:, 2])
-            positions[:, 2] = distance * np.sin(values[:, 2])
-        positions[:, 0] = distance * (direction * np.cos(bearing))
-        positions[:, 1] = distance * (direction * np.sin(bearing))
-        return positions + pose.position[: self.dimension]
+            positions[:, 2] = distance * np.sin(values[:, 2]) + origin[2]
+        positions[:, 0] = distance * (direction * np.cos(bearing)) + origin[0]
+        positions[:, 1] = distance * (direction * np.sin(bearing)) + origin[1]
+        return positions
 
     def jacobian(self, positions: ArrayLike, pose: Pose) -> FloatArray:
         """Return dg/dx, shape (n, d, d).

@@ -177,7 +177,7 @@ class Component:
         r, detected, density = self.existence, view.detected, self.density
         nothing = missed * r * (1.0 - detected) / (1.0 - r * detected)
         own = caused[view.gated]
-        detections = float(own.sum())
+        detections = sum(own.tolist())
         self.existence = min(nothing + detections, 1.0)
         if self.foreign or not self.existence > 0.0:
             return False

@@ -107,7 +107,7 @@ def _add_likelihood(term, sensor, origin, factor, out):  # type: ignore[no-untyp
     for i in range(out.shape[0]):
         a = u[i] - z0
         b = v[i] - z1
-        b -= TWO_PI * math.floor(b * turn + 0.5)
+        b -= TWO_PI * np.floor(b * turn + 0.5)
         c = w[i] - z2
         square = a * (a * i00 + 2.0 * (b * i01 + c * i02)) + b * (b * i11 + 2.0 * c * i12)
         out[i] += factor[i] * exponential(scale - 0.5 * (square + c * c * i22))

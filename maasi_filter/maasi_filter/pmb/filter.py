@@ -177,9 +177,10 @@ class PmbFilter(SearchFilter):
         count_unexplained(scan.centres[alone], self.bounds, result.dropped)
         # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
         radius = self._found_radius(blurred)
+        surely = (caused.sum(axis=1) > 0.5).tolist()
         for i, (item, view) in enumerate(zip(components, seen)):
             moved = item.update(view, missed[i], caused[i], scan, self.generator)
-            if caused[i].sum() > 0.5 and not item.foreign:
+            if surely[i] and not item.foreign:
                 item.pose_error, item.found_radius = blurred.pose_error, radius
             if self._review(item, moved) and not is_known(i, components, caused):
                 result.newly_found.append(self._find(item, member, time))
@@ -247,7 +248,8 @@ class PmbFilter(SearchFilter):
         covariance.flat[:: self.dimension + 1] += item.pose_error**2
         covariance += self._offsets.covariance_of(target.id)
         mean, label = item.density.mean.copy(), item.labels.label
-        return replace(target, position=mean, covariance=covariance, label=label)
+        by, index, time, origin = target.robot, target.measurement, target.time, target.origin
+        return FoundTarget(target.id, mean, covariance, by, index, time, origin, label)
 
     def _predict(self, time: float) -> None:
         """Predict the random walk since the last step; learn how often targets answer."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.records import Label
+from maasi_filter.records import UNLABELLED, Label
 
 # Odds of clutter against the target that a detection names.
 MISREAD = 1e-6
@@ -50,7 +50,7 @@ class LabelTally:
     def label(self) -> Label:
         """The class of the largest sum, with its share of all sums, and the identity."""
         if not self.classes:
-            return Label(identity=self.identity)
+            return Label(identity=self.identity) if self.identity else UNLABELLED
         # Of equal sums the first by name: the order of detections does not matter.
         best = min(self.classes, key=lambda name: (-self.classes[name], name))
         total = sum(self.classes[name] for name in sorted(self.classes))

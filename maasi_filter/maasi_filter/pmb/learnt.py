@@ -36,6 +36,7 @@ LEAST_EXISTENCE = 0.1
 GATE = 4.0
 # Share of the weight of earlier detections that each new one leaves.
 MEMORY = 1.0 - 1.0 / 50.0
+FADING = np.array([MEMORY, MEMORY, MEMORY**2])
 # A single outlier, such as a detection of another target, is no misfit: squares count up to this
 # for each dimension.
 MOST_SQUARE = 6.0
@@ -129,7 +130,7 @@ class Learnt:
         outweighs H P H', and nearer to 1 otherwise.
         """
         mean = (PRIOR_DETECTIONS + self.squares) / (PRIOR_DETECTIONS + self.detections)
-        return float(np.clip(mean, LEAST_FACTOR, MOST_FACTOR))
+        return min(max(mean, LEAST_FACTOR), MOST_FACTOR)
 
     def count_found(
         self,
@@ -142,8 +143,8 @@ class Learnt:
 
         If an error of the position explains the scan (`blurred`), it does not tell the noise.
         """
-        own = [i for i, item in enumerate(components) if item.target and not item.foreign]
-        rows = [i for i in own if caused[i].max(initial=0.0) > 0.5]
+        rows = np.flatnonzero((caused > 0.5).any(axis=1)).tolist()
+        rows = [i for i in rows if components[i].target and not components[i].foreign]
         if rows:
             means, covariances, _ = moments([components[i] for i in rows])
             squares = innovations(member, means, covariances)[3]
@@ -153,8 +154,7 @@ class Learnt:
 
     def count_innovation(self, square: float, d: int, probability: float) -> None:
         """Count a squared innovation; for the noise with a probability that it tells of that."""
-        memory = np.array([MEMORY, MEMORY, MEMORY**2])
-        self.fit = memory * self.fit + np.array([min(square, MOST_SQUARE * d), d, d])
+        self.fit = FADING * self.fit + np.array([min(square, MOST_SQUARE * d), d, d])
         self.detections += probability
         self.squares += probability * (square / d)
 

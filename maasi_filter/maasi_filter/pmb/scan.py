@@ -156,7 +156,7 @@ def make_scan(
         weights,
         means,
         spreads,
-        settings.expected_targets / exploration.volume * weights.mean(axis=1),
+        settings.expected_targets / exploration.volume * (weights.sum(axis=1) / number),
     )
 
 
