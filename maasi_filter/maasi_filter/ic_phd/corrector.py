@@ -146,8 +146,9 @@ def phd_correct(
     part = chunks if pool is None else max(4, -(-chunks // 8))
     firsts = range(0, chunks, part)
     lasts = [min(first + part, chunks) for first in firsts]
+    run = map if pool is None else pool.map
     # A list, so that all of them are done.
-    list((map if pool is None else pool.map)(explain, firsts, lasts))
+    list(run(explain, firsts, lasts))
     factor = 1.0 - probability
     normaliser = background + sums.cumsum(axis=0)[-1]
     for share, row in zip(1.0 / normaliser, psi):

@@ -129,8 +129,9 @@ class IcPhdFilter(SearchFilter):
         self._append(births, (intensity / normaliser[:, None]).ravel())
         self.exploration.update(member.sensor.detection, member.pose)
         unexplained = member.values[normaliser <= clutter]
-        centres = member.sensor.measurement.inverse(unexplained, member.pose)
-        count_unexplained(centres, self.bounds, dropped)
+        if len(unexplained):
+            centres = member.sensor.measurement.inverse(unexplained, member.pose)
+            count_unexplained(centres, self.bounds, dropped)
 
     def _births(
         self, member: CheckedMeasurement, before: Sequence[CheckedMeasurement]
@@ -230,6 +231,8 @@ class IcPhdFilter(SearchFilter):
     ) -> CheckedMeasurement:
         """Return a measurement without detections of found targets and beyond maximum range."""
         member = within_range(member, dropped)
+        if not self.found_targets:
+            return member
         centres = member.sensor.measurement.inverse(member.values, member.pose)
         keep = kept_measurements(
             centres,
