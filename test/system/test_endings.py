@@ -48,6 +48,7 @@ class Scripted(Planner):
 # What would take minutes waits until it is interrupted.
 LONG = """
 import sys, time
+from types import SimpleNamespace
 from maasi_sim.run import run_scenario, scenario_run
 
 def wait(*_):
@@ -55,7 +56,9 @@ def wait(*_):
     while True:
         time.sleep(0.05)
 
-scenario_run.store_report = scenario_run.read_events = wait
+scenario_run.store_report = wait
+replay = SimpleNamespace(recv=wait)
+scenario_run.ScenarioRun._begin_replay = lambda run: setattr(run, '_replay', replay)
 sys.exit(run_scenario.main(sys.argv[1:]))
 """
 

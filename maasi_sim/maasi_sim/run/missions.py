@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -35,3 +36,8 @@ def load_mission(
                 'targets, for which any other planner is allowed'
             )
     return TargetMission(path.stem, check_scenario(layer, overrides))
+
+
+def send_warning(mission: Mission[Any], sends: Connection) -> None:
+    """Send the warning about a scenario."""
+    sends.send(mission.warning())

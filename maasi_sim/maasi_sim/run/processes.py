@@ -15,10 +15,12 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from multiprocessing import forkserver, resource_tracker, util
+from collections.abc import Callable, Sequence
+from multiprocessing import Pipe, forkserver, resource_tracker, util
+from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
+from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from setproctitle import getproctitle, setproctitle
@@ -118,6 +120,23 @@ def find_executable(package: str, executable: str) -> Path:
     if not os.access(path, os.X_OK):
         raise ProcessError(f'package {package}: has no executable {executable} in {folder}')
     return path
+
+
+class _Beside(ForkServerProcess):
+    def run(self) -> None:
+        _die_with(_server)
+        super().run()
+
+
+def beside(function: Callable[..., None], *arguments: Any) -> Connection:
+    """Run a function beside this process, which it cannot outlive, in what the server has loaded.
+
+    Returned is what it sends to its last argument, a connection; it ends with the function.
+    """
+    receives, sends = Pipe(duplex=False)
+    with sends, contextlib.suppress(OSError, EOFError):
+        _Beside(target=function, args=(*arguments, sends), daemon=True).start()
+    return receives
 
 
 class NodeProcess(ForkServerProcess):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 from maasi_sim.arguments import Parser
@@ -40,6 +41,15 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--no-open', action='store_true', help='do not open a browser')
     return parser
+
+
+def send_replay(folder: Path, sends: Connection) -> None:
+    """Write the page of a run beside its report; send the shares that are done, then any error."""
+    try:
+        write_replay(read_events(folder, sends.send), folder / REPLAY)
+        sends.send('')
+    except (BagError, ResultsError) as error:
+        sends.send(str(error))
 
 
 def main(arguments: list[str] | None = None) -> int:
