@@ -135,15 +135,12 @@ TILT, LIFT, SPEED, YAW_RATE, COUNT_FORCE = range(8, 13)
 RATE = 13
 
 
-# By the settings that they depend on.
 _PARAMETERS: dict[str, FloatArray] = {}
-_NEEDED = {'state_weights', 'input_weights', 'acceleration', 'tilt', 'speed', 'yaw_rate'}
-_NEEDED |= {'control_inputs'}
 
 
 def mambo_parameters(settings: MotionSettings) -> FloatArray:
     """Return the parameter array of `mambo_step` for settings."""
-    key = settings.model_dump_json(include=_NEEDED)
+    key = settings.model_dump_json(exclude={'clearance'})
     if key in _PARAMETERS:
         return _PARAMETERS[key].copy()
     gains = lqr_gains(settings)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +37,6 @@ def load_mission(
     return TargetMission(path.stem, check_scenario(layer, overrides))
 
 
-def send_warning(mission: Mission[Any], sends: Connection) -> None:
+def send_warning(mission: Mission[Any], send: Callable[[str], None]) -> None:
     """Send the warning about a scenario."""
-    sends.send(mission.warning())
+    send(mission.warning())

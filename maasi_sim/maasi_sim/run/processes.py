@@ -15,7 +15,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import Pipe, forkserver, resource_tracker, util
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
@@ -122,21 +122,27 @@ def find_executable(package: str, executable: str) -> Path:
     return path
 
 
-class _Beside(ForkServerProcess):
-    def run(self) -> None:
-        _die_with(_server)
-        super().run()
-
-
-def beside(function: Callable[..., None], *arguments: Any) -> Connection:
+def beside(function: Callable[..., None], *arguments: Any) -> Iterator[Any]:
     """Run a function beside this process, which it cannot outlive, in what the server has loaded.
 
-    Returned is what it sends to its last argument, a connection; it ends with the function.
+    Returned is what it sends by its last argument, until it ends.
     """
     receives, sends = Pipe(duplex=False)
+    words = (function, *arguments, sends.send)
     with sends, contextlib.suppress(OSError, EOFError):
-        _Beside(target=function, args=(*arguments, sends), daemon=True).start()
-    return receives
+        ForkServerProcess(target=_call, args=words, daemon=True).start()
+    return _received(receives)
+
+
+def _call(function: Callable[..., None], *arguments: Any) -> None:
+    _die_with(_server)
+    function(*arguments)
+
+
+def _received(connection: Connection) -> Iterator[Any]:
+    with contextlib.suppress(EOFError):
+        while True:
+            yield connection.recv()
 
 
 class NodeProcess(ForkServerProcess):

@@ -8,7 +8,6 @@ import signal
 import threading
 import time
 import warnings
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +136,8 @@ class ScenarioRun:
             self._monitor()
             self._note_ending()
             self._close_bag()
-            self._begin_replay()
+            # Beside the report.
+            self._replay = beside(send_replay, self.folder) if options.record else iter(())
             followed = self._is_followed()
             if not followed:
                 ends.close()
@@ -204,10 +204,6 @@ class ScenarioRun:
         for text in filter(None, texts):
             self.display.say(f'warning: {text}')
 
-    def _warn_of(self, news: Connection) -> None:
-        with contextlib.suppress(EOFError):
-            self._warn(news.recv())
-
     def _monitor(self) -> None:
         """Monitor the run from the start to the end of its nodes."""
         self._name_external_robots()
@@ -243,7 +239,7 @@ class ScenarioRun:
             self.recorder.publish_ready()
             # It takes a while.
             news = beside(send_warning, self.mission)
-            threading.Thread(target=self._warn_of, args=(news,), daemon=True).start()
+            threading.Thread(target=lambda: self._warn(*news), daemon=True).start()
         return ending
 
     def _lacks(self, expected: list[str]) -> dict[str, str]:
@@ -253,8 +249,10 @@ class ScenarioRun:
         ready = set(recorder.take_ready())
         recorder.discover()
         late = [name for name in expected if name not in ready]
+        done = len(expected) - len(late)
+        self.display.update(f'starting: {done} of {len(expected)} nodes are ready', quiet=True)
         if self._page is not None:
-            self._page.starting(len(expected) - len(late), len(expected))
+            self._page.starting(done, len(expected))
         if late:
             return dict.fromkeys(late, 'is not ready')
         self._complete = self._complete or time.monotonic()
@@ -381,22 +379,18 @@ class ScenarioRun:
             code = DONE
         return NOT_WRITTEN if self.unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
-    def _begin_replay(self) -> None:
-        """Begin to write the page that shows the run, from its recording, beside the report."""
-        if self.options.record:
-            self._replay = beside(send_replay, self.folder)
-
     def _leave_replay(self) -> None:
         """Wait until the replay is written."""
         if not self.options.record:
             return
-        try:
-            while isinstance(news := self._replay.recv(), float):
-                self.display.share(REPLAY, news)
-        except EOFError:
-            news = 'the process that writes it has ended'
-        if news:
-            self._warn(f'no {REPLAY}: {news}')
+        problem = 'the process that writes it has ended'
+        for news in self._replay:
+            if isinstance(news, float):
+                self.display.update(f'{REPLAY}: {100.0 * news:.0f} %')
+            else:
+                problem = news
+        if problem:
+            self._warn(f'no {REPLAY}: {problem}')
         else:
             self.display.say(f'replay: {short(self.folder / REPLAY)}')
 

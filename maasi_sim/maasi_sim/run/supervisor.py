@@ -32,11 +32,7 @@ class Supervisor:
     recorder: Recorder
 
     def __init__(
-        self,
-        mission: Mission[Any],
-        options: Options,
-        folder: Path,
-        display: ProgressDisplay,
+        self, mission: Mission[Any], options: Options, folder: Path, display: ProgressDisplay
     ) -> None:
         team, level = options.namespace, options.log_level
         plans = mission.plan_nodes(options, folder / 'scenario.yaml')
@@ -154,6 +150,7 @@ class Supervisor:
         recorder, robots = self.recorder, self._scenario.names()
         # Drivers stop their robots while the simulation, or the robot, still runs. One that hangs
         # does not, and may send a command until it is killed: stop the robots before and after.
+        self._display.update('stopping the nodes', quiet=True)
         recorder.stop_robots(robots)
         stubborn = stop(self.nodes('driver', 'guard'))
         recorder.stop_robots(robots)

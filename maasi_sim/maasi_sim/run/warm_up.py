@@ -10,17 +10,14 @@ import numpy as np
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_planner.settings import PLANNERS
+from maasi_sim.compiling import compiling_said
 from maasi_sim.run.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.simulation.simulated_world import Simulation
 
 # Messages of all nodes; importing them starts no threads.
-_MESSAGES = (
-    *('maasi_msgs.action', 'maasi_msgs.msg', 'diagnostic_msgs.msg', 'geometry_msgs.msg'),
-    *('lifecycle_msgs.msg', 'lifecycle_msgs.srv', 'nav_msgs.msg', 'rcl_interfaces.msg'),
-    *('rcl_interfaces.srv', 'sensor_msgs.msg', 'std_msgs.msg', 'std_srvs.srv'),
-    *('tf2_msgs.msg', 'type_description_interfaces.srv', 'visualization_msgs.msg'),
-)
+_MESSAGES = ('diagnostic', 'geometry', 'lifecycle', 'maasi', 'nav', 'sensor', 'visualization')
+_SERVICES = ('lifecycle_msgs.srv', 'maasi_msgs.action', 'rcl_interfaces.srv', 'std_srvs.srv')
 
 
 def warm_up() -> None:
@@ -44,9 +41,10 @@ def prepare_nodes() -> None:
     Kernels are those of robots and cameras, which several nodes use: filters and planners load
     their own beside each other.
     """
-    _simulate('mambo_turtlebot')
-    for messages in _MESSAGES:
-        importlib.import_module(messages)
+    with compiling_said():
+        _simulate('mambo_turtlebot')
+    for name in (*(f'{name}_msgs.msg' for name in _MESSAGES), *_SERVICES):
+        importlib.import_module(name)
     # Messages import it at their first use.
     importlib.import_module('rosidl_generator_py')
     # Searches of all installed packages and of all modules, which a node needs for its parameters

@@ -281,10 +281,9 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         now = time.monotonic()
         missing = self._missing()
         if missing:
-            # The recorder comes last: it waits for all others.
-            text, last = f'waits for {missing}', missing == self.team_topic(RECORDER)
-            if now - self._wall_start > _PATIENCE and not last and self._is_news(text, now):
-                self.get_logger().info(text)
+            # A run with a recorder says so itself.
+            if now - self._wall_start > _PATIENCE and not self.settings.recorder:
+                self._say_waiting(f'waits for {missing}', now)
             return
         if self._ready_since is None:
             self._ready_since = now
@@ -325,16 +324,13 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         now = time.monotonic()
         if self._waiting and self.active and now - self._wall_step > _PATIENCE:
             waiting = ', '.join(sorted(self._waiting))
-            text = f'step {self.step} waits for {waiting}'
-            if self._is_news(text, now):
-                self.get_logger().warning(text)
+            self._say_waiting(f'step {self.step} waits for {waiting}', now)
 
-    def _is_news(self, text: str, now: float) -> bool:
-        """Return whether a text changes, else seldom: a node may compile for minutes."""
-        if text == self._said and now - self._said_at < _REMINDER:
-            return False
-        self._said, self._said_at = text, now
-        return True
+    def _say_waiting(self, text: str, now: float) -> None:
+        """Warn when the text changes, else seldom: a node may compile for minutes."""
+        if text != self._said or now - self._said_at >= _REMINDER:
+            self._said, self._said_at = text, now
+            self.get_logger().warning(text)
 
     # ---- the steps ---------------------------------------------------------------------------
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from multiprocessing.connection import Connection
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from maasi_sim.arguments import Parser
 from maasi_sim.run.bag import BagError
@@ -43,13 +44,13 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def send_replay(folder: Path, sends: Connection) -> None:
+def send_replay(folder: Path, send: Callable[[Any], None]) -> None:
     """Write the page of a run beside its report; send the shares that are done, then any error."""
     try:
-        write_replay(read_events(folder, sends.send), folder / REPLAY)
-        sends.send('')
+        write_replay(read_events(folder, send), folder / REPLAY)
+        send('')
     except (BagError, ResultsError) as error:
-        sends.send(str(error))
+        send(str(error))
 
 
 def main(arguments: list[str] | None = None) -> int:
