@@ -18,11 +18,10 @@ maasi_fail() {
 maasi_find_python() {
   local candidate
   for candidate in ${PYTHON:-python3 python3.12 python3.11 python3.13 python3.10}; do
-    if "$candidate" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' \
-        2> /dev/null; then
-      command -v "$candidate"
-      return
-    fi
+    # The interpreter itself, not what chooses one at each call.
+    "$candidate" -ISc 'import sys
+(3, 10) <= sys.version_info[:2] <= (3, 13) or sys.exit(1)
+print(sys.executable)' 2> /dev/null && return
   done
   maasi_fail "no Python 3.10 to 3.13 was found${PYTHON:+ at PYTHON=$PYTHON}" \
     'install one, for example: sudo apt install python3 python3-venv'
@@ -154,7 +153,7 @@ maasi_set_up() (
   flock "$maasi_lock"
   key="$( (cat "$maasi_root"/requirements.txt "$maasi_root"/requirements-build.txt \
     "$maasi_root"/requirements-ros.txt "$maasi_root/scripts/mend_wheels.py"
-    "$python" -c 'import sys; print(sys.version, sys.base_prefix)'; echo "$mode $maasi_venv") | maasi_hash)"
+    "$python" -ISc 'import sys; print(sys.version, sys.base_prefix)'; echo "$mode $maasi_venv") | maasi_hash)"
   [ "$(cat "$maasi_venv/.maasi_key" 2> /dev/null)" = "$key" ] \
     || maasi_make_venv "$python" "$mode" "$key"
   maasi_use_venv "$mode"

@@ -154,7 +154,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     def set_up(self) -> None:
         """Compile and connect."""
         settings = self.settings
-        warm_up()
+        warm_up(settings.filter.method)
         self._update_publisher = self.create_publisher(FilterUpdate, 'filter_update', UPDATES)
         self._clusters_publisher = self.create_publisher(ClusterArray, 'clusters', 10)
         self._found_publisher = self.create_publisher(FoundTargetArray, 'found_targets', LATCHED)

@@ -84,8 +84,8 @@ def load_state(path: str | os.PathLike[str]) -> tuple[SearchFilter, Progress | N
         raise StateFileError(f'{path}: does not hold a usable state: {error}') from None
 
 
-def warm_up() -> None:
-    """Compile, or load from the cache, every kernel that a step uses.
+def warm_up(method: str | None = None) -> None:
+    """Compile, or load from the cache, every kernel that a step uses; of one method, or of all.
 
     A node calls this before it reports ready, so that no step waits for a compiler.
     """
@@ -99,6 +99,8 @@ def warm_up() -> None:
             sensor = SensorSettings(detection=detection, noise=noise).build('warm_up', dimension)
             ic_phd = FilterSettings(particles=500, birth_particles=50, particles_minimum=50)
             for settings in (ic_phd, FilterSettings(method='pmb')):
+                if method not in (None, settings.method):
+                    continue
                 search = make_filter(settings, bounds, np.random.default_rng(0))
                 for step in range(6):
                     position = np.array([3.0 + 0.2 * step, 3.0, 3.0])

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.machinery import PathFinder
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,9 @@ _folders: list[str] = []
 
 
 @cache
-def _entry_points(path: tuple[str, ...]) -> Any:
-    """Return the entry points on a search path; their type depends on the version of Python."""
-    return entry_points()
+def _entry_points(folder: str) -> list[EntryPoint]:
+    """Return the entry points of what is installed in a folder of the search path."""
+    return [point for found in distributions(path=[folder]) for point in found.entry_points]
 
 
 class PluginError(ValueError):
@@ -128,7 +128,9 @@ class PluginGroup:
         return model
 
     def _installed(self) -> dict[str, EntryPoint]:
-        return {item.name: item for item in _entry_points(tuple(sys.path)).select(group=self.group)}
+        # What comes first on the path counts.
+        points = [item for folder in reversed(sys.path) for item in _entry_points(folder)]
+        return {item.name: item for item in points if item.group == self.group}
 
     def _unknown(self, name: str, known: list[str]) -> str:
         return f'{unknown(name, known, self.what)}, and module:Class of your own'

@@ -34,7 +34,8 @@ class Run:
         self.recorder = SimpleNamespace(
             elapsed=0.0, step=None, time=0, ready={PLANNER}, take_heartbeats=self.take
         )
-        self.supervisor = Supervisor(mission, Options(), folder, ProgressDisplay(), self.recorder)
+        self.supervisor = Supervisor(mission, Options(), folder, ProgressDisplay())
+        self.supervisor.recorder = self.recorder
         self.supervisor.running = True
         self.nodes = self.supervisor.processes
         for pid, node in enumerate(self.nodes.values(), start=1):

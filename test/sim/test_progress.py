@@ -43,13 +43,17 @@ def test_a_terminal_gets_a_line_that_changes_and_lines_that_stay(monkeypatch):
     assert stream.getvalue() == f'begin\n{erase}{line}{erase}a warning\n{line}\n'
 
 
-def test_the_share_of_what_is_done_comes_now_and_then():
+def test_how_far_something_is_comes_now_and_then_and_on_a_terminal_only_if_quiet():
     for period, said in ((0.0, ['replay: 0 %', 'replay: 50 %']), (1e6, ['replay: 0 %'])):
         stream = io.StringIO()
         display = ProgressDisplay(stream, period=period)
-        for share in (0.0, 0.5):
-            display.share('replay', share)
+        for share in (0, 50):
+            display.update('starting', quiet=True)
+            display.update(f'replay: {share} %')
         assert stream.getvalue().splitlines() == said
+    stream = Terminal()
+    ProgressDisplay(stream).update('starting', quiet=True)
+    assert 'starting' in stream.getvalue()
 
 
 def test_compiling_is_said_and_loading_from_the_cache_is_not(tmp_path):

@@ -276,6 +276,8 @@ def _trim(positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: B
     for w in range(positions.shape[0]):
         last = lengths[w]
         for k in range(last + 1, longest + 1):
-            positions[w, k] = positions[w, last]
+            # By elements: rows take seconds to compile.
+            for axis in range(3):
+                positions[w, k, axis] = positions[w, last, axis]
             yaws[w, k] = yaws[w, last]
     return longest

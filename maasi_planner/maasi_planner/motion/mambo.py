@@ -140,7 +140,7 @@ _PARAMETERS: dict[str, FloatArray] = {}
 
 def mambo_parameters(settings: MotionSettings) -> FloatArray:
     """Return the parameter array of `mambo_step` for settings."""
-    key = settings.model_dump_json()
+    key = settings.model_dump_json(exclude={'clearance'})
     if key in _PARAMETERS:
         return _PARAMETERS[key].copy()
     gains = lqr_gains(settings)

@@ -192,7 +192,7 @@ def _roll_out(
     lengths: IntArray,
     control_cost: FloatArray,
 ) -> None:
-    state, steering = start.copy(), kernel.steering
+    steering = kernel.steering
     straight = kernel.kind == POINT and steering.acceleration == np.inf
     straight = straight and not (steering.face_travel or kernel.obstructed)
     for w in range(waypoints.shape[0]):
@@ -200,10 +200,11 @@ def _roll_out(
         if straight:
             way = _go_straight(kernel, start, goal, positions[w], yaws[w])
         else:
-            state[:] = start
+            state = start.copy()
             way = _close_loop(kernel, state, goal, tables[w], positions[w], yaws[w])
         lengths[w], control_cost[w] = way
-        positions[w, 0] = start[:3]
+        for axis in range(3):
+            positions[w, 0, axis] = start[axis]
 
 
 class CompiledBody(Body):

@@ -85,7 +85,8 @@ def values_given(table: CandidateTable, first: int, last: int, chosen: IntArray)
     """Return T, E and J of the candidates `first` to `last`, given the others' choices, (n, 3)."""
     out = np.empty((last - first, 3))
     for g in range(first, last):
-        out[g - first, :] = candidate_value(table, g, chosen)
+        row = out[g - first]
+        row[0], row[1], row[2] = candidate_value(table, g, chosen)
         if not table.allowed[g] or collides(table, g, chosen):
             out[g - first, 2] = -np.inf
     return out
@@ -120,7 +121,8 @@ def _search_exactly(
     """
     table, order, start, alone = ranking
     if r == len(chosen):
-        best[:] = chosen
+        for other in range(r):
+            best[other] = chosen[other]
         return value, 0
     rest, evaluated = 0.0, 0
     for other in range(len(chosen) - 1, r, -1):

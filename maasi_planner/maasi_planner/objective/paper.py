@@ -51,10 +51,10 @@ def _unseen_nodes(
         count[g], worth, when, left = number, value[g, :number], time[g, :number], np.ones(number)
         at = place[0, g, :number], place[1, g, :number], place[2, g, :number]
         until = when if own_counts else when - 1
-        apply_misses(at, until, left, planned, g, 0, planned.own[g])
+        apply_misses(at, until, left, planned, g, np.int64(0), planned.own[g])
         worth *= left
         for s in range(settled.own.shape[0]):
-            apply_misses(at, when, worth, settled, s, 0, settled.number[s])
+            apply_misses(at, when, worth, settled, s, np.int64(0), settled.number[s])
     return count, value, place, time
 
 

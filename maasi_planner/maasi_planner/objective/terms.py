@@ -50,9 +50,11 @@ def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArr
     out = np.ones(count)
     until, number, place = terms.time[g, :count], planned.number[other], terms.place
     at = place[0, g, :count], place[1, g, :count], place[2, g, :count]
-    apply_misses(at, until, out, planned, other, 0, number)
+    # Not a literal, for which it would be compiled once more.
+    apply_misses(at, until, out, planned, other, np.int64(0), number)
     if terms.used[0] < terms.cache.shape[0]:
-        terms.cache[terms.used[0], :count] = out
+        for index in range(count):
+            terms.cache[terms.used[0], index] = out[index]
         terms.slot[g, other] = terms.used[0]
         terms.used[0] += 1
     return out
@@ -88,7 +90,10 @@ def refinement_given(terms: Terms, g: int, others: IntArray) -> float:
     for c in range(clusters):
         if not np.any(terms.gain[g, c]):
             continue
-        known[:] = terms.base[c]
+        # By elements: an assignment to a slice takes seconds to compile.
+        for a in range(d):
+            for b in range(d):
+                known[a, b] = terms.base[c, a, b]
         for other in others:
             known += terms.gain[other, c]
         for a in range(d):

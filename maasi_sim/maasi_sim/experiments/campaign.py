@@ -328,6 +328,8 @@ def carry_out_all(
     problems: list[str] = []
     team = Workers()
     display = ProgressDisplay(period=_QUIET_PERIOD)
+    tasks = (task for work in campaigns for task in work.tasks)
+    cases = list(dict.fromkeys(f'{task.experiment} {task.case.name}' for task in tasks))
     made = 0
     begin = time.monotonic()
 
@@ -336,10 +338,12 @@ def carry_out_all(
         made += 1
         left = (time.monotonic() - begin) * (number - made) / made
         what = f'{task.experiment} {task.case.name}'
+        what += f', case {cases.index(what) + 1} of {len(cases)}'
         display.show(f'{made} of {number} runs, about {left:.0f} s left ({what})', 0)
 
     try:
         if number:
+            display.update(f'0 of {number} runs, of {len(cases)} cases', quiet=True)
             team = make_workers(number, workers, cluster)
         machine = one_machine(team, campaigns) if number and not mixed else None
         for work in campaigns:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,3 +35,8 @@ def load_mission(
                 'targets, for which any other planner is allowed'
             )
     return TargetMission(path.stem, check_scenario(layer, overrides))
+
+
+def send_warning(mission: Mission[Any], send: Callable[[str], None]) -> None:
+    """Send the warning about a scenario."""
+    send(mission.warning())

@@ -15,10 +15,12 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from multiprocessing import forkserver, resource_tracker, util
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import Pipe, forkserver, resource_tracker, util
+from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
+from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from setproctitle import getproctitle, setproctitle
@@ -118,6 +120,29 @@ def find_executable(package: str, executable: str) -> Path:
     if not os.access(path, os.X_OK):
         raise ProcessError(f'package {package}: has no executable {executable} in {folder}')
     return path
+
+
+def beside(function: Callable[..., None], *arguments: Any) -> Iterator[Any]:
+    """Run a function beside this process, which it cannot outlive, in what the server has loaded.
+
+    Returned is what it sends by its last argument, until it ends.
+    """
+    receives, sends = Pipe(duplex=False)
+    words = (function, *arguments, sends.send)
+    with sends, contextlib.suppress(OSError, EOFError):
+        ForkServerProcess(target=_call, args=words, daemon=True).start()
+    return _received(receives)
+
+
+def _call(function: Callable[..., None], *arguments: Any) -> None:
+    _die_with(_server)
+    function(*arguments)
+
+
+def _received(connection: Connection) -> Iterator[Any]:
+    with contextlib.suppress(EOFError):
+        while True:
+            yield connection.recv()
 
 
 class NodeProcess(ForkServerProcess):

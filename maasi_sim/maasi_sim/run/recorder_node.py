@@ -51,6 +51,8 @@ _LARGEST_LEAD = 10**9
 _ARMING_PERIOD = 2.0
 # Longest wait for the acknowledgement of stop commands [s].
 _STOP_PATIENCE = 1.0
+# Until they are sent again.
+_ACKNOWLEDGED = Duration(seconds=0.1)
 
 
 class Recorder:
@@ -422,7 +424,7 @@ class Recorder:
     def stop_robots(self, names: Collection[str]) -> None:
         """Publish zeros on `cmd_vel` of robots that subscribe to it, and wait until they arrive."""
         types = dict(self.node.get_topic_names_and_types())
-        publishers = []
+        publishers: list[Any] = []
         for topic in (self._full(f'/{name}/cmd_vel') for name in names):
             if self.node.count_subscribers(topic):
                 plain = types[topic] == ['geometry_msgs/msg/Twist']
@@ -434,15 +436,15 @@ class Recorder:
             for publisher in publishers
         ):
             time.sleep(0.005)
-        for publisher in publishers:
-            kind: Any = publisher.msg_type
-            message = kind()
+        messages = [(publisher, publisher.msg_type()) for publisher in publishers]
+        for publisher, message in messages:
             if isinstance(message, TwistStamped):
                 message.header.stamp = stamp_to_ros(self.time)
             publisher.publish(message)
-        for publisher in publishers:
-            left = max(deadline - time.monotonic(), 0.0)
-            publisher.wait_for_all_acked(Duration(nanoseconds=round(left * 1e9)))
+        for publisher, message in messages:
+            # Who missed it hears of it again only seconds later, but of a further one at once.
+            while not publisher.wait_for_all_acked(_ACKNOWLEDGED) and time.monotonic() < deadline:
+                publisher.publish(message)
             self.node.destroy_publisher(publisher)
 
     def followers(self) -> list[str]:

@@ -8,7 +8,6 @@ import signal
 import threading
 import time
 import warnings
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +23,20 @@ from maasi_sim.run.ending import (
     Interruption,
 )
 from maasi_sim.run.mission import RunEnd
-from maasi_sim.run.missions import load_mission
-from maasi_sim.run.processes import stop, wait_for_server
+from maasi_sim.run.missions import load_mission, send_warning
+from maasi_sim.run.processes import beside, stop, wait_for_server
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.report_files import store_report
-from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
+from maasi_sim.run.run_folder import make_folder, write_text
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.live_view import RunPage
-from maasi_sim.run.view.messages import read_events
-from maasi_sim.run.view.page_file import REPLAY, write_replay
+from maasi_sim.run.view.page_file import REPLAY
 from maasi_sim.run.view.scene import scene_of
+from maasi_sim.run.view.view_run import send_replay
 from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning, to_yaml
 
 # Between two checks of processes and topics; while the nodes start, and while they run [s].
@@ -104,7 +103,21 @@ class ScenarioRun:
             write_text(self.folder / 'scenario.yaml', self._scenario.text())
             write_text(self.folder / 'view.rviz', view_text(self.mission, team))
             ends.callback(self.display.close)
+            # Nodes start while this process makes what is its own.
+            self.supervisor = Supervisor(self.mission, options, self.folder, self.display)
+            processes = list(self.supervisor.processes.values())
+            self.display.say(
+                f'{self.mission.name}: seed {self._scenario.seed}, {len(processes)} nodes in ROS '
+                f'domain {domain.number}, results in {short(self.folder)}'
+            )
+            ends.callback(stop, processes)
             types = load_types()
+            # Ctrl-C ends the wait at once; the run reports it.
+            with self.interruption.at_once():
+                wait_for_server()
+            if not self.interruption:
+                for process in processes:
+                    process.start()
             self.observer = self.mission.observer(types)
             if options.record:
                 self._bag = BagWriter(self.folder / 'bag', types, self._scenario.record.images)
@@ -112,14 +125,7 @@ class ScenarioRun:
             step = self._scenario.step
             self.recorder = Recorder(domain.number, self.observer, step, self._bag, team)
             ends.callback(self.recorder.close)
-            self.supervisor = Supervisor(
-                self.mission, options, self.folder, self.display, self.recorder
-            )
-            processes = list(self.supervisor.processes.values())
-            self.display.say(
-                f'{self.mission.name}: seed {self._scenario.seed}, {len(processes)} nodes in ROS '
-                f'domain {domain.number}, results in {short(self.folder)}'
-            )
+            self.supervisor.recorder = self.recorder
             if self._bag is not None:
                 self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
             self._page = self._serve(domain.number)
@@ -127,10 +133,11 @@ class ScenarioRun:
                 served.callback(self._page.close)
                 ends.callback(self._page.end)
                 self.recorder.listener = self._page.put_message
-            ends.callback(stop, processes)
             self._monitor()
             self._note_ending()
             self._close_bag()
+            # Beside the report.
+            self._replay = beside(send_replay, self.folder) if options.record else iter(())
             followed = self._is_followed()
             if not followed:
                 ends.close()
@@ -199,12 +206,6 @@ class ScenarioRun:
 
     def _monitor(self) -> None:
         """Monitor the run from the start to the end of its nodes."""
-        # Ctrl-C ends the wait at once; the run reports it.
-        with self.interruption.at_once():
-            wait_for_server()
-        if not self.interruption:
-            for process in self.supervisor.processes.values():
-                process.start()
         self._name_external_robots()
         self.ending = self._wait_until_ready() or self._follow()
         now = time.monotonic()
@@ -235,7 +236,8 @@ class ScenarioRun:
             self._warn(*(f'{topic} has a publisher that is not recorded' for topic in loose))
             self.recorder.publish_ready()
             # It takes a while.
-            threading.Thread(target=lambda: self._warn(self.mission.warning()), daemon=True).start()
+            news = beside(send_warning, self.mission)
+            threading.Thread(target=lambda: self._warn(*news), daemon=True).start()
         return ending
 
     def _lacks(self, expected: list[str]) -> dict[str, str]:
@@ -245,8 +247,10 @@ class ScenarioRun:
         ready = set(recorder.take_ready())
         recorder.discover()
         late = [name for name in expected if name not in ready]
+        done = len(expected) - len(late)
+        self.display.update(f'starting: {done} of {len(expected)} nodes are ready', quiet=True)
         if self._page is not None:
-            self._page.starting(len(expected) - len(late), len(expected))
+            self._page.starting(done, len(expected))
         if late:
             return dict.fromkeys(late, 'is not ready')
         self._complete = self._complete or time.monotonic()
@@ -374,16 +378,19 @@ class ScenarioRun:
         return NOT_WRITTEN if self.unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
     def _leave_replay(self) -> None:
-        """Write the page that shows the run, from its recording."""
+        """Wait until the replay is written."""
         if not self.options.record:
             return
-        file = self.folder / REPLAY
-        try:
-            write_replay(read_events(self.folder, partial(self.display.share, REPLAY)), file)
-        except (BagError, ResultsError) as error:
-            self._warn(f'no {REPLAY}: {error}')
+        problem = 'the process that writes it has ended'
+        for news in self._replay:
+            if isinstance(news, float):
+                self.display.update(f'{REPLAY}: {100.0 * news:.0f} %')
+            else:
+                problem = news
+        if problem:
+            self._warn(f'no {REPLAY}: {problem}')
         else:
-            self.display.say(f'replay: {short(file)}')
+            self.display.say(f'replay: {short(self.folder / REPLAY)}')
 
 
 def short(path: Path) -> str:

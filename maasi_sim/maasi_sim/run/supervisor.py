@@ -28,13 +28,11 @@ _LAST_MESSAGES = 0.02
 class Supervisor:
     """Watches the nodes of a run: one that dies or hangs is restarted, or ends the run."""
 
+    #: What the nodes say; it may be made while they start.
+    recorder: Recorder
+
     def __init__(
-        self,
-        mission: Mission[Any],
-        options: Options,
-        folder: Path,
-        display: ProgressDisplay,
-        recorder: Recorder,
+        self, mission: Mission[Any], options: Options, folder: Path, display: ProgressDisplay
     ) -> None:
         team, level = options.namespace, options.log_level
         plans = mission.plan_nodes(options, folder / 'scenario.yaml')
@@ -49,7 +47,6 @@ class Supervisor:
         self._scenario = mission.scenario
         self._options = options
         self._display = display
-        self._recorder = recorder
         self._checked = 0.0
         # Newest step and simulated time, and since when they have been so [s].
         self._moment: tuple[int | None, int] = (None, 0)
@@ -63,7 +60,7 @@ class Supervisor:
         if gap < _CHECK_PERIOD:
             return None
         self._checked = now
-        beats = self._recorder.take_heartbeats()
+        beats = self.recorder.take_heartbeats()
         for name, process in self.processes.items():
             if name in beats:
                 process.beat(beats[name])
@@ -72,7 +69,7 @@ class Supervisor:
                 process.beaten = min(process.beaten + gap, now)
             if ending := self._check_node(self.plans[name], process, now):
                 return ending
-        moment = self._recorder.step, self._recorder.time
+        moment = self.recorder.step, self.recorder.time
         # A restarted node may have to compile: `limits.start` applies.
         restarting = any(item.restarts and item.beaten is None for item in self.processes.values())
         if not self.running or restarting or moment != self._moment:
@@ -102,7 +99,7 @@ class Supervisor:
         else:
             return None
         if plan.namespace in self._scenario.robots and (not died or plan.role == 'driver'):
-            self._recorder.stop_robots([plan.namespace])
+            self.recorder.stop_robots([plan.namespace])
         # A restarted simulation would begin at time 0.
         respawns = self._scenario.on_exit == 'respawn' and plan.role != 'clock'
         if not respawns or process.restarts >= limits.restarts:
@@ -113,7 +110,7 @@ class Supervisor:
             return Ending(f'node_{word}', NODE_FAILED, text, [name])
         if died:
             self.note(name, 'restarted')
-            self._recorder.ready.discard(name)
+            self.recorder.ready.discard(name)
             remove_dead()
             process.restart()
         else:
@@ -124,7 +121,7 @@ class Supervisor:
 
     def note(self, name: str, event: str, **details: str) -> None:
         """Add to the events."""
-        time_ = self._recorder.elapsed
+        time_ = self.recorder.elapsed
         self.events.append({'time': time_, 'node': name, 'event': event, **details})
 
     def _standstill(self, now: float) -> Ending:
@@ -133,11 +130,11 @@ class Supervisor:
         if self._options.follow_clock:
             text = f'/clock, which this run follows, stands still {silence}'
             return Ending('clock_stopped', NODE_FAILED, text)
-        step = self._recorder.step
+        step = self.recorder.step
         if step is None:
             return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
-        steps = self._recorder.done_steps()
-        reached = self._recorder.observer.last_steps()
+        steps = self.recorder.done_steps()
+        reached = self.recorder.observer.last_steps()
         steps |= {
             name: reached.get(plan.namespace, -1)
             for name, plan in self.plans.items()
@@ -156,9 +153,10 @@ class Supervisor:
 
     def stop(self, keep_clock: bool) -> None:
         """Stop the robots, then the nodes, and record their last messages."""
-        recorder, robots = self._recorder, self._scenario.names()
+        recorder, robots = self.recorder, self._scenario.names()
         # Drivers stop their robots while the simulation, or the robot, still runs. One that hangs
         # does not, and may send a command until it is killed: stop the robots before and after.
+        self._display.update('stopping the nodes', quiet=True)
         recorder.stop_robots(robots)
         stubborn = stop(self.nodes('driver', 'guard'))
         recorder.stop_robots(robots)

@@ -293,8 +293,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         now = time.monotonic()
         missing = self._missing()
         if missing:
-            # The recorder comes last: it waits for all others.
-            if now - self._wall_start > _PATIENCE and missing != self._recorder:
+            # A run with a recorder says so itself.
+            if now - self._wall_start > _PATIENCE and not self.settings.recorder:
                 self._say_waiting(f'waits for {missing}', now)
             return
         if self._ready_since is None:

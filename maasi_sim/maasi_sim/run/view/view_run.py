@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from maasi_sim.arguments import Parser
 from maasi_sim.run.bag import BagError
@@ -40,6 +42,15 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--no-open', action='store_true', help='do not open a browser')
     return parser
+
+
+def send_replay(folder: Path, send: Callable[[Any], None]) -> None:
+    """Write the page of a run beside its report; send the shares that are done, then any error."""
+    try:
+        write_replay(read_events(folder, send), folder / REPLAY)
+        send('')
+    except (BagError, ResultsError) as error:
+        send(str(error))
 
 
 def main(arguments: list[str] | None = None) -> int:
