@@ -4,32 +4,57 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Ellipse, Polygon, Rectangle
+from matplotlib.patches import Circle
 from matplotlib.path import Path as Outline
 from numpy.typing import ArrayLike, NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.colours import AWAY, FOUND, POTENTIAL, SEEN, robot_colours
 from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, draw_box
-from maasi_sim.run.report_panels import ellipse
+from maasi_sim.run.report_panels import PALE, UNSEEN
 from maasi_sim.run.run_folder import write_whole
 from maasi_sim.run.view.event_log import Event, EventLog, Scene
 from maasi_sim.run.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
-# Pictures per second, and size [in] at a resolution [px/in].
-RATE = 10
+# Pictures per second; GIFs would be large. Size [in] at a resolution [px/in].
+RATE, GIF_RATE = 30, 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80
 # The last picture is shown for so long [s].
 _HOLD = 2.0
 # Detections are shown for so long [s].
 _FADE = 1.0
+# Points of a way that are drawn, and of an outline.
+_MOST_POINTS = 600
+_CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 40)) for f in (np.cos, np.sin)], axis=1)
+_SOLID = '#59636E'
+# Texts, where they belong to, marks and colours.
+_LEGEND = (
+    ('left or cannot go on', '', '>', AWAY),
+    ('planned way', '', '--', PALE),
+    ('waypoint', 'targets', 's', PALE),
+    ('field of view', 'floor', ':', PALE),
+    ('not explored', 'floor', 's', UNSEEN),
+    ('found, 3 sigma', 'targets', 'o', FOUND),
+    ('potential, 2 sigma', 'targets', 'o', POTENTIAL),
+    ('detection', 'targets', '+', SEEN),
+    ('true target', 'targets', 'x', '0.2'),
+    ('obstacle', 'obstacles', 'o', _SOLID),
+    ('geofence', 'fence', '-.', PALE),
+    ('cuboid to visit', 'cuboids', 's', OPEN),
+    ('cuboid visited', 'cuboids', 's', VISITED),
+    ('building', 'cuboids', 's', OBJECT),
+    ('radio link', 'cuboids', ':', '0.3'),
+)
 
 
 class Moments:
@@ -80,26 +105,33 @@ class Moments:
         return f'{self.scene.get("name", "")}   {self.time:.1f} s   {word} {found}{of}'
 
 
-def write_video(log: EventLog, path: Path, speed: float = 5.0) -> None:
-    """Write a run as FILE.mp4 or FILE.gif, `speed` times as fast."""
-    pictures = _pictures(log, speed)
-    write = _write_gif if path.suffix == '.gif' else _write_mp4
+def write_video(
+    log: EventLog, path: Path, speed: float = 5.0, progress: Callable[[float], object] = float
+) -> None:
+    """Write a run as FILE.mp4 or FILE.gif, `speed` times as fast.
+
+    `progress` is called with the share of the pictures that is made.
+    """
+    is_gif = path.suffix == '.gif'
+    pictures = _pictures(log, speed, GIF_RATE if is_gif else RATE, progress)
     # Keep the suffix: it tells the type of the file.
-    write_whole(path, lambda part: write(part, pictures))
+    write_whole(path, lambda part: (_write_gif if is_gif else _write_mp4)(part, pictures))
 
 
 def _write_mp4(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
-    import cv2
-
     first = next(pictures)
     height, width = first.shape[:2]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'mp4v'), RATE, (width, height))
     try:
         if not writer.isOpened():
             raise OSError(f'{path}: cannot be written as a video')
-        writer.write(np.ascontiguousarray(first[:, :, ::-1]))
-        for picture in pictures:
-            writer.write(np.ascontiguousarray(picture[:, :, ::-1]))
+        # Encoded beside drawing.
+        with ThreadPoolExecutor(1) as encoder:
+            done = encoder.submit(writer.write, cv2.cvtColor(first, cv2.COLOR_RGB2BGR))
+            for picture in pictures:
+                turned = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+                done.result()
+                done = encoder.submit(writer.write, turned)
     finally:
         writer.release()
 
@@ -108,161 +140,245 @@ def _write_gif(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
     from PIL import Image
 
     frames = [Image.fromarray(item).quantize(64, Image.Quantize.MEDIANCUT) for item in pictures]
+    period = 1000 // GIF_RATE
     frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=1000 // RATE, loop=0, optimize=True
+        path, save_all=True, append_images=frames[1:], duration=period, loop=0, optimize=True
     )
 
 
-def _pictures(log: EventLog, speed: float) -> Iterator[NDArray[np.uint8]]:
+def _pictures(
+    log: EventLog, speed: float, rate: int, progress: Callable[[float], object]
+) -> Iterator[NDArray[np.uint8]]:
     """Yield pictures of the run, (height, width, 3)."""
     now = Moments(log)
     places = [event[3][:2] for event in log.events if event[1] == 'robot'] or [[0, 0], [1, 1]]
     extent = [np.min(places, axis=0) - 1.0, np.max(places, axis=0) + 1.0]
-    bounds = np.array(log.scene.get('bounds') or np.transpose(extent))
-    figure = Figure(figsize=_SIZE, dpi=_RESOLUTION, layout='constrained')
-    canvas = FigureCanvasAgg(figure)
-    picture = np.zeros((1, 1, 3), np.uint8)
-    for index in range(max(1, math.ceil(log.duration / speed * RATE)) + 1):
-        now.advance(min(index * speed / RATE, log.duration))
-        figure.clear()
-        _draw(figure.add_subplot(projection='3d' if len(bounds) == 3 else None), now, bounds)
-        canvas.draw()
-        picture = np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+    sheet = Sheet(np.array(log.scene.get('bounds') or np.transpose(extent)), now)
+    duration = log.duration
+    count = max(1, math.ceil(duration / speed * rate)) + 1
+    for index in range(count):
+        now.advance(min(index * speed / rate, duration))
+        picture = sheet.draw(now)
         yield picture
-    for _ in range(round(_HOLD * RATE)):
+        progress((index + 1) / count)
+    for _ in range(round(_HOLD * rate)):
         yield picture
 
 
-def _draw(axes: Any, now: Moments, bounds: NDArray[np.float64]) -> None:
-    size = len(bounds)
-    for name, limits in zip('xyz', bounds):
-        axes.set(**{f'{name}lim': limits, f'{name}label': f'{name} [m]'})
-    if size == 3:
-        # Labels of the axes need room.
-        axes.set_box_aspect(bounds[:, 1] - bounds[:, 0], zoom=0.9)
-        _draw_boxes(axes, now)
-    else:
-        axes.set_aspect('equal')
-        _draw_floor(axes, now)
-    _draw_targets(axes, now, size)
-    for name, colour in robot_colours(now.robots).items():
-        if name in now.last['robot']:
-            _draw_robot(axes, now, name, colour, bounds)
-    axes.set_title(now.title())
+class Sheet:
+    """Axes on which a run is drawn: what moves, on a ground that is kept while it holds."""
 
-
-def _plot(axes: Any, places: ArrayLike, size: int, style: str, **options: Any) -> None:
-    """Draw places (n, 3) [m]; in the plane without their height."""
-    axes.plot(*np.asarray(places, dtype=float).reshape(-1, 3)[:, :size].T, style, **options)
-
-
-def _draw_floor(axes: Any, now: Moments) -> None:
-    for event in list(now.last['map'].values())[:1]:
-        (x, y, _), (dx, dy, _), (nx, ny, _), digits = event[3:7]
-        values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
-        extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
-        axes.imshow(values, origin='lower', extent=extent, cmap='Greys', vmin=0, vmax=24)
-    kept = max((robot.get('clearance', 0.0) for robot in now.scene['robots'].values()), default=0.0)
-    for *centre, radius in now.scene.get('obstacles', []):
-        axes.add_patch(Circle(centre[:2], radius, color='#59636e'))
-        if kept:
-            axes.add_patch(Circle(centre[:2], radius + kept, fill=False, ls='--', ec='#59636e'))
-
-
-def _draw_boxes(axes: Any, now: Moments) -> None:
-    """Draw buildings and cuboids, and lines between robots of which one hears the other."""
-    for key, colour, alpha in (('objects', OBJECT, 0.35), ('blocks', OBSTACLE, 0.6)):
-        for box in now.scene.get(key, []):
-            draw_box(axes, np.array(box), colour, alpha, '')
-    for number, box in enumerate(now.scene.get('cuboids', [])):
-        style = (VISITED, 0.12) if number in now.visited else (OPEN, 0.35)
-        draw_box(axes, np.array(box), *style, '')
-    places = {name: way[-1] for name, way in now.ways.items()}
-    for name, event in now.last['cuboid'].items():
-        for other in event[6]:
-            if name in places and other in places:
-                _plot(axes, [places[name], places[other]], 3, ':', color='0.3', lw=1.0)
-
-
-def _draw_targets(axes: Any, now: Moments, size: int) -> None:
-    for event in now.last['truth'].values():
-        _plot(axes, event[3], size, 'x', color='0.2', ms=6)
-    for event in now.last['filter'].values():
-        for x, y, z, mass, *covariance in event[4]:
-            _mark(axes, (x, y, z)[:size], covariance, 2.0, POTENTIAL, min(0.3 + mass, 1.0))
-    for event in now.last['found'].values():
-        for number, x, y, z, covariance, *_ in event[3]:
-            _mark(axes, (x, y, z)[:size], covariance, 3.0, FOUND, 1.0)
-            axes.text(*(x, y, z)[:size], f'  {number}', fontsize=8)
-    for *_, place, detections in now.seen:
-        for reach, bearing, elevation, *_ in detections:
-            level = math.cos(elevation)
-            ray = level * math.cos(bearing), level * math.sin(bearing), math.sin(elevation)
-            _plot(axes, np.add(place, np.multiply(reach, ray)), size, '+', color=SEEN, ms=6)
-
-
-def _mark(
-    axes: Any,
-    place: tuple[float, ...],
-    covariance: list[float],
-    deviations: float,
-    colour: str,
-    alpha: float,
-) -> None:
-    """Draw a place; in the plane with the ellipse of its covariance."""
-    axes.plot(*np.array(place)[:, None], 'o', color=colour, ms=4, alpha=alpha)
-    if len(place) == 2:
-        xx, xy, _, yy, *_ = covariance
-        spread, style = np.array([[xx, xy], [xy, yy]]), {'color': colour, 'alpha': alpha}
-        axes.add_patch(ellipse((place[0], place[1]), spread, deviations, 0.0, **style))
-
-
-def _draw_robot(
-    axes: Any, now: Moments, name: str, colour: str, bounds: NDArray[np.float64]
-) -> None:
-    size, robot = len(bounds), now.scene.get('robots', {}).get(name, {})
-    (*place, yaw), _, status = now.last['robot'][name][3:6]
-    away = status in (UNAVAILABLE, LEFT, SILENT)
-    if status != LEFT:
-        _plot(axes, now.ways[name], size, '-', color=colour, lw=1.3)
-    colour = AWAY if away else colour
-    if status == MOVING:
-        _plot(axes, now.last['way'].get(name, [[]])[-1], size, '--', color=colour, lw=1.3)
-        waypoint = now.waypoints.get(name) or []
-        _plot(axes, waypoint, size, 's', color=colour, ms=8, mfc='none')
-    if size == 3 and not away:
-        # How high it is.
-        x, y, z = place
-        axes.plot([x, x], [y, y], [bounds[2, 0], z], ':', color=colour, lw=0.8)
-    elif 'view' in robot and not away:
-        axes.add_patch(_view(robot['view'], place, yaw, colour))
-    # From above it points ahead.
-    arrow = [[1.4, 0.0], [-0.9, 0.8], [-0.5, 0.0], [-0.9, -0.8], [1.4, 0.0]]
-    marker: Any = 'D' if size == 3 else Outline(arrow @ _turn(yaw))
-    _plot(axes, place, size, '', marker=marker, color=colour, ms=8 if size == 3 else 16)
-    label = f'   {name}' + (' (left)' if status == LEFT else '')
-    axes.text(*place[:size], label, fontsize=9, weight='bold')
-    if 'fence' in robot:
-        (left, right), (low, high), _ = robot['fence']
+    def __init__(self, bounds: FloatArray, now: Moments) -> None:
+        self.bounds = bounds
+        self.size = size = len(bounds)
+        self._robots: dict[str, Any] = now.scene.get('robots', {})
+        self._colours = robot_colours(now.robots)
+        figure = Figure(figsize=_SIZE, dpi=_RESOLUTION, layout='constrained')
+        self._canvas = FigureCanvasAgg(figure)
+        self._axes: Any = figure.add_subplot(projection='3d' if size == 3 else None)
+        for name, limits in zip('xyz', bounds):
+            self._axes.set(**{f'{name}lim': limits, f'{name}label': f'{name} [m]'})
         if size == 3:
-            draw_box(axes, np.array(robot['fence']), colour, 0.05, '')
+            # Labels of the axes need room.
+            self._axes.set_box_aspect(bounds[:, 1] - bounds[:, 0], zoom=0.9)
         else:
-            line: Any = {'fill': False, 'ec': colour, 'ls': '-.', 'lw': 0.9, 'alpha': 0.7}
-            axes.add_patch(Rectangle((left, low), right - left, high - low, **line))
+            self._axes.set_aspect('equal')
+        self._add_legend(now.scene)
+        self._title = self._axes.set_title(now.title(), animated=True)
+        # All that is ever drawn, by its name; and what is drawn now, in this order.
+        self._made: dict[tuple[Any, ...], Any] = {}
+        self._drawn: list[Any] = []
+        # Once: the axes and the legend. On them is the ground, and what that shows.
+        self._canvas.draw()
+        self._axes_alone = self._ground = self._canvas.copy_from_bbox(figure.bbox)
+        self._shown: list[Any] = []
+
+    def draw(self, now: Moments) -> NDArray[np.uint8]:
+        """Return a picture of what holds now, (height, width, 3)."""
+        last = now.last
+        shown = [len(now.visited), *last['map'].values(), *last['found'].values()]
+        shown += last['truth'].values()
+        if shown != self._shown:
+            self._shown = shown
+            (self._draw_boxes if self.size == 3 else self._draw_floor)(now)
+            self._draw_still(now)
+            self._flush(self._axes_alone)
+            self._ground = self._canvas.copy_from_bbox(self._canvas.figure.bbox)
+        self._title.set_text(now.title())
+        self._drawn.append(self._title)
+        self._draw_moving(now)
+        for name in self._colours:
+            if name in last['robot']:
+                self._draw_robot(now, name)
+        self._flush(self._ground)
+        return cv2.cvtColor(np.asarray(self._canvas.buffer_rgba()), cv2.COLOR_RGBA2RGB)
+
+    def _flush(self, ground: Any) -> None:
+        """Draw what waits on a ground; what is solid in space from the back."""
+        self._canvas.restore_region(ground)
+        self._drawn.sort(key=lambda item: -getattr(item, 'do_3d_projection', lambda: -math.inf)())
+        for artist in self._drawn:
+            self._axes.draw_artist(artist)
+        self._drawn.clear()
+
+    def _use(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+        """Have something drawn, and return it; it is made where it is not there yet."""
+        if key not in self._made:
+            self._made[key] = make()
+        self._drawn.append(self._made[key])
+        return self._made[key]
+
+    def _line(self, key: tuple[Any, ...], places: ArrayLike, style: str, **options: Any) -> None:
+        """Draw places (n, 2 or 3) [m]; in the plane without their height."""
+        points = np.asarray(places, dtype=float)
+        points = points.reshape(-1, points.shape[-1] if points.ndim > 1 else 3)[:, : self.size].T
+        line = self._use((*key, style), lambda: self._axes.plot(*points, style, **options)[0])
+        (line.set_data_3d if self.size == 3 else line.set_data)(*points)
+        line.set(**options)
+
+    def _text(self, key: tuple[Any, ...], place: list[float], text: str, **options: Any) -> None:
+        at = place[: self.size]
+        label = self._use((*key, 'text'), lambda: self._axes.text(*at, text, **options))
+        label.set_text(text)
+        (label.set_position_3d if self.size == 3 else label.set_position)(at)
+
+    def _draw_floor(self, now: Moments) -> None:
+        """Draw map, obstacles and fences."""
+        axes = self._axes
+        for event in [*now.last['map'].values()][:1]:
+            (x, y, _), (dx, dy, _), (nx, ny, _), digits = event[3:7]
+            values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
+            extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
+            shades: Any = {'origin': 'lower', 'cmap': 'Greys', 'vmin': 0, 'vmax': 24}
+            self._drawn.append(axes.imshow(values, extent=extent, **shades))
+        kept = max((robot.get('clearance', 0.0) for robot in self._robots.values()), default=0.0)
+        for *centre, radius in now.scene.get('obstacles', []):
+            place = centre[:2]
+            self._drawn.append(axes.add_patch(Circle(place, radius, color=_SOLID)))
+            if kept:
+                self._line(('kept', *place), (radius + kept) * _CIRCLE + place, '--', color=_SOLID)
+        for name, colour in self._colours.items():
+            if 'fence' in self._robots.get(name, {}):
+                (left, right), (low, high), _ = self._robots[name]['fence']
+                corners = [(left, low), (right, low), (right, high), (left, high), (left, low)]
+                self._line((name, 'fence'), corners, '-.', color=colour, lw=0.9, alpha=0.7)
+
+    def _draw_boxes(self, now: Moments) -> None:
+        """Draw buildings, cuboids and fences."""
+        boxes = [(box, OBJECT, 0.35) for box in now.scene.get('objects', [])]
+        boxes += [(box, OBSTACLE, 0.6) for box in now.scene.get('blocks', [])]
+        for number, box in enumerate(now.scene.get('cuboids', [])):
+            boxes.append((box, *((VISITED, 0.12) if number in now.visited else (OPEN, 0.35))))
+        for name, colour in self._colours.items():
+            if 'fence' in self._robots.get(name, {}):
+                boxes.append((self._robots[name]['fence'], colour, 0.05))
+        for number, (box, *style) in enumerate(boxes):
+            key = 'box', number, *style
+            self._use(key, lambda box=box, style=style: draw_box(self._axes, box, *style, ''))
+
+    def _draw_still(self, now: Moments) -> None:
+        """Draw true and found targets."""
+        for event in now.last['truth'].values():
+            self._line(('truth',), event[3], 'x', color='0.2', ms=6)
+        for space, event in now.last['found'].items():
+            for number, *place, covariance, _, _ in event[3]:
+                self._mark(('found', space, number), place, covariance, 3.0, color=FOUND)
+                self._text(('found', space, number), place, f'  {number}', fontsize=8)
+
+    def _mark(
+        self,
+        key: tuple[Any, ...],
+        place: list[float],
+        covariance: list[float],
+        deviations: float,
+        **style: Any,
+    ) -> None:
+        """Draw a place; in the plane with the ellipse of its covariance."""
+        self._line(key, place, 'o', ms=4, **style)
+        if self.size == 2:
+            xx, xy, _, yy, *_ = covariance
+            # The root of the covariance by Cholesky.
+            first = math.sqrt(max(xx, 1e-12))
+            other = math.sqrt(max(yy - (xy / first) ** 2, 0.0))
+            ring = _CIRCLE @ np.array([[first, xy / first], [0.0, other]])
+            self._line(key, place[:2] + deviations * ring, '-', lw=1.0, **style)
+
+    def _draw_moving(self, now: Moments) -> None:
+        """Draw lines between robots of which one hears the other, and what filters expect."""
+        places = {name: way[-1] for name, way in now.ways.items()}
+        for name, event in now.last['cuboid'].items():
+            for other in event[6]:
+                if name in places and other in places:
+                    ends = [places[name], places[other]]
+                    self._line((name, other), ends, ':', color='0.3', lw=1.0)
+        for space, event in now.last['filter'].items():
+            for number, (*place, mass, xx, xy, xz, yy, yz, zz) in enumerate(event[4]):
+                style: Any = {'color': POTENTIAL, 'alpha': min(0.3 + mass, 1.0)}
+                covariance = [xx, xy, xz, yy, yz, zz]
+                self._mark(('potential', space, number), place, covariance, 2.0, **style)
+        seen = []
+        for *_, place, detections in now.seen:
+            for reach, bearing, elevation, *_ in detections:
+                level = math.cos(elevation)
+                ray = level * math.cos(bearing), level * math.sin(bearing), math.sin(elevation)
+                seen.append(np.add(place, np.multiply(reach, ray)))
+        self._line(('seen',), seen, '+', color=SEEN, ms=6)
+
+    def _draw_robot(self, now: Moments, name: str) -> None:
+        size, robot = self.size, self._robots.get(name, {})
+        (*place, yaw), _, status = now.last['robot'][name][3:6]
+        away, colour = status in (UNAVAILABLE, LEFT, SILENT), self._colours[name]
+        if status != LEFT:
+            way = now.ways[name]
+            way = [*way[:: math.ceil(len(way) / _MOST_POINTS)], way[-1]]
+            self._line((name,), way, '-', color=colour, lw=1.3)
+        colour = AWAY if away else colour
+        if status == MOVING:
+            plan = now.last['way'].get(name, [[]])[-1]
+            self._line((name,), plan, '--', color=colour, lw=1.3)
+            waypoint = now.waypoints.get(name) or []
+            self._line((name,), waypoint, 's', color=colour, ms=8, mfc='none')
+        if size == 3 and not away:
+            # How high it is.
+            foot = [*place[:2], self.bounds[2, 0]]
+            self._line((name,), [foot, place], ':', color=colour, lw=0.8)
+        elif 'view' in robot and not away:
+            outline = _view(robot['view'], place, yaw)
+            style: Any = {'ec': colour, 'fc': (*to_rgb(colour), 0.12), 'ls': ':'}
+            view = self._use((name, 'view'), lambda: self._axes.fill(*outline.T, **style)[0])
+            view.set_xy(outline)
+        # From above it points ahead.
+        arrow = [[1.4, 0.0], [-0.9, 0.8], [-0.5, 0.0], [-0.9, -0.8], [1.4, 0.0]]
+        marker: Any = 'D' if size == 3 else Outline(arrow @ _turn(yaw))
+        self._line((name,), place, '', marker=marker, color=colour, ms=8 if size == 3 else 16)
+        label = f'   {name}' + (' (left)' if status == LEFT else '')
+        self._text((name,), place, label, fontsize=9, weight='bold')
+
+    def _add_legend(self, scene: Scene) -> None:
+        kinds = {'', 'cuboids' if scene.get('cuboids') else 'targets'}
+        kinds |= {'floor'} if self.size == 2 else set()
+        kinds |= {'obstacles'} if self.size == 2 and scene.get('obstacles') else set()
+        kinds |= {'fence'} if any('fence' in robot for robot in self._robots.values()) else set()
+        robots = [(name, '', '>-', colour) for name, colour in self._colours.items()]
+        for text, kind, style, colour in (*robots, *_LEGEND):
+            if kind in kinds:
+                face = {'mfc': 'none'} if text == 'waypoint' else {}
+                none: list[list[float]] = [[]] * self.size
+                self._axes.plot(*none, style, color=colour, label=text, ms=8, **face)
+        place: Any = {'loc': 'outside right upper', 'frameon': False, 'fontsize': 9}
+        self._axes.figure.legend(**place)
 
 
-def _turn(yaw: float) -> NDArray[np.float64]:
+def _turn(yaw: float) -> FloatArray:
     """Return what turns rows x, y by a yaw [rad]."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return np.array([[cos, sin], [-sin, cos]])
 
 
-def _view(view: dict[str, Any], place: list[float], yaw: float, colour: str) -> Any:
-    """Return the outline of a field of view from above."""
-    style: Any = {'ec': colour, 'fc': (*to_rgb(colour), 0.12), 'ls': ':'}
+def _view(view: dict[str, Any], place: list[float], yaw: float) -> FloatArray:
+    """Return the outline of a field of view from above, (n, 2) [m]."""
     if view['kind'] != 'box':
-        wide, high = view['size'][:2]
-        return Ellipse((place[0], place[1]), 2.0 * wide, 2.0 * high, **style)
+        return np.asarray(_CIRCLE * view['size'][:2] + place[:2])
     (left, low), (right, high) = view['lower'][:2], view['upper'][:2]
     corners = np.array([[left, low], [right, low], [right, high], [left, high]])
-    return Polygon(corners @ _turn(yaw if view['turns'] else 0.0) + place[:2], **style)
+    return np.asarray(corners @ _turn(yaw if view['turns'] else 0.0) + place[:2])
