@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -37,23 +38,23 @@ _FADE = 1.0
 _MOST_POINTS = 600
 _CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 40)) for f in (np.cos, np.sin)], axis=1)
 _SOLID = '#59636E'
-# Texts, where they belong to, marks and colours.
+# Where they are shown, texts, marks and colours.
 _LEGEND = (
-    ('left or cannot go on', '', '>', AWAY),
-    ('planned way', '', '--', PALE),
-    ('waypoint', 'targets', 's', PALE),
-    ('field of view', 'floor', ':', PALE),
-    ('not explored', 'floor', 's', UNSEEN),
-    ('found, 3 sigma', 'targets', 'o', FOUND),
-    ('potential, 2 sigma', 'targets', 'o', POTENTIAL),
-    ('detection', 'targets', '+', SEEN),
-    ('true target', 'targets', 'x', '0.2'),
-    ('obstacle', 'obstacles', 'o', _SOLID),
-    ('geofence', 'fence', '-.', PALE),
-    ('cuboid to visit', 'cuboids', 's', OPEN),
-    ('cuboid visited', 'cuboids', 's', VISITED),
-    ('building', 'cuboids', 's', OBJECT),
-    ('radio link', 'cuboids', ':', '0.3'),
+    ('', 'left or cannot go on', '>', AWAY),
+    ('', 'planned way', '--', PALE),
+    ('targets', 'waypoint', 's', PALE),
+    ('floor', 'field of view', ':', PALE),
+    ('floor', 'not explored', 's', UNSEEN),
+    ('targets', 'found, 3 sigma', 'o', FOUND),
+    ('targets', 'potential, 2 sigma', 'o', POTENTIAL),
+    ('targets', 'detection', '+', SEEN),
+    ('targets', 'true target', 'x', '0.2'),
+    ('obstacles', 'obstacle', 'o', _SOLID),
+    ('fence', 'geofence', '-.', PALE),
+    ('cuboids', 'cuboid to visit', 's', OPEN),
+    ('cuboids', 'cuboid visited', 's', VISITED),
+    ('cuboids', 'building', 's', OBJECT),
+    ('cuboids', 'radio link', ':', '0.3'),
 )
 
 
@@ -175,43 +176,44 @@ class Sheet:
         self._colours = robot_colours(now.robots)
         figure = Figure(figsize=_SIZE, dpi=_RESOLUTION, layout='constrained')
         self._canvas = FigureCanvasAgg(figure)
-        self._axes: Any = figure.add_subplot(projection='3d' if size == 3 else None)
+        axes: Any = figure.add_subplot(projection='3d' if size == 3 else None)
         for name, limits in zip('xyz', bounds):
-            self._axes.set(**{f'{name}lim': limits, f'{name}label': f'{name} [m]'})
+            axes.set(**{f'{name}lim': limits, f'{name}label': f'{name} [m]'})
         if size == 3:
             # Labels of the axes need room.
-            self._axes.set_box_aspect(bounds[:, 1] - bounds[:, 0], zoom=0.9)
+            axes.set_box_aspect(np.ptp(bounds, axis=1), zoom=0.9)
         else:
-            self._axes.set_aspect('equal')
+            axes.set_aspect('equal')
+        self._axes = axes
         self._add_legend(now.scene)
-        self._title = self._axes.set_title(now.title(), animated=True)
-        # All that is ever drawn, by its name; and what is drawn now, in this order.
-        self._made: dict[tuple[Any, ...], Any] = {}
+        self._title = axes.set_title(now.title(), animated=True)
+        # Artists by kind, which are used again; how many of a kind are in use; what is to be drawn.
+        self._pool: dict[str, list[Any]] = defaultdict(list)
+        self._used: Counter[str] = Counter()
         self._drawn: list[Any] = []
-        # Once: the axes and the legend. On them is the ground, and what that shows.
+        # Drawn once: the axes and the legend. On them is the ground, and what that shows.
         self._canvas.draw()
         self._axes_alone = self._ground = self._canvas.copy_from_bbox(figure.bbox)
         self._shown: list[Any] = []
 
     def draw(self, now: Moments) -> NDArray[np.uint8]:
-        """Return a picture of what holds now, (height, width, 3)."""
-        last = now.last
-        shown = [len(now.visited), *last['map'].values(), *last['found'].values()]
-        shown += last['truth'].values()
+        """Return a picture of what holds now, (height, width, 3), until the next."""
+        kinds = (now.last[kind].values() for kind in ('map', 'truth', 'found'))
+        shown = [len(now.visited), *chain.from_iterable(kinds)]
         if shown != self._shown:
             self._shown = shown
             (self._draw_boxes if self.size == 3 else self._draw_floor)(now)
-            self._draw_still(now)
+            self._draw_known(now)
             self._flush(self._axes_alone)
             self._ground = self._canvas.copy_from_bbox(self._canvas.figure.bbox)
         self._title.set_text(now.title())
         self._drawn.append(self._title)
-        self._draw_moving(now)
-        for name in self._colours:
-            if name in last['robot']:
-                self._draw_robot(now, name)
+        self._draw_expected(now)
+        for name, colour in self._colours.items():
+            if name in now.last['robot']:
+                self._draw_robot(now, name, colour)
         self._flush(self._ground)
-        return cv2.cvtColor(np.asarray(self._canvas.buffer_rgba()), cv2.COLOR_RGBA2RGB)
+        return np.asarray(self._canvas.buffer_rgba())[:, :, :3]
 
     def _flush(self, ground: Any) -> None:
         """Draw what waits on a ground; what is solid in space from the back."""
@@ -220,153 +222,141 @@ class Sheet:
         for artist in self._drawn:
             self._axes.draw_artist(artist)
         self._drawn.clear()
+        self._used.clear()
 
-    def _use(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
-        """Have something drawn, and return it; it is made where it is not there yet."""
-        if key not in self._made:
-            self._made[key] = make()
-        self._drawn.append(self._made[key])
-        return self._made[key]
+    def _next(self, kind: str, make: Callable[[], Any]) -> Any:
+        """Have an artist of a kind drawn, and return it; it is made where none is free."""
+        pool, number = self._pool[kind], self._used[kind]
+        if number == len(pool):
+            pool.append(make())
+        self._used[kind] += 1
+        self._drawn.append(pool[number])
+        return pool[number]
 
-    def _line(self, key: tuple[Any, ...], places: ArrayLike, style: str, **options: Any) -> None:
+    def _line(self, places: ArrayLike, style: str, **options: Any) -> None:
         """Draw places (n, 2 or 3) [m]; in the plane without their height."""
         points = np.asarray(places, dtype=float)
         points = points.reshape(-1, points.shape[-1] if points.ndim > 1 else 3)[:, : self.size].T
-        line = self._use((*key, style), lambda: self._axes.plot(*points, style, **options)[0])
+        line = self._next(style, lambda: self._axes.plot(*points, style)[0])
         (line.set_data_3d if self.size == 3 else line.set_data)(*points)
-        line.set(**options)
+        line.set(**{'alpha': 1.0, 'mfc': options['color'], **options})
 
-    def _text(self, key: tuple[Any, ...], place: list[float], text: str, **options: Any) -> None:
-        at = place[: self.size]
-        label = self._use((*key, 'text'), lambda: self._axes.text(*at, text, **options))
-        label.set_text(text)
-        (label.set_position_3d if self.size == 3 else label.set_position)(at)
+    def _text(self, place: list[float], text: str, **options: Any) -> None:
+        label = self._next('text', lambda: self._axes.text(*place[: self.size], text))
+        (label.set_position_3d if self.size == 3 else label.set_position)(place[: self.size])
+        label.set(text=text, **options)
 
-    def _draw_floor(self, now: Moments) -> None:
-        """Draw map, obstacles and fences."""
-        axes = self._axes
-        for event in [*now.last['map'].values()][:1]:
-            (x, y, _), (dx, dy, _), (nx, ny, _), digits = event[3:7]
-            values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
-            extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
-            shades: Any = {'origin': 'lower', 'cmap': 'Greys', 'vmin': 0, 'vmax': 24}
-            self._drawn.append(axes.imshow(values, extent=extent, **shades))
-        kept = max((robot.get('clearance', 0.0) for robot in self._robots.values()), default=0.0)
-        for *centre, radius in now.scene.get('obstacles', []):
-            place = centre[:2]
-            self._drawn.append(axes.add_patch(Circle(place, radius, color=_SOLID)))
-            if kept:
-                self._line(('kept', *place), (radius + kept) * _CIRCLE + place, '--', color=_SOLID)
-        for name, colour in self._colours.items():
-            if 'fence' in self._robots.get(name, {}):
-                (left, right), (low, high), _ = self._robots[name]['fence']
-                corners = [(left, low), (right, low), (right, high), (left, high), (left, low)]
-                self._line((name, 'fence'), corners, '-.', color=colour, lw=0.9, alpha=0.7)
-
-    def _draw_boxes(self, now: Moments) -> None:
-        """Draw buildings, cuboids and fences."""
-        boxes = [(box, OBJECT, 0.35) for box in now.scene.get('objects', [])]
-        boxes += [(box, OBSTACLE, 0.6) for box in now.scene.get('blocks', [])]
-        for number, box in enumerate(now.scene.get('cuboids', [])):
-            boxes.append((box, *((VISITED, 0.12) if number in now.visited else (OPEN, 0.35))))
-        for name, colour in self._colours.items():
-            if 'fence' in self._robots.get(name, {}):
-                boxes.append((self._robots[name]['fence'], colour, 0.05))
-        for number, (box, *style) in enumerate(boxes):
-            key = 'box', number, *style
-            self._use(key, lambda box=box, style=style: draw_box(self._axes, box, *style, ''))
-
-    def _draw_still(self, now: Moments) -> None:
-        """Draw true and found targets."""
-        for event in now.last['truth'].values():
-            self._line(('truth',), event[3], 'x', color='0.2', ms=6)
-        for space, event in now.last['found'].items():
-            for number, *place, covariance, _, _ in event[3]:
-                self._mark(('found', space, number), place, covariance, 3.0, color=FOUND)
-                self._text(('found', space, number), place, f'  {number}', fontsize=8)
-
-    def _mark(
-        self,
-        key: tuple[Any, ...],
-        place: list[float],
-        covariance: list[float],
-        deviations: float,
-        **style: Any,
-    ) -> None:
-        """Draw a place; in the plane with the ellipse of its covariance."""
-        self._line(key, place, 'o', ms=4, **style)
+    def _mark(self, row: list[float], deviations: float, **style: Any) -> None:
+        """Draw a place [m]; in the plane with the ellipse of its covariance."""
+        x, y, z, xx, xy, _, yy, *_ = row
+        self._line([x, y, z], 'o', ms=4, **style)
         if self.size == 2:
-            xx, xy, _, yy, *_ = covariance
             # The root of the covariance by Cholesky.
             first = math.sqrt(max(xx, 1e-12))
             other = math.sqrt(max(yy - (xy / first) ** 2, 0.0))
             ring = _CIRCLE @ np.array([[first, xy / first], [0.0, other]])
-            self._line(key, place[:2] + deviations * ring, '-', lw=1.0, **style)
+            self._line((x, y) + deviations * ring, '-', lw=1.0, **style)
 
-    def _draw_moving(self, now: Moments) -> None:
-        """Draw lines between robots of which one hears the other, and what filters expect."""
-        places = {name: way[-1] for name, way in now.ways.items()}
-        for name, event in now.last['cuboid'].items():
-            for other in event[6]:
-                if name in places and other in places:
-                    ends = [places[name], places[other]]
-                    self._line((name, other), ends, ':', color='0.3', lw=1.0)
-        for space, event in now.last['filter'].items():
-            for number, (*place, mass, xx, xy, xz, yy, yz, zz) in enumerate(event[4]):
+    def _draw_floor(self, now: Moments) -> None:
+        for event in list(now.last['map'].values())[:1]:
+            (x, y, _), (dx, dy, _), (nx, ny, _), digits = event[3:7]
+            values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
+            extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
+            shades: Any = {'origin': 'lower', 'cmap': 'Greys', 'vmin': 0, 'vmax': 24}
+            self._drawn.append(self._axes.imshow(values, extent=extent, **shades))
+        kept = max((robot.get('clearance', 0.0) for robot in self._robots.values()), default=0.0)
+        for *centre, radius in now.scene.get('obstacles', []):
+            self._drawn.append(self._axes.add_patch(Circle(centre[:2], radius, color=_SOLID)))
+            self._line(centre[:2] + (radius + kept) * _CIRCLE, '--', color=_SOLID, lw=1.0)
+
+    def _draw_boxes(self, now: Moments) -> None:
+        """Draw buildings and cuboids."""
+        for key, colour, alpha in (('objects', OBJECT, 0.35), ('blocks', OBSTACLE, 0.6)):
+            for box in now.scene.get(key, []):
+                self._box(box, colour, alpha)
+        for number, box in enumerate(now.scene.get('cuboids', [])):
+            self._box(box, *((VISITED, 0.12) if number in now.visited else (OPEN, 0.35)))
+
+    def _box(self, box: list[list[float]], colour: str, alpha: float) -> None:
+        sides = np.array(box)
+        self._next(f'{box} {alpha}', lambda: draw_box(self._axes, sides, colour, alpha, ''))
+
+    def _draw_known(self, now: Moments) -> None:
+        """Draw fences, and true and found targets."""
+        for name, colour in self._colours.items():
+            fence = self._robots.get(name, {}).get('fence')
+            if fence and self.size == 3:
+                self._box(fence, colour, 0.05)
+            elif fence:
+                box = _outline(*np.transpose(fence[:2]))
+                self._line(box, '-.', color=colour, lw=0.9, alpha=0.7)
+        for event in now.last['truth'].values():
+            self._line(event[3], 'x', color='0.2', ms=6)
+        for event in now.last['found'].values():
+            for number, x, y, z, covariance, *_ in event[3]:
+                self._mark([x, y, z, *covariance], 3.0, color=FOUND)
+                self._text([x, y, z], f'  {number}', fontsize=8, weight='normal')
+
+    def _draw_expected(self, now: Moments) -> None:
+        """Draw potential targets, detections, and lines to robots that one hears."""
+        for event in now.last['filter'].values():
+            for x, y, z, mass, *covariance in event[4]:
                 style: Any = {'color': POTENTIAL, 'alpha': min(0.3 + mass, 1.0)}
-                covariance = [xx, xy, xz, yy, yz, zz]
-                self._mark(('potential', space, number), place, covariance, 2.0, **style)
-        seen = []
+                self._mark([x, y, z, *covariance], 2.0, **style)
         for *_, place, detections in now.seen:
             for reach, bearing, elevation, *_ in detections:
                 level = math.cos(elevation)
                 ray = level * math.cos(bearing), level * math.sin(bearing), math.sin(elevation)
-                seen.append(np.add(place, np.multiply(reach, ray)))
-        self._line(('seen',), seen, '+', color=SEEN, ms=6)
+                self._line(np.add(place, np.multiply(reach, ray)), '+', color=SEEN, ms=6)
+        places = {name: way[-1] for name, way in now.ways.items()}
+        for name, event in now.last['cuboid'].items():
+            for other in places.keys() & {*event[6]} if name in places else ():
+                self._line([places[name], places[other]], ':', color='0.3', lw=1.0)
 
-    def _draw_robot(self, now: Moments, name: str) -> None:
+    def _draw_robot(self, now: Moments, name: str, colour: str) -> None:
         size, robot = self.size, self._robots.get(name, {})
         (*place, yaw), _, status = now.last['robot'][name][3:6]
-        away, colour = status in (UNAVAILABLE, LEFT, SILENT), self._colours[name]
+        away = status in (UNAVAILABLE, LEFT, SILENT)
         if status != LEFT:
             way = now.ways[name]
             way = [*way[:: math.ceil(len(way) / _MOST_POINTS)], way[-1]]
-            self._line((name,), way, '-', color=colour, lw=1.3)
+            self._line(way, '-', color=colour, lw=1.3)
         colour = AWAY if away else colour
         if status == MOVING:
-            plan = now.last['way'].get(name, [[]])[-1]
-            self._line((name,), plan, '--', color=colour, lw=1.3)
-            waypoint = now.waypoints.get(name) or []
-            self._line((name,), waypoint, 's', color=colour, ms=8, mfc='none')
+            self._line(now.last['way'].get(name, [[]])[-1], '--', color=colour, lw=1.3)
+            self._line(now.waypoints.get(name) or [], 's', color=colour, ms=8, mfc='none')
         if size == 3 and not away:
             # How high it is.
             foot = [*place[:2], self.bounds[2, 0]]
-            self._line((name,), [foot, place], ':', color=colour, lw=0.8)
+            self._line([foot, place], ':', color=colour, lw=0.8)
         elif 'view' in robot and not away:
             outline = _view(robot['view'], place, yaw)
-            style: Any = {'ec': colour, 'fc': (*to_rgb(colour), 0.12), 'ls': ':'}
-            view = self._use((name, 'view'), lambda: self._axes.fill(*outline.T, **style)[0])
-            view.set_xy(outline)
+            view = self._next('view', lambda: self._axes.fill(*outline.T, ls=':')[0])
+            view.set(xy=outline, ec=colour, fc=(*to_rgb(colour), 0.12))
         # From above it points ahead.
         arrow = [[1.4, 0.0], [-0.9, 0.8], [-0.5, 0.0], [-0.9, -0.8], [1.4, 0.0]]
         marker: Any = 'D' if size == 3 else Outline(arrow @ _turn(yaw))
-        self._line((name,), place, '', marker=marker, color=colour, ms=8 if size == 3 else 16)
+        self._line(place, '', marker=marker, color=colour, ms=8 if size == 3 else 16)
         label = f'   {name}' + (' (left)' if status == LEFT else '')
-        self._text((name,), place, label, fontsize=9, weight='bold')
+        self._text(place, label, fontsize=9, weight='bold')
 
     def _add_legend(self, scene: Scene) -> None:
-        kinds = {'', 'cuboids' if scene.get('cuboids') else 'targets'}
-        kinds |= {'floor'} if self.size == 2 else set()
-        kinds |= {'obstacles'} if self.size == 2 and scene.get('obstacles') else set()
-        kinds |= {'fence'} if any('fence' in robot for robot in self._robots.values()) else set()
-        robots = [(name, '', '>-', colour) for name, colour in self._colours.items()]
-        for text, kind, style, colour in (*robots, *_LEGEND):
-            if kind in kinds:
-                face = {'mfc': 'none'} if text == 'waypoint' else {}
-                none: list[list[float]] = [[]] * self.size
-                self._axes.plot(*none, style, color=colour, label=text, ms=8, **face)
-        place: Any = {'loc': 'outside right upper', 'frameon': False, 'fontsize': 9}
-        self._axes.figure.legend(**place)
+        flat, of_buildings = self.size == 2, bool(scene.get('cuboids'))
+        shown = {
+            '': True,
+            'cuboids': of_buildings,
+            'targets': not of_buildings,
+            'floor': flat,
+            'obstacles': flat and bool(scene.get('obstacles')),
+            'fence': any('fence' in robot for robot in self._robots.values()),
+        }
+        robots = [('', name, '>-', colour) for name, colour in self._colours.items()]
+        for kind, text, style, colour in (*robots, *_LEGEND):
+            if shown[kind]:
+                face = 'none' if text == 'waypoint' else colour
+                none: list[Any] = [[]] * self.size
+                self._axes.plot(*none, style, color=colour, label=text, ms=8, mfc=face)
+        self._axes.figure.legend(loc='outside right upper', frameon=False, fontsize=9)
 
 
 def _turn(yaw: float) -> FloatArray:
@@ -379,6 +369,11 @@ def _view(view: dict[str, Any], place: list[float], yaw: float) -> FloatArray:
     """Return the outline of a field of view from above, (n, 2) [m]."""
     if view['kind'] != 'box':
         return np.asarray(_CIRCLE * view['size'][:2] + place[:2])
-    (left, low), (right, high) = view['lower'][:2], view['upper'][:2]
-    corners = np.array([[left, low], [right, low], [right, high], [left, high]])
+    corners = _outline(*np.array([view['lower'][:2], view['upper'][:2]]))
     return np.asarray(corners @ _turn(yaw if view['turns'] else 0.0) + place[:2])
+
+
+def _outline(lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """Return the outline of a rectangle from its corners, (5, 2) [m]."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+    return np.asarray(lower + corners * (upper - lower))
