@@ -7,13 +7,9 @@ from collections import defaultdict, deque
 from collections.abc import Callable
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maasi_drivers.settings.camera import CameraSettings
-from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.images import decode_image, image_to_array
 from maasi_filter.models.pose import Pose
 from maasi_sim.run.bag import COMPRESSED_TYPE, IMAGE_TYPE
 
@@ -54,6 +50,13 @@ def picture(
     The camera is that of a scene; without it, the detections' places are not known. Values are
     range, bearing and elevation of detections, which are on the floor.
     """
+    # Deferred: they take long to import, and most runs show no picture.
+    import cv2
+
+    from maasi_drivers.settings.camera import CameraSettings
+    from maasi_drivers.vision.camera_model import Camera
+    from maasi_drivers.vision.images import decode_image, image_to_array
+
     image = image_to_array(message) if hasattr(message, 'encoding') else decode_image(message)
     height, width = image.shape[:2]
     size = min(width, _WIDTH), round(height * min(1.0, _WIDTH / width))
