@@ -10,7 +10,7 @@ robot       [x, y, z, yaw], battery (negative: unknown), goal status, reason; be
             AgentState: 6 it left, 7 it is silent, 8 the run has ended
 seen        [x, y, z] of the robot, detections [range, bearing, elevation, and a deviation of each]
 picture     JPEG in base64 of what its camera saw as it measured, [width, height] of the image [px],
-            detections in it [column, row, radius]
+            detections in it [column, row, radius], or null where they are not known
 filter      expected number, clusters [x, y, z, mass, covariance], measurements so far
 found       targets [id, x, y, z, covariance, robot, time]
 plan        planner, explored share, objective, reason, robots [name, index, chosen, waypoint,

@@ -62,7 +62,7 @@ def picture(
     size = min(width, _WIDTH), round(height * min(1.0, _WIDTH / width))
     small = cv2.resize(image[:, :, ::-1], size, interpolation=cv2.INTER_AREA)
     data = cv2.imencode('.jpg', small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    marks: list[Any] = []
+    marks: list[Any] | None = None
     if camera is not None:
         reach, bearing, elevation = np.reshape(np.asarray(values, dtype=float), (-1, 3)).T
         level, (x, y, _) = reach * np.cos(elevation), pose.position

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.path import Path as Outline
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from maasi_filter.arrays import FloatArray
+from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.colours import AWAY, FOUND, POTENTIAL, SEEN, robot_colours
 from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, draw_box
 from maasi_sim.run.report_panels import PALE, UNSEEN
@@ -27,6 +27,8 @@ from maasi_sim.run.run_folder import write_whole
 from maasi_sim.run.view.event_log import Event, EventLog, Scene
 from maasi_sim.run.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
+# Called with the share that is done.
+Progress = Callable[[float], object]
 # Pictures per second; GIFs would be large. Size [in] at a resolution [px/in].
 RATE, GIF_RATE = 30, 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80
@@ -106,29 +108,23 @@ class Moments:
         return f'{self.scene.get("name", "")}   {self.time:.1f} s   {word} {found}{of}'
 
 
-def write_video(
-    log: EventLog, path: Path, speed: float = 5.0, progress: Callable[[float], object] = float
-) -> None:
-    """Write a run as FILE.mp4 or FILE.gif, `speed` times as fast.
-
-    `progress` is called with the share of the pictures that is made.
-    """
-    is_gif = path.suffix == '.gif'
-    pictures = _pictures(log, speed, GIF_RATE if is_gif else RATE, progress)
+def write_video(log: EventLog, path: Path, speed: float = 5.0, progress: Progress = float) -> None:
+    """Write a run as FILE.mp4 or FILE.gif, `speed` times as fast."""
+    write, rate = (_write_gif, GIF_RATE) if path.suffix == '.gif' else (_write_mp4, RATE)
+    pictures = _pictures(log, speed, rate, progress)
     # Keep the suffix: it tells the type of the file.
-    write_whole(path, lambda part: (_write_gif if is_gif else _write_mp4)(part, pictures))
+    write_whole(path, lambda part: write(part, pictures))
 
 
-def _write_mp4(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
-    first = next(pictures)
-    height, width = first.shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'mp4v'), RATE, (width, height))
+def _write_mp4(path: Path, pictures: Iterator[ImageArray]) -> None:
+    size = round(_SIZE[0] * _RESOLUTION), round(_SIZE[1] * _RESOLUTION)
+    writer: Any = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'mp4v'), RATE, size)
     try:
         if not writer.isOpened():
             raise OSError(f'{path}: cannot be written as a video')
         # Encoded beside drawing.
         with ThreadPoolExecutor(1) as encoder:
-            done = encoder.submit(writer.write, cv2.cvtColor(first, cv2.COLOR_RGB2BGR))
+            done: Future[Any] = encoder.submit(int)
             for picture in pictures:
                 turned = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
                 done.result()
@@ -137,19 +133,17 @@ def _write_mp4(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
         writer.release()
 
 
-def _write_gif(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
+def _write_gif(path: Path, pictures: Iterator[ImageArray]) -> None:
     from PIL import Image
 
-    frames = [Image.fromarray(item).quantize(64, Image.Quantize.MEDIANCUT) for item in pictures]
-    period = 1000 // GIF_RATE
-    frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=period, loop=0, optimize=True
+    first, *rest = (
+        Image.fromarray(item).quantize(64, Image.Quantize.MEDIANCUT) for item in pictures
     )
+    every: Any = {'duration': 1000 // GIF_RATE, 'loop': 0, 'optimize': True}
+    first.save(path, save_all=True, append_images=rest, **every)
 
 
-def _pictures(
-    log: EventLog, speed: float, rate: int, progress: Callable[[float], object]
-) -> Iterator[NDArray[np.uint8]]:
+def _pictures(log: EventLog, speed: float, rate: int, progress: Progress) -> Iterator[ImageArray]:
     """Yield pictures of the run, (height, width, 3)."""
     now = Moments(log)
     places = [event[3][:2] for event in log.events if event[1] == 'robot'] or [[0, 0], [1, 1]]
@@ -196,7 +190,7 @@ class Sheet:
         self._axes_alone = self._ground = self._canvas.copy_from_bbox(figure.bbox)
         self._shown: list[Any] = []
 
-    def draw(self, now: Moments) -> NDArray[np.uint8]:
+    def draw(self, now: Moments) -> ImageArray:
         """Return a picture of what holds now, (height, width, 3), until the next."""
         kinds = (now.last[kind].values() for kind in ('map', 'truth', 'found'))
         shown = [len(now.visited), *chain.from_iterable(kinds)]
@@ -341,21 +335,17 @@ class Sheet:
         self._text(place, label, fontsize=9, weight='bold')
 
     def _add_legend(self, scene: Scene) -> None:
-        flat, of_buildings = self.size == 2, bool(scene.get('cuboids'))
-        shown = {
-            '': True,
-            'cuboids': of_buildings,
-            'targets': not of_buildings,
-            'floor': flat,
-            'obstacles': flat and bool(scene.get('obstacles')),
-            'fence': any('fence' in robot for robot in self._robots.values()),
-        }
+        kinds = {'', 'cuboids' if scene.get('cuboids') else 'targets'}
+        if self.size == 2:
+            kinds |= {'floor', 'obstacles' if scene.get('obstacles') else ''}
+        if any('fence' in robot for robot in self._robots.values()):
+            kinds.add('fence')
         robots = [('', name, '>-', colour) for name, colour in self._colours.items()]
         for kind, text, style, colour in (*robots, *_LEGEND):
-            if shown[kind]:
+            if kind in kinds:
                 face = 'none' if text == 'waypoint' else colour
-                none: list[Any] = [[]] * self.size
-                self._axes.plot(*none, style, color=colour, label=text, ms=8, mfc=face)
+                ends = np.zeros((self.size, 0))
+                self._axes.plot(*ends, style, color=colour, label=text, ms=8, mfc=face)
         self._axes.figure.legend(loc='outside right upper', frameon=False, fontsize=9)
 
 

@@ -3,25 +3,18 @@
 import { SEEN, robotColour } from './colours.js';
 import { element } from './text.js';
 
-const SVG = 'http://www.w3.org/2000/svg';
-
-function part(name, attributes) {
-  const made = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  return made;
+// A circle around a detection in an image.
+function detectionMark([width, height], [column, row, radius]) {
+  const mark = element('i');
+  const half = 1.4 * radius + width / 80;
+  mark.style.left = `${(100 * (column - half)) / width}%`;
+  mark.style.top = `${(100 * (row - half)) / height}%`;
+  mark.style.width = `${(200 * half) / width}%`;
+  mark.style.borderColor = SEEN;
+  return mark;
 }
 
-// Circles around detections.
-function circles([width, height], marks) {
-  const over = part('svg', { viewBox: `0 0 ${width} ${height}`, 'aria-hidden': 'true' });
-  for (const [x, y, radius] of marks) {
-    const style = { fill: 'none', stroke: SEEN, 'stroke-width': width / 80 };
-    over.append(part('circle', { cx: x, cy: y, r: 1.4 * radius + width / 80, ...style }));
-  }
-  return over;
-}
-
-function make(log, name) {
+function pictureFrame(log, name) {
   const figure = element('figure');
   figure.dataset.robot = name;
   const caption = element('figcaption');
@@ -39,18 +32,18 @@ export function showPictures(section, log, time, onSelect) {
   const key = `${log.scene.name} ${names} ${document.documentElement.dataset.theme}`;
   if (list.dataset.key !== key) {
     list.dataset.key = key;
-    list.replaceChildren(...names.map((name) => make(log, name)));
+    list.replaceChildren(...names.map((name) => pictureFrame(log, name)));
     for (const figure of list.children) figure.onclick = () => onSelect(figure.dataset.robot);
   }
-  for (const figure of list.children) show(figure, log.at('picture', figure.dataset.robot, time), time);
+  for (const figure of list.children) fillPicture(figure, log.at('picture', figure.dataset.robot, time), time);
 }
 
-function show(figure, event, time) {
-  const { length } = event ? event[5] : [];
-  const count = `${length} detection${length === 1 ? '' : 's'}`;
+function fillPicture(figure, event, time) {
+  const marks = event && event[5];
+  const count = marks ? `, ${marks.length} detection${marks.length === 1 ? '' : 's'}` : '';
   const seconds = event && Math.floor(time - event[0]);
   const age = seconds < 1 ? 'now' : `${seconds} s ago`;
-  const words = event ? `${age}, ${count}` : 'no picture yet';
+  const words = event ? age + count : 'no picture yet';
   const shown = figure.querySelector('.age');
   if (shown.textContent !== words) shown.textContent = words;
   const at = event ? String(event[0]) : '';
@@ -59,10 +52,10 @@ function show(figure, event, time) {
   const frame = figure.querySelector('.image');
   frame.replaceChildren();
   if (!event) return;
-  const [when, , robot, data, size, marks] = event;
+  const [when, , robot, data, size] = event;
   const image = element('img');
   [image.width, image.height] = size;
   image.src = `data:image/jpeg;base64,${data}`;
-  image.alt = `Camera of ${robot} at ${when.toFixed(1)} s: ${count}`;
-  frame.append(image, circles(size, marks));
+  image.alt = `Camera of ${robot} at ${when.toFixed(1)} s${count}`;
+  frame.append(image, ...(marks || []).map((mark) => detectionMark(size, mark)));
 }
