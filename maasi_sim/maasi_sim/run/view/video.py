@@ -257,7 +257,9 @@ class Sheet:
             values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
             extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
             shades: Any = {'origin': 'lower', 'cmap': 'Greys', 'vmin': 0, 'vmax': 24}
-            self._drawn.append(self._axes.imshow(values, extent=extent, **shades))
+            # The frame again, which the map covers.
+            image = self._axes.imshow(values, extent=extent, **shades)
+            self._drawn += [image, *self._axes.spines.values()]
         kept = max((robot.get('clearance', 0.0) for robot in self._robots.values()), default=0.0)
         for *centre, radius in now.scene.get('obstacles', []):
             self._drawn.append(self._axes.add_patch(Circle(centre[:2], radius, color=_SOLID)))
