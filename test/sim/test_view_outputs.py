@@ -13,12 +13,12 @@ from maasi_filter import colours
 from maasi_sim.run.bag import load_types
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.rviz_view import shown_topics
+from maasi_sim.run.view import view_run
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.page_file import FOLDER, write_replay
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.video import write_video
-from maasi_sim.run.view.view_run import main
 from maasi_sim.scenario.loading import config_folder
 from maasi_sim.search import search
 
@@ -61,7 +61,34 @@ def test_a_video_shows_the_run_move(tmp_path, suffix):
 
 def test_a_video_of_a_search_in_space(tmp_path):
     log = search(load_mission('ranging_drone_3d').scenario, 1).trace.log('drone')
-    assert frames(log, tmp_path / 'run.mp4')[0].shape == (576, 768, 3)
+    pictures = frames(log, tmp_path / 'run.mp4', log.duration)
+    assert pictures[0].shape == (576, 768, 3)
+    # A second, and two of the last picture.
+    assert len(pictures) == 31 + 60 and np.abs(pictures[0] - pictures[-1]).max() > 100
+
+
+def test_a_video_has_30_frames_a_second_a_legend_and_says_how_far_it_is(
+    departing, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(view_run, 'read_events', lambda *_: departing)
+    path = tmp_path / 'run.mp4'
+    assert view_run.main([str(tmp_path), '--video', str(path), '--speed', '2']) == 0
+    shown = capsys.readouterr()
+    assert shown.out == f'{path}\n' and re.search(r'^run\.mp4: \d+ %$', shown.err, re.MULTILINE)
+    video = cv2.VideoCapture(str(path))
+    assert video.get(cv2.CAP_PROP_FPS) == 30.0
+    # 3 s twice as fast, and 2 s of the last picture.
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 46 + 60
+    read, picture = video.read()
+    # Beside the map, whose frame is black, the robot, found and potential targets, in this order.
+    frame = np.flatnonzero((picture[100:400] < 60).all(axis=2).mean(axis=0) > 0.9)[-1]
+    rows = []
+    for colour in (colours.robot_colours(['mambo'])['mambo'], colours.FOUND, colours.POTENTIAL):
+        tint = np.array([*bytes.fromhex(colour[1:])][::-1])
+        near = np.abs(picture[:, frame + 5 :].astype(int) - tint).max(axis=2) < 40
+        assert read and near.sum() > 15, colour
+        rows.append(np.flatnonzero(near.any(axis=1)).mean())
+    assert rows == sorted(rows)
 
 
 def test_a_video_shows_where_a_robot_points_what_it_sees_and_where_it_goes(tmp_path):
@@ -104,7 +131,9 @@ def departing():
 
 def test_a_robot_that_left_goes_nowhere_in_a_video(departing, tmp_path):
     pictures = frames(departing, tmp_path / 'run.mp4', speed=1.0)
-    assert bluish(pictures[25]).sum() < 0.5 * bluish(pictures[15]).sum()
+    # The legend has a mark of its colour.
+    legend = bluish(pictures[0])[:, 600:].sum()
+    assert bluish(pictures[75]).sum() - legend < 0.1 * (bluish(pictures[45]).sum() - legend)
 
 
 @needs_chromium
@@ -286,7 +315,7 @@ def test_robots_have_the_colours_of_the_page():
 
 def test_a_video_of_another_kind_is_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
-        main([str(tmp_path), '--video', 'run.avi'])
+        view_run.main([str(tmp_path), '--video', 'run.avi'])
     assert 'allowed are FILE.mp4 and FILE.gif' in capsys.readouterr().err
 
 

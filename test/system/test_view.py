@@ -1,5 +1,9 @@
 """The page of a run in a browser: what it shows is what the bag and the report hold."""
 
+import base64
+import re
+
+import cv2
 import numpy as np
 import pytest
 import rclpy
@@ -15,7 +19,7 @@ from maasi_sim.run.topics import message_class
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.live_view import RunPage
 from maasi_sim.run.view.messages import is_shown, read_events
-from maasi_sim.run.view.page_file import REPLAY, write_replay
+from maasi_sim.run.view.page_file import REPLAY, empty_page, write_replay
 from maasi_sim.run.view.scene import empty_scene
 from maasi_sim.run.view.view_node import ViewNode
 from maasi_sim.run.view.view_run import main
@@ -32,6 +36,8 @@ def watch(run, address):
         shown.page.click('button[data-command=pause]')
         shown.until("/[^.]$/.test(document.querySelector('#controls [role=status]').innerText)")
         run.answer = shown.page.inner_text('#controls [role=status]')
+        shown.until("document.querySelectorAll('#cameras img').length === 2")
+        run.pictures = [image.get_attribute('alt') for image in shown.page.locator('img').all()]
         shown.until('document.body.dataset.connection === "ended"', PATIENCE)
         shown.page.keyboard.press('End')
         shown.settle()
@@ -143,6 +149,48 @@ def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run):
 
 
 @needs_chromium
+def test_pictures_of_the_cameras_have_circles_around_the_markers(run, tmp_path):
+    log = read_events(run.folder)
+    pictures = [event for event in log.events if event[1] == 'picture']
+    assert {event[2] for event in pictures} == {'mambo', 'turtlebot'}
+    assert all(re.match(r'Camera of \w+ at .* s, \d+ detections?$', text) for text in run.pictures)
+    whole = [event for event in pictures if event[5]]
+    for *_, data, size, marks in whole:
+        image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        assert image.shape[1::-1] == tuple(size)
+        blueness = image.astype(int) @ (2, -1, -1)
+        for column, row, radius in marks:
+            assert 1.0 < radius < 20.0
+            assert blueness[round(row), round(column)] > np.median(blueness) + 50
+    assert len(whole) > 2
+    file = tmp_path / 'page.html'
+    write_replay(log, file, 150_000)
+    assert file.stat().st_size < 150_000 + len(empty_page())
+    with chromium() as shown:
+        page = shown.page
+        shown.open(file.as_uri())
+        kept = page.evaluate('maasi.log.slot("picture", "mambo").events')
+        assert 2 < len(kept) < 0.7 * sum(event[2] == 'mambo' for event in pictures)
+        gaps = np.diff([event[0] for event in kept])
+        assert gaps.max() < 2.0 * gaps.min()
+        shown.seek(kept[2][0] - 0.01)
+        figure = page.locator('#cameras figure[data-robot=mambo]')
+        count = len(kept[1][5])
+        words = f'mambo {int(gaps[1] - 0.01)} s ago, {count} detection' + 's' * (count != 1)
+        assert figure.inner_text().strip() == words
+        image = figure.locator('img')
+        assert image.get_attribute('src').endswith(kept[1][3])
+        assert image.evaluate('(image) => image.decode().then(() => image.naturalWidth)') == 160
+        seen = next(event for event in kept if event[5])
+        shown.seek(seen[0])
+        assert figure.inner_text().strip().startswith('mambo now, ')
+        frame, mark = (figure.locator(part).bounding_box() for part in ('img', 'i >> nth=0'))
+        for at, size, shown, number in (('x', 'width', 160, 0), ('y', 'height', 120, 1)):
+            middle = (mark[at] + 0.5 * mark[size] - frame[at]) / frame[size]
+            assert middle == pytest.approx(seen[5][0][number] / shown, abs=0.01)
+
+
+@needs_chromium
 def test_a_search_in_space_from_above_is_shaded_by_its_columns(tmp_path):
     scene = {'name': 'space', 'robots': {}, 'bounds': [[0, 1], [0, 1], [0, 2]]}
     # Explored at the ground, and above it of one column only.
@@ -157,6 +205,8 @@ def test_a_search_in_space_from_above_is_shaded_by_its_columns(tmp_path):
         )[3::4]
         # From the upper left corner, by rows: y falls, x rises.
         assert shades == [90, 0, 90, 90]
+        # No robot has a camera.
+        assert shown.page.is_hidden('#cameras')
 
 
 def test_a_run_leaves_its_page_which_is_made_again_of_its_bag_or_of_the_newest_run(

@@ -45,6 +45,10 @@ class ProgressDisplay:
         self._found = found
         self._write(text)
 
+    def share(self, what: str, part: float) -> None:
+        """Show how much of something is done, if an update is due."""
+        self.update(f'{what}: {100.0 * part:.0f} %')
+
     def update(self, text: str, quiet: bool = False) -> None:
         """Show how far something is, if an update is due; quiet: only on a terminal."""
         if self.due and (self._terminal or not quiet):

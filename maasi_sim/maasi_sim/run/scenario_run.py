@@ -384,7 +384,7 @@ class ScenarioRun:
         problem = 'the process that writes it has ended'
         for news in self._replay:
             if isinstance(news, float):
-                self.display.update(f'{REPLAY}: {100.0 * news:.0f} %')
+                self.display.share(REPLAY, news)
             else:
                 problem = news
         if problem:

@@ -73,14 +73,14 @@ def legend(axes: Any, columns: int = 4) -> None:
     )
 
 
-def draw_box(axes: Any, box: FloatArray, colour: str, alpha: float, label: str) -> None:
-    """Draw a box (3, 2) [m] on 3D axes."""
+def draw_box(axes: Any, box: FloatArray, colour: str, alpha: float, label: str) -> Any:
+    """Draw a box (3, 2) [m] on 3D axes, and return its sides."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     corners = np.array([[x, y, z] for x in box[0] for y in box[1] for z in box[2]])
     sides = [corners[list(side)] for side in _SIDES]
-    axes.add_collection3d(
-        Poly3DCollection(sides, facecolor=colour, edgecolor=colour, alpha=alpha, linewidth=0.4)
-    )
+    solid = Poly3DCollection(sides, facecolor=colour, edgecolor=colour, alpha=alpha, linewidth=0.4)
+    axes.add_collection3d(solid)
     # A collection has no handle for a legend in 3D.
     axes.plot([], [], [], 's', color=colour, alpha=max(alpha, 0.35), label=label)
+    return solid

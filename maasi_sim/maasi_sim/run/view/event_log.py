@@ -9,6 +9,8 @@ kind        after time, kind and owner
 robot       [x, y, z, yaw], battery (negative: unknown), goal status, reason; beyond the statuses of
             AgentState: 6 it left, 7 it is silent, 8 the run has ended
 seen        [x, y, z] of the robot, detections [range, bearing, elevation, and a deviation of each]
+picture     JPEG in base64 of what its camera saw as it measured, [width, height] of the image [px],
+            detections in it [column, row, radius], or null where they are not known
 filter      expected number, clusters [x, y, z, mass, covariance], measurements so far
 found       targets [id, x, y, z, covariance, robot, time]
 plan        planner, explored share, objective, reason, robots [name, index, chosen, waypoint,
@@ -36,6 +38,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -48,7 +51,7 @@ Listener = Callable[[Event], None]
 LARGEST = 4_500_000
 # Shortest time between states of a robot, and between other events that may be thinned [s].
 STATE_PERIOD = 0.1
-_THINNED = ('robot', 'seen', 'filter', 'map', 'way', 'score', 'cuboid')
+_THINNED = ('robot', 'seen', 'filter', 'map', 'way', 'score', 'cuboid', 'picture')
 
 
 def line(event: Event | Scene) -> str:
@@ -71,11 +74,13 @@ class EventLog:
     def packed(self, largest: int = LARGEST) -> str:
         """Return the log compressed (gzip) in base64, thinned until it is at most so large.
 
-        What was thinned stands in `thinned` of its scene: the period of states and, where that
-        was not enough, of all that changes gradually. Decisions, found targets and messages stay.
+        Half of it may be pictures. What else was thinned stands in `thinned` of its scene: the
+        period of states and, where that was not enough, of all that changes gradually. Decisions,
+        found targets and messages stay.
         """
         period = 0.0
-        log = self
+        events = fewer_pictures(self.events, largest // 2)
+        log = EventLog(self.scene, events)
         while True:
             text = '\n'.join([line(log.scene), *map(line, log.events)])
             packed = base64.b64encode(gzip.compress(text.encode(), 7, mtime=0)).decode()
@@ -83,7 +88,16 @@ class EventLog:
             if len(packed) <= largest or period > 1e5:
                 return packed
             period = max(2.0 * period, 2.0 * STATE_PERIOD)
-            log = EventLog({**self.scene, 'thinned': period}, thin(self.events, period))
+            log = EventLog({**self.scene, 'thinned': period}, thin(events, period))
+
+
+def fewer_pictures(events: list[Event], room: int) -> list[Event]:
+    """Return events with as many pictures, evenly of each robot, as fit into a room [bytes]."""
+    pictures = sorted((item for item in events if item[1] == 'picture'), key=lambda item: item[2])
+    # Packed they are a little larger.
+    stride = math.ceil(1.05 * sum(len(item[3]) for item in pictures) / room) or 1
+    dropped = {id(item) for item in pictures} - {id(item) for item in pictures[::stride]}
+    return [item for item in events if id(item) not in dropped]
 
 
 class Thinning:

@@ -170,6 +170,10 @@ class EventMaker:
             rows.append([significant(value) for value in row])
         self._put(time, 'seen', robot, self._place(position), rows)
 
+    def picture(self, time: float, robot: str, content: Sequence[Any]) -> None:
+        """Add what a camera saw as its robot measured, see `maasi_sim.run.view.pictures`."""
+        self._put(time, 'picture', robot, *content)
+
     def filter(
         self,
         time: float,

@@ -20,10 +20,12 @@ from maasi_planner.motion.base import RobotState
 from maasi_planner.team import Decision
 from maasi_sim.run.bag import load_types
 from maasi_sim.run.run_options import ViewOptions
+from maasi_sim.run.topics import time_at
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, EventLog, Scene
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.messages import MARKERS, MessageEvents
 from maasi_sim.run.view.page_file import open_browser
+from maasi_sim.run.view.pictures import IMAGES
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.server import Commander, Hub, ViewServer
 from maasi_sim.scenario.schema import Scenario
@@ -149,8 +151,12 @@ class RunPage(LiveView):
 
     def put_message(self, topic: str, type_name: str, data: bytes) -> None:
         """Take a message of a topic that is shown; never waits."""
-        if not (self._known and type_name == MARKERS):
-            decode, take = self._types.deserialize_cdr, self._messages.take
+        decode, take = self._types.deserialize_cdr, self._messages.take
+        if type_name in IMAGES:
+            # Not in the queue: most are never decoded.
+            stamp = time_at(data, 4) / 1e9
+            self._messages.pictures.keep(topic, stamp, lambda: decode(data, type_name))
+        elif not (self._known and type_name == MARKERS):
             self.put(lambda _: take(topic, type_name, decode(data, type_name)))
 
     def starting(self, ready: int, total: int) -> None:

@@ -6,6 +6,7 @@ so that recordings of `ros2 bag record -a` and teams in a namespace are read as 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
 from maasi_planner.team import Decision, RobotDecision
 from maasi_sim.run.bag import Bag, BagError
@@ -21,6 +23,7 @@ from maasi_sim.run.targets.tally import found_target
 from maasi_sim.run.topics import point, seconds
 from maasi_sim.run.view.event_log import Event, EventLog
 from maasi_sim.run.view.event_maker import EventMaker
+from maasi_sim.run.view.pictures import IMAGES, Pictures, picture
 from maasi_sim.run.view.scene import empty_scene, scene_of_facts
 
 STEP = 'maasi_msgs/msg/LockstepStep'
@@ -60,6 +63,7 @@ TOPICS: dict[str, tuple[str, ...]] = {
     MARKERS: ('_take_markers', 'ground_truth/markers', 'search_area', 'markers'),
     'rcl_interfaces/msg/Log': ('_take_log', 'rosout'),
     'diagnostic_msgs/msg/DiagnosticArray': ('_take_diagnostics', 'diagnostics'),
+    **{kind: ('_take_image', name) for kind, name in IMAGES.items()},
 }
 
 
@@ -94,6 +98,8 @@ class MessageEvents:
         # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
+        #: Images that wait for their detections.
+        self.pictures = Pictures()
 
     def take(self, topic: str, type_name: str, message: Any) -> None:
         """Take a message of a topic for which `is_shown` is true."""
@@ -156,7 +162,10 @@ class MessageEvents:
                 message.reason,
             )
 
-    def _take_detections(self, _: str, message: Any) -> None:
+    def _take_image(self, topic: str, message: Any) -> None:
+        self.pictures.keep(topic, seconds(message.header.stamp), lambda: message)
+
+    def _take_detections(self, topic: str, message: Any) -> None:
         values, covariances = [], []
         for item in message.detections:
             own = np.asarray(item.covariance, dtype=float)
@@ -164,8 +173,16 @@ class MessageEvents:
             usable = size in (2, 3) and size**2 == len(own)
             covariances.append(own.reshape(size, size) if usable else None)
             values.append((item.range, item.bearing, item.elevation))
-        place = point(message.pose.pose.position)
-        self.maker.seen(self._time(message), message.robot, place, values, covariances)
+        place, turn = point(message.pose.pose.position), message.pose.pose.orientation
+        time, robot = self._time(message), message.robot
+        self.maker.seen(time, robot, place, values, covariances)
+        image = self.pictures.at(topic.rpartition('/')[0], seconds(message.header.stamp))
+        if image is not None:
+            camera = self.maker.scene['robots'].get(robot, {}).get('camera')
+            # One that cannot be decoded is not shown.
+            with contextlib.suppress(ValueError):
+                pose = Pose(np.array(place), np.array([turn.w, turn.x, turn.y, turn.z]))
+                self.maker.picture(time, robot, picture(image, camera, pose, values))
 
     def _take_update(self, topic: str, message: Any) -> None:
         clusters = []

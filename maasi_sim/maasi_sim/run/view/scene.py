@@ -106,6 +106,7 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
         'view': view,
         'deviations': [*deviations, 0.0][:3],
         **fence,
+        'camera': robot.camera and robot.camera.model_dump(exclude={'segmentation'}),
     }
 
 

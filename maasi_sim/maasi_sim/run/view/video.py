@@ -3,33 +3,61 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Ellipse, Polygon, Rectangle
+from matplotlib.patches import Circle
 from matplotlib.path import Path as Outline
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.colours import AWAY, FOUND, POTENTIAL, SEEN, robot_colours
 from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, draw_box
-from maasi_sim.run.report_panels import ellipse
+from maasi_sim.run.report_panels import PALE, UNSEEN
 from maasi_sim.run.run_folder import write_whole
 from maasi_sim.run.view.event_log import Event, EventLog, Scene
 from maasi_sim.run.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
-# Pictures per second, and size [in] at a resolution [px/in].
-RATE = 10
+# Called with the share that is done.
+Progress = Callable[[float], object]
+# Pictures per second; GIFs would be large. Size [in] at a resolution [px/in].
+RATE, GIF_RATE = 30, 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80
 # The last picture is shown for so long [s].
 _HOLD = 2.0
 # Detections are shown for so long [s].
 _FADE = 1.0
+# Points of a way that are drawn, and of an outline.
+_MOST_POINTS = 600
+_CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 40)) for f in (np.cos, np.sin)], axis=1)
+_SOLID = '#59636E'
+# Where they are shown, texts, marks and colours.
+_LEGEND = (
+    ('', 'left or cannot go on', '>', AWAY),
+    ('', 'planned way', '--', PALE),
+    ('targets', 'waypoint', 's', PALE),
+    ('floor', 'field of view', ':', PALE),
+    ('floor', 'not explored', 's', UNSEEN),
+    ('targets', 'found, 3 sigma', 'o', FOUND),
+    ('targets', 'potential, 2 sigma', 'o', POTENTIAL),
+    ('targets', 'detection', '+', SEEN),
+    ('targets', 'true target', 'x', '0.2'),
+    ('obstacles', 'obstacle', 'o', _SOLID),
+    ('fence', 'geofence', '-.', PALE),
+    ('cuboids', 'cuboid to visit', 's', OPEN),
+    ('cuboids', 'cuboid visited', 's', VISITED),
+    ('cuboids', 'building', 's', OBJECT),
+    ('cuboids', 'radio link', ':', '0.3'),
+)
 
 
 class Moments:
@@ -80,189 +108,264 @@ class Moments:
         return f'{self.scene.get("name", "")}   {self.time:.1f} s   {word} {found}{of}'
 
 
-def write_video(log: EventLog, path: Path, speed: float = 5.0) -> None:
+def write_video(log: EventLog, path: Path, speed: float = 5.0, progress: Progress = float) -> None:
     """Write a run as FILE.mp4 or FILE.gif, `speed` times as fast."""
-    pictures = _pictures(log, speed)
-    write = _write_gif if path.suffix == '.gif' else _write_mp4
+    write, rate = (_write_gif, GIF_RATE) if path.suffix == '.gif' else (_write_mp4, RATE)
+    pictures = _pictures(log, speed, rate, progress)
     # Keep the suffix: it tells the type of the file.
     write_whole(path, lambda part: write(part, pictures))
 
 
-def _write_mp4(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
-    import cv2
-
-    first = next(pictures)
-    height, width = first.shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'mp4v'), RATE, (width, height))
+def _write_mp4(path: Path, pictures: Iterator[ImageArray]) -> None:
+    size = round(_SIZE[0] * _RESOLUTION), round(_SIZE[1] * _RESOLUTION)
+    writer: Any = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'mp4v'), RATE, size)
     try:
         if not writer.isOpened():
             raise OSError(f'{path}: cannot be written as a video')
-        writer.write(np.ascontiguousarray(first[:, :, ::-1]))
-        for picture in pictures:
-            writer.write(np.ascontiguousarray(picture[:, :, ::-1]))
+        # Encoded beside drawing.
+        with ThreadPoolExecutor(1) as encoder:
+            done: Future[Any] = encoder.submit(int)
+            for picture in pictures:
+                turned = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+                done.result()
+                done = encoder.submit(writer.write, turned)
     finally:
         writer.release()
 
 
-def _write_gif(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
+def _write_gif(path: Path, pictures: Iterator[ImageArray]) -> None:
     from PIL import Image
 
-    frames = [Image.fromarray(item).quantize(64, Image.Quantize.MEDIANCUT) for item in pictures]
-    frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=1000 // RATE, loop=0, optimize=True
+    first, *rest = (
+        Image.fromarray(item).quantize(64, Image.Quantize.MEDIANCUT) for item in pictures
     )
+    every: Any = {'duration': 1000 // GIF_RATE, 'loop': 0, 'optimize': True}
+    first.save(path, save_all=True, append_images=rest, **every)
 
 
-def _pictures(log: EventLog, speed: float) -> Iterator[NDArray[np.uint8]]:
+def _pictures(log: EventLog, speed: float, rate: int, progress: Progress) -> Iterator[ImageArray]:
     """Yield pictures of the run, (height, width, 3)."""
     now = Moments(log)
     places = [event[3][:2] for event in log.events if event[1] == 'robot'] or [[0, 0], [1, 1]]
     extent = [np.min(places, axis=0) - 1.0, np.max(places, axis=0) + 1.0]
-    bounds = np.array(log.scene.get('bounds') or np.transpose(extent))
-    figure = Figure(figsize=_SIZE, dpi=_RESOLUTION, layout='constrained')
-    canvas = FigureCanvasAgg(figure)
-    picture = np.zeros((1, 1, 3), np.uint8)
-    for index in range(max(1, math.ceil(log.duration / speed * RATE)) + 1):
-        now.advance(min(index * speed / RATE, log.duration))
-        figure.clear()
-        _draw(figure.add_subplot(projection='3d' if len(bounds) == 3 else None), now, bounds)
-        canvas.draw()
-        picture = np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+    sheet = Sheet(np.array(log.scene.get('bounds') or np.transpose(extent)), now)
+    duration = log.duration
+    count = max(1, math.ceil(duration / speed * rate)) + 1
+    for index in range(count):
+        now.advance(min(index * speed / rate, duration))
+        picture = sheet.draw(now)
         yield picture
-    for _ in range(round(_HOLD * RATE)):
+        progress((index + 1) / count)
+    for _ in range(round(_HOLD * rate)):
         yield picture
 
 
-def _draw(axes: Any, now: Moments, bounds: NDArray[np.float64]) -> None:
-    size = len(bounds)
-    for name, limits in zip('xyz', bounds):
-        axes.set(**{f'{name}lim': limits, f'{name}label': f'{name} [m]'})
-    if size == 3:
-        # Labels of the axes need room.
-        axes.set_box_aspect(bounds[:, 1] - bounds[:, 0], zoom=0.9)
-        _draw_boxes(axes, now)
-    else:
-        axes.set_aspect('equal')
-        _draw_floor(axes, now)
-    _draw_targets(axes, now, size)
-    for name, colour in robot_colours(now.robots).items():
-        if name in now.last['robot']:
-            _draw_robot(axes, now, name, colour, bounds)
-    axes.set_title(now.title())
+class Sheet:
+    """Axes on which a run is drawn: what moves, on a ground that is kept while it holds."""
 
-
-def _plot(axes: Any, places: ArrayLike, size: int, style: str, **options: Any) -> None:
-    """Draw places (n, 3) [m]; in the plane without their height."""
-    axes.plot(*np.asarray(places, dtype=float).reshape(-1, 3)[:, :size].T, style, **options)
-
-
-def _draw_floor(axes: Any, now: Moments) -> None:
-    for event in list(now.last['map'].values())[:1]:
-        (x, y, _), (dx, dy, _), (nx, ny, _), digits = event[3:7]
-        values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
-        extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
-        axes.imshow(values, origin='lower', extent=extent, cmap='Greys', vmin=0, vmax=24)
-    kept = max((robot.get('clearance', 0.0) for robot in now.scene['robots'].values()), default=0.0)
-    for *centre, radius in now.scene.get('obstacles', []):
-        axes.add_patch(Circle(centre[:2], radius, color='#59636e'))
-        if kept:
-            axes.add_patch(Circle(centre[:2], radius + kept, fill=False, ls='--', ec='#59636e'))
-
-
-def _draw_boxes(axes: Any, now: Moments) -> None:
-    """Draw buildings and cuboids, and lines between robots of which one hears the other."""
-    for key, colour, alpha in (('objects', OBJECT, 0.35), ('blocks', OBSTACLE, 0.6)):
-        for box in now.scene.get(key, []):
-            draw_box(axes, np.array(box), colour, alpha, '')
-    for number, box in enumerate(now.scene.get('cuboids', [])):
-        style = (VISITED, 0.12) if number in now.visited else (OPEN, 0.35)
-        draw_box(axes, np.array(box), *style, '')
-    places = {name: way[-1] for name, way in now.ways.items()}
-    for name, event in now.last['cuboid'].items():
-        for other in event[6]:
-            if name in places and other in places:
-                _plot(axes, [places[name], places[other]], 3, ':', color='0.3', lw=1.0)
-
-
-def _draw_targets(axes: Any, now: Moments, size: int) -> None:
-    for event in now.last['truth'].values():
-        _plot(axes, event[3], size, 'x', color='0.2', ms=6)
-    for event in now.last['filter'].values():
-        for x, y, z, mass, *covariance in event[4]:
-            _mark(axes, (x, y, z)[:size], covariance, 2.0, POTENTIAL, min(0.3 + mass, 1.0))
-    for event in now.last['found'].values():
-        for number, x, y, z, covariance, *_ in event[3]:
-            _mark(axes, (x, y, z)[:size], covariance, 3.0, FOUND, 1.0)
-            axes.text(*(x, y, z)[:size], f'  {number}', fontsize=8)
-    for *_, place, detections in now.seen:
-        for reach, bearing, elevation, *_ in detections:
-            level = math.cos(elevation)
-            ray = level * math.cos(bearing), level * math.sin(bearing), math.sin(elevation)
-            _plot(axes, np.add(place, np.multiply(reach, ray)), size, '+', color=SEEN, ms=6)
-
-
-def _mark(
-    axes: Any,
-    place: tuple[float, ...],
-    covariance: list[float],
-    deviations: float,
-    colour: str,
-    alpha: float,
-) -> None:
-    """Draw a place; in the plane with the ellipse of its covariance."""
-    axes.plot(*np.array(place)[:, None], 'o', color=colour, ms=4, alpha=alpha)
-    if len(place) == 2:
-        xx, xy, _, yy, *_ = covariance
-        spread, style = np.array([[xx, xy], [xy, yy]]), {'color': colour, 'alpha': alpha}
-        axes.add_patch(ellipse((place[0], place[1]), spread, deviations, 0.0, **style))
-
-
-def _draw_robot(
-    axes: Any, now: Moments, name: str, colour: str, bounds: NDArray[np.float64]
-) -> None:
-    size, robot = len(bounds), now.scene.get('robots', {}).get(name, {})
-    (*place, yaw), _, status = now.last['robot'][name][3:6]
-    away = status in (UNAVAILABLE, LEFT, SILENT)
-    if status != LEFT:
-        _plot(axes, now.ways[name], size, '-', color=colour, lw=1.3)
-    colour = AWAY if away else colour
-    if status == MOVING:
-        _plot(axes, now.last['way'].get(name, [[]])[-1], size, '--', color=colour, lw=1.3)
-        waypoint = now.waypoints.get(name) or []
-        _plot(axes, waypoint, size, 's', color=colour, ms=8, mfc='none')
-    if size == 3 and not away:
-        # How high it is.
-        x, y, z = place
-        axes.plot([x, x], [y, y], [bounds[2, 0], z], ':', color=colour, lw=0.8)
-    elif 'view' in robot and not away:
-        axes.add_patch(_view(robot['view'], place, yaw, colour))
-    # From above it points ahead.
-    arrow = [[1.4, 0.0], [-0.9, 0.8], [-0.5, 0.0], [-0.9, -0.8], [1.4, 0.0]]
-    marker: Any = 'D' if size == 3 else Outline(arrow @ _turn(yaw))
-    _plot(axes, place, size, '', marker=marker, color=colour, ms=8 if size == 3 else 16)
-    label = f'   {name}' + (' (left)' if status == LEFT else '')
-    axes.text(*place[:size], label, fontsize=9, weight='bold')
-    if 'fence' in robot:
-        (left, right), (low, high), _ = robot['fence']
+    def __init__(self, bounds: FloatArray, now: Moments) -> None:
+        self.bounds = bounds
+        self.size = size = len(bounds)
+        self._robots: dict[str, Any] = now.scene.get('robots', {})
+        self._colours = robot_colours(now.robots)
+        figure = Figure(figsize=_SIZE, dpi=_RESOLUTION, layout='constrained')
+        self._canvas = FigureCanvasAgg(figure)
+        axes: Any = figure.add_subplot(projection='3d' if size == 3 else None)
+        for name, limits in zip('xyz', bounds):
+            axes.set(**{f'{name}lim': limits, f'{name}label': f'{name} [m]'})
         if size == 3:
-            draw_box(axes, np.array(robot['fence']), colour, 0.05, '')
+            # Labels of the axes need room.
+            axes.set_box_aspect(np.ptp(bounds, axis=1), zoom=0.9)
         else:
-            line: Any = {'fill': False, 'ec': colour, 'ls': '-.', 'lw': 0.9, 'alpha': 0.7}
-            axes.add_patch(Rectangle((left, low), right - left, high - low, **line))
+            axes.set_aspect('equal')
+        self._axes = axes
+        self._add_legend(now.scene)
+        self._title = axes.set_title(now.title(), animated=True)
+        # Artists by kind, which are used again; how many of a kind are in use; what is to be drawn.
+        self._pool: dict[str, list[Any]] = defaultdict(list)
+        self._used: Counter[str] = Counter()
+        self._drawn: list[Any] = []
+        # Drawn once: the axes and the legend. On them is the ground, and what that shows.
+        self._canvas.draw()
+        self._axes_alone = self._ground = self._canvas.copy_from_bbox(figure.bbox)
+        self._shown: list[Any] = []
+
+    def draw(self, now: Moments) -> ImageArray:
+        """Return a picture of what holds now, (height, width, 3), until the next."""
+        kinds = (now.last[kind].values() for kind in ('map', 'truth', 'found'))
+        shown = [len(now.visited), *chain.from_iterable(kinds)]
+        if shown != self._shown:
+            self._shown = shown
+            (self._draw_boxes if self.size == 3 else self._draw_floor)(now)
+            self._draw_known(now)
+            self._flush(self._axes_alone)
+            self._ground = self._canvas.copy_from_bbox(self._canvas.figure.bbox)
+        self._title.set_text(now.title())
+        self._drawn.append(self._title)
+        self._draw_expected(now)
+        for name, colour in self._colours.items():
+            if name in now.last['robot']:
+                self._draw_robot(now, name, colour)
+        self._flush(self._ground)
+        return np.asarray(self._canvas.buffer_rgba())[:, :, :3]
+
+    def _flush(self, ground: Any) -> None:
+        """Draw what waits on a ground; what is solid in space from the back."""
+        self._canvas.restore_region(ground)
+        self._drawn.sort(key=lambda item: -getattr(item, 'do_3d_projection', lambda: -math.inf)())
+        for artist in self._drawn:
+            self._axes.draw_artist(artist)
+        self._drawn.clear()
+        self._used.clear()
+
+    def _next(self, kind: str, make: Callable[[], Any]) -> Any:
+        """Have an artist of a kind drawn, and return it; it is made where none is free."""
+        pool, number = self._pool[kind], self._used[kind]
+        if number == len(pool):
+            pool.append(make())
+        self._used[kind] += 1
+        self._drawn.append(pool[number])
+        return pool[number]
+
+    def _line(self, places: ArrayLike, style: str, **options: Any) -> None:
+        """Draw places (n, 2 or 3) [m]; in the plane without their height."""
+        points = np.asarray(places, dtype=float)
+        points = points.reshape(-1, points.shape[-1] if points.ndim > 1 else 3)[:, : self.size].T
+        line = self._next(style, lambda: self._axes.plot(*points, style)[0])
+        (line.set_data_3d if self.size == 3 else line.set_data)(*points)
+        line.set(**{'alpha': 1.0, 'mfc': options['color'], **options})
+
+    def _text(self, place: list[float], text: str, **options: Any) -> None:
+        label = self._next('text', lambda: self._axes.text(*place[: self.size], text))
+        (label.set_position_3d if self.size == 3 else label.set_position)(place[: self.size])
+        label.set(text=text, **options)
+
+    def _mark(self, row: list[float], deviations: float, **style: Any) -> None:
+        """Draw a place [m]; in the plane with the ellipse of its covariance."""
+        x, y, z, xx, xy, _, yy, *_ = row
+        self._line([x, y, z], 'o', ms=4, **style)
+        if self.size == 2:
+            # The root of the covariance by Cholesky.
+            first = math.sqrt(max(xx, 1e-12))
+            other = math.sqrt(max(yy - (xy / first) ** 2, 0.0))
+            ring = _CIRCLE @ np.array([[first, xy / first], [0.0, other]])
+            self._line((x, y) + deviations * ring, '-', lw=1.0, **style)
+
+    def _draw_floor(self, now: Moments) -> None:
+        for event in list(now.last['map'].values())[:1]:
+            (x, y, _), (dx, dy, _), (nx, ny, _), digits = event[3:7]
+            values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
+            extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
+            shades: Any = {'origin': 'lower', 'cmap': 'Greys', 'vmin': 0, 'vmax': 24}
+            # The frame again, which the map covers.
+            image = self._axes.imshow(values, extent=extent, **shades)
+            self._drawn += [image, *self._axes.spines.values()]
+        kept = max((robot.get('clearance', 0.0) for robot in self._robots.values()), default=0.0)
+        for *centre, radius in now.scene.get('obstacles', []):
+            self._drawn.append(self._axes.add_patch(Circle(centre[:2], radius, color=_SOLID)))
+            self._line(centre[:2] + (radius + kept) * _CIRCLE, '--', color=_SOLID, lw=1.0)
+
+    def _draw_boxes(self, now: Moments) -> None:
+        """Draw buildings and cuboids."""
+        for key, colour, alpha in (('objects', OBJECT, 0.35), ('blocks', OBSTACLE, 0.6)):
+            for box in now.scene.get(key, []):
+                self._box(box, colour, alpha)
+        for number, box in enumerate(now.scene.get('cuboids', [])):
+            self._box(box, *((VISITED, 0.12) if number in now.visited else (OPEN, 0.35)))
+
+    def _box(self, box: list[list[float]], colour: str, alpha: float) -> None:
+        sides = np.array(box)
+        self._next(f'{box} {alpha}', lambda: draw_box(self._axes, sides, colour, alpha, ''))
+
+    def _draw_known(self, now: Moments) -> None:
+        """Draw fences, and true and found targets."""
+        for name, colour in self._colours.items():
+            fence = self._robots.get(name, {}).get('fence')
+            if fence and self.size == 3:
+                self._box(fence, colour, 0.05)
+            elif fence:
+                box = _outline(*np.transpose(fence[:2]))
+                self._line(box, '-.', color=colour, lw=0.9, alpha=0.7)
+        for event in now.last['truth'].values():
+            self._line(event[3], 'x', color='0.2', ms=6)
+        for event in now.last['found'].values():
+            for number, x, y, z, covariance, *_ in event[3]:
+                self._mark([x, y, z, *covariance], 3.0, color=FOUND)
+                self._text([x, y, z], f'  {number}', fontsize=8, weight='normal')
+
+    def _draw_expected(self, now: Moments) -> None:
+        """Draw potential targets, detections, and lines to robots that one hears."""
+        for event in now.last['filter'].values():
+            for x, y, z, mass, *covariance in event[4]:
+                style: Any = {'color': POTENTIAL, 'alpha': min(0.3 + mass, 1.0)}
+                self._mark([x, y, z, *covariance], 2.0, **style)
+        for *_, place, detections in now.seen:
+            for reach, bearing, elevation, *_ in detections:
+                level = math.cos(elevation)
+                ray = level * math.cos(bearing), level * math.sin(bearing), math.sin(elevation)
+                self._line(np.add(place, np.multiply(reach, ray)), '+', color=SEEN, ms=6)
+        places = {name: way[-1] for name, way in now.ways.items()}
+        for name, event in now.last['cuboid'].items():
+            for other in places.keys() & {*event[6]} if name in places else ():
+                self._line([places[name], places[other]], ':', color='0.3', lw=1.0)
+
+    def _draw_robot(self, now: Moments, name: str, colour: str) -> None:
+        size, robot = self.size, self._robots.get(name, {})
+        (*place, yaw), _, status = now.last['robot'][name][3:6]
+        away = status in (UNAVAILABLE, LEFT, SILENT)
+        if status != LEFT:
+            way = now.ways[name]
+            way = [*way[:: math.ceil(len(way) / _MOST_POINTS)], way[-1]]
+            self._line(way, '-', color=colour, lw=1.3)
+        colour = AWAY if away else colour
+        if status == MOVING:
+            self._line(now.last['way'].get(name, [[]])[-1], '--', color=colour, lw=1.3)
+            self._line(now.waypoints.get(name) or [], 's', color=colour, ms=8, mfc='none')
+        if size == 3 and not away:
+            # How high it is.
+            foot = [*place[:2], self.bounds[2, 0]]
+            self._line([foot, place], ':', color=colour, lw=0.8)
+        elif 'view' in robot and not away:
+            outline = _view(robot['view'], place, yaw)
+            view = self._next('view', lambda: self._axes.fill(*outline.T, ls=':')[0])
+            view.set(xy=outline, ec=colour, fc=(*to_rgb(colour), 0.12))
+        # From above it points ahead.
+        arrow = [[1.4, 0.0], [-0.9, 0.8], [-0.5, 0.0], [-0.9, -0.8], [1.4, 0.0]]
+        marker: Any = 'D' if size == 3 else Outline(arrow @ _turn(yaw))
+        self._line(place, '', marker=marker, color=colour, ms=8 if size == 3 else 16)
+        label = f'   {name}' + (' (left)' if status == LEFT else '')
+        self._text(place, label, fontsize=9, weight='bold')
+
+    def _add_legend(self, scene: Scene) -> None:
+        kinds = {'', 'cuboids' if scene.get('cuboids') else 'targets'}
+        if self.size == 2:
+            kinds |= {'floor', 'obstacles' if scene.get('obstacles') else ''}
+        if any('fence' in robot for robot in self._robots.values()):
+            kinds.add('fence')
+        robots = [('', name, '>-', colour) for name, colour in self._colours.items()]
+        for kind, text, style, colour in (*robots, *_LEGEND):
+            if kind in kinds:
+                face = 'none' if text == 'waypoint' else colour
+                ends = np.zeros((self.size, 0))
+                self._axes.plot(*ends, style, color=colour, label=text, ms=8, mfc=face)
+        self._axes.figure.legend(loc='outside right upper', frameon=False, fontsize=9)
 
 
-def _turn(yaw: float) -> NDArray[np.float64]:
+def _turn(yaw: float) -> FloatArray:
     """Return what turns rows x, y by a yaw [rad]."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return np.array([[cos, sin], [-sin, cos]])
 
 
-def _view(view: dict[str, Any], place: list[float], yaw: float, colour: str) -> Any:
-    """Return the outline of a field of view from above."""
-    style: Any = {'ec': colour, 'fc': (*to_rgb(colour), 0.12), 'ls': ':'}
+def _view(view: dict[str, Any], place: list[float], yaw: float) -> FloatArray:
+    """Return the outline of a field of view from above, (n, 2) [m]."""
     if view['kind'] != 'box':
-        wide, high = view['size'][:2]
-        return Ellipse((place[0], place[1]), 2.0 * wide, 2.0 * high, **style)
-    (left, low), (right, high) = view['lower'][:2], view['upper'][:2]
-    corners = np.array([[left, low], [right, low], [right, high], [left, high]])
-    return Polygon(corners @ _turn(yaw if view['turns'] else 0.0) + place[:2], **style)
+        return np.asarray(_CIRCLE * view['size'][:2] + place[:2])
+    corners = _outline(*np.array([view['lower'][:2], view['upper'][:2]]))
+    return np.asarray(corners @ _turn(yaw if view['turns'] else 0.0) + place[:2])
+
+
+def _outline(lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """Return the outline of a rectangle from its corners, (5, 2) [m]."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+    return np.asarray(lower + corners * (upper - lower))

@@ -14,6 +14,7 @@ from rclpy.qos import HistoryPolicy
 from rclpy.utilities import remove_ros_args
 
 from maasi_filter.ros.qos import reader_of
+from maasi_sim.run.bag import IMAGE_TYPE
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.run_options import ViewOptions, add_view_options
 from maasi_sim.run.topics import message_class
@@ -48,7 +49,9 @@ class ViewNode(Node):
     def _discover(self) -> None:
         """Subscribe to the topics that have appeared."""
         for topic, types in self.get_topic_names_and_types():
-            if topic in self._known or not is_shown(topic, types[0]):
+            # Raw images would load the network of real robots.
+            unknown = topic not in self._known and types[0] != IMAGE_TYPE
+            if not (unknown and is_shown(topic, types[0])):
                 continue
             offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
             if not offers:

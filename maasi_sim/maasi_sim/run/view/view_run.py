@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from maasi_sim.arguments import Parser
 from maasi_sim.run.bag import BagError
+from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.run_folder import ResultsError
 from maasi_sim.run.view.messages import read_events
 from maasi_sim.run.view.page_file import REPLAY, open_browser, write_replay
@@ -65,25 +66,30 @@ def main(arguments: list[str] | None = None) -> int:
     if options.recording is None and not bags:
         parser.error('there is no run in runs: name a recording')
     recording = options.recording or bags[-1].parents[1]
+    display = ProgressDisplay()
     try:
-        log = read_events(recording)
+        log = read_events(recording, partial(display.share, 'reading'))
         if options.video is not None:
             # Deferred: Matplotlib takes long to import.
             from maasi_sim.run.view.video import write_video
 
-            write_video(log, options.video, options.speed)
-            print(options.video)
+            file, share = options.video, partial(display.share, options.video.name)
+            write_video(log, file, options.speed, share)
+            display.close()
+            print(file)
             return DONE
         # In the folder of its run, or beside the recording.
         folder = recording if (recording / 'bag').is_dir() else recording.resolve().parent
         file = options.out or folder / REPLAY
         write_replay(log, file)
     except BagError as error:
-        print(f'error: {error}', file=sys.stderr)
+        display.say(f'error: {error}')
         return WRONG_INPUT
     except (ResultsError, OSError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        display.say(f'error: {error}')
         return NOT_WRITTEN
+    finally:
+        display.close()
     print(file)
     if not options.no_open:
         open_browser(file.resolve().as_uri())

@@ -7,6 +7,7 @@ import { MapView } from './map.js';
 import { showLegend } from './legend.js';
 import { drawMarks } from './marks.js';
 import { showLog, showNumbers, showRobots } from './panels.js';
+import { showPictures } from './pictures.js';
 import { RunLog, unpack } from './run_log.js';
 import { element } from './text.js';
 import { showTip, tipAt } from './tips.js';
@@ -351,6 +352,7 @@ class Page {
     this.curve.draw(log, time);
     showNumbers($('numbers'), log, time);
     showRobots($('robots').tBodies[0], log, time, this.selected, (name) => this.select(name));
+    showPictures($('cameras'), log, time, (name) => this.select(name));
     showWhy($('why_body'), log, time, this.selected, this.marked, (row) => this.mark(row));
     showLog($('log'), log, time, (event) => {
       if (log.slots.has(`decision/${event[4]}`)) this.select(event[4]);

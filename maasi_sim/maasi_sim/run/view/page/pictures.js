@@ -1,0 +1,61 @@
+// What the cameras saw when their robots last measured, with the detections in it.
+
+import { SEEN, robotColour } from './colours.js';
+import { element } from './text.js';
+
+// A circle around a detection in an image.
+function detectionMark([width, height], [column, row, radius]) {
+  const mark = element('i');
+  const half = 1.4 * radius + width / 80;
+  mark.style.left = `${(100 * (column - half)) / width}%`;
+  mark.style.top = `${(100 * (row - half)) / height}%`;
+  mark.style.width = `${(200 * half) / width}%`;
+  mark.style.borderColor = SEEN;
+  return mark;
+}
+
+function pictureFrame(log, name) {
+  const figure = element('figure');
+  figure.dataset.robot = name;
+  const caption = element('figcaption');
+  const swatch = element('span', 'swatch');
+  swatch.style.background = robotColour(log.robots(), name);
+  caption.append(swatch, element('b', '', name), ' ', element('span', 'age'));
+  figure.append(element('div', 'image'), caption);
+  return figure;
+}
+
+export function showPictures(section, log, time, onSelect) {
+  const names = log.owners('picture');
+  section.hidden = names.length === 0;
+  const list = section.querySelector('div');
+  const key = `${log.scene.name} ${names} ${document.documentElement.dataset.theme}`;
+  if (list.dataset.key !== key) {
+    list.dataset.key = key;
+    list.replaceChildren(...names.map((name) => pictureFrame(log, name)));
+    for (const figure of list.children) figure.onclick = () => onSelect(figure.dataset.robot);
+  }
+  for (const figure of list.children) fillPicture(figure, log.at('picture', figure.dataset.robot, time), time);
+}
+
+function fillPicture(figure, event, time) {
+  const marks = event && event[5];
+  const count = marks ? `, ${marks.length} detection${marks.length === 1 ? '' : 's'}` : '';
+  const seconds = event && Math.floor(time - event[0]);
+  const age = seconds < 1 ? 'now' : `${seconds} s ago`;
+  const words = event ? age + count : 'no picture yet';
+  const shown = figure.querySelector('.age');
+  if (shown.textContent !== words) shown.textContent = words;
+  const at = event ? String(event[0]) : '';
+  if (figure.dataset.at === at) return;
+  figure.dataset.at = at;
+  const frame = figure.querySelector('.image');
+  frame.replaceChildren();
+  if (!event) return;
+  const [when, , robot, data, size] = event;
+  const image = element('img');
+  [image.width, image.height] = size;
+  image.src = `data:image/jpeg;base64,${data}`;
+  image.alt = `Camera of ${robot} at ${when.toFixed(1)} s${count}`;
+  frame.append(image, ...(marks || []).map((mark) => detectionMark(size, mark)));
+}
