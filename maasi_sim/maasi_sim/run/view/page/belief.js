@@ -11,7 +11,7 @@ const REACH = 3.5;
 
 export class Belief {
   constructor() {
-    this.floor = new FloorGrid();
+    this.floor = new FloorGrid(true);
     this.events = [];
   }
 

@@ -77,13 +77,10 @@ function drawFaces(view, log, visited, { object, sides }) {
     const colour = faceColour(done.length / own.length);
     if (isWall) {
       const along = 1 - axis;
-      const ends = (part) => part[along].map((value) => place.map((other, index) => (index === along ? value : other)));
+      path(context, camera, sides[along].map((value) => place.map((other, index) => (index === along ? value : other))));
       context.lineWidth = 6;
-      for (const [part, tint] of [[sides, colour], ...done.map((cell) => [cell.part, PHOTOGRAPHED])]) {
-        context.strokeStyle = tint;
-        path(context, camera, ends(part));
-        context.stroke();
-      }
+      context.strokeStyle = colour;
+      context.stroke();
       context.lineWidth = 1;
     } else {
       if (!camera.spatial && name === 'bottom') return;

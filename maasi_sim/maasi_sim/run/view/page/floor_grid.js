@@ -1,7 +1,8 @@
 // A grid on the floor whose cells have colours, from above as an image, else cell by cell.
 
 export class FloorGrid {
-  constructor() {
+  constructor(isSmooth = false) {
+    this.isSmooth = isSmooth;
     this.canvas = document.createElement('canvas');
   }
 
@@ -41,7 +42,7 @@ export class FloorGrid {
       this.canvas.getContext('2d').putImageData(pixels, 0, 0);
     }
     const [x, y] = camera.project([left, low + ny * step[1]]);
-    context.imageSmoothingEnabled = false;
+    context.imageSmoothingEnabled = this.isSmooth;
     context.drawImage(this.canvas, x, y, nx * step[0] * camera.scale, ny * step[1] * camera.scale);
   }
 }

@@ -24,8 +24,8 @@ function entries(log, selected, layers) {
       ['box', 'var(--text)', 'planned, in the colour of its robot'],
       ['box', VISITED, 'cuboid visited'],
       ['area', 'rgba(140, 140, 160, .75)', 'building'],
-      log.scene.cells && ['area', PHOTOGRAPHED, 'part of a face that was photographed'],
-      log.scene.cells && ['area', faceGradient, 'the rest of it: share photographed, from none to all'],
+      log.scene.cells && ['area', faceGradient, 'face of a building: share photographed, from none to all'],
+      log.scene.cells && ['area', PHOTOGRAPHED, 'photographed part of it'],
       (log.scene.blocks || []).length && ['area', 'rgb(110, 100, 85)', 'obstacle'],
       ['dot', '', 'radio link, or where a robot is drawn to'],
     );
@@ -56,7 +56,7 @@ function stripEntries(log) {
   if (!names.length) return [];
   return [
     ['break'],
-    ['text', '', 'Below the time line, in the colour of each robot:', ''],
+    ['text', '', 'Strips, in the colour of each robot:', ''],
     ['area', colour, 'on the way'],
     ['area', `${colour}4d`, 'waiting'],
     ['area', 'var(--fault)', 'cannot go on'],

@@ -352,7 +352,8 @@ class Page {
       this.fitted = Boolean(log.scene.bounds) || !this.isLive;
     }
     this.map.marked = this.marked;
-    this.map.pulses = !reducedMotion.matches;
+    // Above a second of a fast replay, too.
+    this.map.pulse = reducedMotion.matches ? 0 : Math.max(4, 1.2 * Number($('speed').value));
     this.map.draw(log, time, this.selected);
     this.curve.draw(log, time);
     showNumbers($('numbers'), log, time);

@@ -12,8 +12,7 @@ import { drawBuildings } from './buildings.js';
 
 // Detections are shown for this time [s].
 const FADE = 1.5;
-// A ring runs out from what was found for this time [s], so far [px].
-const PULSE = 4;
+// How far the ring runs out from what was found [px].
 const PULSE_REACH = 40;
 
 export class MapView {
@@ -23,8 +22,8 @@ export class MapView {
     this.camera = camera;
     this.layers = { truth: true, unseen: true, belief: false, view: true, ways: true, clusters: true, detections: true };
     this.marked = null;
-    // Whether a ring runs out from what is found.
-    this.pulses = true;
+    // How long a ring runs out from what was found [s of the run].
+    this.pulse = 0;
     this.unexplored = new Unexplored();
     this.belief = new Belief();
     // Where robots and candidates were drawn, for clicks.
@@ -234,8 +233,8 @@ export class MapView {
         context.arc(px, py, 3, 0, 2 * Math.PI);
         context.fill();
         dropLine(context, camera, [x, y, z], this.floor);
-        if (this.pulses && time - when < PULSE) {
-          const age = Math.max(0, (time - when) / PULSE);
+        if (time - when < this.pulse) {
+          const age = Math.max(0, (time - when) / this.pulse);
           context.globalAlpha = 1 - age;
           context.lineWidth = 3;
           context.beginPath();
