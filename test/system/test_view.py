@@ -77,7 +77,8 @@ def test_a_browser_saw_the_run_while_it_went_on(run):
     assert not run.controls
     assert run.headline == f'Ended: time limit; {run.found} of 12 found after 30 s'
     assert './scripts/run_scenario mambo_turtlebot --seed 1 --lockstep' in run.card
-    assert str(REPLAY) in run.card
+    # Where it is, as the terminal says it.
+    assert f'Replay: {run.folder / REPLAY}' in run.card and (run.folder / REPLAY).is_file()
     # Each number of nodes that were ready, up to all.
     assert run.starts[-1][3:] == [run.starts[-1][4]] * 2 and len(run.starts) > 1
     assert 'mambo searching, turtlebot paused' in run.modes

@@ -7,7 +7,8 @@ import { element } from './text.js';
 const HEAT = 'linear-gradient(90deg, rgba(var(--heat-low), .25), rgba(var(--heat-high), .9))';
 
 // Return the entries: class of the mark, its colour, text, and what else is in the mark.
-function entries(log, selected, layers) {
+function entries(log, time, selected, layers) {
+  const isEmpty = !(log.potential.at(time) >= 0.005);
   const robots = Object.values(log.scene.robots);
   const cividis = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(scaleColour).join(', ')})`;
   const faceGradient = `linear-gradient(90deg, ${faceColour(0)}, ${faceColour(1)})`;
@@ -32,7 +33,7 @@ function entries(log, selected, layers) {
   }
   return of(
     ['area', 'rgba(var(--unseen), .53)', 'unexplored'],
-    layers.belief && ['area', HEAT, 'belief: potential targets per area, from few to many'],
+    layers.belief && ['area', HEAT, `belief: potential targets per area, from few to many${isEmpty ? ' (none now)' : ''}`],
     ...ways,
     ['dash', '', 'planned way'],
     ['box', '', 'its waypoint'],
@@ -65,8 +66,8 @@ function stripEntries(log) {
   ];
 }
 
-export function showLegend(parent, log, selected, layers) {
-  const shown = [...entries(log, selected, layers), ...stripEntries(log)];
+export function showLegend(parent, log, time, selected, layers) {
+  const shown = [...entries(log, time, selected, layers), ...stripEntries(log)];
   if (log.scene.thinned) shown.push(['text', '', `thinned: one state per ${log.scene.thinned} s`]);
   const key = JSON.stringify(shown);
   if (parent.dataset.key === key) return;

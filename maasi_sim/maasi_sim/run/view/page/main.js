@@ -335,7 +335,7 @@ class Page {
     const { log, time } = this;
     this.tell();
     // It may take room from the map.
-    showLegend($('legend'), log, this.selected, this.map.layers);
+    showLegend($('legend'), log, time, this.selected, this.map.layers);
     const wantsRoom = showStrips($('strips'), log, time, (name, at) => {
       this.select(name);
       this.seek(at);
