@@ -154,7 +154,8 @@ def test_a_search_in_space_from_above_is_shaded_by_its_columns(tmp_path):
         shown.page.click('#space')
         shown.settle()
         shades = shown.page.evaluate(
-            'Array.from(maasi.map.shading.canvas.getContext("2d").getImageData(0, 0, 2, 2).data)'
+            'Array.from(maasi.map.unexplored.floor.canvas'
+            '.getContext("2d").getImageData(0, 0, 2, 2).data)'
         )[3::4]
         # From the upper left corner, by rows: y falls, x rises.
         assert shades == [90, 0, 90, 90]
