@@ -30,12 +30,14 @@ export class Belief {
     for (const event of events) {
       const own = new Float32Array(this.density.length);
       for (const cluster of event[4]) highest = Math.max(highest, this.add(own, cluster));
-      own.forEach((value, index) => {
-        this.density[index] = Math.max(this.density[index], value);
-      });
+      for (let index = 0; index < own.length; index += 1) this.density[index] = Math.max(this.density[index], own[index]);
     }
     // As dark as can be where a whole target is as certain as the most certain one.
-    this.levels = Uint8Array.from(this.density, (value) => (value ? Math.round(LEVELS * Math.sqrt(Math.min(value / highest, 1))) : 0));
+    this.levels = new Uint8Array(this.density.length);
+    this.isEmpty = highest === 0;
+    for (let index = 0; index < this.levels.length && !this.isEmpty; index += 1) {
+      this.levels[index] = Math.round(LEVELS * Math.sqrt(Math.min(this.density[index] / highest, 1)));
+    }
   }
 
   // Add a potential target, seen from above; return the density that a whole one would have at most.
@@ -61,6 +63,7 @@ export class Belief {
 
   draw(view, log, time) {
     this.update(log, time);
+    if (this.isEmpty) return;
     const key = themed('--heat-low') + themed('--heat-high');
     if (this.key !== key) {
       const [low, high] = ['--heat-low', '--heat-high'].map((name) => themed(name).split(',').map(Number));

@@ -37,7 +37,9 @@ export class FloorGrid {
       [this.canvas.width, this.canvas.height] = [nx, ny];
       const pixels = new ImageData(nx, ny);
       for (let i = 0; i < nx; i += 1) {
-        for (let j = 0; j < ny; j += 1) pixels.data.set(colours[levels[i * ny + j]], 4 * ((ny - 1 - j) * nx + i));
+        for (let j = 0; j < ny; j += 1) {
+          if (levels[i * ny + j]) pixels.data.set(colours[levels[i * ny + j]], 4 * ((ny - 1 - j) * nx + i));
+        }
       }
       this.canvas.getContext('2d').putImageData(pixels, 0, 0);
     }

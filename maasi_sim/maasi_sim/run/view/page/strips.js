@@ -88,7 +88,7 @@ export function showStrips(parent, log, time, onChoose) {
       };
       canvas.onclick = (event) => onChoose(name, at(event));
       return [element('span', 'quiet', names.length > NAMED_ROBOTS ? '' : name), canvas];
-    }), element('i', ''));
+    }), ...names.slice(0, 1).map(() => element('i', '')));
   }
   const strips = [...parent.querySelectorAll('canvas')];
   if (!strips.length) return isNew;
