@@ -28,6 +28,10 @@ def watch(run, address):
     with chromium() as shown:
         shown.open(address)
         shown.until('maasi.log.duration > 1')
+        run.strips = [
+            strip.get_attribute('aria-label')
+            for strip in shown.page.locator('#strips canvas').all()
+        ]
         shown.page.click('#robots tr[data-robot=turtlebot]')
         shown.page.click('button[data-command=pause]')
         shown.until("/[^.]$/.test(document.querySelector('#controls [role=status]').innerText)")
@@ -73,6 +77,9 @@ def test_a_browser_saw_the_run_while_it_went_on(run):
     assert run.found == len(run.report['found'])
     assert run.decisions == sum(len(item['robots']) for item in of_topic(run, '/decisions'))
     assert run.answer == 'pause: turtlebot'
+    # What robots have done so far is below the time line of a live run, too.
+    assert [strip.partition(':')[0] for strip in run.strips] == ['mambo', 'turtlebot']
+    assert all('on the way' in strip and ' measurements' in strip for strip in run.strips)
     # Nobody follows after the end.
     assert not run.controls
     assert run.headline == f'Ended: time limit; {run.found} of 12 found after 30 s'
