@@ -98,9 +98,8 @@ def warm_up(method: str | None = None) -> None:
             noise = NoiseSettings(range=0.5, bearing=0.1, elevation=0.1)
             sensor = SensorSettings(detection=detection, noise=noise).build('warm_up', dimension)
             ic_phd = FilterSettings(particles=500, birth_particles=50, particles_minimum=50)
-            for settings in (ic_phd, FilterSettings(method='pmb')):
-                if method not in (None, settings.method):
-                    continue
+            both = (ic_phd, FilterSettings(method='pmb'))
+            for settings in [item for item in both if method in (None, item.method)]:
                 search = make_filter(settings, bounds, np.random.default_rng(0))
                 for step in range(6):
                     position = np.array([3.0 + 0.2 * step, 3.0, 3.0])

@@ -41,6 +41,9 @@ def test_a_terminal_gets_a_line_that_changes_and_lines_that_stay(monkeypatch):
     display.close()
     erase, line = '\r\x1b[K', '7 measurements '
     assert stream.getvalue() == f'begin\n{erase}{line}{erase}a warning\n{line}\n'
+    display._line = 'half'
+    display.say('done', instead=True)
+    assert stream.getvalue().endswith(f'{erase}done\n')
 
 
 def test_how_far_something_is_comes_now_and_then_and_on_a_terminal_only_if_quiet():

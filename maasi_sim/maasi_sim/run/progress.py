@@ -32,9 +32,13 @@ class ProgressDisplay:
         """Whether an update is due."""
         return time.monotonic() - self._last >= self._period
 
-    def say(self, text: str) -> None:
-        """Print a line; a closed terminal or a full disk does not end the run."""
+    def say(self, text: str, instead: bool = False) -> None:
+        """Print a line, before the one that changes or instead of it.
+
+        A closed terminal or a full disk does not end the run.
+        """
         erase = _ERASE if self._line else ''
+        self._line = '' if instead else self._line
         with contextlib.suppress(OSError):
             print(f'{erase}{text}\n{self._line}', end='', file=self._stream, flush=True)
 

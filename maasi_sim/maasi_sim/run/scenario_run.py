@@ -136,8 +136,9 @@ class ScenarioRun:
             self._monitor()
             self._note_ending()
             self._close_bag()
-            # Beside the report.
-            self._replay = beside(send_replay, self.folder) if options.record else iter(())
+            # Beside the report; never before the server of the nodes is there.
+            ran = options.record and processes[0].pid is not None
+            self._replay = beside(send_replay, self.folder) if ran else iter(())
             followed = self._is_followed()
             if not followed:
                 ends.close()
@@ -247,10 +248,11 @@ class ScenarioRun:
         ready = set(recorder.take_ready())
         recorder.discover()
         late = [name for name in expected if name not in ready]
-        done = len(expected) - len(late)
-        self.display.update(f'starting: {done} of {len(expected)} nodes are ready', quiet=True)
+        nodes = self.supervisor.processes
+        done = len(ready & nodes.keys())
+        self.display.update(f'starting: {done} of {len(nodes)} nodes are ready', quiet=True)
         if self._page is not None:
-            self._page.starting(done, len(expected))
+            self._page.starting(done, len(nodes))
         if late:
             return dict.fromkeys(late, 'is not ready')
         self._complete = self._complete or time.monotonic()
@@ -381,7 +383,7 @@ class ScenarioRun:
         """Wait until the replay is written."""
         if not self.options.record:
             return
-        problem = 'the process that writes it has ended'
+        problem = 'it was not written'
         for news in self._replay:
             if isinstance(news, float):
                 self.display.share(REPLAY, news)
@@ -390,7 +392,7 @@ class ScenarioRun:
         if problem:
             self._warn(f'no {REPLAY}: {problem}')
         else:
-            self.display.say(f'replay: {short(self.folder / REPLAY)}')
+            self.display.say(f'replay: {short(self.folder / REPLAY)}', instead=True)
 
 
 def short(path: Path) -> str:
