@@ -35,7 +35,8 @@ class Pictures:
 
     def at(self, space: str, stamp: float) -> Any:
         """Return the message of a robot's image with a stamp [s], if a picture is due, or None."""
-        images = dict(self._images[space])
+        # A copy: another thread may keep images meanwhile.
+        images = dict(self._images[space].copy())
         if stamp not in images or abs(stamp - self._last.get(space, -_PERIOD)) < _PERIOD:
             return None
         self._last[space] = stamp

@@ -36,7 +36,7 @@ _SIZE, _RESOLUTION = (9.6, 7.2), 80
 _HOLD = 2.0
 # Detections are shown for so long [s].
 _FADE = 1.0
-# Points of a way that are drawn, and of an outline.
+# Points of a way that are drawn, and those of a circle.
 _MOST_POINTS = 600
 _CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 40)) for f in (np.cos, np.sin)], axis=1)
 _SOLID = '#59636E'
