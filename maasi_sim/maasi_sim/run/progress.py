@@ -33,10 +33,7 @@ class ProgressDisplay:
         return time.monotonic() - self._last >= self._period
 
     def say(self, text: str, instead: bool = False) -> None:
-        """Print a line, before the one that changes or instead of it.
-
-        A closed terminal or a full disk does not end the run.
-        """
+        """Print a line, before the one that changes or instead of it; no error ends the run."""
         erase = _ERASE if self._line else ''
         self._line = '' if instead else self._line
         with contextlib.suppress(OSError):
