@@ -104,6 +104,8 @@ def run(
         # Objects created so far are permanent: exclude them from garbage collection.
         gc.collect()
         gc.freeze()
+        # Messages are freed without it: it looks for what is left seldom.
+        gc.set_threshold(50_000, 20, 100)
         while rclpy.ok() and not asked:
             # Returns only to look for signals; `spin_once` would after each callback.
             executor.spin_until_future_complete(Future(), _SIGNAL_PERIOD)

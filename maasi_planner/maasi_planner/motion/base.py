@@ -250,7 +250,7 @@ def check_waypoints(waypoints: ArrayLike) -> FloatArray:
 def check_command(velocity_command: ArrayLike) -> FloatArray:
     """Return a velocity command as a (4,) array."""
     array = np.array(velocity_command, dtype=float)
-    if array.shape != (4,) or not np.isfinite(array).all():
+    if array.shape != (4,) or not all(map(math.isfinite, array.tolist())):
         raise ValueError(f'velocity command: got {array.tolist()}, allowed are four finite numbers')
     return array
 
