@@ -125,7 +125,8 @@ def test_detections_of_ones_own_are_found_without_a_warning(domain):
         node.terminate()
         log, _ = node.communicate(timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
-    match = re.match(r'found a target at \((.*), (.*)\) m after', done.stdout)
+    # Fast DDS may complain there of the ports of processes that were killed.
+    match = re.search(r'found a target at \((.*), (.*)\) m after', done.stdout)
     assert match and np.allclose([float(part) for part in match.groups()], [3.0, 2.0], atol=0.1)
     assert 'came late' not in log and 'allowed is' not in log, log
 

@@ -45,7 +45,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('guard', GuardSettings, in_robot=True, lockstep_member=False, **options)
+        super().__init__('guard', GuardSettings, in_robot=True, **options)
         self._last = b''
         # Whether it ever heard a driver, and whether there is none any more.
         self._heard = self._lost = False

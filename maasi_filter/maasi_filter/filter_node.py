@@ -239,9 +239,16 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     # ---- what comes in -----------------------------------------------------------------------
 
     def _on_batch(self, batch: MeasurementBatch) -> None:
-        if self.active:
-            self._batches.add(batch)
-            self._process_complete()
+        if not self.active:
+            return
+        if self.settings.lockstep and batch.step < (self._progress.step or 0):
+            self.get_logger().warning(
+                f'measurement_batch.step went back from {self._progress.step} to {batch.step}: '
+                'starting anew'
+            )
+            self.reset()
+        self._batches.add(batch)
+        self._process_complete()
 
     def _on_detections(self, name: str, message: DetectionArray) -> None:
         if not self.active:

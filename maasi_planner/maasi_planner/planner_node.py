@@ -53,7 +53,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     `<robot>/state` (maasi_msgs/AgentState), `filter_update` (maasi_msgs/FilterUpdate);
     `<robot>/destination` (geometry_msgs/PointStamped) of robots that plan for themselves;
     `found_targets` (maasi_msgs/FoundTargetArray, latched); running freely, `/diagnostics`
-    (diagnostic_msgs/DiagnosticArray): heartbeats of the publishers of `filter_update`
+    (diagnostic_msgs/DiagnosticArray): heartbeats of the publishers of `filter_update`; in lockstep
+    `lockstep/step` (maasi_msgs/LockstepStep)
 
     Publishes
     ---------
@@ -117,6 +118,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 LockstepDone, self.team_topic('lockstep/done'), RELIABLE
             )
             self.expect_subscribers(self._done_publisher)
+            self.create_subscription(
+                LockstepStep, self.team_topic('lockstep/step'), self._on_step, RELIABLE
+            )
         # Before the publisher of batches: a filter with batches must discover the kept targets.
         self._keeper = FoundKeeper(self)
         self._batches.set_up()
@@ -165,6 +169,11 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             for _ in range(_LAST_TASKS):
                 self.executor.spin_once(timeout_sec=0.0)
         super().destroy_node()
+
+    def _restart(self, reason: str) -> None:
+        self.get_logger().warning(f'{reason}: starting anew')
+        self.reset()
+        self.step = -1
 
     def reset(self) -> None:
         """Begin a new search."""
@@ -237,11 +246,16 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     # ---- input -------------------------------------------------------------------------------
 
-    def on_step(self, message: LockstepStep) -> None:
+    def _on_step(self, message: LockstepStep) -> None:
         """Plan when all states of this step have arrived.
 
         A step is republished for a restarted node: resend the messages that it may have missed.
         """
+        if not self.active:
+            return
+        if message.step < self.step:
+            self._restart(f'step {message.step} came after {self.step}')
+        self.step = message.step
         before = self._expected
         if before is None and message.step == self._taken_step:
             self._batches.publish_again()
@@ -274,13 +288,11 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             return
         before = self._heard.get(name)
         if before is not None and message.step < before.step:
-            if self.settings.lockstep or before.step - message.step <= 1.0 / self.settings.step:
+            back = before.step - message.step
+            if not self.settings.lockstep and back <= 1.0 / self.settings.step:
                 self.drop('old state', f'{name}/state.step: read {message.step}, had {before.step}')
                 return
-            self.get_logger().warning(
-                f'{name}/state.step went back from {before.step} to {message.step}: starting anew'
-            )
-            self.reset()
+            self._restart(f'{name}/state.step went back from {before.step} to {message.step}')
         goal = message.goal_id, message.goal_status, message.reason
         self._heard[name] = HeardState(message.step, state, *goal, Silence(self))
         if self.settings.lockstep:

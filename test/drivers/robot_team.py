@@ -18,7 +18,7 @@ from maasi_drivers.drivers import MamboDriver, RangingDriver, TurtlebotDriver
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import point_to_ros, pose_from_ros, pose_to_ros, stamp_to_ros
-from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import (
     AgentState,
@@ -100,9 +100,13 @@ class Team(Node):
         self.images = self.create_publisher(Image, 'camera/image_raw', RELIABLE)
         self.calibrations = self.create_publisher(CameraInfo, 'camera/camera_info', RELIABLE)
         self.ranges = self.create_publisher(RangeArray, 'ranges', RELIABLE)
-        self.steps = self.create_publisher(LockstepStep, '/lockstep/step', RELIABLE)
+        self.present = self.create_publisher(LockstepStep, '/lockstep/robots', LATCHED)
         # What a driver with these settings listens to.
-        self.used = [self.batches, *[self.battery] * (not deaf), *[self.steps] * settings.lockstep]
+        self.used = [
+            self.batches,
+            *[self.battery] * (not deaf),
+            *[self.present] * settings.lockstep,
+        ]
         self.used += [self.odometry] * (not deaf and settings.poses == 'odometry')
         topic = settings.image_source == 'topic'
         self.used += [self.images] * topic if settings.camera else [self.ranges]
@@ -158,15 +162,12 @@ class Team(Node):
                 self.until(lambda: self.states and self.state.step == self.step, 'no state')
             self.body.step(self.command, STEP)
 
-    def begin_step(self, k, robots=('rover',), first='odom'):
-        """Begin a step in lockstep; the odometry comes before or after it."""
+    def begin_step(self, k, robots=('rover',)):
+        """Begin a step in lockstep."""
         self.step = k
-        odometry, step = self.odometry_message(), stamp_to_ros(k * NANOSECONDS)
-        if first == 'odom' and 'rover' in robots:
-            self.odometry.publish(odometry)
-        self.steps.publish(LockstepStep(step=k, stamp=step, robots=robots))
-        if first != 'odom':
-            self.odometry.publish(odometry)
+        self.present.publish(LockstepStep(step=k, robots=robots))
+        if 'rover' in robots:
+            self.odometry.publish(self.odometry_message())
 
     def awaken(self):
         """Send odometry until the driver hears it: whether it does is not known from here."""

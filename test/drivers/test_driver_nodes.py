@@ -13,7 +13,7 @@ from sensor_msgs.msg import CameraInfo
 
 from maasi_filter.ros.conversions import pose_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
-from maasi_msgs.msg import AgentState, DetectionArray, LockstepStep, RangeArray, RangeMeasurement
+from maasi_msgs.msg import AgentState, DetectionArray, RangeArray, RangeMeasurement
 
 
 @pytest.mark.parametrize('kind', ['turtlebot', 'mambo', 'ranging'])
@@ -260,12 +260,11 @@ def test_ranges_of_a_mounted_sensor_are_turned_by_the_pose(play):
     assert len(item.covariance) == 9
 
 
-@pytest.mark.parametrize('first', ['odom', 'step'])
-def test_in_lockstep_each_step_has_a_state_and_a_command(play, first):
+def test_in_lockstep_each_step_has_a_state_and_a_command(play):
     _, team = play(lockstep=True)
     image = rendered(team, [[2.0, 2.0]], team.start)
     for k in range(5):
-        team.begin_step(k, first=first)
+        team.begin_step(k)
         team.until_done(k + 1)
         assert team.state.step == k
         assert team.commands[-1].header.stamp == stamp_to_ros(k * NANOSECONDS)
@@ -278,7 +277,7 @@ def test_in_lockstep_each_step_has_a_state_and_a_command(play, first):
     expected = [AgentState.IDLE] * 3 + [AgentState.MOVING] * 2
     assert [state.goal_status for state in team.states] == expected
     # A step and a batch can come twice: somebody was started again.
-    team.begin_step(4, first=first)
+    team.begin_step(4)
     team.until_done(6)
     assert team.states[-1] == team.states[-2] and team.commands[-1] == team.commands[-2]
     team.batch -= 1
@@ -294,7 +293,6 @@ def test_in_lockstep_nobody_waits_for_bad_odometry_or_a_robot_that_has_left(play
     bad = team.odometry_message(NANOSECONDS)
     bad.pose.pose.position.x = math.nan
     team.odometry.publish(bad)
-    team.steps.publish(LockstepStep(step=1, stamp=stamp_to_ros(NANOSECONDS), robots=['rover']))
     team.until_done(2)
     assert team.state.step == 1 and driver.dropped['odometry'] == 1
     assert_array_equal(team.command, np.zeros(4))

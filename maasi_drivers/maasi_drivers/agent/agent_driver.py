@@ -20,8 +20,8 @@ from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_filter.models.pose import Pose
-from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.lifecycle_node import SettingsError
+from maasi_filter.ros.qos import LATCHED
 from maasi_filter.ros.run_node import run as run_node
 from maasi_msgs.msg import LockstepStep
 from maasi_planner.motion import RobotState
@@ -45,7 +45,8 @@ class AgentDriver(RobotNode):
     of the team; what link and sensor need: `odom` (nav_msgs/Odometry), `battery_state`
     (sensor_msgs/BatteryState), `camera/image_raw`, `camera/camera_info`, `scan`
     (sensor_msgs/LaserScan) or `ranges` (maasi_msgs/RangeArray); `pose`
-    (geometry_msgs/PoseStamped, in the map) where the parameter `pose_source` says so
+    (geometry_msgs/PoseStamped, in the map) where the parameter `pose_source` says so; in lockstep
+    `lockstep/robots` (maasi_msgs/LockstepStep, latched)
 
     Publishes
     ---------
@@ -102,10 +103,6 @@ class AgentDriver(RobotNode):
         self._motion = self.link.make_motion()
         self.follower = WaypointFollower(self._motion)
         self._pose_speed = PoseSpeed()
-        # Stamps of the step that is awaited, answered, or has no usable odometry [ns].
-        self._awaited: int | None = None
-        self._answered: int | None = None
-        self._unusable: int | None = None
 
     def set_up(self) -> None:
         """Compile, make the parts and connect."""
@@ -128,7 +125,10 @@ class AgentDriver(RobotNode):
         if settings.poses == 'pose':
             PoseTopic(self, partial(self._take_localised, 'pose'))
         self.sensor_input.set_up()
-        if not settings.lockstep:
+        if settings.lockstep:
+            topic = self.team_topic('lockstep/robots')
+            self.create_subscription(LockstepStep, topic, self._on_robots, LATCHED)
+        else:
             self.create_wall_timer(PERIOD, self._watchdog.check)
 
     def start(self) -> None:
@@ -169,7 +169,6 @@ class AgentDriver(RobotNode):
         self._responder.reset()
         self._watchdog.reset()
         self.follower = WaypointFollower(self._motion)
-        self._awaited = self._answered = self._unusable = None
         if self.settings.odometry_origin == 'first':
             self.map_odometry = None
         self.link.reset()
@@ -196,18 +195,23 @@ class AgentDriver(RobotNode):
             # It may have been silent with the odometry.
             self._watchdog.sensed_at = None
         if self.settings.lockstep:
-            self.history.add(placed)
-            self._answer_step()
-            return
-        self._watchdog.note_pose(placed)
+            self.link.begin_step(placed.stamp)
+        else:
+            self._watchdog.note_pose(placed)
         self.history.add(placed)
         self._control(placed)
         self._responder.serve()
 
     def refuse_pose(self, stamp: int) -> None:
-        """Note that the odometry of a stamp [ns] could not be used."""
-        self._unusable = stamp
-        self._answer_step()
+        """Stop the robot in lockstep, where the step of a stamp [ns] waits for the command."""
+        if self.settings.lockstep:
+            self._state.publish_status(stamp, self.step_of(stamp))
+            self.link.hold_step(stamp)
+
+    def answer_again(self) -> None:
+        """See `RobotNode.answer_again`."""
+        self._state.repeat()
+        self.link.repeat()
 
     def _take_localised(self, topic: str, stamp: int, pose: Pose) -> None:
         if self.active and self.is_new_pose(topic, stamp):
@@ -252,37 +256,12 @@ class AgentDriver(RobotNode):
         self.link.send(placed, command.tolist())
         self.goals.publish_feedback(placed)
 
-    # ---- lockstep ----------------------------------------------------------------------------
-
-    def on_step(self, message: LockstepStep) -> None:
-        """Do the control step of step k once its odometry is received."""
+    def _on_robots(self, message: LockstepStep) -> None:
+        """Give the goal up when the robot leaves, in lockstep."""
         self.goals.away = self.robot not in message.robots
-        if self.goals.away:
-            # The sim does not wait for a robot that has left.
+        if self.goals.away and self.active:
             self.end_goal(GoalStatus.ABORTED, 'left')
             self.follower.let_go()
-            return
-        self._awaited = stamp_from_ros(message.stamp)
-        self._answer_step()
-
-    def _answer_step(self) -> None:
-        stamp, latest = self._awaited, self.history.latest
-        if stamp is None:
-            return
-        if stamp == self._answered:
-            # Republish for a restarted peer.
-            self._state.repeat()
-            self.link.repeat()
-        elif latest is not None and latest.stamp == stamp:
-            self.link.begin_step(stamp)
-            self._control(latest)
-        elif stamp == self._unusable:
-            self._state.publish_status(stamp, self.step)
-            self.link.hold_step(stamp)
-        else:
-            return
-        self._awaited, self._answered = None, stamp
-        self._responder.serve()
 
     # ---- the services stop and release -------------------------------------------------------
 

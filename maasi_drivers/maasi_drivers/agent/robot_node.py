@@ -180,7 +180,9 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
             return True
         if self.restart_if_back(what, stamp):
             return True
-        if stamp < latest.stamp or not self.settings.lockstep:
+        if self.settings.lockstep:
+            self.answer_again()
+        else:
             self.drop(
                 'odometry stamp',
                 f'{what}: read {stamp} ns, allowed are stamps after {latest.stamp} ns',
@@ -189,8 +191,8 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
 
     def restart_if_back(self, what: str, stamp: int) -> bool:
         """Restart the driver if a stamp [ns] is far before the latest pose's; return whether."""
-        latest = self.history.latest
-        if latest is None or latest.stamp - stamp <= JUMP:
+        latest, least = self.history.latest, 0 if self.settings.lockstep else JUMP
+        if latest is None or latest.stamp - stamp <= least:
             return False
         self.get_logger().warning(
             f'{what} jumped back by {1e-9 * (latest.stamp - stamp):.3f} s: starting anew'
@@ -204,6 +206,9 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
 
     def refuse_pose(self, stamp: int) -> None:
         """Note that the odometry of a stamp [ns] could not be used."""
+
+    def answer_again(self) -> None:
+        """Answer odometry that came twice in lockstep: a restarted peer missed the answer."""
 
     @abstractmethod
     def take_charge(self, charge: float) -> None:

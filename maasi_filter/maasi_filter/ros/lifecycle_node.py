@@ -25,8 +25,8 @@ from maasi_filter.ros.clocks import ClockWatch, stamp_problem
 from maasi_filter.ros.entities import Endpoints, NodeEntities, survive_bad_requests
 from maasi_filter.ros.loopback import loopback_fault
 from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, SettingsT
-from maasi_filter.ros.qos import LATCHED, RELIABLE
-from maasi_msgs.msg import LockstepDone, LockstepStep
+from maasi_filter.ros.qos import LATCHED
+from maasi_msgs.msg import LockstepDone
 
 __all__ = ['LockstepLifecycleNode', 'SettingsError']
 
@@ -48,16 +48,10 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     `/diagnostics` (diagnostic_msgs/DiagnosticArray), each second;
     `lockstep/ready` (maasi_msgs/LockstepDone)
 
-    Subscribes
-    ----------
-    `lockstep/step` (maasi_msgs/LockstepStep), in lockstep
-
     Parameters
     ----------
     in_robot : bool
         Whether its namespace is that of a robot: topics of the team are one level up.
-    lockstep_member : bool
-        Whether it takes part in lockstep.
     """
 
     #: Read in *configure*, and valid until the next one.
@@ -69,12 +63,10 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         settings: type[SettingsT],
         *,
         in_robot: bool = False,
-        lockstep_member: bool = True,
         **options: Any,
     ) -> None:
         super().__init__(name, allow_undeclared_parameters=True, **options)
         self._always_in_robot = self._in_robot = in_robot
-        self._lockstep_member = lockstep_member
         self._parameters_read = NodeParameters(self, settings)
         self._entities_made = NodeEntities(self)
         self.permanent = self._entities_made.permanent
@@ -159,10 +151,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.step = -1
         self._prepared = True
         self.prepare()
-        if self.settings.lockstep and self._lockstep_member:
-            self.create_subscription(
-                LockstepStep, self.team_topic('lockstep/step'), self._hear_step, RELIABLE
-            )
         self.set_up()
         # Last: publishers are discovered in this order, so who hears it knows all others.
         self._ready_publisher = self.create_publisher(
@@ -287,20 +275,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             self.get_logger().info(text)
         if missing and (fault := loopback_fault()):
             self.get_logger().warning(fault)
-
-    def _hear_step(self, message: LockstepStep) -> None:
-        if not self.active:
-            return
-        if message.step < self.step:
-            self.warn_throttled(
-                'step back', f'step {message.step} came after {self.step}: starting anew'
-            )
-            self.reset()
-        self.step = message.step
-        self.on_step(message)
-
-    def on_step(self, message: LockstepStep) -> None:
-        """Process a step in lockstep."""
 
     # ---- time --------------------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ class NodeSettings(Settings):
     step: float = Field(default=0.05, gt=0.0, le=10.0, description='Duration of a step [s]')
     seed: int = Field(default=1, ge=0, description='Of all random numbers')
     lockstep: bool = Field(
-        default=False, description='Whether the steps are those of lockstep/step, all awaited'
+        default=False, description='Whether each step of lockstep/step waits for its nodes'
     )
     frame: str = Field(default='map', min_length=1, description='Name of the common frame')
     largest_message: int = Field(

@@ -28,7 +28,7 @@ from maasi_filter.ros.conversions import (
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LATCHED, LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
 from maasi_filter.ros.run_node import run
-from maasi_msgs.msg import AgentState, CuboidDecision, LockstepStep, SearchLink, SearchLinkArray
+from maasi_msgs.msg import AgentState, CuboidDecision, SearchLink, SearchLinkArray
 from maasi_planner.buildings.agent import Activity, SearchAgent, decision_stream
 from maasi_planner.buildings.conversions import (
     agent_markers,
@@ -207,12 +207,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
 
     # ---- input -------------------------------------------------------------------------------
 
-    def on_step(self, message: LockstepStep) -> None:
-        """Plan when state and messages of this step have arrived."""
-        if self.name in message.robots:
-            self._wanted_step = int(message.step)
-            self._try_step()
-
     def _on_odometry(self, message: Odometry) -> None:
         if not self.active:
             return
@@ -240,14 +234,13 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             raise ValueError(
                 f'{read}, which is far from the one before; allowed if the next one follows it'
             )
-        if not lockstep and step < self._decided_step:
+        if step < self._decided_step:
             self.get_logger().warning(f'odom.header.stamp went back to step {step}: starting anew')
             self.reset()
         # Odometry is relative to the start.
         pose = compose(Pose.from_yaw(self.settings.start, self.settings.yaw), reading)
         self._state = (step, pose, pose.rotation() @ velocity)
-        if not lockstep:
-            self._wanted_step = step
+        self._wanted_step = step
 
     def _on_heard(self, message: SearchLinkArray) -> None:
         if not self.active:

@@ -308,7 +308,7 @@ class Recorder:
         It is that of its stamp, so that no stamp is later, unless it has none of this clock.
         """
         stamp = stamp_of(topic, self._subscriptions[topic].msg_type, data)
-        known = 0 < stamp <= self.time + _LARGEST_LEAD
+        known = 0 <= stamp <= self.time + _LARGEST_LEAD
         return max(stamp, before) if known else self.time
 
     def _note_planner(self, status: DiagnosticStatus) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import struct
+from functools import cache
 from typing import Any
 
 CLOCK = '/clock'
@@ -28,14 +29,25 @@ def point(item: Any) -> tuple[float, float, float]:
 
 
 def stamp_of(topic: str, kind: Any, data: bytes) -> int:
-    """Return the first stamp of a serialised message, 0 if it has none [ns]."""
-    first = next(iter(kind.get_fields_and_field_types()))
-    if first in ('header', 'clock'):
-        return time_at(data, 4)
+    """Return the stamp of a serialised message, -1 if it has none near its beginning [ns]."""
+    offset = _stamp_offset(kind)
     # Transforms are a sequence, which starts with its length.
-    if topic.rpartition('/')[2] == 'tf' and first == 'transforms' and len(data) >= 16:
-        return time_at(data, 8)
-    return 0
+    if topic.rpartition('/')[2] == 'tf' and len(data) >= 16:
+        offset = 8
+    return -1 if offset is None else time_at(data, offset)
+
+
+@cache
+def _stamp_offset(kind: Any) -> int | None:
+    """Return where the stamp of a serialised message is, if only long numbers are before it."""
+    offset = 4
+    for field in kind.get_fields_and_field_types().values():
+        if field in ('builtin_interfaces/Time', 'std_msgs/Header'):
+            return offset
+        if field not in ('uint64', 'int64', 'double'):
+            return None
+        offset += 8
+    return None
 
 
 def time_at(data: bytes, offset: int) -> int:

@@ -18,7 +18,7 @@ from rosgraph_msgs.msg import Clock
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.node_settings import NodeSettings
-from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, SENSOR, sensor_reader
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, SENSOR, sensor_reader
 from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.scenario.loading import load_scenario
@@ -95,8 +95,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     (sensor_msgs/CameraInfo), `<robot>/scan` (sensor_msgs/LaserScan), `<robot>/ranges`
     (maasi_msgs/RangeArray): those that the robot has;
     `/clock` (rosgraph_msgs/Clock), unless it follows one, in lockstep four times a second;
-    `lockstep/step`
-    (maasi_msgs/LockstepStep);
+    `lockstep/step` (maasi_msgs/LockstepStep), and, latched, `lockstep/robots` where these change;
     `ground_truth/targets` (geometry_msgs/PoseArray), `ground_truth/markers`
     (visualization_msgs/MarkerArray): latched, only for scoring and for the eye
 
@@ -114,7 +113,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     simulate: ClassVar[Any] = Simulation
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('sim_node', SimNodeSettings, lockstep_member=False, **options)
+        super().__init__('sim_node', SimNodeSettings, **options)
         self._stamp = 0
         self._linked: dict[str, LinkedRobot] = {}
 
@@ -151,6 +150,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._waiting: set[str] = set()
         # Last step that the recorder has taken.
         self._recorded = 0
+        # Robots of the step before.
+        self._taking_part: list[str] = []
         self._last_command: dict[str, int] = {}
         self._due = 0.0
         self._said, self._said_at = '', 0.0
@@ -178,14 +179,14 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._robot_of = {node: name for name, node in self._driver_of.items()}
         step_topics = [self.resolve_topic_name('lockstep/step')] if lockstep else []
         self._expected = {
-            self._driver_of[name]: [*step_topics, *topics.needed]
-            for name, topics in self._robots.items()
+            self._driver_of[name]: topics.needed for name, topics in self._robots.items()
         }
         self._planners = set()
         for namespace in self.scenario.namespaces():
-            for node in ('filter_node', 'planner_node'):
-                self._expected[self.team_topic(f'{namespace}/{node}'.strip('/'))] = step_topics
-            self._planners.add(self.team_topic(f'{namespace}/planner_node'.strip('/')))
+            self._expected[self.team_topic(f'{namespace}/filter_node'.strip('/'))] = []
+            planner = self.team_topic(f'{namespace}/planner_node'.strip('/'))
+            self._expected[planner] = step_topics
+            self._planners.add(planner)
         self._recorder = self.team_topic(RECORDER)
         if self.settings.recorder:
             self._expected[self._recorder] = step_topics
@@ -203,6 +204,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             if isinstance(robot, ExternalRobot):
                 self.create_subscription(AgentState, f'{name}/state', robot.take, 10)
         self.connect()
+        self._robots_publisher = self.create_publisher(LockstepStep, 'lockstep/robots', LATCHED)
         # After all other publishers, which the recorder then knows: it waits for clock and step.
         self._clock_publisher: Publisher | None = None
         if self._follows:
@@ -373,8 +375,16 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         When a step is republished, images of the other robots are not taken again.
         """
         stamp = stamp_to_ros(self._stamp)
-        for name in robots:
-            self._robots[name].publish(stamp)
+        present = self.simulation.present
+        if present != self._taking_part:
+            self._taking_part = present
+            message = LockstepStep(step=self.step, stamp=stamp, robots=present)
+            self._robots_publisher.publish(message)
+        for name in present:
+            if name in robots:
+                self._robots[name].publish(stamp)
+            else:
+                self._robots[name].publish_odometry(stamp)
         # In lockstep the step is the time of the nodes: a clock for each would cost a tenth more.
         if self._clock_publisher is not None and self._is_time_due():
             self._clock_publisher.publish(Clock(clock=stamp))
@@ -382,7 +392,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             LockstepStep(
                 step=self.step,
                 stamp=stamp,
-                robots=self.simulation.present,
+                robots=present,
                 imaging=[name for name in robots if self.simulation.images_due(name)],
             )
         )

@@ -102,8 +102,7 @@ class RobotTopics:
     def publish(self, stamp: Time) -> bool:
         """Publish what is due; return whether camera or ranging sensor had something."""
         simulation, robot, name = self.simulation, self.robot, self.name
-        if self._odometry_publisher is not None:
-            self._publish_odometry(stamp, self._odometry_publisher)
+        self.publish_odometry(stamp)
         imaging = simulation.images_due(name)
         if imaging and robot.camera is not None:
             image = robot.image(simulation.step, simulation.time)
@@ -127,7 +126,10 @@ class RobotTopics:
             self._battery_publisher.publish(self._battery)
         return imaging
 
-    def _publish_odometry(self, stamp: Time, publisher: Publisher) -> None:
+    def publish_odometry(self, stamp: Time) -> None:
+        """Publish the odometry, unless the robot reports its own pose."""
+        if self._odometry_publisher is None:
+            return
         reading, message = self.robot.odometry, self._odometry
         message.header.stamp = stamp
         place, turn = message.pose.pose.position, message.pose.pose.orientation
@@ -137,7 +139,7 @@ class RobotTopics:
         linear, angular = message.twist.twist.linear, message.twist.twist.angular
         linear.x, linear.y, linear.z = reading.velocity.tolist()
         angular.x, angular.y, angular.z = reading.angular_velocity.tolist()
-        publisher.publish(message)
+        self._odometry_publisher.publish(message)
 
 
 def range_messages(sweep: Sweep) -> list[RangeMeasurement]:
