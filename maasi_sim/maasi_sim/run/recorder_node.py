@@ -87,6 +87,7 @@ class Recorder:
         step_length: float,
         bag: BagWriter | None,
         team: str = '',
+        lockstep: bool = False,
     ) -> None:
         self.context = Context()
         rclpy.init(
@@ -104,6 +105,7 @@ class Recorder:
         )
         self.observer = observer
         self._step_length = step_length
+        self._lockstep = lockstep
         self.bag = bag
         self._team = team
         self.name = within(team, f'/{NAME}')
@@ -252,7 +254,8 @@ class Recorder:
         messages are dropped, so that equal runs give equal recordings.
         """
         self.take_ready()
-        before = self.time
+        # In lockstep a message may come later than others that were published after it.
+        before = 0 if self._lockstep else self.time
         # Messages that an update refers to precede it: take updates first, add them last.
         updates = self._take(self.observer.update_topics)
         steps = self._take([STEP])
@@ -303,9 +306,9 @@ class Recorder:
         self._record(taken)
 
     def _logged(self, before: int, topic: str, data: bytes) -> int:
-        """Return the time under which a message is recorded [ns], from the last drain on.
+        """Return the time under which a message is recorded [ns]: its stamp, or now.
 
-        It is that of its stamp, so that no stamp is later, unless it has none of this clock.
+        A stamp before `before` [ns] is too old, and one far ahead is not of this clock.
         """
         stamp = stamp_of(topic, self._subscriptions[topic].msg_type, data)
         known = 0 <= stamp <= self.time + _LARGEST_LEAD

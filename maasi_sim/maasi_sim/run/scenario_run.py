@@ -123,7 +123,9 @@ class ScenarioRun:
                 self._bag = BagWriter(self.folder / 'bag', types, self._scenario.record.images)
                 ends.callback(self._close_bag)
             step = self._scenario.step
-            self.recorder = Recorder(domain.number, self.observer, step, self._bag, team)
+            self.recorder = Recorder(
+                domain.number, self.observer, step, self._bag, team, options.lockstep
+            )
             ends.callback(self.recorder.close)
             self.supervisor.recorder = self.recorder
             if self._bag is not None:

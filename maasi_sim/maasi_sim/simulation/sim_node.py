@@ -35,8 +35,9 @@ _LOOK_PERIOD = 0.02
 _PATIENCE, _REMINDER = 3.0, 15.0
 # Longest wait for the subscriptions of a node that reports ready [s].
 _CONNECTION_PATIENCE = 5.0
-# Most steps from the recorder to the simulation.
-_MOST_AHEAD = 100
+# Most steps from the recorder to the simulation: a port of Fast DDS holds 512 messages, then they
+# have to be sent again.
+_MOST_AHEAD = 20
 # Period of the clock in lockstep [s].
 _CLOCK_PERIOD = 0.25
 # At shutdown: how long linked robots stay reachable for drivers that stop them [s].
