@@ -27,10 +27,10 @@ def scenario(tmp_path):
 
 
 def recorded(folder):
-    """Return the times of the clock in a recording without its end [ns]."""
+    """Return the times of the steps in a recording without its end [ns]."""
     with Bag(folder) as bag:
         assert 'the end of bag.mcap is missing' in bag.recovered or not bag.recovered
-        times = [stamp_from_ros(item.message.clock) for item in bag.messages(['/clock'])]
+        times = [stamp_from_ros(item.message.stamp) for item in bag.messages(['/lockstep/step'])]
     assert times == sorted(times) and len(times) > 10
     return times
 

@@ -45,8 +45,9 @@ _SKIPPED = ('/parameter_events', READY)
 _KEPT = '/found_targets/kept'
 # Topics still recorded during shutdown.
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
-# The clock may come after messages of its time; a larger lead is of another clock [ns].
-_LARGEST_LEAD = 10**9
+# The clock may come after messages of its time: by so much [s], in lockstep by so many steps. A
+# larger lead is of another clock.
+_LARGEST_LEAD, _MOST_STEPS = 1.0, 50
 # Between two calls to take off [s].
 _ARMING_PERIOD = 2.0
 # Longest wait for the acknowledgement of stop commands [s].
@@ -106,6 +107,7 @@ class Recorder:
         self.observer = observer
         self._step_length = step_length
         self._lockstep = lockstep
+        self._lead = round(1e9 * max(_LARGEST_LEAD, _MOST_STEPS * step_length))
         self.bag = bag
         self._team = team
         self.name = within(team, f'/{NAME}')
@@ -311,7 +313,7 @@ class Recorder:
         A stamp before `before` [ns] is too old, and one far ahead is not of this clock.
         """
         stamp = stamp_of(topic, self._subscriptions[topic].msg_type, data)
-        known = 0 <= stamp <= self.time + _LARGEST_LEAD
+        known = 0 <= stamp <= self.time + self._lead
         return max(stamp, before) if known else self.time
 
     def _note_planner(self, status: DiagnosticStatus) -> None:
