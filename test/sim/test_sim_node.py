@@ -332,7 +332,7 @@ def test_a_filter_that_was_started_again_gets_the_step_anew(make_team):
     team.spin_until(lambda: len(team.filter.steps) == 1 and len(team.planner.steps) == 2)
     assert team.filter.steps[0].step == 0
     # The answers of drivers may have been missed.
-    assert steps_of(team.drivers['mambo'].of('odom')) == [0, 0]
+    team.spin_until(lambda: steps_of(team.drivers['mambo'].of('odom')) == [0, 0])
     team.planner.quiet = False
     team.planner.say_done(0)
     team.run(5)

@@ -270,8 +270,10 @@ class Recorder:
         clocks = self._take([CLOCK])
         for _, data in clocks:
             self.time = max(self.time, time_at(data, 4))
-        others = self._take([topic for topic in self._subscriptions if topic not in self._in_order])
-        others = [item for item in others if self._is_own(*item)]
+        topics = [topic for topic in self._subscriptions if topic not in self._in_order]
+        # Detections refer to images of the same stamp.
+        topics.sort(key=lambda topic: topic.endswith('/detections'))
+        others = [item for item in self._take(topics) if self._is_own(*item)]
         if limit is not None and self.step is not None and not self._finished:
             # Messages of the step at the limit may come before that step.
             end, length = limit + (self._begun or 0), self._step_length
