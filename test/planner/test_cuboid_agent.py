@@ -8,6 +8,8 @@ import pytest
 from cuboid_instances import AREA, robots_at, two_buildings
 from std_msgs.msg import Header
 
+from maasi_filter.colours import ROBOTS
+from maasi_filter.ros.conversions import colour_of
 from maasi_planner.buildings.agent import Activity, SearchAgent
 from maasi_planner.buildings.conversions import (
     agent_markers,
@@ -275,3 +277,13 @@ def test_a_decision_has_its_snapshots_and_markers(agent):
     assert len(set(visited)) == 1
     assert visited[0] != markers[0].color.r
     assert len(mission_markers(agent.mission, Header()).markers) == 2
+
+
+def test_markers_have_the_colour_that_the_robot_has_in_its_team(agent):
+    agent.name = 'walker'
+    agent.observe(1, agent.mission.centres[4], np.zeros(3))
+    plan = agent.decide([], random(1))
+    for team, number in (([], 0), (['climber', 'rover', 'walker'], 2)):
+        markers = agent_markers(agent, plan, HEADER, team).markers
+        (robot,) = (marker for marker in markers if marker.ns == 'walker/robot')
+        assert robot.color == colour_of(ROBOTS[number])

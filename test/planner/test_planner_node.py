@@ -12,7 +12,10 @@ from own_context import own_context
 from player import Player
 from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+from visualization_msgs.msg import MarkerArray
 
+from maasi_filter import colours
+from maasi_filter.ros.conversions import colour_of
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
@@ -290,6 +293,23 @@ def test_wrong_destinations_and_searches_are_dropped():
             team.until(answer.done)
             assert not answer.result().accepted
         assert team.tested.dropped['bad goal'] == 2
+
+
+def test_markers_have_the_colours_of_the_whole_team():
+    with running(others={'aa': OtherRobotSettings(start=[0.2, 1.8, 0.0])}) as team:
+        arrays = team.hear(MarkerArray, 'markers')
+        team.begin()
+        for step in (20, 40):
+            team.tell(step)
+        team.until(lambda: any(len(of_robots(array)) == len(ROBOTS) for array in arrays))
+        shown = of_robots(arrays[-1])
+        for marker, index in zip(shown, (0, 2)):
+            wanted, tint = colour_of(colours.ROBOTS[index]), marker.color
+            assert (tint.r, tint.g, tint.b) == pytest.approx((wanted.r, wanted.g, wanted.b))
+
+
+def of_robots(array):
+    return [marker for marker in array.markers if marker.ns == 'robots']
 
 
 # ---- the filter --------------------------------------------------------------------------------

@@ -213,6 +213,13 @@ def test_a_long_run_is_thinned_until_it_fits_and_says_so():
     seen = [[time, 'seen', 'a', [0, 0, 0], []] for time in (0.0, 0.1, 0.2, 0.3)]
     seen[2][4].append([1, 0, 0, 0, 0, 0])
     assert [event[0] for event in thin(seen, 10.0)] == [0.0, 0.2, 0.3]
+    # So is each plan at buildings, to which a line of the log leads.
+    plans = [[2], [2], [2, 3], [3], [3], [3]]
+    decided = [
+        [0.1 * step, 'cuboid', 'a', 'searching', 'optimal', [0, 0, 0], [], plan, [], False]
+        for step, plan in enumerate(plans)
+    ]
+    assert [event[7] for event in thin(decided, 10.0)] == [[2], [2, 3], [3], [3]]
 
 
 def test_scenes_are_the_same_from_a_scenario_and_from_what_a_recording_says_of_it():
@@ -222,6 +229,13 @@ def test_scenes_are_the_same_from_a_scenario_and_from_what_a_recording_says_of_i
         assert scene == scene_of(name, scenario, 3)
         assert json.loads(line(scene)) == scene
     assert len(scene['cuboids']) == 32 and len(scene['objects']) == 2
+    # Each cuboid is for a part of a face; the parts make up the four walls of both.
+    sizes = [np.diff(sides)[:, 0] for _, _, sides in scene['cells']]
+    assert len(sizes) == 32
+    assert sum(np.prod(size[size > 0.0]) for size in sizes) == pytest.approx(8 * 60.0**2)
+    for owner, face, sides in scene['cells']:
+        axis, upper = divmod(face, 2)
+        assert sides[axis] == 2 * [scene['objects'][owner][axis][upper]]
     # Of a planner with another objective there are no weights.
     changes = {'planner': (('planner', 'name'), 'maas')}
     assert 'weights' not in scene_of('maas', load_mission('mambo_turtlebot', changes).scenario)

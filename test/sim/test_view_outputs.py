@@ -122,6 +122,7 @@ def test_a_robot_that_left_goes_nowhere_on_the_page(departing, tmp_path):
             pixels.append(bluish(cv2.imdecode(data, cv2.IMREAD_COLOR)).sum())
         assert pixels[1] < 0.1 * pixels[0]
         shown.page.click('#robots tr[data-robot=mambo]')
+        shown.settle()
         assert shown.page.inner_text('#why_body') == 'mambo has left.'
         shown.seek(9.0)
         shown.until("document.querySelector('#headline').textContent.startsWith('Ended')")

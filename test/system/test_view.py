@@ -28,6 +28,10 @@ def watch(run, address):
     with chromium() as shown:
         shown.open(address)
         shown.until('maasi.log.duration > 1')
+        run.strips = [
+            strip.get_attribute('aria-label')
+            for strip in shown.page.locator('#strips canvas').all()
+        ]
         shown.page.click('#robots tr[data-robot=turtlebot]')
         shown.page.click('button[data-command=pause]')
         shown.until("/[^.]$/.test(document.querySelector('#controls [role=status]').innerText)")
@@ -73,11 +77,15 @@ def test_a_browser_saw_the_run_while_it_went_on(run):
     assert run.found == len(run.report['found'])
     assert run.decisions == sum(len(item['robots']) for item in of_topic(run, '/decisions'))
     assert run.answer == 'pause: turtlebot'
+    # What robots have done so far is below the time line of a live run, too.
+    assert [strip.partition(':')[0] for strip in run.strips] == ['mambo', 'turtlebot']
+    assert all('on the way' in strip and ' measurements' in strip for strip in run.strips)
     # Nobody follows after the end.
     assert not run.controls
     assert run.headline == f'Ended: time limit; {run.found} of 12 found after 30 s'
     assert './scripts/run_scenario mambo_turtlebot --seed 1 --lockstep' in run.card
-    assert str(REPLAY) in run.card
+    # Where it is, as the terminal says it.
+    assert f'Replay: {run.folder / REPLAY}' in run.card and (run.folder / REPLAY).is_file()
     # Each number of nodes that were ready, up to all.
     assert run.starts[-1][3:] == [run.starts[-1][4]] * 2 and len(run.starts) > 1
     assert 'mambo searching, turtlebot paused' in run.modes
@@ -153,7 +161,8 @@ def test_a_search_in_space_from_above_is_shaded_by_its_columns(tmp_path):
         shown.page.click('#space')
         shown.settle()
         shades = shown.page.evaluate(
-            'Array.from(maasi.map.shading.canvas.getContext("2d").getImageData(0, 0, 2, 2).data)'
+            'Array.from(maasi.map.unexplored.floor.canvas'
+            '.getContext("2d").getImageData(0, 0, 2, 2).data)'
         )[3::4]
         # From the upper left corner, by rows: y falls, x rises.
         assert shades == [90, 0, 90, 90]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from geometry_msgs.msg import Vector3
 from std_msgs.msg import ColorRGBA, Header
@@ -140,10 +142,12 @@ def mission_markers(mission: CoveragePlan, header: Header) -> MarkerArray:
     return MarkerArray(markers=objects + others)
 
 
-def agent_markers(agent: SearchAgent, plan: Plan, header: Header) -> MarkerArray:
-    """Return markers of a robot, its plan, its search map, and its camera direction."""
+def agent_markers(
+    agent: SearchAgent, plan: Plan, header: Header, team: Sequence[str] = ()
+) -> MarkerArray:
+    """Return markers of a robot of a team, its plan, search map, and camera direction."""
     name = agent.name
-    tint_of_robot = colour_of(robot_colours([name])[name])
+    tint_of_robot = colour_of(robot_colours({name, *team})[name])
     markers = []
     for number, box in enumerate(agent.mission.boxes):
         visited = bool(agent.visited[number])

@@ -340,7 +340,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             self._decision_publisher.publish(decision)
             self._published_shots = len(agent.snapshots)
             self._path_publisher.publish(path_to_ros(plan.positions, header))
-            markers = agent_markers(agent, plan, header)
+            markers = agent_markers(agent, plan, header, self.settings.team)
             self._markers_publisher.publish(self._board.replace(markers))
         self._decided_step = step
         self._publish_state(step, header)

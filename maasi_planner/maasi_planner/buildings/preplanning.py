@@ -52,6 +52,12 @@ class Cell:
     size: FloatArray
     box: FloatArray
 
+    def sides(self) -> FloatArray:
+        """Return lower and upper corner of the cell, (3, 2) [m]: flat along its normal."""
+        half = np.zeros(3)
+        half[self.normal == 0.0] = 0.5 * self.size
+        return np.stack([self.centre - half, self.centre + half], axis=1)
+
     def distance(self, position: ArrayLike) -> float:
         """Return how far a position (3,) is from the face [m]."""
         return float((np.asarray(position, dtype=float) - self.centre) @ self.normal)

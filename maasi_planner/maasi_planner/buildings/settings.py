@@ -230,6 +230,7 @@ class CuboidPlannerSettings(NodeSettings, SearcherSettings):
         'the service search/start',
     )
     step: float = Field(default=1.0, gt=0.0, le=10.0, description='dT, duration of a step [s]')
+    team: list[str] = Field(default=[], description='Names of all robots, for their colours')
     environment: EnvironmentSettings = Field(description='Where robots may be')
     planner: CuboidMethodSettings = Field(
         default_factory=CuboidMethodSettings, description='The method'

@@ -60,5 +60,7 @@ class PlannerViews:
             path = coordinator.plans[name].positions
             place = np.asarray(robot.state.pose.position)
             shown[name] = (place, path[-1] if len(path) else place, path)
-        markers = planner_markers(shown, robot_colours(coordinator.names), header, self._size)
+        # Of the whole team, so that a robot that plans for itself has its colour of the team.
+        tints = robot_colours([*coordinator.names, *self._node.settings.others])
+        markers = planner_markers(shown, tints, header, self._size)
         self._markers.publish(self._board.replace(markers))

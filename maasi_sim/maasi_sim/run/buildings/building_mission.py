@@ -69,6 +69,7 @@ def _planner_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -
         {
             **common,
             'environment': scenario.environment.of_nodes(),
+            'team': scenario.names(),
             'start': robot.start,
             'yaw': robot.yaw,
             'dynamics': robot.dynamics,

@@ -104,7 +104,9 @@ class Thinning:
         if kind not in _THINNED or seen:
             return True
         last = self._last.get((kind, owner))
-        news = kind == 'robot' and last is not None and event[5:] != last[5:]
+        # Another status or reason of a robot, another plan or activity of one at buildings.
+        parts = {'robot': (5, 6), 'cuboid': (3, 7)}.get(kind, ())
+        news = last is not None and any(event[part] != last[part] for part in parts)
         if last is None or news or time - last[0] >= self._period - 1e-6:
             self._last[kind, owner] = event
             return True

@@ -17,8 +17,8 @@ FOLDER = Path(__file__).with_name('page')
 REPLAY = 'replay.html'
 # Each uses only what is before it.
 _MODULES = (
-    'run_log camera colours text words shapes labels robots buildings map why panels legend marks '
-    'tips curve live main'
+    'run_log camera colours text words shapes labels floor_grid unexplored belief robots buildings '
+    'map why panels legend marks strips tips curve live main'
 )
 
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from maasi_drivers.agent.flight_rules import make_fence
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.settings import DETECTIONS
+from maasi_planner.buildings.settings import FACES
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.run.buildings.scenario import NAME as BUILDINGS
 from maasi_sim.run.buildings.scenario import CuboidScenario
@@ -81,11 +82,13 @@ def _objective(settings: PlannerSettings) -> Scene:
 
 def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
     detection = robot.sensor.detection
+    _, parameters = detection.build(scenario.dimension).kernel()
     view: dict[str, Any] = {'kind': detection.kind, 'turns': detection.frame == 'robot'}
+    view['gain'] = float(parameters[0])
     if detection.kind == 'box':
-        view |= {'lower': list(detection.lower), 'upper': list(detection.upper)}
+        corners = {'lower': list(detection.lower), 'upper': list(detection.upper)}
+        view |= corners | {'edge': detection.edge}
     elif detection.kind not in DETECTIONS.own:
-        _, parameters = detection.build(scenario.dimension).kernel()
         view['size'] = [1.0 / float(parameters[1])] * scenario.dimension
     else:
         view['size'] = list(detection.size)[: scenario.dimension]
@@ -115,6 +118,10 @@ def _buildings(scenario: CuboidScenario) -> Scene:
         'objects': rounded(mission.objects),
         'blocks': rounded(mission.obstacles),
         'cuboids': rounded(mission.boxes),
+        # The part of a face that each is for: object, number of the face, sides.
+        'cells': [
+            [cell.target, FACES.index(cell.face), rounded(cell.sides())] for cell in mission.cells
+        ],
         'robots': {
             name: {
                 'type': robot.type,

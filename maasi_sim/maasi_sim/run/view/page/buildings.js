@@ -2,7 +2,15 @@
 
 import { OPEN, VISITED, robotColour, themed } from './colours.js';
 import { isAway, MOVING } from './run_log.js';
-import { box, path } from './shapes.js';
+import { box, path, side } from './shapes.js';
+
+const FACES = ['west', 'east', 'south', 'north', 'bottom', 'top'];
+export const PHOTOGRAPHED = '#2f8fd0';
+
+// Return the colour of a face of which a share was photographed.
+export function faceColour(share) {
+  return `rgba(${140 - 93 * share}, 140, ${160 + 48 * share}, .75)`;
+}
 
 export function drawBuildings(view, log, time) {
   const { context, camera } = view;
@@ -17,7 +25,7 @@ export function drawBuildings(view, log, time) {
     if (event && here && here[5] === MOVING) for (const cuboid of event[7]) planned.set(cuboid, name);
   }
   const boxes = [
-    ...(log.scene.objects || []).map((sides) => ({ sides, fill: 'rgba(140, 140, 160, .75)', stroke: themed('--quiet') })),
+    ...(log.scene.objects || []).map((sides, object) => ({ sides, object, fill: 'rgba(140, 140, 160, .75)', stroke: themed('--quiet') })),
     ...(log.scene.blocks || []).map((sides) => ({ sides, fill: 'rgba(110, 100, 85, .85)', stroke: themed('--text') })),
     ...(log.scene.cuboids || []).map((sides, cuboid) => ({ sides, cuboid, ...look(cuboid) })),
   ];
@@ -37,18 +45,51 @@ export function drawBuildings(view, log, time) {
   boxes.sort((a, b) => b.depth - a.depth);
   for (const item of boxes) {
     context.lineWidth = item.wide ? 2.5 : 1;
-    if (camera.spatial) box(context, camera, item.sides, item.fill, item.stroke);
-    else {
+    if (camera.spatial) {
+      box(context, camera, item.sides, item.fill, item.stroke);
+      if (item.object !== undefined) drawFaces(view, log, visited, item);
+    } else {
       const [[left, right], [low, high]] = item.sides;
       path(context, camera, [[left, low], [right, low], [right, high], [left, high]], true);
       context.fillStyle = item.fill;
       context.strokeStyle = item.stroke;
       context.fill();
       context.stroke();
+      if (item.object !== undefined) drawFaces(view, log, visited, item);
     }
   }
   context.lineWidth = 1;
   drawLinks(view, log, time);
+}
+
+// The faces of an object by the share that was photographed, and the photographed parts; from above
+// the walls are lines.
+function drawFaces(view, log, visited, { object, sides }) {
+  const { context, camera } = view;
+  const cells = (log.scene.cells || []).map(([owner, number, part], cuboid) => ({ owner, number, part, cuboid }));
+  FACES.forEach((name, number) => {
+    const own = cells.filter((cell) => cell.owner === object && cell.number === number);
+    const done = own.filter((cell) => visited.has(cell.cuboid));
+    if (!own.length) return;
+    const axis = number >> 1;
+    const place = sides.map(([low, high], other) => (other === axis ? sides[axis][number % 2] : (low + high) / 2));
+    const isWall = !camera.spatial && axis < 2;
+    const colour = faceColour(done.length / own.length);
+    if (isWall) {
+      const along = 1 - axis;
+      path(context, camera, sides[along].map((value) => place.map((other, index) => (index === along ? value : other))));
+      context.lineWidth = 6;
+      context.strokeStyle = colour;
+      context.stroke();
+      context.lineWidth = 1;
+    } else {
+      if (!camera.spatial && name === 'bottom') return;
+      if (!side(context, camera, sides, number, colour, themed('--quiet'))) return;
+      for (const cell of done) side(context, camera, cell.part, number, PHOTOGRAPHED, themed('--floor'));
+    }
+    const [x, y] = camera.project(place);
+    view.targets.push({ x, y, face: { object, name, done: done.length, total: own.length } });
+  });
 }
 
 // Lines between robots of which one hears the other.

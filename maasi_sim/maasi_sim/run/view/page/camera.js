@@ -86,6 +86,19 @@ export class Camera {
     ];
   }
 
+  // Return the place at a height below a point of the canvas.
+  ground(x, y, height) {
+    if (!this.spatial) return this.place(x, y);
+    // A point of the ray at a depth d is right = a (D + d), up = b (D + d), with D the distance of the eye.
+    const [a, b] = [(x - this.width / 2) / (this.scale * this.distance), (this.height / 2 - y) / (this.scale * this.distance)];
+    const z = height - this.centre[2];
+    // From up = z cos + away sin, and d = away cos - z sin.
+    const slope = this.sinTilt - b * this.cosTilt;
+    const away = (b * (this.distance - z * this.sinTilt) - z * this.cosTilt) / slope;
+    const right = a * (this.distance + away * this.cosTilt - z * this.sinTilt);
+    return [this.centre[0] + right * this.cosTurn + away * this.sinTurn, this.centre[1] - right * this.sinTurn + away * this.cosTurn];
+  }
+
   drag(dx, dy) {
     if (this.spatial) {
       this.turn -= 0.008 * dx;

@@ -1,12 +1,17 @@
 // What the marks on the map mean.
 
-import { FOUND, OPEN, POTENTIAL, SEEN, VISITED, scaleColour } from './colours.js';
+import { FOUND, OPEN, POTENTIAL, SEEN, VISITED, robotColour, scaleColour } from './colours.js';
+import { faceColour, PHOTOGRAPHED } from './buildings.js';
 import { element } from './text.js';
 
+const HEAT = 'linear-gradient(90deg, rgba(var(--heat-low), .25), rgba(var(--heat-high), .9))';
+
 // Return the entries: class of the mark, its colour, text, and what else is in the mark.
-function entries(log, selected) {
+function entries(log, time, selected, layers) {
+  const isEmpty = !(log.potential.at(time) >= 0.005);
   const robots = Object.values(log.scene.robots);
   const cividis = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(scaleColour).join(', ')})`;
+  const faceGradient = `linear-gradient(90deg, ${faceColour(0)}, ${faceColour(1)})`;
   const of = (...list) => list.filter(Boolean);
   const ways = of(
     ['text', '', 'robot, in its colour', '➤'],
@@ -20,12 +25,15 @@ function entries(log, selected) {
       ['box', 'var(--text)', 'planned, in the colour of its robot'],
       ['box', VISITED, 'cuboid visited'],
       ['area', 'rgba(140, 140, 160, .75)', 'building'],
+      log.scene.cells && ['area', faceGradient, 'face of a building: share photographed, from none to all'],
+      log.scene.cells && ['area', PHOTOGRAPHED, 'photographed part of it'],
       (log.scene.blocks || []).length && ['area', 'rgb(110, 100, 85)', 'obstacle'],
       ['dot', '', 'radio link, or where a robot is drawn to'],
     );
   }
   return of(
     ['area', 'rgba(var(--unseen), .53)', 'unexplored'],
+    layers.belief && ['area', HEAT, `belief: potential targets per area, from few to many${isEmpty ? ' (none now)' : ''}`],
     ...ways,
     ['dash', '', 'planned way'],
     ['box', '', 'its waypoint'],
@@ -42,14 +50,31 @@ function entries(log, selected) {
   );
 }
 
-export function showLegend(parent, log, selected) {
-  const shown = entries(log, selected);
+// Return the entries of the strips below the time line.
+function stripEntries(log) {
+  const names = log.robots();
+  const colour = robotColour(names, names[0]);
+  if (!names.length) return [];
+  return [
+    ['break'],
+    ['text', '', 'Strips, in the colour of each robot:', ''],
+    ['area', colour, 'on the way'],
+    ['area', `${colour}4d`, 'waiting'],
+    ['area', 'var(--fault)', 'cannot go on'],
+    ['line', 'var(--away)', 'left, silent or ended'],
+    ['text', SEEN, log.isOfBuildings ? 'snapshot' : 'measurement', '|'],
+  ];
+}
+
+export function showLegend(parent, log, time, selected, layers) {
+  const shown = [...entries(log, time, selected, layers), ...stripEntries(log)];
   if (log.scene.thinned) shown.push(['text', '', `thinned: one state per ${log.scene.thinned} s`]);
   const key = JSON.stringify(shown);
   if (parent.dataset.key === key) return;
   parent.dataset.key = key;
   parent.replaceChildren(
     ...shown.map(([kind, colour, text, sign]) => {
+      if (kind === 'break') return element('br', '');
       const entry = element('span', '');
       const mark = element('i', kind, sign);
       mark.setAttribute('aria-hidden', 'true');

@@ -9,6 +9,7 @@ import { drawMarks } from './marks.js';
 import { showLog, showNumbers, showRobots } from './panels.js';
 import { RunLog, unpack } from './run_log.js';
 import { element } from './text.js';
+import { showStrips } from './strips.js';
 import { showTip, tipAt } from './tips.js';
 import { showWhy } from './why.js';
 import { hasEnded, headline, showCard, showHeadline } from './words.js';
@@ -110,11 +111,11 @@ class Page {
   }
 
   addLayers() {
-    const layers = [['truth', 'Truth'], ['unseen', 'Unexplored'], ['view', 'Field of view'], ['ways', 'Ways'], ['clusters', 'Potential'], ['detections', 'Detections']];
+    const layers = [['truth', 'Truth'], ['unseen', 'Unexplored'], ['belief', 'Belief'], ['view', 'Field of view'], ['ways', 'Ways'], ['clusters', 'Potential'], ['detections', 'Detections']];
     for (const [name, title] of layers) {
       const button = element('button', '', title);
       button.dataset.layer = name;
-      button.setAttribute('aria-pressed', 'true');
+      button.setAttribute('aria-pressed', String(this.map.layers[name]));
       button.onclick = () => {
         this.map.layers[name] = !this.map.layers[name];
         button.setAttribute('aria-pressed', String(this.map.layers[name]));
@@ -334,7 +335,12 @@ class Page {
     const { log, time } = this;
     this.tell();
     // It may take room from the map.
-    showLegend($('legend'), log, this.selected);
+    showLegend($('legend'), log, time, this.selected, this.map.layers);
+    const wantsRoom = showStrips($('strips'), log, time, (name, at) => {
+      this.select(name);
+      this.seek(at);
+    });
+    if (wantsRoom) this.fitted = false;
     this.map.resize();
     if (!this.fitted) {
       if (log.isSpatial && !this.camera.chosen) {
@@ -346,7 +352,8 @@ class Page {
       this.fitted = Boolean(log.scene.bounds) || !this.isLive;
     }
     this.map.marked = this.marked;
-    this.map.pulses = !reducedMotion.matches;
+    // Above a second of a fast replay, too.
+    this.map.pulse = reducedMotion.matches ? 0 : Math.max(4, 1.2 * Number($('speed').value));
     this.map.draw(log, time, this.selected);
     this.curve.draw(log, time);
     showNumbers($('numbers'), log, time);

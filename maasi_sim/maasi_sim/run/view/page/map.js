@@ -1,17 +1,18 @@
 // Draws a search for targets at a time.
 
+import { Belief } from './belief.js';
 import { FOUND, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colours.js';
 import { Labels } from './labels.js';
 import { drawRobot, drawWays } from './robots.js';
 import { LEFT } from './run_log.js';
 import { circle, cross, dropLine, ellipse, matrix, path } from './shapes.js';
 import { number } from './text.js';
+import { Unexplored } from './unexplored.js';
 import { drawBuildings } from './buildings.js';
 
 // Detections are shown for this time [s].
 const FADE = 1.5;
-// A ring runs out from what was found for this time [s], so far [px].
-const PULSE = 4;
+// How far the ring runs out from what was found [px].
 const PULSE_REACH = 40;
 
 export class MapView {
@@ -19,11 +20,12 @@ export class MapView {
     this.canvas = canvas;
     this.context = canvas.getContext('2d');
     this.camera = camera;
-    this.layers = { truth: true, unseen: true, view: true, ways: true, clusters: true, detections: true };
+    this.layers = { truth: true, unseen: true, belief: false, view: true, ways: true, clusters: true, detections: true };
     this.marked = null;
-    // Whether a ring runs out from what is found.
-    this.pulses = true;
-    this.shading = { event: null, canvas: document.createElement('canvas') };
+    // How long a ring runs out from what was found [s of the run].
+    this.pulse = 0;
+    this.unexplored = new Unexplored();
+    this.belief = new Belief();
     // Where robots and candidates were drawn, for clicks.
     this.targets = [];
   }
@@ -50,7 +52,9 @@ export class MapView {
     context.fillStyle = themed('--back');
     context.fillRect(0, 0, camera.width, camera.height);
     this.drawGround(log);
-    if (this.layers.unseen) this.drawUnseen(log, time);
+    this.unexplored.update(log, time);
+    if (this.layers.unseen) this.unexplored.draw(this);
+    if (this.layers.belief && !log.isOfBuildings) this.belief.draw(this, log, time);
     this.drawObstacles(log);
     this.drawFences(log);
     if (log.isOfBuildings || log.scene.objects) drawBuildings(this, log, time);
@@ -99,80 +103,6 @@ export class MapView {
     context.textAlign = 'right';
     context.fillText(`grid ${Number(step.toPrecision(2))} m`, camera.width - 10, camera.height - 6);
     context.textAlign = 'left';
-  }
-
-  drawUnseen(log, time) {
-    for (const space of log.owners('map')) {
-      const event = log.at('map', space, time);
-      if (!event) continue;
-      if (event[5][2] > 1 && this.camera.spatial) this.drawUnseenSpace(event);
-      else this.drawUnseenFloor(event);
-      return;
-    }
-  }
-
-  // From above a search in space has the mean of each column.
-  drawUnseenFloor([, , , corner, step, [nx, ny, nz], digits]) {
-    const { context, camera } = this;
-    const half = [step[0] / 2, step[1] / 2];
-    const colour = themed('--unseen');
-    if (camera.spatial) {
-      for (let level = 1; level <= 9; level += 1) {
-        context.fillStyle = `rgba(${colour}, ${0.06 * level})`;
-        context.beginPath();
-        for (let i = 0; i < nx; i += 1) {
-          for (let j = 0; j < ny; j += 1) {
-            if (digits.charCodeAt(i * ny + j) - 48 !== level) continue;
-            const [x, y] = [corner[0] + i * step[0], corner[1] + j * step[1]];
-            const around = [[x - half[0], y - half[1]], [x + half[0], y - half[1]], [x + half[0], y + half[1]], [x - half[0], y + half[1]]];
-            around.forEach(([px, py], index) => {
-              const [sx, sy] = camera.project([px, py, this.floor]);
-              if (index) context.lineTo(sx, sy);
-              else context.moveTo(sx, sy);
-            });
-            context.closePath();
-          }
-        }
-        context.fill();
-      }
-      return;
-    }
-    if (this.shading.event !== digits || this.shading.colour !== colour) {
-      const { canvas } = this.shading;
-      [canvas.width, canvas.height] = [nx, ny];
-      const pixels = new ImageData(nx, ny);
-      const [red, green, blue] = colour.split(',').map(Number);
-      for (let i = 0; i < nx; i += 1) {
-        for (let j = 0; j < ny; j += 1) {
-          let value = 0;
-          for (let k = 0; k < nz; k += 1) value += (digits.charCodeAt((i * ny + j) * nz + k) - 48) / nz;
-          pixels.data.set([red, green, blue, 15 * value], 4 * ((ny - 1 - j) * nx + i));
-        }
-      }
-      canvas.getContext('2d').putImageData(pixels, 0, 0);
-      this.shading.event = digits;
-      this.shading.colour = colour;
-    }
-    const [x, y] = camera.project([corner[0] - half[0], corner[1] + (ny - 0.5) * step[1]]);
-    context.imageSmoothingEnabled = false;
-    context.drawImage(this.shading.canvas, x, y, nx * step[0] * camera.scale, ny * step[1] * camera.scale);
-  }
-
-  drawUnseenSpace([, , , corner, step, [nx, ny, nz], digits]) {
-    const { context, camera } = this;
-    const colour = themed('--unseen');
-    const skip = Math.max(1, Math.round(Math.cbrt((nx * ny * nz) / 3000)));
-    for (let i = 0; i < nx; i += skip) {
-      for (let j = 0; j < ny; j += skip) {
-        for (let k = 0; k < nz; k += skip) {
-          const value = digits.charCodeAt((i * ny + j) * nz + k) - 48;
-          if (value < 1) continue;
-          const [x, y] = camera.project([corner[0] + i * step[0], corner[1] + j * step[1], corner[2] + k * step[2]]);
-          context.fillStyle = `rgba(${colour}, ${0.09 * value})`;
-          context.fillRect(x - 2, y - 2, 4, 4);
-        }
-      }
-    }
   }
 
   drawObstacles(log) {
@@ -303,8 +233,8 @@ export class MapView {
         context.arc(px, py, 3, 0, 2 * Math.PI);
         context.fill();
         dropLine(context, camera, [x, y, z], this.floor);
-        if (this.pulses && time - when < PULSE) {
-          const age = Math.max(0, (time - when) / PULSE);
+        if (time - when < this.pulse) {
+          const age = Math.max(0, (time - when) / this.pulse);
           context.globalAlpha = 1 - age;
           context.lineWidth = 3;
           context.beginPath();

@@ -3,7 +3,7 @@
 import { FOUND, themed } from './colours.js';
 
 // Of the line of the input, from the middle of its knob at the left [px].
-const KNOB = 8;
+export const KNOB = 8;
 
 export function drawMarks(canvas, log) {
   const ratio = window.devicePixelRatio || 1;

@@ -27,13 +27,14 @@ export function drawWays(view, log, time) {
     const stride = Math.ceil(count / MOST_POINTS);
     const points = [];
     for (let index = 0; index < count; index += stride) points.push(slot.events[index][3]);
-    points.push(slot.events[count - 1][3]);
+    const here = log.pose(name, time);
+    points.push(here);
     context.lineWidth = 1.6;
     context.globalAlpha = 0.85;
     path(context, camera, points);
     context.stroke();
     context.globalAlpha = 1;
-    if (slot.events[count - 1][5] === MOVING) drawPlan(view, log, time, name, slot.events[count - 1][3]);
+    if (slot.events[count - 1][5] === MOVING) drawPlan(view, log, time, name, here);
   }
   context.lineWidth = 1;
 }
@@ -62,13 +63,13 @@ export function drawRobot(view, log, time, name, selected) {
   const event = log.at('robot', name, time);
   if (!event) return;
   const { context, camera } = view;
-  const [x, y, z, yaw] = event[3];
+  const [x, y, z, yaw] = log.pose(name, time);
   const robot = log.scene.robots[name] || {};
   const isPale = isAway(event);
   const colour = isPale ? themed('--away') : robotColour(view.names, name);
   context.strokeStyle = colour;
   context.fillStyle = colour;
-  if (view.layers.view && robot.view && !isPale) drawFieldOfView(view, robot.view, event[3], log.isSpatial);
+  if (view.layers.view && robot.view && !isPale) drawFieldOfView(view, robot.view, [x, y, z, yaw], log.isSpatial);
   if (log.isSpatial || z > 0) dropLine(context, camera, [x, y, z], view.floor);
   const nose = 9 / camera.scale;
   const size = Math.max(robot.radius || 0, nose);

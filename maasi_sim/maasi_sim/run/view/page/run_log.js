@@ -4,8 +4,9 @@
 // (cannot go on, left, silent).
 export const MOVING = 1;
 export const LEFT = 6;
+export const SILENT = 7;
 export const ENDED = 8;
-const AWAY = [5, 6, 7];
+const AWAY = [5, LEFT, SILENT];
 
 export function isAway(robotEvent) {
   return AWAY.includes(robotEvent[5]);
@@ -89,10 +90,24 @@ export class RunLog {
     return slot && slot.at(time);
   }
 
+  // Where a robot is and points to; on the way also between two of its states.
+  pose(name, time) {
+    const slot = this.slot('robot', name);
+    const count = slot.count(time);
+    if (!count) return undefined;
+    const [before, after] = slot.events.slice(count - 1, count + 1);
+    if (!after || before[5] !== MOVING || after[5] !== MOVING) return before[3];
+    const share = (time - before[0]) / (after[0] - before[0]);
+    return before[3].map((value, axis) => {
+      const change = after[3][axis] - value;
+      return value + share * (axis < 3 ? change : Math.atan2(Math.sin(change), Math.cos(change)));
+    });
+  }
+
   owners(kind) {
     const names = [];
-    for (const key of this.slots.keys()) {
-      if (key.startsWith(`${kind}/`)) names.push(key.slice(kind.length + 1));
+    for (const [key, { times }] of this.slots) {
+      if (times.length && key.startsWith(`${kind}/`)) names.push(key.slice(kind.length + 1));
     }
     return names.sort();
   }

@@ -44,25 +44,27 @@ export function circle([x, y, z = 0], radius, count = 48) {
 const SIDES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
 
 // Draw the sides of a box that face the reader.
-export function box(context, camera, [xs, ys, zs], fill, stroke) {
-  const corners = [];
-  for (const x of xs) for (const y of ys) for (const z of zs) corners.push(camera.project([x, y, z]));
+export function box(context, camera, sides, fill, stroke) {
+  for (let number = 0; number < SIDES.length; number += 1) side(context, camera, sides, number, fill, stroke);
+}
+
+// Draw one side of a box, west, east, south, north, bottom or top, and return whether it faces the reader.
+export function side(context, camera, sides, number, fill, stroke) {
+  const points = SIDES[number].map((corner) => camera.project(sides.map((range, axis) => range[(corner >> (2 - axis)) & 1])));
+  let area = 0;
+  points.forEach(([x, y], index) => {
+    const [nx, ny] = points[(index + 1) % 4];
+    area += x * ny - nx * y;
+  });
+  if (area >= 0) return false;
   context.fillStyle = fill;
   context.strokeStyle = stroke;
-  for (const side of SIDES) {
-    const points = side.map((index) => corners[index]);
-    let area = 0;
-    points.forEach(([x, y], index) => {
-      const [nx, ny] = points[(index + 1) % 4];
-      area += x * ny - nx * y;
-    });
-    if (area >= 0) continue;
-    context.beginPath();
-    points.forEach(([x, y], index) => (index ? context.lineTo(x, y) : context.moveTo(x, y)));
-    context.closePath();
-    context.fill();
-    context.stroke();
-  }
+  context.beginPath();
+  points.forEach(([x, y], index) => (index ? context.lineTo(x, y) : context.moveTo(x, y)));
+  context.closePath();
+  context.fill();
+  context.stroke();
+  return true;
 }
 
 export function cross(context, x, y, size) {

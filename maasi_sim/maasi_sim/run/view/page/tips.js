@@ -35,19 +35,23 @@ function tell(log, time, selected, hit) {
     const middle = log.scene.cuboids[hit.cuboid].map(([low, high]) => (low + high) / 2);
     return `cuboid ${hit.cuboid}: ${by}, ${at(middle, 3)}`;
   }
+  if (hit.face) {
+    const { object, name, done, total } = hit.face;
+    return `${name} face of building ${object}: ${done} of ${total} parts photographed (${Math.round((100 * done) / total)} %)`;
+  }
   return hit.truth ? `true target ${at(hit.truth, size)}` : '';
 }
 
-// Return the text for a point of the canvas; from above, there is one for each cell as well.
+// Return the text for a point of the canvas; there is one for each cell as well.
 export function tipAt(view, log, time, selected, x, y) {
   const hit = view.hit(x, y);
   const text = hit && tell(log, time, selected, hit);
-  if (text || view.camera.spatial) return text || '';
-  const place = view.camera.place(x, y);
-  const share = log.unexplored(time, place);
-  if (share === undefined) return '';
-  const word = share > 0 ? `unexplored ${Math.round(100 * share)} %` : 'explored';
-  return `${word} ${at(place, 2)}`;
+  if (text) return text;
+  const cell = view.unexplored.pick(view, x, y);
+  if (!cell) return '';
+  const share = Math.round(100 * cell.share);
+  const belief = view.layers.belief && !log.isOfBuildings ? `, ${view.belief.words(cell.place)}` : '';
+  return `${share > 0 ? `unexplored ${share} %` : 'explored'} ${at(cell.place, 3)}${belief}`;
 }
 
 // Show a text beside a point of its parent; none hides it.

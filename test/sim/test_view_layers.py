@@ -1,0 +1,247 @@
+"""What lies on the map and below its time line: belief, the unexplored, faces, strips."""
+
+import base64
+import math
+
+import cv2
+import numpy as np
+import pytest
+from browsers import chromium, needs_chromium
+
+from maasi_sim.run.missions import load_mission
+from maasi_sim.run.view.event_log import EventLog
+from maasi_sim.run.view.page_file import write_replay
+from maasi_sim.run.view.scene import scene_of
+
+pytestmark = needs_chromium
+
+PLANE = {'name': 'plane', 'robots': {}, 'bounds': [[0, 4], [0, 4]]}
+SPACE = {'name': 'space', 'robots': {}, 'bounds': [[0, 4], [0, 4], [0, 4]]}
+GREEN, BLUE, PHOTOGRAPHED = (0, 158, 115), (0, 114, 178), (47, 143, 208)
+
+
+def picture(shown, canvas='#map'):
+    """Return the pixels of a canvas: red, green, blue and opacity."""
+    address = shown.page.evaluate(f'document.querySelector("{canvas}").toDataURL()')
+    data = np.frombuffer(base64.b64decode(address.partition(',')[2]), np.uint8)
+    return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)[:, :, [2, 1, 0, 3]].astype(int)
+
+
+def colour_at(shown, x, y, canvas='#map'):
+    return picture(shown, canvas)[round(y), round(x)][:3].tolist()
+
+
+def place(shown, *position):
+    return shown.page.evaluate(f'maasi.camera.project({list(map(float, position))})')[:2]
+
+
+def tip(shown, x, y):
+    box = shown.page.locator('#map').bounding_box()
+    shown.page.mouse.move(box['x'] + x, box['y'] + y)
+    return shown.page.inner_text('#tip') if shown.page.is_visible('#tip') else ''
+
+
+def of_colour(shown, colour):
+    """Return how many pixels of the map have a colour."""
+    return int((np.abs(picture(shown)[:, :, :3] - colour).max(axis=2) < 40).sum())
+
+
+@pytest.fixture
+def opened(tmp_path):
+    """Return a function that opens the replay of a scene and its events."""
+
+    def open_run(shown, scene, *events):
+        write_replay(EventLog(scene, list(events)), tmp_path / 'page.html')
+        shown.open((tmp_path / 'page.html').as_uri())
+
+    return open_run
+
+
+def test_the_belief_is_a_heat_map_that_can_be_switched_on_from_above_and_in_space(opened):
+    # Of two filters the one that expects more counts.
+    broad = [0.0, 'filter', 'a', 0.6, [[3.0, 1.0, 0.0, 0.6, 0.25, 0.0, 0.0, 0.25, 0.0, 0.0]], 1]
+    less = [0.0, 'filter', 'b', 0.1, [[3.0, 1.0, 0.0, 0.1, 0.25, 0.0, 0.0, 0.25, 0.0, 0.0]], 1]
+    with chromium() as shown:
+        for scene in (PLANE, SPACE):
+            opened(shown, scene, broad, less)
+            if scene is SPACE:
+                shown.page.click('#space')
+                shown.settle()
+            for turned in (False, True):
+                if turned:
+                    shown.page.click('#space')
+                    shown.settle()
+                # Beside the outline of the potential target, and far away.
+                places = [place(shown, 3.35, 1.35, 0.0), place(shown, 1.0, 3.3, 0.0)]
+                before = [colour_at(shown, *item) for item in places]
+                shown.page.click('button[data-layer=clusters]')
+                shown.page.click('button[data-layer=belief]')
+                shown.settle()
+                red, _, blue = colour_at(shown, *places[0])
+                assert red > blue + 40
+                assert colour_at(shown, *places[1]) == before[1]
+                assert 'belief' in shown.page.inner_text('#legend')
+                shown.page.click('button[data-layer=belief]')
+                shown.page.click('button[data-layer=clusters]')
+                shown.settle()
+                assert [colour_at(shown, *item) for item in places] == before
+                assert 'belief' not in shown.page.inner_text('#legend')
+        density = shown.page.evaluate('maasi.map.belief.words([3, 1])')
+        assert float(density.split()[1]) == pytest.approx(0.6 / (2 * math.pi * 0.25), rel=0.02)
+
+
+def moving(sensor):
+    """Return scene and events of a robot that flies from x = 1 to x = 3 in 2 s and sees."""
+    events = [[0.0, 'map', '', [0, 0, 0], [0.1, 0.1, 0], [41, 41, 1], '9' * 41 * 41, 0.0]]
+    for step in range(21):
+        where = [1.0 + 0.1 * step, 2.0, 1.0]
+        events.append([0.1 * step, 'robot', 'rover', [*where, 0.0], 1.0, 1, ''])
+        if step in (0, 10):
+            events.append([0.1 * step, 'seen', 'rover', where, []])
+    found = [[1, 2.0, 3.5, 0.0, [0.001, 0, 0, 0.001, 0, 0], 'rover', 0.5]]
+    return {**PLANE, 'robots': {'rover': {'view': sensor}}}, [*events, [0.5, 'found', '', found]]
+
+
+def test_the_dark_goes_as_the_field_of_view_moves_and_stays_away_where_it_was_measured(opened):
+    corners = {'lower': [-0.3, -0.3], 'upper': [0.3, 0.3], 'edge': 0.0}
+    scene, events = moving({'kind': 'box', 'turns': True, 'gain': 0.8, **corners})
+    unseen = '(x) => maasi.map.unexplored.mean(Math.round(10 * x), 20)'
+    with chromium() as shown:
+        opened(shown, scene, *events)
+        shares = {}
+        for time in (0.5, 0.52, 0.54, 0.56, 1.5, 2.0):
+            shown.seek(time)
+            shares[time] = [
+                shown.page.evaluate(f'({unseen})({x})') for x in (1.0, 1.5, 1.8, 2.2, 3.5)
+            ]
+        assert shares[0.5] == pytest.approx([1.0, 0.2, 0.6, 1.0, 1.0], abs=0.01)
+        # Little by little while its edge passes, between two of its states.
+        passing = [shares[time][2] for time in (0.5, 0.52, 0.54, 0.56)]
+        assert np.all(np.diff(passing) < -0.05)
+        # What it measured since the map stays; what it only passed is as the planner has it.
+        assert shares[1.5][3] == pytest.approx(0.12, abs=0.01)
+        assert shares[2.0] == pytest.approx([1.0, 1.0, 0.2, 0.2, 1.0], abs=0.01)
+        assert tip(shown, *place(shown, 2.0, 2.0)).startswith('unexplored 20 % at (2, 2) m')
+        # As dark as what is left.
+        here, beside = (colour_at(shown, *place(shown, 1.87, y)) for y in (2.17, 2.87))
+        assert sum(here) > sum(beside) + 30
+
+
+def test_a_ring_runs_out_from_what_is_found_unless_motion_is_to_be_reduced(opened):
+    run = moving({'kind': 'exponential', 'turns': False, 'gain': 0.9, 'size': [0.3, 0.3]})
+    green = {}
+    for motion in ('reduce', 'no-preference'):
+        with chromium(reduced_motion=motion) as shown:
+            opened(shown, run[0], *run[1])
+            shown.page.evaluate('maasi.setPlaying(false)')
+            shown.seek(0.6)
+            green[motion] = of_colour(shown, GREEN)
+            shown.seek(1.5)
+            green[motion, 'later'] = of_colour(shown, GREEN)
+    assert green['no-preference'] > green['reduce'] + 60
+    assert green['reduce', 'later'] == pytest.approx(green['reduce'], abs=10)
+
+
+def test_cells_say_how_unexplored_they_are_in_perspective(opened):
+    grid = [0.0, 'map', '', [0, 0, 0], [2, 2, 2], [3, 3, 3], '0' * 13 + '6' + '0' * 13, 0.9]
+    floor = [0.0, 'map', '', [0, 0, 0], [1, 1, 0], [5, 5, 1], '0' * 12 + '9' + '0' * 12, 0.9]
+    with chromium() as shown:
+        opened(shown, SPACE, grid)
+        assert shown.page.evaluate('maasi.camera.spatial')
+        assert tip(shown, *place(shown, 2, 2, 2)) == 'unexplored 67 % at (2, 2, 2) m'
+        assert tip(shown, *place(shown, 0, 2, 2)) == ''
+        opened(shown, PLANE, floor)
+        shown.page.click('#space')
+        shown.settle()
+        assert tip(shown, *place(shown, 2, 2, 0)).startswith('unexplored 100 % at (2')
+        where = tip(shown, *place(shown, 3.3, 0.7, 0))
+        assert where.startswith('explored at (')
+        numbers = [float(item) for item in where[where.index('(') + 1 : -3].split(', ')]
+        assert numbers == pytest.approx([3.3, 0.7], abs=0.02)
+
+
+def test_faces_of_buildings_fill_and_what_the_log_offers_is_there(opened):
+    scene = scene_of('buildings', load_mission('buildings_four').scenario)
+    owner, face, part = scene['cells'][5]
+    own = [index for index, cell in enumerate(scene['cells']) if cell[:2] == [owner, face]]
+    shot = [5, 150.0, 60.0, 20.0, 0.88]
+    events = []
+    for time, planned, shots in ((0.0, [5, 6], []), (1.0, [6], []), (2.0, [6], [shot])):
+        plan = ['searching', 'optimal', [160.0, 60.0, 20.0], [], planned, shots, False]
+        events.append([time, 'robot', 'blue', [150.0, 60.0, 20.0, 0.0], -1.0, 1, ''])
+        events.append([time, 'cuboid', 'blue', *plan])
+        words = f'cuboids that it plans to visit: {", ".join(map(str, planned))}'
+        if not shots:
+            events.append([time, 'log', '', 'decision', 'blue', words])
+    events.append([2.0, 'log', '', 'found', 'blue', 'snapshot of cuboid 5'])
+    middle = np.mean(part, axis=1)
+    box = np.mean(scene['objects'][owner], axis=1)
+    with chromium() as shown:
+        opened(shown, scene, *events)
+        # Seen from in front of the face.
+        ahead = np.sign(middle - box)[face // 2] * np.eye(3)[face // 2]
+        turn = math.atan2(-ahead[0], -ahead[1])
+        shown.page.evaluate(f'maasi.camera.turn = {turn}; maasi.camera.update(); maasi.fit()')
+        beside = np.mean(scene['cells'][next(i for i in own if i != 5)][2], axis=1)
+        for time, share in ((1.0, 0), (2.0, 100 // len(own))):
+            shown.seek(time)
+            colours = [colour_at(shown, *place(shown, *item)) for item in (middle, beside)]
+            assert (np.abs(np.subtract(colours[0], PHOTOGRAPHED)).max() < 60) == (time == 2.0)
+            assert np.abs(np.subtract(colours[1], PHOTOGRAPHED)).max() > 60
+            centre = np.array([*box])
+            centre[face // 2] = middle[face // 2]
+            assert f'photographed ({share} %)' in tip(shown, *place(shown, *centre))
+        legend = shown.page.inner_text('#legend')
+        assert 'share photographed' in legend and 'belief' not in legend
+        for words, time in (('6', 1.0), ('5, 6', 0.0)):
+            shown.seek(2.0)
+            shown.page.click(f'#log li.decision:has-text("visit: {words}") >> nth=0')
+            shown.settle()
+            assert f' {words} within its horizon' in shown.page.inner_text('#why_body')
+            assert shown.page.evaluate('maasi.time') == time
+        shown.seek(2.0)
+        shown.page.click('#space')
+        shown.settle()
+        wall = np.array([*box])
+        wall[face // 2] = middle[face // 2]
+        assert 'parts photographed' in tip(shown, *place(shown, *wall))
+
+
+@pytest.mark.parametrize('width', [1280, 390])
+def test_a_strip_for_each_robot_has_the_scale_of_the_time_line(opened, width):
+    # On the way to 4 s, waits to 6 s, cannot go on to 8 s, and has left.
+    statuses = [(0.0, 1), (4.0, 2), (6.0, 5), (8.0, 6)]
+    events = [
+        [time, 'robot', 'rover', [1.0, 1.0, 0.0, 0.0], 1.0, status, ''] for time, status in statuses
+    ]
+    events += [[time, 'seen', 'rover', [1.0, 1.0, 0.0], []] for time in (2.0, 5.0)]
+    events += [[time, 'robot', 'walker', [2.0, 2.0, 0.0, 0.0], 1.0, 1, ''] for time in (0.0, 10.0)]
+    with chromium(width, 800) as shown:
+        opened(shown, PLANE, *events)
+        page = shown.page
+        strip = page.locator('#strips canvas').first
+        box, line = strip.bounding_box(), page.locator('#time').bounding_box()
+        assert (box['x'], box['width']) == (line['x'], line['width'])
+        words = strip.get_attribute('aria-label')
+        shares = 'on the way 40 %, waiting 20 %, cannot go on 20 %, left 20 %'
+        assert words == f'rover: {shares}, 2 measurements'
+
+        def at(time):
+            return 8 + (box['width'] - 16) * time / 10.0
+
+        colours = [colour_at(shown, at(time), 3, '#strips canvas') for time in (3, 5, 7, 9)]
+        assert colours[0] == list(BLUE) and colours[2] == [184, 74, 0]
+        # Pale, and only a line.
+        assert 60 < picture(shown, '#strips canvas')[3, round(at(5))][3] < 90
+        assert colours[3] not in (colours[0], colours[2])
+        tick, none = (colour_at(shown, at(time), 9, '#strips canvas') for time in (2.0, 3.0))
+        assert tick != none
+        strip.click(position={'x': at(5.0), 'y': 3})
+        shown.settle()
+        assert page.evaluate('maasi.time') == pytest.approx(5.0, abs=0.1)
+        assert page.evaluate('maasi.selected') == 'rover'
+        now = page.locator('#strips > i').bounding_box()
+        assert now['x'] == pytest.approx(box['x'] + at(5.0), abs=2)
+        legend = page.inner_text('#legend')
+        assert all(word in legend for word in ('waiting', 'measurement', 'left, silent or ended'))
+        assert page.evaluate('document.documentElement.scrollWidth') <= width
