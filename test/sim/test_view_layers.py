@@ -230,7 +230,7 @@ def test_a_strip_for_each_robot_has_the_scale_of_the_time_line(opened, width):
             return 8 + (box['width'] - 16) * time / 10.0
 
         colours = [colour_at(shown, at(time), 3, '#strips canvas') for time in (3, 5, 7, 9)]
-        assert colours[0] == list(BLUE) and colours[2] == [184, 74, 0]
+        assert colours[0] == list(BLUE) and colours[2] == [27, 31, 36]
         # Pale, and only a line.
         assert 60 < picture(shown, '#strips canvas')[3, round(at(5))][3] < 90
         assert colours[3] not in (colours[0], colours[2])

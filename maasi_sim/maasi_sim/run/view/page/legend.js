@@ -60,7 +60,7 @@ function stripEntries(log) {
     ['text', '', 'Strips, in the colour of each robot:', ''],
     ['area', colour, 'on the way'],
     ['area', `${colour}4d`, 'waiting'],
-    ['area', 'var(--fault)', 'cannot go on'],
+    ['area', 'var(--text)', 'cannot go on'],
     ['line', 'var(--away)', 'left, silent or ended'],
     ['text', SEEN, log.isOfBuildings ? 'snapshot' : 'measurement', '|'],
   ];

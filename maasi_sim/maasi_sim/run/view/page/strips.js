@@ -50,7 +50,7 @@ function drawStrip(canvas, log, names, name, height) {
   const x = (time) => KNOB + ((width - 2 * KNOB) * time) / (log.duration || 1);
   const [stretches, measured] = historyOf(log, name);
   for (const [kind, from, to] of stretches) {
-    context.fillStyle = kind === 2 ? themed('--fault') : robotColour(names, name);
+    context.fillStyle = kind === 2 ? themed('--text') : robotColour(names, name);
     context.globalAlpha = kind === 1 ? 0.3 : 1;
     const wide = Math.max(x(to) - x(from), 1);
     if (kind < 3) context.fillRect(x(from), 1, wide, 0.55 * height);
