@@ -34,7 +34,7 @@ from maasi_sim.search import search
 HEAD = 'condition', 'runs', '', 'mean GOSPA [m]', 'at the end [m]', 'step [ms]'
 CUTOFF = 10.0
 START = datetime.datetime(2026, 1, 1)
-# Of what Stone Soup is told: the least clutter in a scan, as of `pmb`.
+# Setting of Stone Soup: the least clutter in a scan, as of `pmb`.
 LEAST_CLUTTER = 0.05
 # A track is deleted after this many expected detections in a row that did not come.
 MOST_MISSES = 3.0
@@ -49,7 +49,7 @@ def probability(scan, state):
 
 
 class ViewedHypothesiser(PDAHypothesiser):
-    """Data association that is told pi at each track: a constant deletes tracks out of view."""
+    """Data association with pi at each track: a constant deletes tracks out of view."""
 
     scan: Any = Property(doc='The scan that is processed')
 
