@@ -29,6 +29,12 @@ _LAUNCH_FLAGS = ('lockstep', 'follow_clock', 'view')
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
 
+def short(path: Path) -> str:
+    """Return a path relative to the working directory, if it is below."""
+    here = Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+
+
 @dataclass(frozen=True)
 class Options:
     """Options of a run."""
@@ -50,7 +56,7 @@ class Options:
 
     def command(self, seed: int) -> str:
         """Return the command that runs the same again."""
-        words = ['./scripts/run_scenario', self.scenario, '--seed', str(seed)]
+        words = ['./scripts/run_scenario', short(Path(self.scenario)), '--seed', str(seed)]
         words += ['--lockstep'] if self.lockstep else []
         given = {'--rate': self.rate, '--planner': self.planner, '--time-limit': self.time_limit}
         for name, value in given.items():

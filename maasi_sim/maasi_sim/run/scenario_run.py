@@ -8,7 +8,6 @@ import signal
 import threading
 import time
 import warnings
-from pathlib import Path
 from typing import Any
 
 from maasi_sim.run.bag import ENDING_TOPIC, BagError, BagWriter, load_types
@@ -29,7 +28,7 @@ from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.report_files import store_report
 from maasi_sim.run.run_folder import make_folder, write_text
-from maasi_sim.run.run_options import Options
+from maasi_sim.run.run_options import Options, short
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
 from maasi_sim.run.view.event_maker import EventMaker
@@ -395,9 +394,3 @@ class ScenarioRun:
             self._warn(f'no {REPLAY}: {problem}')
         else:
             self.display.say(f'replay: {short(self.folder / REPLAY)}', instead=True)
-
-
-def short(path: Path) -> str:
-    """Return a path relative to the working directory, if it is below."""
-    here = Path.cwd()
-    return str(path.relative_to(here) if path.is_relative_to(here) else path)

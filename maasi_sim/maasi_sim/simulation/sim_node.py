@@ -382,21 +382,18 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             message = LockstepStep(step=self.step, stamp=stamp, robots=present)
             self._robots_publisher.publish(message)
         for name in present:
-            if name in robots:
-                self._robots[name].publish(stamp)
-            else:
-                self._robots[name].publish_odometry(stamp)
+            self._robots[name].publish_odometry(stamp)
         # In lockstep the step is the time of the nodes: a clock for each would cost a tenth more.
         if self._clock_publisher is not None and self._is_time_due():
             self._clock_publisher.publish(Clock(clock=stamp))
+        again = [name for name in present if name in robots]
+        imaging = [name for name in again if self.simulation.images_due(name)]
         self._step_publisher.publish(
-            LockstepStep(
-                step=self.step,
-                stamp=stamp,
-                robots=present,
-                imaging=[name for name in robots if self.simulation.images_due(name)],
-            )
+            LockstepStep(step=self.step, stamp=stamp, robots=present, imaging=imaging)
         )
+        # Last: robots and planners work while images are made.
+        for name in again:
+            self._robots[name].publish_sensors(stamp)
 
     def _is_time_due(self) -> bool:
         every = max(round(_CLOCK_PERIOD / self._length), 1) if self.settings.lockstep else 1

@@ -99,10 +99,9 @@ class RobotTopics:
             self._scan_publisher = publisher(LaserScan, 'scan')
             self._scan = scan_message(laser.settings, f'{name}/base_scan')
 
-    def publish(self, stamp: Time) -> bool:
-        """Publish what is due; return whether camera or ranging sensor had something."""
+    def publish_sensors(self, stamp: Time) -> None:
+        """Publish what its sensors and its battery report in this step."""
         simulation, robot, name = self.simulation, self.robot, self.name
-        self.publish_odometry(stamp)
         imaging = simulation.images_due(name)
         if imaging and robot.camera is not None:
             image = robot.image(simulation.step, simulation.time)
@@ -124,7 +123,6 @@ class RobotTopics:
             self._battery.header.stamp = stamp
             self._battery.percentage = self._full * robot.battery.charge
             self._battery_publisher.publish(self._battery)
-        return imaging
 
     def publish_odometry(self, stamp: Time) -> None:
         """Publish the odometry, unless the robot reports its own pose."""
