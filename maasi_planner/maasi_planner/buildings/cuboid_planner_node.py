@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry, Path
+from rclpy.duration import Duration
 from rclpy.subscription import Subscription
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -48,6 +49,8 @@ from maasi_planner.node.search_modes import Mode, SearchModes
 
 # Largest difference of the stamps of odometry and step [ns].
 _STAMP_TOLERANCE = 1_000_000
+# Longest wait until the last command has arrived [s].
+_STOP_TIME = Duration(seconds=0.3)
 _REASONS = {
     Activity.SEARCHING: '',
     Activity.RETURNING: 'battery failed: flies to its station',
@@ -164,6 +167,9 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         """End the search: the robot stops."""
         self.modes.command('stop')
         self._stop_robot()
+        # A process that ends takes with it what nobody has received yet.
+        if self.configured:
+            self._command_publisher.wait_for_all_acked(_STOP_TIME)
 
     def _stop_robot(self) -> None:
         self._observed = False

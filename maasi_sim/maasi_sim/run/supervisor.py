@@ -159,6 +159,8 @@ class Supervisor:
         self._display.update('stopping the nodes', quiet=True)
         recorder.stop_robots(robots)
         stubborn = stop(self.nodes('driver', 'guard'))
+        # Their last commands come before it, also in the recording.
+        recorder.drain()
         recorder.stop_robots(robots)
         time.sleep(_LAST_MESSAGES)
         recorder.drain()
