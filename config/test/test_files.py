@@ -3,23 +3,17 @@
 import json
 from pathlib import Path
 
-import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-TYPES = {path.stem for path in (ROOT / 'robots').glob('*.yaml')} - {'all'}
 
 
-@pytest.mark.parametrize('path', sorted((ROOT / 'scenarios').glob('*.yaml')), ids=lambda x: x.stem)
-def test_robots_of_a_scenario_have_a_type(path):
-    robots = yaml.safe_load(path.read_text())['robots']
-    assert robots
-    assert {robot['type'] for robot in robots.values()} <= TYPES
-
-
-@pytest.mark.parametrize('path', sorted((ROOT / 'robots').glob('*.yaml')), ids=lambda x: x.stem)
-def test_a_robot_type_is_a_mapping(path):
-    assert isinstance(yaml.safe_load(path.read_text()), dict)
+def test_robots_of_each_scenario_have_a_type():
+    types = {path.stem: yaml.safe_load(path.read_text()) for path in ROOT.glob('robots/*.yaml')}
+    assert all(isinstance(content, dict) for content in types.values())
+    for path in ROOT.glob('scenarios/*.yaml'):
+        robots = yaml.safe_load(path.read_text())['robots'].values()
+        assert robots and {robot['type'] for robot in robots} <= types.keys() - {'all'}, path
 
 
 def test_views_can_be_read():

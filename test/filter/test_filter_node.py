@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections import Counter
 from contextlib import contextmanager
 from functools import reduce
 
@@ -185,35 +186,41 @@ def test_what_is_said_again_counts_once():
         assert not team.tested.dropped
 
 
-@pytest.mark.parametrize(
-    ('changes', 'reason'),
-    [
-        ({'header__frame_id': 'odom'}, 'bad detections'),
-        ({'robot': 'nobody'}, 'bad detections'),
-        ({'pose__pose__position__x': math.nan}, 'bad detections'),
-        ({'pose__pose__orientation__w': 0.0}, 'bad detections'),
-        ({'pose__covariance': [math.nan] * 36}, 'bad detections'),
-        ({'detections': [Detection(range=math.nan)]}, 'bad detection'),
-        ({'detections': [Detection(range=-1.0)]}, 'bad detection'),
-        ({'detections': [Detection(range=1.0, bearing=9.0)]}, 'bad detection'),
-        ({'detections': [Detection(range=1.0, covariance=[1.0])]}, 'bad detection'),
-        ({'detections': [Detection(range=1.0, covariance=[1.0, 2, 2, 1])]}, 'bad detection'),
-    ],
-)
-def test_what_is_wrong_is_dropped_and_counted_and_the_node_goes_on(team, changes, reason):
-    reports = team.hear(DiagnosticArray, '/diagnostics')
-    assert team.step(1, {'a': SEEN}, **changes).expected_number == 0.0
-    assert team.tested.dropped[reason] == 1
-    if changes == {'robot': 'nobody'}:
-        team.until(lambda: reports and reports[-1].status[0].level == DiagnosticStatus.WARN)
-        assert reports[-1].status[0].message == 'active; dropped: bad detections 1'
-    assert team.step(2, {'a': SEEN}).expected_number > 0.0
+WRONG = [
+    ({'robot': 'nobody'}, 'bad detections'),
+    ({'header__frame_id': 'odom'}, 'bad detections'),
+    ({'pose__pose__position__x': math.nan}, 'bad detections'),
+    ({'pose__pose__orientation__w': 0.0}, 'bad detections'),
+    ({'pose__covariance': [math.nan] * 36}, 'bad detections'),
+    ({'detections': [Detection(range=math.nan)]}, 'bad detection'),
+    ({'detections': [Detection(range=-1.0)]}, 'bad detection'),
+    ({'detections': [Detection(range=1.0, bearing=9.0)]}, 'bad detection'),
+    ({'detections': [Detection(range=1.0, covariance=[1.0])]}, 'bad detection'),
+    ({'detections': [Detection(range=1.0, covariance=[1.0, 2, 2, 1])]}, 'bad detection'),
+]
 
 
-def test_detections_of_a_far_too_large_message_are_not_read(team):
-    update = team.step(1, {'a': [(0.3, 1e-4 * index) for index in range(4000)]})
-    assert team.tested.dropped == {'too large message': 1} and list(update.missing) == ['a']
-    assert not team.step(2, {'a': SEEN}).missing
+def test_what_is_wrong_is_dropped_and_counted_and_the_node_goes_on(team):
+    reports, dropped = team.hear(DiagnosticArray, '/diagnostics'), Counter()
+    for number, (changes, reason) in enumerate(WRONG, start=1):
+        assert team.step(number, {'a': SEEN}, **changes).expected_number == 0.0
+        dropped[reason] += 1
+        assert team.tested.dropped == dropped, changes
+        if number == 1:
+            team.until(lambda: reports and reports[-1].status[0].level == DiagnosticStatus.WARN)
+            assert reports[-1].status[0].message == 'active; dropped: bad detections 1'
+    update = team.step(11, {'a': [(0.3, 1e-4 * index) for index in range(4000)]})
+    assert team.tested.dropped['too large message'] == 1 and list(update.missing) == ['a']
+    for count, number in enumerate((2**64 - 1, 2**63), start=1):
+        team.batch.publish(MeasurementBatch(id=number, step=number))
+        team.until(lambda count=count: team.tested.dropped['bad batch'] == count)
+    update = team.step(12, {'a': SEEN * 3_000})
+    assert update.expected_number > 0.0 and update.found == 0 and not update.missing
+    assert team.tested.dropped['equal detection'] == 2_999
+    begin = time.monotonic()
+    team.step(13, {'a': [(0.3 + 1e-5 * k, 0.5) for k in range(3_000)]})
+    assert team.tested.dropped['too many detections'] == 3_000 - MOST_DETECTIONS
+    assert time.monotonic() - begin < 10.0
 
 
 def test_one_stamp_before_or_far_after_the_others_does_not_silence_its_robot(team):
@@ -231,23 +238,6 @@ def test_one_stamp_before_or_far_after_the_others_does_not_silence_its_robot(tea
         update = team.step(number, {'a': SEEN}, **change)
         assert list(update.missing) == (['a'] if change in (early, far) else [])
         assert team.tested.dropped['bad detections'] == dropped
-
-
-def test_detections_that_are_equal_or_too_many_are_counted_and_cost_no_time(team):
-    assert team.step(1, {'a': SEEN * 3_000}).found == 0
-    assert team.tested.dropped['equal detection'] == 2_999
-    begin = time.monotonic()
-    team.step(2, {'a': [(0.3 + 1e-5 * k, 0.5) for k in range(3_000)]})
-    assert team.tested.dropped['too many detections'] == 3_000 - MOST_DETECTIONS
-    assert time.monotonic() - begin < 10.0
-
-
-@pytest.mark.parametrize('number', [2**64 - 1, 2**63])
-def test_an_absurd_batch_is_refused_and_the_next_one_is_not(team, number):
-    team.step(1, {'a': []})
-    team.batch.publish(MeasurementBatch(id=number, step=number))
-    team.until(lambda: team.tested.dropped['bad batch'] == 1)
-    assert team.step(2, {'a': []}).batch_id == 2
 
 
 def test_a_node_saves_on_a_timer_and_another_one_goes_on_to_the_bit(tmp_path):

@@ -3,7 +3,7 @@
 import campaign
 import pytest
 
-from maasi_sim.arguments import LARGEST, positive, whole
+from maasi_sim.arguments import LARGEST
 from maasi_sim.experiments import reproduce
 from maasi_sim.run import run_options
 
@@ -16,8 +16,3 @@ def test_a_seed_that_is_none_ends_with_2(command, seed, capsys):
     assert caught.value.code == 2
     said = capsys.readouterr().err
     assert f"--seed: read '{seed[:60]}', allowed are whole numbers from 0 to {LARGEST}" in said
-
-
-def test_numbers_are_read():
-    assert whole(str(LARGEST)) == LARGEST
-    assert positive('1e-3') == 0.001

@@ -6,12 +6,10 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import search_quality
-from clairvoyant import _expected_end, _Robots, clairvoyant
+from clairvoyant import clairvoyant
 
-from maasi_filter.models.detection import BoxDetection
 from maasi_sim.experiments.searches import find_times
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
@@ -68,28 +66,6 @@ def test_a_regime_is_run_and_its_table_written_between_marks(tmp_path, capsys, m
     table, _, below = rest.partition(search_quality.END)
     assert (above, below) == ('above\n', '\nbelow\n')
     assert table.startswith('Block `development`') and table in said
-
-
-@pytest.mark.parametrize(('seen', 'ends'), [(True, (2.0, 5.0)), (False, (3.0, 7.0))])
-def test_expected_end_of_a_sure_sensor(seen, ends):
-    """A robot moves 1 m each tick, sees 0.5 m far, and needs two detections of each target."""
-    kind, parameters = BoxDetection([-0.5, -0.5], [0.5, 0.5], 1.0).kernel()
-    robot = _Robots(
-        remaining_path=np.zeros((1, 1, 3)),
-        free=np.zeros(1, np.int64),
-        speed=np.ones(1),
-        pause=np.zeros(1),
-        period=np.ones(1, np.int64),
-        kind=np.array([kind], np.int64),
-        parameters=parameters[None],
-        yaw=np.zeros(1),
-    )
-    targets = np.array([[3.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
-    routes = np.array([[0, 1, -1]])
-    # The cost is the time to find all plus the mean time to find, both without the last tick.
-    cost, stops = _expected_end(robot, routes, targets, np.full(2, seen), 2)
-    assert cost == pytest.approx(ends[1] + 0.5 * sum(ends))
-    assert stops[0] == pytest.approx([3.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize('name', ['ranging_drone_3d', 'mambo'])

@@ -181,7 +181,7 @@ def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_pa
         Domain(57, str(tmp_path), team='team/b', shared=True).release()
 
 
-def test_a_domain_is_locked_without_a_file():
+def test_a_domain_is_locked_without_a_file_until_its_process_ends(tmp_path):
     """In a shared folder another user could have put a link in the place of one."""
     code = (
         'import os, sys\n'
@@ -189,12 +189,14 @@ def test_a_domain_is_locked_without_a_file():
         'def note(event, words):\n'
         "    made = event == 'open' and isinstance(words[2], int) and words[2] & os.O_CREAT\n"
         "    if made or event in ('os.mkdir', 'os.chmod', 'os.link', 'os.symlink'):\n"
-        '        print(event, *words)\n'
-        'sys.addaudithook(note)\nDomain().release()\n'
+        '        print(event, *words, flush=True)\n'
+        'sys.addaudithook(note)\nDomain().release()\nDomain(33, sys.argv[1])\n'
+        'os.kill(os.getpid(), 9)\n'
     )
-    command = [sys.executable, '-B', '-c', code]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.stdout == ''
+    command = [sys.executable, '-B', '-c', code, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    assert (done.returncode, done.stdout) == (-signal.SIGKILL, ''), done.stderr
+    Domain(33, str(tmp_path)).release()
 
 
 def test_a_domain_with_other_nodes_is_left_to_them():
@@ -204,18 +206,6 @@ def test_a_domain_with_other_nodes_is_left_to_them():
         other.bind(('', 7400 + 250 * number))
         with Domain() as domain:
             assert domain.number != number
-
-
-def test_the_lock_ends_with_the_process(tmp_path):
-    code = (
-        'import os, sys\nfrom maasi_sim.run.domain import Domain\n'
-        'Domain(33, sys.argv[1])\nos.kill(os.getpid(), 9)\n'
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', code, str(tmp_path)], check=False, timeout=PATIENCE
-    )
-    assert done.returncode == -signal.SIGKILL
-    Domain(33, str(tmp_path)).release()
 
 
 def test_a_run_says_that_the_loopback_interface_is_down():

@@ -18,7 +18,7 @@ TURTLEBOTS = {
 
 def scenario(kind, height=0.0):
     robot = ('robots', {'rover': {'type': kind, 'start': [0.5, 0.5, height]}})
-    targets = ('targets', {'count': 4, 'separation': 0.2, 'margin': 0.1})
+    targets = ('targets', {'count': 2, 'separation': 0.2, 'margin': 0.1})
     values = changed(robot, targets, ('filter.method', 'pmb'), ('limits.time', 400.0))
     return scenario_from_values(values, 'test')
 

@@ -62,8 +62,8 @@ LINKED = {
         },
     },
     'events': [
-        {'at': 6.0, 'robot': 'drone', 'do': 'leave'},
-        {'at': 9.0, 'robot': 'drone', 'do': 'back'},
+        {'at': 2.0, 'robot': 'drone', 'do': 'leave'},
+        {'at': 5.0, 'robot': 'drone', 'do': 'back'},
     ],
 }
 FORWARD = (0.2, 0.0, 0.0, 0.0)

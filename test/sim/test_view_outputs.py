@@ -3,11 +3,12 @@
 import base64
 import json
 import re
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
-from browsers import chromium, needs_chromium
+from browsers import browser, needs_chromium, page_of
 
 from maasi_filter import colours
 from maasi_sim.run.bag import load_types
@@ -137,7 +138,7 @@ def test_a_robot_that_left_goes_nowhere_in_a_video(departing, tmp_path):
 
 
 @needs_chromium
-def test_a_robot_that_left_goes_nowhere_on_the_page(departing, tmp_path):
+def test_a_robot_that_left_goes_nowhere_on_the_page(chromium, departing, tmp_path):
     write_replay(departing, tmp_path / 'page.html')
     with chromium() as shown:
         shown.open((tmp_path / 'page.html').as_uri())
@@ -164,6 +165,13 @@ def test_a_robot_that_left_goes_nowhere_on_the_page(departing, tmp_path):
 
 
 @pytest.fixture(scope='module')
+def chromium():
+    """Return what `browsers.chromium` is, with one browser for all pages of this module."""
+    with browser() as own:
+        yield partial(page_of, own)
+
+
+@pytest.fixture(scope='module')
 def searched(tmp_path_factory):
     """Return the replay of a search with a robot that leaves, and its log."""
     scenario = load_mission('mambo_turtlebot').scenario
@@ -175,7 +183,7 @@ def searched(tmp_path_factory):
 
 
 @needs_chromium
-def test_a_replay_plays_by_itself_and_says_what_happens_to_its_end(searched):
+def test_a_replay_plays_by_itself_and_says_what_happens_to_its_end(chromium, searched):
     with chromium(reduced_motion='no-preference') as shown:
         shown.open(searched[0].as_uri())
         shown.until('maasi.playing && maasi.time > 0.5')
@@ -194,7 +202,7 @@ def test_a_replay_plays_by_itself_and_says_what_happens_to_its_end(searched):
 
 
 @needs_chromium
-def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(searched):
+def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chromium, searched):
     path, log = searched
     decision = next(event for event in log.events if event[1] == 'plan')[7][0]
     name, _, chosen, waypoint, candidates, _ = decision
@@ -233,7 +241,9 @@ def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(searc
 
 
 @needs_chromium
-def test_on_a_phone_in_the_dark_the_legend_is_whole_and_it_plays_by_the_space_bar(searched):
+def test_on_a_phone_in_the_dark_the_legend_is_whole_and_it_plays_by_the_space_bar(
+    chromium, searched
+):
     with chromium(390, 844, color_scheme='dark', has_touch=True) as shown:
         page = shown.page
         shown.open(searched[0].as_uri())
@@ -281,7 +291,7 @@ def contrast(*colours):
 
 @needs_chromium
 @pytest.mark.parametrize('theme', ['light', 'dark'])
-def test_texts_and_robots_stand_out(searched, theme):
+def test_texts_and_robots_stand_out(chromium, searched, theme):
     style = 'getComputedStyle(document.documentElement).getPropertyValue("--{}").trim()'
     swatches = '[...document.querySelectorAll("#robots .swatch")].map((s) => s.style.background)'
     with chromium(color_scheme=theme) as shown:
