@@ -2,6 +2,7 @@
 
 import gc
 import signal
+from functools import partial
 
 import pytest
 
@@ -28,6 +29,15 @@ def domain(monkeypatch, request):
         # See `own_context`. What fixtures returned may hold nodes, and is held by the test.
         request.node.funcargs.clear()
         gc.collect()
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    """Return what `browsers.chromium` is, with one browser for all pages of a module."""
+    from browsers import browser, page_of
+
+    with browser() as own:
+        yield partial(page_of, own)
 
 
 @pytest.fixture

@@ -1,8 +1,7 @@
 """Parameters as ROS tools see them: ranges, changes at run time, dumps, foreign keys."""
 
-import os
+import shutil
 import subprocess
-import sys
 from functools import reduce
 
 import pytest
@@ -17,6 +16,7 @@ from waiting import PATIENCE, wait_until
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
+from maasi_sim.run.processes import NodeProcess, find_executable
 
 SETTINGS = FilterNodeSettings.model_validate(
     {
@@ -39,22 +39,20 @@ def process(domain, tmp_path):
     running = []
 
     def start(flat=None, before=()):
-        command = [*before, sys.executable, '-m', 'maasi_filter.filter_node', '--ros-args']
+        command = [*before, str(find_executable('maasi_filter', 'filter_node')), '--ros-args']
+        name = f'node{len(running)}'
         if flat is not None:
-            file = tmp_path / f'parameters{len(running)}.yaml'
+            file = tmp_path / f'{name}.yaml'
             file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
             command += ['--params-file', str(file)]
-        environment = os.environ | domain.environment()
-        running.append(
-            subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-        )
+        running.append(NodeProcess(name, command, tmp_path / name))
+        running[-1].start()
         return running[-1]
 
     yield start
     for item in running:
-        if item.poll() is None:
-            item.kill()
-        item.communicate()
+        item.kill()
+        item.join()
 
 
 @pytest.fixture
@@ -95,9 +93,10 @@ def ended(node, *, ask=False):
     """Return the exit code of a process, which may be asked to end, and what it said."""
     if ask:
         node.terminate()
-    _, said = node.communicate(timeout=PATIENCE)
+    node.join(PATIENCE)
+    said = node.last_words(10_000)
     assert 'Traceback' not in said
-    return node.returncode, said
+    return node.exitcode, said
 
 
 def test_numbers_have_real_ranges(node):
@@ -165,8 +164,8 @@ def test_missing_and_wrong_parameters_are_named_with_what_was_read(process):
 
 def test_a_node_started_alone_says_that_the_loopback_interface_is_down(process):
     # A network namespace of its own has a loopback interface that is down.
-    alone = ['unshare', '--map-root-user', '--net']
+    alone = [shutil.which('unshare') or 'unshare', '--map-root-user', '--net']
     if subprocess.run([*alone, 'true'], capture_output=True).returncode:
         pytest.skip('a network namespace needs root, or user namespaces in the kernel')
-    said = iter(process(flatten(SETTINGS), alone).stderr.readline, '')
-    assert any('the loopback interface cannot be used' in line for line in said)
+    node = process(flatten(SETTINGS), alone)
+    wait_until(lambda: 'the loopback interface cannot be used' in node.last_words())

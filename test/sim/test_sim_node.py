@@ -250,37 +250,32 @@ def test_every_topic_comes_at_its_rate_with_the_stamps_of_the_steps(make_team):
     assert [marker.ns for marker in markers] == ['truth', 'truth', 'obstacles']
 
 
-def test_nothing_is_published_until_everybody_is_there(make_team, monkeypatch):
+def test_the_time_starts_only_when_everybody_is_there_and_would_miss_nothing(
+    make_team, monkeypatch
+):
     monkeypatch.setattr('maasi_sim.simulation.sim_node._PATIENCE', 0.0)
-    team = make_team(recorder=True)
-    team.settle()
-    assert team.sim.status()['waits for'] == '/recorder'
-    # What runs a recorder says who is missing.
-    assert team.sim._said == ''
-    assert not team.drivers['mambo'].of('odom') and not team.filter.steps
-    recorder = team.add('recorder')
-    recorder.say_ready()
-    team.run(5)
-    recorder.destroy_node()
-
-
-def test_the_time_starts_only_when_no_subscription_would_miss_it(make_team, monkeypatch):
-    team = make_team()
-    counts = {}
+    matched, counts = Publisher.get_subscription_count, {'/clock': 0}
 
     def late(publisher):
         # As if discovery had told of the subscriptions, and was still about to connect them.
         return counts.get(publisher.topic_name, matched(publisher))
 
-    matched = Publisher.get_subscription_count
     monkeypatch.setattr(Publisher, 'get_subscription_count', late)
-    counts['/clock'] = 0
+    team = make_team(recorder=True)
     team.settle()
-    assert team.sim.status()['waits for'] == '' and team.sim.step < 0
+    assert team.sim.status()['waits for'] == '/recorder'
+    # What runs a recorder says who is missing.
+    assert team.sim._said == ''
+    recorder = team.add('recorder')
+    recorder.say_ready()
+    team.spin_until(lambda: team.sim.status()['waits for'] == '')
+    team.settle()
+    assert team.sim.step < 0 and not team.drivers['mambo'].of('odom')
     assert not team.filter.steps and not team.filter.seen['/clock']
     del counts['/clock']
-    team.run(2)
+    team.run(5)
     assert seconds(team.filter.seen['/clock'][0].clock) == 0.0
+    recorder.destroy_node()
 
 
 def test_a_step_waits_for_everybody_and_for_every_command(make_team):

@@ -2,12 +2,11 @@
 
 import base64
 import math
-from functools import partial
 
 import cv2
 import numpy as np
 import pytest
-from browsers import browser, needs_chromium, page_of
+from browsers import needs_chromium
 
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog
@@ -45,13 +44,6 @@ def tip(shown, x, y):
 def of_colour(shown, colour):
     """Return how many pixels of the map have a colour."""
     return int((np.abs(picture(shown)[:, :, :3] - colour).max(axis=2) < 40).sum())
-
-
-@pytest.fixture(scope='module')
-def chromium():
-    """Return what `browsers.chromium` is, with one browser for all pages of this module."""
-    with browser() as own:
-        yield partial(page_of, own)
 
 
 @pytest.fixture
