@@ -77,23 +77,18 @@ def test_births_of_a_robot_count_what_the_robots_before_it_missed():
     assert second.expected_number == pytest.approx(missed * alone.expected_number, rel=0.05)
 
 
-def test_nobody_measuring_changes_nothing_but_survival():
+def test_a_first_detection_is_a_cluster_of_mass_one_that_only_survival_changes_unmeasured():
     search = cube_search(survival_probability=0.9)
-    search.step([drone([[20.0, 0.3, 0.1]])], 1, 0.0)
+    result = search.step([drone([[20.0, 0.3, 0.1]])], 1, 0.0)
+    assert result.newly_found == []
+    (cluster,) = result.clusters
+    assert cluster.mass == pytest.approx(1.0, abs=0.05)
+    expected = cube_sensor().measurement.inverse([[20.0, 0.3, 0.1]], Pose([100.0] * 3))[0]
+    np.testing.assert_allclose(cluster.position, expected, atol=0.5)
     weights = search.weights
     result = search.step([], 3, 1.0)
     np.testing.assert_allclose(search.weights, weights * 0.9**3)
     assert result.expected_number == pytest.approx(weights.sum() * 0.9**3)
-
-
-def test_a_first_detection_is_a_cluster_of_mass_one_and_not_yet_found():
-    search = cube_search()
-    result = search.step([drone([[20.0, 0.3, 0.1]])], 1, 0.0)
-    assert result.newly_found == []
-    assert len(result.clusters) == 1
-    assert result.clusters[0].mass == pytest.approx(1.0, abs=0.05)
-    expected = cube_sensor().measurement.inverse([[20.0, 0.3, 0.1]], Pose([100.0] * 3))[0]
-    np.testing.assert_allclose(result.clusters[0].position, expected, atol=0.5)
 
 
 @pytest.mark.parametrize('method', ['ic_phd', 'pmb'])

@@ -99,36 +99,31 @@ def ended(node, *, ask=False):
     return node.exitcode, said
 
 
-def test_numbers_have_real_ranges(node):
+def test_numbers_have_ranges_and_what_may_change_when_can_be_set_and_read(node):
+    def refused(name, value, words):
+        (answer,) = node.set_parameters([Parameter(name, value=value)])
+        return not answer.successful and words in answer.reason
+
     described = {item.name: item for item in node.describe_parameters(['step', 'seed'])}
     found = described['step'].floating_point_range[0]
     assert (found.from_value, found.to_value) == (0.0, 10.0)
     assert described['seed'].integer_range[0].from_value == 0
-    refused = node.set_parameters([Parameter('step', value=11.0)])[0]
-    assert not refused.successful and 'step' in refused.reason
+    assert refused('step', 11.0, 'step')
     # Not in the range, which has its ends.
-    refused = node.set_parameters([Parameter('step', value=0.0)])[0]
-    assert not refused.successful and 'greater than 0' in refused.reason
-
-
-def test_rates_and_timeouts_can_be_set_while_the_node_runs(node):
+    assert refused('step', 0.0, 'greater than 0')
     assert node.trigger_configure().name == 'SUCCESS', node.problem
+    # What a preset resolves to.
+    assert node.get_parameter('filter.particles').value == 5000
+    assert node.filter.settings.resolved().particles == 5000
+    assert node.get_parameter('filter.found_radius').value == 1.1
     assert node.trigger_activate().name == 'SUCCESS'
     for name, value in (('batch_timeout', 2.5), ('markers_rate', 1.0), ('particles_rate', 0.0)):
         assert node.set_parameters([Parameter(name, value=value)])[0].successful
         assert getattr(node.settings, name) == value
-    refused = node.set_parameters([Parameter('batch_timeout', value=-1.0)])[0]
-    assert not refused.successful and 'batch_timeout' in refused.reason
-    refused = node.set_parameters([Parameter('filter.particles', value=10)])[0]
-    assert not refused.successful and 'is read in configure' in refused.reason
+    assert refused('batch_timeout', -1.0, 'batch_timeout')
+    assert refused('filter.particles', 10, 'is read in configure')
     assert node.settings.batch_timeout == 2.5
-
-
-def test_what_a_preset_resolves_to_can_be_read(node):
-    assert node.trigger_configure().name == 'SUCCESS', node.problem
-    assert node.get_parameter('filter.particles').value == 5000
-    assert node.filter.settings.resolved().particles == 5000
-    assert node.get_parameter('filter.found_radius').value == 1.1
+    node.trigger_deactivate()
     node.trigger_cleanup()
     assert node.set_parameters([Parameter('filter.preset', value='paper_003')])[0].successful
     assert node.trigger_configure().name == 'SUCCESS', node.problem

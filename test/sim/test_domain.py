@@ -147,7 +147,7 @@ def test_what_another_user_put_there_is_left(folder, monkeypatch):
     assert remove_dead(folder=folder / 'missing') == []
 
 
-def test_domains_are_not_shared(monkeypatch):
+def test_domains_are_not_shared_with_runs_or_other_nodes(monkeypatch):
     profiles = 'FASTRTPS_DEFAULT_PROFILES_FILE'
     monkeypatch.delenv(profiles, raising=False)
     for number in (-1, 102):
@@ -164,6 +164,12 @@ def test_domains_are_not_shared(monkeypatch):
         }
         monkeypatch.setenv(profiles, 'of the user')
         assert profiles not in first.environment()
+    with Domain() as domain:
+        number = domain.number
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(('', 7400 + 250 * number))
+        with Domain() as domain:
+            assert domain.number != number
 
 
 def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_path):
@@ -197,15 +203,6 @@ def test_a_domain_is_locked_without_a_file_until_its_process_ends(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert (done.returncode, done.stdout) == (-signal.SIGKILL, ''), done.stderr
     Domain(33, str(tmp_path)).release()
-
-
-def test_a_domain_with_other_nodes_is_left_to_them():
-    with Domain() as domain:
-        number = domain.number
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(('', 7400 + 250 * number))
-        with Domain() as domain:
-            assert domain.number != number
 
 
 def test_a_run_says_that_the_loopback_interface_is_down():

@@ -367,19 +367,17 @@ def test_lockstep_keeps_to_the_rate_that_is_asked_for(make_team):
     assert time.monotonic() - begin > 0.18
 
 
-@pytest.mark.parametrize(
-    ('content', 'parameters', 'text'),
-    [
+def test_wrong_parameters_are_refused_with_what_is_wrong(make_team):
+    follow = 'follow_clock: read true, allowed is false in lockstep'
+    for content, parameters, text in (
         (SCENARIO, {'lockstep': False, 'rate': 0.0}, 'parameter rate: read 0'),
         (SCENARIO, {'rate': -1.0}, 'rate'),
-        (SCENARIO, {'follow_clock': True}, 'follow_clock: read true, allowed is false in lockstep'),
+        (SCENARIO, {'follow_clock': True}, follow),
         (SCENARIO, {'step': 0.03}, 'whole multiples of step'),
         (LINKED, {'lockstep': False, 'rate': 2.0}, r'drone\.link: .* runs in real time'),
-    ],
-)
-def test_wrong_parameters_are_refused_with_what_is_wrong(make_team, content, parameters, text):
-    with pytest.raises(AssertionError, match=text):
-        make_team(content, **parameters)
+    ):
+        with pytest.raises(AssertionError, match=text):
+            make_team(content, **parameters)
 
 
 def test_a_linked_robot_is_cut_off_while_it_is_away(make_team, tmp_path):

@@ -44,6 +44,11 @@ def test_intervals_of_few_values():
     result = statistics.independent_difference(ours, statistics.from_published(2.0, None, 10))
     assert result.half_width == pytest.approx(ours.half_width * math.sqrt(1.3))
     assert result.mean == pytest.approx(ours.mean - 2.0)
+    assert math.isnan(statistics.bootstrap_difference([], []).mean)
+    one = statistics.bootstrap_difference([3.0], [1.0])
+    assert one.mean == 2.0 and math.isnan(one.low) and not one.told_from_zero
+    same = statistics.bootstrap_difference([1.0, 2.0], [1.0, 2.0])
+    assert (same.mean, same.low, same.high, same.needed) == (0.0, 0.0, 0.0, None)
 
 
 @pytest.mark.parametrize(('effect', 'expected'), [(0.2, 199), (0.5, 34), (0.8, 15)])
@@ -62,14 +67,6 @@ def test_bootstrap_interval_of_normal_differences_is_near_students():
     assert (gap.low, gap.high) == pytest.approx((low, high), abs=0.1)
     assert gap.told_from_zero
     assert statistics.bootstrap_difference(first, second) == gap
-
-
-def test_bootstrap_of_few_or_equal_values():
-    assert math.isnan(statistics.bootstrap_difference([], []).mean)
-    one = statistics.bootstrap_difference([3.0], [1.0])
-    assert one.mean == 2.0 and math.isnan(one.low) and not one.told_from_zero
-    same = statistics.bootstrap_difference([1.0, 2.0], [1.0, 2.0])
-    assert (same.mean, same.low, same.high, same.needed) == (0.0, 0.0, 0.0, None)
 
 
 def test_verdict_says_when_the_seeds_are_too_few():

@@ -17,7 +17,7 @@ from maasi_msgs import msg
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog, line, thin
 from maasi_sim.run.view.event_maker import ENDED, LEFT, SILENT, EventMaker
-from maasi_sim.run.view.messages import MessageEvents, is_shown
+from maasi_sim.run.view.messages import MessageEvents
 from maasi_sim.run.view.page_file import REPLAY, empty_page
 from maasi_sim.run.view.scene import empty_scene, scene_of, scene_of_facts
 from maasi_sim.search import search
@@ -175,19 +175,6 @@ def test_time_that_jumps_back_begins_another_run():
     taken.take('/rover/state', state(101.0))
     assert len(made) == 1
     assert [event[0] for event in taken.events] == [0.0, 30.0, 0.0]
-
-
-def test_topics_are_known_by_type_and_name():
-    topics = {
-        '/team/rover/state': 'maasi_msgs/msg/AgentState',
-        '/rover/plan': 'nav_msgs/msg/Path',
-        '/rover/local_path': 'nav_msgs/msg/Path',
-        '/found_targets/kept': 'maasi_msgs/msg/FoundTargetArray',
-        '/search/_action/state': 'maasi_msgs/msg/AgentState',
-        '/rover/odom': 'nav_msgs/msg/Odometry',
-    }
-    shown = [topic for topic, kind in topics.items() if is_shown(topic, kind)]
-    assert shown == ['/team/rover/state', '/rover/plan']
 
 
 def unpacked(text):
