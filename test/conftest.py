@@ -34,8 +34,10 @@ def domain(monkeypatch, request):
 @pytest.fixture(scope='module')
 def chromium():
     """Return what `browsers.chromium` is, with one browser for all pages of a module."""
-    from browsers import browser, page_of
+    from browsers import CHROMIUM, browser, needs_chromium, page_of
 
+    if CHROMIUM is None:
+        pytest.skip(needs_chromium.kwargs['reason'])
     with browser() as own:
         yield partial(page_of, own)
 

@@ -1,11 +1,10 @@
 """Benchmark commands, tables of search quality, and the reference that knows the targets."""
 
 import json
-import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
+import bench
 import pytest
 import search_quality
 from clairvoyant import clairvoyant
@@ -14,28 +13,31 @@ from maasi_sim.experiments.searches import find_times
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
-BENCH = Path(__file__).parents[1] / 'benchmarks' / 'bench.py'
 
+@pytest.fixture
+def run_bench(monkeypatch):
+    def run(*arguments):
+        monkeypatch.setattr(sys, 'argv', ['bench', *map(str, arguments)])
+        return bench.main()
 
-def bench(*arguments):
-    return subprocess.run(
-        [sys.executable, str(BENCH), *arguments], capture_output=True, text=True, check=False
-    )
+    return run
 
 
 @pytest.mark.parametrize('file', ['missing/figures.json', '.'])
-def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path, file):
-    done = bench('drivers', '--json', str(tmp_path / file))
-    assert done.returncode == 2
-    assert '--json: read' in done.stderr and done.stdout == ''
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(
+    run_bench, tmp_path, file, capsys
+):
+    with pytest.raises(SystemExit, match='2'):
+        run_bench('drivers', '--json', tmp_path / file)
+    said = capsys.readouterr()
+    assert '--json: read' in said.err and said.out == ''
 
 
-def test_quick_figures(tmp_path):
+def test_quick_figures(run_bench, tmp_path, capsys):
     file = tmp_path / 'figures.json'
-    done = bench('drivers', '--quick', '--json', str(file))
-    assert done.returncode == 0, done.stderr
+    run_bench('drivers', '--quick', '--json', file)
     rows = json.loads(file.read_text())
-    assert len(rows) == len(done.stdout.splitlines()) == 4
+    assert len(rows) == len(capsys.readouterr().out.splitlines()) == 4
     assert all(row['value'] > 0.0 for row in rows)
 
 

@@ -5,7 +5,6 @@ from contextlib import closing
 from functools import partial
 
 import rclpy
-from browsers import needs_chromium
 from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import Trigger
 from waiting import PATIENCE, wait_until
@@ -60,7 +59,6 @@ def test_a_stop_of_all_does_not_wait_for_other_commands(domain, context, monkeyp
     assert control('stop', None) == (False, 'the run has ended')
 
 
-@needs_chromium
 def test_a_stop_of_all_passes_what_waits_in_the_browser(chromium):
     calls, released = [], threading.Event()
 
@@ -89,7 +87,6 @@ def test_a_stop_of_all_passes_what_waits_in_the_browser(chromium):
         server.close()
 
 
-@needs_chromium
 def test_buttons_that_change_nothing_are_off_and_states_and_answers_are_whole(chromium):
     answer = 'pause: rover; ' + 'a long story, ' * 20 + 'whose end is read'
     hub = Hub({'name': 'test', 'robots': {}, 'bounds': [[0, 1], [0, 1]], 'control': True})

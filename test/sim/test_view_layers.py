@@ -6,14 +6,11 @@ import math
 import cv2
 import numpy as np
 import pytest
-from browsers import needs_chromium
 
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.run.view.scene import scene_of
-
-pytestmark = needs_chromium
 
 PLANE = {'name': 'plane', 'robots': {}, 'bounds': [[0, 4], [0, 4]]}
 SPACE = {'name': 'space', 'robots': {}, 'bounds': [[0, 4], [0, 4], [0, 4]]}

@@ -7,7 +7,6 @@ import re
 import cv2
 import numpy as np
 import pytest
-from browsers import needs_chromium
 
 from maasi_filter import colours
 from maasi_sim.run.bag import load_types
@@ -136,7 +135,6 @@ def test_a_robot_that_left_goes_nowhere_in_a_video(departing, tmp_path):
     assert bluish(pictures[5]).sum() - legend < 0.1 * (bluish(pictures[3]).sum() - legend)
 
 
-@needs_chromium
 def test_a_robot_that_left_goes_nowhere_on_the_page(chromium, departing, tmp_path):
     write_replay(departing, tmp_path / 'page.html')
     with chromium() as shown:
@@ -174,7 +172,6 @@ def searched(tmp_path_factory):
     return path, log
 
 
-@needs_chromium
 def test_a_replay_plays_by_itself_and_says_what_happens_to_its_end(chromium, searched):
     with chromium(reduced_motion='no-preference') as shown:
         shown.open(searched[0].as_uri())
@@ -193,7 +190,6 @@ def test_a_replay_plays_by_itself_and_says_what_happens_to_its_end(chromium, sea
         assert states == ['left', 'run ended']
 
 
-@needs_chromium
 def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chromium, searched):
     path, log = searched
     decision = next(event for event in log.events if event[1] == 'plan')[7][0]
@@ -232,7 +228,6 @@ def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chrom
         assert tip((x, y)).startswith(f'target {number}: found by ')
 
 
-@needs_chromium
 def test_on_a_phone_in_the_dark_the_legend_is_whole_and_it_plays_by_the_space_bar(
     chromium, searched
 ):
@@ -281,7 +276,6 @@ def contrast(*colours):
     return (bright + 0.05) / (dark + 0.05)
 
 
-@needs_chromium
 @pytest.mark.parametrize('theme', ['light', 'dark'])
 def test_texts_and_robots_stand_out(chromium, searched, theme):
     style = 'getComputedStyle(document.documentElement).getPropertyValue("--{}").trim()'

@@ -7,7 +7,6 @@ import os
 import pty
 import re
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -15,7 +14,6 @@ import urllib.request
 from urllib.parse import urlsplit
 
 import pytest
-from browsers import chromium, needs_chromium
 from waiting import PATIENCE, wait_until
 
 from maasi_sim.run.view import live_view
@@ -155,14 +153,6 @@ def test_other_machines_need_the_whole_link(public, capsys):
     assert ask(server, 'POST', '/control', '{}', {'X-Maasi-Token': server.token})[0] == 403
 
 
-@needs_chromium
-def test_a_browser_on_another_machine_gets_the_events_by_the_whole_link(public):
-    public.hub.put(state(3))
-    with chromium() as shown:
-        shown.open(public.server.address)
-        shown.until("maasi.log.robots().includes('rover')")
-
-
 def test_where_a_port_is_in_use_the_next_one_is_taken_and_said(server, capsys):
     view = LiveView(SCENE, server.port)
     view.announce(print)
@@ -183,10 +173,8 @@ print('gone')
 """
 
 
-def test_a_finished_page_stays_in_a_terminal_until_enter_and_not_without_one():
+def test_a_finished_page_stays_in_a_terminal_until_enter():
     command = [sys.executable, '-c', STAYING]
-    said = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True).stdout
-    assert 'stays' not in said and said.endswith('gone\n')
     child, terminal = pty.fork()
     if child == 0:
         os.execv(command[0], command)
