@@ -128,6 +128,14 @@ def test_the_share_explored_is_that_of_the_planners_diagnostics(session):
         publisher.publish(DiagnosticArray(status=[status]))
         session.until(lambda: '/planner_node' in session.recorder.take_heartbeats())
         assert session.recorder.take_complaints() == ['/planner_node: refused'] * complaints
+    session.connect()
+    assert session.recorder.unmatched() == []
+    loose = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    other = session.node.create_publisher(Odometry, '/rover/odom', loose)
+    # The reader that is there already is reliable.
+    session.until(lambda: session.recorder.unmatched() == ['/rover/odom'])
+    session.node.destroy_publisher(other)
+    session.until(lambda: session.recorder.unmatched() == [])
 
 
 LATE, STATE = 'the recording lacks the first 6.0 s of /rover/state', '/rover/state'
@@ -166,17 +174,6 @@ def test_a_state_of_the_last_step_counts_also_after_the_end(session):
     session.until(lambda: '/rover/state' in session.recorder.last_seen)
     record = session.recorder.observer.record(RunEnd('time_limit', 10.0, 1.0))
     assert [place[1] for place in record.trajectories['rover']] == pytest.approx([0.3])
-
-
-def test_a_publisher_that_is_known_but_not_connected_is_named(session):
-    session.connect()
-    assert session.recorder.unmatched() == []
-    loose = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-    other = session.node.create_publisher(Odometry, '/rover/odom', loose)
-    # The reader that is there already is reliable.
-    session.until(lambda: session.recorder.unmatched() == ['/rover/odom'])
-    session.node.destroy_publisher(other)
-    session.until(lambda: session.recorder.unmatched() == [])
 
 
 PEER = """
