@@ -125,10 +125,16 @@ def test_numbers_have_ranges_and_what_may_change_when_can_be_set_and_read(node):
     assert node.settings.batch_timeout == 2.5
     node.trigger_deactivate()
     node.trigger_cleanup()
-    assert node.set_parameters([Parameter('filter.preset', value='paper_003')])[0].successful
+    assert refused('filter.found_mass', -1.0, 'read -1.0')
+    # Also of a robot that is new.
+    changes = {'filter.preset': 'paper_003', 'robots': ['a', 'b'], 'robot.b.sensor.period': 0.25}
+    for name, value in changes.items():
+        assert node.set_parameters([Parameter(name, value=value)])[0].successful
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     assert node.get_parameter('filter.found_radius').value == 0.5
     assert node.filter.settings.resolved().found_radius == 0.5
+    assert node.settings.robots['b'].sensor.period == 0.25
+    wait_until(lambda: node.count_subscribers('/b/detections') == 1)
 
 
 def test_a_dump_loads_again_and_foreign_keys_are_named(process, dump):

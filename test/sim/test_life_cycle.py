@@ -97,27 +97,6 @@ def test_after_some_cycles_a_node_has_the_same_entities(context, kind):
     node.destroy_node()
 
 
-def test_parameters_that_are_set_after_cleanup_count_from_the_next_configure(context):
-    node = KINDS['filter'].make(context)
-    wanted = Parameter('filter.found_radius', value=0.07)
-    assert node.trigger_configure().name == 'SUCCESS'
-    (refused,) = node.set_parameters([wanted])
-    assert not refused.successful and 'unconfigured' in refused.reason
-    assert node.trigger_cleanup().name == 'SUCCESS'
-    (wrong,) = node.set_parameters([Parameter('filter.found_radius', value=-1.0)])
-    assert not wrong.successful
-    assert 'filter.found_radius' in wrong.reason and '-1.0' in wrong.reason
-    # Also of a robot that is new.
-    robots = Parameter('robots', value=['rover', 'scout'])
-    for item in (wanted, robots, Parameter('robot.scout.sensor.period', value=0.25)):
-        assert node.set_parameters([item])[0].successful
-    assert node.trigger_configure().name == 'SUCCESS', node.problem
-    assert node.settings.filter.found_radius == node.filter.settings.found_radius == 0.07
-    assert node.settings.robots['scout'].sensor.period == 0.25
-    wait_until(lambda: node.count_subscribers('/scout/detections') == 1)
-    node.destroy_node()
-
-
 def test_a_configure_that_fails_leaves_nothing_and_can_be_repeated(context):
     node = KINDS['sim'].make(context, scenario='nowhere.yaml')
     before = made_by(node)
