@@ -3,17 +3,18 @@
 import json
 from pathlib import Path
 
+import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_robots_of_each_scenario_have_a_type():
-    types = {path.stem: yaml.safe_load(path.read_text()) for path in ROOT.glob('robots/*.yaml')}
+@pytest.mark.parametrize('path', sorted((ROOT / 'scenarios').glob('*.yaml')), ids=lambda x: x.stem)
+def test_robots_of_a_scenario_have_a_type(path):
+    types = {file.stem: yaml.safe_load(file.read_text()) for file in ROOT.glob('robots/*.yaml')}
     assert all(isinstance(content, dict) for content in types.values())
-    for path in ROOT.glob('scenarios/*.yaml'):
-        robots = yaml.safe_load(path.read_text())['robots'].values()
-        assert robots and {robot['type'] for robot in robots} <= types.keys() - {'all'}, path
+    robots = yaml.safe_load(path.read_text())['robots'].values()
+    assert robots and {robot['type'] for robot in robots} <= types.keys() - {'all'}
 
 
 def test_views_can_be_read():

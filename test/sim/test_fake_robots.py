@@ -72,7 +72,10 @@ def test_pyparrot_flies_it(pair):
     # Acknowledged commands are not repeated.
     assert fake.refused == 0 and fake.heard[(2, 0, 1)] == 1
     wait_until(lambda: not fake._unacked)
-    # One that lands by itself is not ordered to take off again.
+
+
+def test_one_that_lands_by_itself_is_not_told_to_take_off_again(pair):
+    fake, link = pair
     link.take_off()
     wait_until(lambda: link.flying_state == 'hovering')
     fake.firmware.land()
@@ -80,7 +83,7 @@ def test_pyparrot_flies_it(pair):
     # Three times as long as from one request to the next.
     end = fake.firmware.time + 2.1
     wait_until(lambda: fake.firmware.time > end)
-    assert fake.firmware.take_offs == 2 and link.flying_state == 'landed'
+    assert fake.firmware.take_offs == 1 and link.flying_state == 'landed'
 
 
 def test_a_packet_that_is_repeated_is_not_believed(pair):
