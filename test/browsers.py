@@ -56,20 +56,35 @@ class Page:
 
 
 @contextlib.contextmanager
-def chromium(width=1280, height=720, reduced_motion='reduce', **options):
-    """Yield a page that complains of nothing and asks no other host; no replay plays by itself."""
+def browser():
+    """Yield a browser for several pages, one after the other."""
     with sync_playwright() as player:
         # Root, as in containers, has no sandbox.
         arguments = ['--no-sandbox'] if os.geteuid() == 0 else []
-        browser = player.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        made = player.chromium.launch(executable_path=CHROMIUM, args=arguments)
         try:
-            viewport = {'width': width, 'height': height}
-            shown = Page(
-                browser.new_page(viewport=viewport, reduced_motion=reduced_motion, **options)
-            )
-            yield shown
-            assert shown.errors == []
-            hosts = [urlsplit(address).hostname for address in shown.requests]
-            assert {*hosts, None} == {*hosts[:1], None}
+            yield made
         finally:
-            browser.close()
+            made.close()
+
+
+@contextlib.contextmanager
+def page_of(browser, width=1280, height=720, reduced_motion='reduce', **options):
+    """Yield a page that complains of nothing and asks no other host; no replay plays by itself."""
+    viewport = {'width': width, 'height': height}
+    page = browser.new_page(viewport=viewport, reduced_motion=reduced_motion, **options)
+    try:
+        shown = Page(page)
+        yield shown
+        assert shown.errors == []
+        hosts = [urlsplit(address).hostname for address in shown.requests]
+        assert {*hosts, None} == {*hosts[:1], None}
+    finally:
+        page.close()
+
+
+@contextlib.contextmanager
+def chromium(*size, **options):
+    """Yield a page in a browser of its own."""
+    with browser() as own, page_of(own, *size, **options) as shown:
+        yield shown

@@ -2,6 +2,7 @@
 
 import gc
 import signal
+from functools import partial
 
 import pytest
 
@@ -28,6 +29,17 @@ def domain(monkeypatch, request):
         # See `own_context`. What fixtures returned may hold nodes, and is held by the test.
         request.node.funcargs.clear()
         gc.collect()
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    """Return what `browsers.chromium` is, with one browser for all pages of a module."""
+    from browsers import CHROMIUM, browser, needs_chromium, page_of
+
+    if CHROMIUM is None:
+        pytest.skip(needs_chromium.kwargs['reason'])
+    with browser() as own:
+        yield partial(page_of, own)
 
 
 @pytest.fixture

@@ -7,19 +7,14 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-TYPES = {path.stem for path in (ROOT / 'robots').glob('*.yaml')} - {'all'}
 
 
 @pytest.mark.parametrize('path', sorted((ROOT / 'scenarios').glob('*.yaml')), ids=lambda x: x.stem)
 def test_robots_of_a_scenario_have_a_type(path):
-    robots = yaml.safe_load(path.read_text())['robots']
-    assert robots
-    assert {robot['type'] for robot in robots.values()} <= TYPES
-
-
-@pytest.mark.parametrize('path', sorted((ROOT / 'robots').glob('*.yaml')), ids=lambda x: x.stem)
-def test_a_robot_type_is_a_mapping(path):
-    assert isinstance(yaml.safe_load(path.read_text()), dict)
+    types = {file.stem: yaml.safe_load(file.read_text()) for file in ROOT.glob('robots/*.yaml')}
+    assert all(isinstance(content, dict) for content in types.values())
+    robots = yaml.safe_load(path.read_text())['robots'].values()
+    assert robots and {robot['type'] for robot in robots} <= types.keys() - {'all'}
 
 
 def test_views_can_be_read():

@@ -38,13 +38,10 @@ def test_gospa_is_the_best_assignment(estimates, truth, cutoff, power):
     assert value.total == pytest.approx(parts ** (1 / power))
 
 
-def test_gospa_parts_by_hand():
+def test_values_by_hand():
     value = gospa([[0.0, 3.0], [50.0, 0.0]], [[0.0, 0.0], [0.0, 40.0], [9.0, 9.0]], 10.0, 2.0)
     assert (value.localisation, value.missed, value.false) == (9.0, 100.0, 50.0)
     assert value.matched == 1
-
-
-def test_matching_is_one_to_one_and_takes_as_many_pairs_as_it_can():
     match = match_targets([[1.0, 0.0], [0.1, 0.0], [9.0, 9.0]], [[0.0, 0.0], [-1.0, 0.0]], 1.2)
     assert sorted(match.pairs) == [(0, 0), (1, 1)]
     assert (match.true_found, match.missed, match.false_found) == (2, 0, 1)

@@ -84,16 +84,6 @@ def wander(generator, number, centre=130.0, size=110.0, stride=12.0):
         yield position
 
 
-def separated(generator, number, lower, upper, apart, dimension):
-    """Return random targets at least `apart` from each other."""
-    targets = []
-    while len(targets) < number:
-        candidate = lower + (upper - lower) * generator.random(dimension)
-        if all(np.linalg.norm(candidate - other) >= apart for other in targets):
-            targets.append(candidate)
-    return np.array(targets)
-
-
 def plane_sensor(probability=0.9, clutter=0.0, range_noise=3.0, bearing=0.08):
     return SensorSettings(
         detection=DetectionSettings(

@@ -8,11 +8,9 @@ from maasi_filter import AgentMeasurement, ExponentialDetection, Pose, Sensor
 from maasi_filter.found_targets import FoundTargets
 from maasi_filter.ic_phd.births import (
     gaussian_births,
-    jittered,
     measurement_births,
     noise_in_space,
     resample,
-    uniform_births,
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.corrector import phd_correct, phd_scan
@@ -44,13 +42,6 @@ def test_births_weigh_what_the_constant_intensity_predicts(dimension):
     assert births.sum() == pytest.approx(expected, rel=0.02)
 
 
-def test_uniform_births_fill_the_environment():
-    bounds = np.array([[0.0, 10.0], [5.0, 6.0]])
-    particles, weights = uniform_births(bounds, 0.7, 5000, np.random.default_rng(0))
-    assert weights.sum() == pytest.approx(0.7)
-    np.testing.assert_allclose(particles.mean(axis=0), [5.0, 5.5], atol=0.1)
-
-
 def test_gaussian_births_stand_for_a_constant_intensity():
     """Weights Y / (J p(x)) estimate Y times any volume, here that of a ball in the middle."""
     bounds = np.array([[0.0, 100.0]] * 2)
@@ -79,7 +70,7 @@ def test_noise_in_space_is_that_of_drawn_measurements(dimension):
     np.testing.assert_allclose(spread, expected, atol=0.05 * np.trace(expected))
 
 
-@pytest.mark.parametrize('detections', [1, 4, 40])
+@pytest.mark.parametrize('detections', [0, 1, 40])
 @pytest.mark.parametrize('dimension', [2, 3])
 def test_the_corrector_is_equation_13(dimension, detections):
     """The factor and C(z) of (13) and (16), summed densely."""
@@ -112,36 +103,6 @@ def test_copies_are_in_proportion_to_the_weights():
         counts += np.bincount(index, minlength=7)
     np.testing.assert_array_equal(counts[weights == 0.0], 0.0)
     np.testing.assert_allclose(counts / 400, 50 * weights / 10.0, rtol=0.05)
-
-
-def test_first_copies_stay_and_further_ones_move_within_the_bounds():
-    particles = np.array([[0.0, 0.0], [9.95, 5.0]])
-    bounds = np.array([[0.0, 10.0]] * 2)
-    index = np.repeat([0, 1], 5000)
-    moved = jittered(particles, index, 0.1, bounds, np.random.default_rng(0))
-    np.testing.assert_array_equal(moved[[0, 5000]], particles)
-    assert ((moved >= 0.0) & (moved <= 10.0)).all()
-    assert moved[5001:, 1].std() == pytest.approx(0.1, rel=0.05)
-    assert len(np.unique(moved[5000:, 1])) == 5000
-
-
-def test_kmeans_separates_clouds_and_keeps_a_warm_start():
-    generator = np.random.default_rng(0)
-    centres = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
-    label = np.repeat(np.arange(3), 200)
-    particles = centres[label] + generator.normal(size=(600, 2))
-    weights = np.full(600, 6.0 / 600)
-    found, means = kmeans(particles, weights, 3, generator, centres)
-    np.testing.assert_array_equal(found, label)
-    _, cold_means = kmeans(particles, weights, 3, generator, np.empty((0, 2)))
-    np.testing.assert_allclose(np.sort(cold_means, axis=0), np.sort(means, axis=0), atol=0.1)
-    clusters = clusters_of(particles, weights, found, means)
-    assert list(clusters) == [0, 1, 2]
-    for c, cluster in clusters.items():
-        member = particles[label == c]
-        assert cluster.mass == pytest.approx(2.0)
-        np.testing.assert_allclose(cluster.covariance, np.cov(member.T, bias=True), atol=1e-9)
-        assert cluster.radius == pytest.approx(np.sqrt(np.trace(np.cov(member.T, bias=True))))
 
 
 @pytest.mark.parametrize('in_order', [True, False])

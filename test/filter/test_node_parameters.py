@@ -1,8 +1,7 @@
 """Parameters as ROS tools see them: ranges, changes at run time, dumps, foreign keys."""
 
-import os
+import shutil
 import subprocess
-import sys
 from functools import reduce
 
 import pytest
@@ -17,6 +16,7 @@ from waiting import PATIENCE, wait_until
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
+from maasi_sim.run.processes import NodeProcess, find_executable
 
 SETTINGS = FilterNodeSettings.model_validate(
     {
@@ -39,22 +39,20 @@ def process(domain, tmp_path):
     running = []
 
     def start(flat=None, before=()):
-        command = [*before, sys.executable, '-m', 'maasi_filter.filter_node', '--ros-args']
+        command = [*before, str(find_executable('maasi_filter', 'filter_node')), '--ros-args']
+        name = f'node{len(running)}'
         if flat is not None:
-            file = tmp_path / f'parameters{len(running)}.yaml'
+            file = tmp_path / f'{name}.yaml'
             file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
             command += ['--params-file', str(file)]
-        environment = os.environ | domain.environment()
-        running.append(
-            subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-        )
+        running.append(NodeProcess(name, command, tmp_path / name))
+        running[-1].start()
         return running[-1]
 
     yield start
     for item in running:
-        if item.poll() is None:
-            item.kill()
-        item.communicate()
+        item.kill()
+        item.join()
 
 
 @pytest.fixture
@@ -95,46 +93,48 @@ def ended(node, *, ask=False):
     """Return the exit code of a process, which may be asked to end, and what it said."""
     if ask:
         node.terminate()
-    _, said = node.communicate(timeout=PATIENCE)
+    node.join(PATIENCE)
+    said = node.last_words(10_000)
     assert 'Traceback' not in said
-    return node.returncode, said
+    return node.exitcode, said
 
 
-def test_numbers_have_real_ranges(node):
+def test_numbers_have_ranges_and_what_may_change_when_can_be_set_and_read(node):
+    def refused(name, value, words):
+        (answer,) = node.set_parameters([Parameter(name, value=value)])
+        return not answer.successful and words in answer.reason
+
     described = {item.name: item for item in node.describe_parameters(['step', 'seed'])}
     found = described['step'].floating_point_range[0]
     assert (found.from_value, found.to_value) == (0.0, 10.0)
     assert described['seed'].integer_range[0].from_value == 0
-    refused = node.set_parameters([Parameter('step', value=11.0)])[0]
-    assert not refused.successful and 'step' in refused.reason
+    assert refused('step', 11.0, 'step')
     # Not in the range, which has its ends.
-    refused = node.set_parameters([Parameter('step', value=0.0)])[0]
-    assert not refused.successful and 'greater than 0' in refused.reason
-
-
-def test_rates_and_timeouts_can_be_set_while_the_node_runs(node):
+    assert refused('step', 0.0, 'greater than 0')
     assert node.trigger_configure().name == 'SUCCESS', node.problem
+    # What a preset resolves to.
+    assert node.get_parameter('filter.particles').value == 5000
+    assert node.filter.settings.resolved().particles == 5000
+    assert node.get_parameter('filter.found_radius').value == 1.1
     assert node.trigger_activate().name == 'SUCCESS'
     for name, value in (('batch_timeout', 2.5), ('markers_rate', 1.0), ('particles_rate', 0.0)):
         assert node.set_parameters([Parameter(name, value=value)])[0].successful
         assert getattr(node.settings, name) == value
-    refused = node.set_parameters([Parameter('batch_timeout', value=-1.0)])[0]
-    assert not refused.successful and 'batch_timeout' in refused.reason
-    refused = node.set_parameters([Parameter('filter.particles', value=10)])[0]
-    assert not refused.successful and 'is read in configure' in refused.reason
+    assert refused('batch_timeout', -1.0, 'batch_timeout')
+    assert refused('filter.particles', 10, 'is read in configure')
     assert node.settings.batch_timeout == 2.5
-
-
-def test_what_a_preset_resolves_to_can_be_read(node):
-    assert node.trigger_configure().name == 'SUCCESS', node.problem
-    assert node.get_parameter('filter.particles').value == 5000
-    assert node.filter.settings.resolved().particles == 5000
-    assert node.get_parameter('filter.found_radius').value == 1.1
+    node.trigger_deactivate()
     node.trigger_cleanup()
-    assert node.set_parameters([Parameter('filter.preset', value='paper_003')])[0].successful
+    assert refused('filter.found_mass', -1.0, 'read -1.0')
+    # Also of a robot that is new.
+    changes = {'filter.preset': 'paper_003', 'robots': ['a', 'b'], 'robot.b.sensor.period': 0.25}
+    for name, value in changes.items():
+        assert node.set_parameters([Parameter(name, value=value)])[0].successful
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     assert node.get_parameter('filter.found_radius').value == 0.5
     assert node.filter.settings.resolved().found_radius == 0.5
+    assert node.settings.robots['b'].sensor.period == 0.25
+    wait_until(lambda: node.count_subscribers('/b/detections') == 1)
 
 
 def test_a_dump_loads_again_and_foreign_keys_are_named(process, dump):
@@ -165,8 +165,8 @@ def test_missing_and_wrong_parameters_are_named_with_what_was_read(process):
 
 def test_a_node_started_alone_says_that_the_loopback_interface_is_down(process):
     # A network namespace of its own has a loopback interface that is down.
-    alone = ['unshare', '--map-root-user', '--net']
+    alone = [shutil.which('unshare') or 'unshare', '--map-root-user', '--net']
     if subprocess.run([*alone, 'true'], capture_output=True).returncode:
         pytest.skip('a network namespace needs root, or user namespaces in the kernel')
-    said = iter(process(flatten(SETTINGS), alone).stderr.readline, '')
-    assert any('the loopback interface cannot be used' in line for line in said)
+    node = process(flatten(SETTINGS), alone)
+    wait_until(lambda: 'the loopback interface cannot be used' in node.last_words())

@@ -72,15 +72,12 @@ def test_a_robot_that_drifted_is_located_by_what_it_found():
     assert search._offsets.mean[:3] == pytest.approx(drifted, abs=1.5)
 
 
-def test_errors_without_the_setting_count_as_independent():
-    search = looked(new_filter(), {'a': np.zeros(3)})
-    assert not search._offsets.active and search._offsets.keys == []
-
-
 def test_update_is_the_exact_one_of_two_robots_and_a_target_known_exactly():
     """Against the posterior of the difference of two normal errors, by hand."""
     offsets = Offsets(OffsetSettings(deviation=2.0), 3)
     search = looked(new_filter(), {'a': np.zeros(3)})
+    # Without the setting errors count as independent.
+    assert not search._offsets.active and search._offsets.keys == []
     generator = np.random.default_rng(3)
     offsets.localise(checked(scan(generator, 'a', np.zeros(3))), [], 1e-9, 1e-9)
     item = next(item for item in search.components if item.target is not None)

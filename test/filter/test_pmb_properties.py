@@ -1,5 +1,7 @@
 """What holds of the multi-Bernoulli filter whatever it measures; its state; its consistency."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from searches import (
@@ -15,12 +17,7 @@ from searches import (
     wander,
 )
 
-from maasi_filter import (
-    AgentMeasurement,
-    FilterSettings,
-    Pose,
-    wrap_angle,
-)
+from maasi_filter import AgentMeasurement, FilterSettings, Pose, wrap_angle
 from maasi_filter.make_filter import make_filter
 from maasi_filter.metrics import match_targets
 from maasi_filter.pmb.filter import PmbFilter
@@ -87,35 +84,30 @@ def test_numbers_are_finite_and_not_negative(seed):
         assert len(search.particles) == len(weights)
 
 
+WRONG = [
+    ({'values': np.array([[np.nan, 0.0]])}, 'values: got .* allowed are finite'),
+    ({'values': np.zeros((1, 3))}, r'values: got shape \(1, 3\)'),
+    ({'covariances': np.zeros((2, 2, 2))}, 'covariances: got shape'),
+    ({'covariances': -np.ones((1, 2, 2))}, 'allowed is a symmetric positive definite'),
+    ({'position_covariance': -np.eye(3)}, 'position_covariance: got'),
+    ({'position_covariance': np.eye(2)}, 'position_covariance: got'),
+    ({'position_covariance': np.full((3, 3), np.nan)}, 'position_covariance: got'),
+    ({'sensor': cube_sensor()}, 'sensor: got 3 dimensions'),
+    ({'labels': [Label()] * 2}, 'labels: got 2, allowed are 1, or none'),
+]
+
+
 @pytest.mark.parametrize('method', ['pmb', 'ic_phd'])
-@pytest.mark.parametrize(
-    ('change', 'text'),
-    [
-        ({'values': np.array([[np.nan, 0.0]])}, 'values: got .* allowed are finite'),
-        ({'values': np.zeros((1, 3))}, r'values: got shape \(1, 3\)'),
-        ({'covariances': np.zeros((2, 2, 2))}, 'covariances: got shape'),
-        ({'covariances': -np.ones((1, 2, 2))}, 'allowed is a symmetric positive definite'),
-        ({'position_covariance': -np.eye(3)}, 'position_covariance: got'),
-        ({'position_covariance': np.eye(2)}, 'position_covariance: got'),
-        ({'position_covariance': np.full((3, 3), np.nan)}, 'position_covariance: got'),
-        ({'sensor': cube_sensor()}, 'sensor: got 3 dimensions'),
-        ({'labels': [Label()] * 2}, 'labels: got 2, allowed are 1, or none'),
-    ],
-)
-def test_bad_measurements_are_refused_and_change_nothing(method, change, text):
+def test_bad_measurements_are_refused_and_change_nothing(method):
     settings = FilterSettings(method=method, use_detection_covariances=True)
-    search = play(make_filter(settings, PLANE, np.random.default_rng(0)), scans(3, number=5))
-    untouched = play(make_filter(settings, PLANE, np.random.default_rng(0)), scans(3, number=5))
-    fields = {
-        'robot': 'b',
-        'pose': Pose([1.0, 1.0, 0.0]),
-        'sensor': plane_sensor(),
-        'values': np.array([[10.0, 0.0]]),
-        **change,
-    }
+    search, untouched = (
+        play(make_filter(settings, PLANE, np.random.default_rng(0)), scans(3, number=5))
+        for _ in range(2)
+    )
     good = measured(plane_sensor(), (1.0, 1.0), [[10.0, 0.0]])
-    with pytest.raises(ValueError, match=text):
-        search.step([good, AgentMeasurement(**fields)], 1, 9.0)
+    for change, text in WRONG:
+        with pytest.raises(ValueError, match=text):
+            search.step([good, replace(good, robot='b', **change)], 1, 9.0)
     for steps, time in ((-1, 0.0), (0.5, 0.0), (True, 0.0), (1, np.inf)):
         with pytest.raises(ValueError, match=r'steps|time'):
             search.step([], steps, time)

@@ -61,17 +61,6 @@ def test_messages_come_back_in_order_with_rising_times(types, tmp_path):
         assert bag.counts == {'/text': 300}
 
 
-def test_scenario_is_found_again(types, tmp_path):
-    with BagWriter(tmp_path / 'bag', types) as writer:
-        writer.write_scenario('seed: 3\nnodes: {}\n', {'seed': '3'})
-        writer.add_topic('/found', 'std_msgs/msg/String', topic_qos(latched=True))
-    with Bag(tmp_path / 'bag') as bag:
-        assert bag.scenario() == {'seed': 3, 'nodes': {}}
-    text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
-    for words in ("seed: '3'", 'durability: transient_local', 'reliability: reliable'):
-        assert words in text
-
-
 def stored(types, folder, kind, message):
     with BagWriter(folder / 'bag', types, images=kind) as writer:
         writer.add_topic('/image', 'sensor_msgs/msg/Image')
@@ -177,22 +166,29 @@ def _installed_hash(type_name):
     return next(item['hash_string'] for item in hashes if item['type_name'] == type_name)
 
 
-def test_a_recording_names_distribution_and_type_hashes_as_ros_does(types, tmp_path):
+def test_a_recording_holds_its_scenario_and_names_distribution_and_hashes_as_ros_does(
+    types, tmp_path
+):
     kinds = [f'maasi_msgs/msg/{name}' for name in ('FilterUpdate', 'AgentState', 'PlanDecision')]
     kinds += ['nav_msgs/msg/Odometry', 'sensor_msgs/msg/BatteryState', 'rosgraph_msgs/msg/Clock']
     with BagWriter(tmp_path / 'bag', types) as writer:
         for kind in kinds:
             writer.add_topic(f'/{kind.rpartition("/")[2]}', kind)
         writer.add_topic('/image', 'sensor_msgs/msg/Image')
-    content = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
-    content = content['rosbag2_bagfile_information']
+        writer.add_topic('/found', 'std_msgs/msg/String', topic_qos(latched=True))
+        writer.write_scenario('seed: 3\nnodes: {}\n', {'seed': '3'})
+    with Bag(tmp_path / 'bag') as bag:
+        assert bag.scenario() == {'seed': 3, 'nodes': {}}
+    text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
+    for words in ("seed: '3'", 'durability: transient_local', 'reliability: reliable'):
+        assert words in text
+    content = yaml.safe_load(text)['rosbag2_bagfile_information']
     assert (content['version'], content['ros_distro']) == (9, 'jazzy')
     stored = {
         item['topic_metadata']['type']: item['topic_metadata']['type_description_hash']
         for item in content['topics_with_message_count']
     }
-    assert stored == {
-        kind: _installed_hash(kind) for kind in [*kinds, 'sensor_msgs/msg/CompressedImage']
-    }
+    kinds += ['sensor_msgs/msg/CompressedImage', 'std_msgs/msg/String']
+    assert stored == {kind: _installed_hash(kind) for kind in kinds}
     # The reader of rosbag2 takes the distribution from the copy inside the file.
     assert b'ros_distro: jazzy' in (tmp_path / 'bag' / 'bag.mcap').read_bytes()

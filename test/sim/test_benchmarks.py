@@ -1,43 +1,43 @@
 """Benchmark commands, tables of search quality, and the reference that knows the targets."""
 
 import json
-import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
+import bench
 import pytest
 import search_quality
-from clairvoyant import _expected_end, _Robots, clairvoyant
+from clairvoyant import clairvoyant
 
-from maasi_filter.models.detection import BoxDetection
 from maasi_sim.experiments.searches import find_times
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
-BENCH = Path(__file__).parents[1] / 'benchmarks' / 'bench.py'
 
+@pytest.fixture
+def run_bench(monkeypatch):
+    def run(*arguments):
+        monkeypatch.setattr(sys, 'argv', ['bench', *map(str, arguments)])
+        return bench.main()
 
-def bench(*arguments):
-    return subprocess.run(
-        [sys.executable, str(BENCH), *arguments], capture_output=True, text=True, check=False
-    )
+    return run
 
 
 @pytest.mark.parametrize('file', ['missing/figures.json', '.'])
-def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path, file):
-    done = bench('drivers', '--json', str(tmp_path / file))
-    assert done.returncode == 2
-    assert '--json: read' in done.stderr and done.stdout == ''
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(
+    run_bench, tmp_path, file, capsys
+):
+    with pytest.raises(SystemExit, match='2'):
+        run_bench('drivers', '--json', tmp_path / file)
+    said = capsys.readouterr()
+    assert '--json: read' in said.err and said.out == ''
 
 
-def test_quick_figures(tmp_path):
+def test_quick_figures(run_bench, tmp_path, capsys):
     file = tmp_path / 'figures.json'
-    done = bench('drivers', '--quick', '--json', str(file))
-    assert done.returncode == 0, done.stderr
+    run_bench('drivers', '--quick', '--json', file)
     rows = json.loads(file.read_text())
-    assert len(rows) == len(done.stdout.splitlines()) == 4
+    assert len(rows) == len(capsys.readouterr().out.splitlines()) == 4
     assert all(row['value'] > 0.0 for row in rows)
 
 
@@ -70,35 +70,9 @@ def test_a_regime_is_run_and_its_table_written_between_marks(tmp_path, capsys, m
     assert table.startswith('Block `development`') and table in said
 
 
-@pytest.mark.parametrize(('seen', 'ends'), [(True, (2.0, 5.0)), (False, (3.0, 7.0))])
-def test_expected_end_of_a_sure_sensor(seen, ends):
-    """A robot moves 1 m each tick, sees 0.5 m far, and needs two detections of each target."""
-    kind, parameters = BoxDetection([-0.5, -0.5], [0.5, 0.5], 1.0).kernel()
-    robot = _Robots(
-        remaining_path=np.zeros((1, 1, 3)),
-        free=np.zeros(1, np.int64),
-        speed=np.ones(1),
-        pause=np.zeros(1),
-        period=np.ones(1, np.int64),
-        kind=np.array([kind], np.int64),
-        parameters=parameters[None],
-        yaw=np.zeros(1),
-    )
-    targets = np.array([[3.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
-    routes = np.array([[0, 1, -1]])
-    # The cost is the time to find all plus the mean time to find, both without the last tick.
-    cost, stops = _expected_end(robot, routes, targets, np.full(2, seen), 2)
-    assert cost == pytest.approx(ends[1] + 0.5 * sum(ends))
-    assert stops[0] == pytest.approx([3.0, 0.0, 0.0])
-
-
 @pytest.mark.parametrize('name', ['ranging_drone_3d', 'mambo'])
-def test_knowing_the_targets_helps_on_average(name):
+def test_knowing_the_targets_helps(name):
     scenario = load_scenario(name)
-    ours, known = 0, 0
-    for seed in (20_000, 20_003):
-        ours += search(scenario, seed).steps
-        result = search(scenario, seed, planner=clairvoyant)
-        assert result.complete
-        known += result.steps
-    assert known < 0.9 * ours
+    result = search(scenario, 20_000, planner=clairvoyant)
+    assert result.complete
+    assert result.steps < 0.9 * search(scenario, 20_000).steps

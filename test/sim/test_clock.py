@@ -1,7 +1,6 @@
 """A real `/clock` that goes back: every node lives on, and a robot without a pose stands."""
 
 import signal
-import subprocess
 import time
 
 import pytest
@@ -20,6 +19,7 @@ from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
+from maasi_sim.run.processes import NodeProcess
 
 SECOND = 1_000_000_000
 JUMPS = tuple(item * SECOND for item in (60, 5, 61, 0, 2))
@@ -66,9 +66,12 @@ class World(Operator):
             # Best effort: one message may be lost.
             self.tell(nanoseconds)
             for name, process in nodes.items():
-                assert process.poll() is None, f'{name} ended with {process.returncode}'
+                assert process.is_alive(), f'{name} {process.how_it_ended()}'
             # A sim stamps its own with the time that it publishes itself.
-            return all(self.stamps.get(name) == stamp for name in nodes if 'sim' not in name)
+            return all(
+                name in self.stamps if 'sim' in name else self.stamps.get(name) == stamp
+                for name in nodes
+            )
 
         self.until(stamped, f'diagnostics at {nanoseconds}')
 
@@ -95,20 +98,21 @@ def start(tmp_path):
     def make(kind, namespace='', **changes):
         command = KINDS[kind].command(tmp_path / f'{kind}.yaml', namespace, **changes)
         command += ['-p', 'use_sim_time:=true']
-        running.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True))
+        running.append(NodeProcess(f'/{kind}', command, tmp_path / f'{kind}.log'))
+        running[-1].start()
         return running[-1]
 
     yield make
     for process in running:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+        process.kill()
+        process.join()
 
 
 def interrupted(process):
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, said
+    process.signal(signal.SIGINT)
+    process.join(PATIENCE)
+    said = process.last_words(10_000)
+    assert process.exitcode == 0 and 'Traceback' not in said, said
     return said
 
 
@@ -123,20 +127,11 @@ def is_active(world, name):
 
 def test_every_type_of_node_lives_through_a_clock_that_goes_back(world, start):
     nodes = {f'/{kind}/{made.name}': start(kind, f'/{kind}') for kind, made in KINDS.items()}
-    for name, process in nodes.items():
-
-        def heard(name=name, process=process):
-            assert process.poll() is None, f'{name} ended with {process.returncode}'
-            return name in world.stamps
-
-        world.until(heard, name)
     for time_ in JUMPS:
         world.seen_at(time_, nodes)
     assert all(is_active(world, name) for name in nodes)
-    for name, process in nodes.items():
-        said = interrupted(process)
-        assert 'Traceback' not in said, (name, said)
-        assert 'clock jumped back by' in said, (name, said)
+    for process in nodes.values():
+        assert 'clock jumped back by' in interrupted(process), process.name
 
 
 class Rover:
@@ -206,7 +201,7 @@ def test_a_robot_stands_when_the_time_jumps_back_and_goes_on_with_a_new_pose(wor
     assert 'odometry' in world.states[-1].reason
     rover.now = rover.step = SECOND
     world.until(lambda: rover.move() and world.states[-1].goal_status != AgentState.UNAVAILABLE)
-    assert process.poll() is None
+    assert process.is_alive()
     rover.client.destroy()
 
 

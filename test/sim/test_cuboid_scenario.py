@@ -30,7 +30,7 @@ def scenario_with(*changes):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_our_scenarios_load_and_are_read_back(name, tmp_path):
+def test_our_scenarios_load_and_are_read_back_also_by_nodes(name, tmp_path):
     scenario = load_cuboid_scenario(name)
     assert scenario.planner.name == 'cuboid_mpc'
     copy = tmp_path / 'copy.yaml'
@@ -38,11 +38,6 @@ def test_our_scenarios_load_and_are_read_back(name, tmp_path):
     assert load_cuboid_scenario(copy) == scenario
     cells = {'buildings_one': 36, 'buildings_four': 32, 'buildings_obstacles': 16}
     assert len(scenario.mission().cells) == cells[name]
-
-
-@pytest.mark.parametrize('name', NAMES)
-def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
-    scenario = load_cuboid_scenario(name)
     mission, file = BuildingMission(name, scenario), Path('/s.yaml')
     planners = [f'/{robot}/cuboid_planner' for robot in scenario.names()]
     # Nothing moves in lockstep while a planner hangs.

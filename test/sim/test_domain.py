@@ -147,7 +147,7 @@ def test_what_another_user_put_there_is_left(folder, monkeypatch):
     assert remove_dead(folder=folder / 'missing') == []
 
 
-def test_domains_are_not_shared(monkeypatch):
+def test_domains_are_not_shared_with_runs_or_other_nodes(monkeypatch):
     profiles = 'FASTRTPS_DEFAULT_PROFILES_FILE'
     monkeypatch.delenv(profiles, raising=False)
     for number in (-1, 102):
@@ -164,6 +164,12 @@ def test_domains_are_not_shared(monkeypatch):
         }
         monkeypatch.setenv(profiles, 'of the user')
         assert profiles not in first.environment()
+    with Domain() as domain:
+        number = domain.number
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(('', 7400 + 250 * number))
+        with Domain() as domain:
+            assert domain.number != number
 
 
 def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_path):
@@ -181,7 +187,7 @@ def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_pa
         Domain(57, str(tmp_path), team='team/b', shared=True).release()
 
 
-def test_a_domain_is_locked_without_a_file():
+def test_a_domain_is_locked_without_a_file_until_its_process_ends(tmp_path):
     """In a shared folder another user could have put a link in the place of one."""
     code = (
         'import os, sys\n'
@@ -189,32 +195,13 @@ def test_a_domain_is_locked_without_a_file():
         'def note(event, words):\n'
         "    made = event == 'open' and isinstance(words[2], int) and words[2] & os.O_CREAT\n"
         "    if made or event in ('os.mkdir', 'os.chmod', 'os.link', 'os.symlink'):\n"
-        '        print(event, *words)\n'
-        'sys.addaudithook(note)\nDomain().release()\n'
+        '        print(event, *words, flush=True)\n'
+        'sys.addaudithook(note)\nDomain().release()\nDomain(33, sys.argv[1])\n'
+        'os.kill(os.getpid(), 9)\n'
     )
-    command = [sys.executable, '-B', '-c', code]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.stdout == ''
-
-
-def test_a_domain_with_other_nodes_is_left_to_them():
-    with Domain() as domain:
-        number = domain.number
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(('', 7400 + 250 * number))
-        with Domain() as domain:
-            assert domain.number != number
-
-
-def test_the_lock_ends_with_the_process(tmp_path):
-    code = (
-        'import os, sys\nfrom maasi_sim.run.domain import Domain\n'
-        'Domain(33, sys.argv[1])\nos.kill(os.getpid(), 9)\n'
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', code, str(tmp_path)], check=False, timeout=PATIENCE
-    )
-    assert done.returncode == -signal.SIGKILL
+    command = [sys.executable, '-B', '-c', code, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    assert (done.returncode, done.stdout) == (-signal.SIGKILL, ''), done.stderr
     Domain(33, str(tmp_path)).release()
 
 

@@ -10,7 +10,7 @@ from waiting import wait_until
 
 from maasi_filter.ros.run_node import executor_of
 
-CYCLES = 20
+CYCLES = 5
 
 
 def made_by(node):
@@ -54,7 +54,7 @@ def wait_until_known(node, turn=lambda: time.sleep(0.01)):
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
+def test_after_some_cycles_a_node_has_the_same_entities(context, kind):
     node = KINDS[kind].make(context)
     executor = executor_of(node, context)
 
@@ -94,27 +94,6 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
     assert node.trigger_cleanup().name == 'SUCCESS'
     wait_until(lambda: (made_by(node), in_graph(node)) == cleaned, spin)
     executor.shutdown()
-    node.destroy_node()
-
-
-def test_parameters_that_are_set_after_cleanup_count_from_the_next_configure(context):
-    node = KINDS['filter'].make(context)
-    wanted = Parameter('filter.found_radius', value=0.07)
-    assert node.trigger_configure().name == 'SUCCESS'
-    (refused,) = node.set_parameters([wanted])
-    assert not refused.successful and 'unconfigured' in refused.reason
-    assert node.trigger_cleanup().name == 'SUCCESS'
-    (wrong,) = node.set_parameters([Parameter('filter.found_radius', value=-1.0)])
-    assert not wrong.successful
-    assert 'filter.found_radius' in wrong.reason and '-1.0' in wrong.reason
-    # Also of a robot that is new.
-    robots = Parameter('robots', value=['rover', 'scout'])
-    for item in (wanted, robots, Parameter('robot.scout.sensor.period', value=0.25)):
-        assert node.set_parameters([item])[0].successful
-    assert node.trigger_configure().name == 'SUCCESS', node.problem
-    assert node.settings.filter.found_radius == node.filter.settings.found_radius == 0.07
-    assert node.settings.robots['scout'].sensor.period == 0.25
-    wait_until(lambda: node.count_subscribers('/scout/detections') == 1)
     node.destroy_node()
 
 

@@ -128,27 +128,34 @@ def test_the_share_explored_is_that_of_the_planners_diagnostics(session):
         publisher.publish(DiagnosticArray(status=[status]))
         session.until(lambda: '/planner_node' in session.recorder.take_heartbeats())
         assert session.recorder.take_complaints() == ['/planner_node: refused'] * complaints
+    session.connect()
+    assert session.recorder.unmatched() == []
+    loose = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    other = session.node.create_publisher(Odometry, '/rover/odom', loose)
+    # The reader that is there already is reliable.
+    session.until(lambda: session.recorder.unmatched() == ['/rover/odom'])
+    session.node.destroy_publisher(other)
+    session.until(lambda: session.recorder.unmatched() == [])
 
 
-@pytest.mark.parametrize(
-    ('joined', 'first', 'gaps'),
-    [
-        (False, {'step': 0, 'state': 0}, []),
-        (False, {'step': 0, 'state': 6}, ['the recording lacks the first 6.0 s of /rover/state']),
-        (False, {'step': 0}, ['the recording lacks /rover/state']),
-        (True, {'step': 30, 'state': 31}, []),
-        (True, {'step': 30, 'state': 36}, ['the recording lacks the first 6.0 s of /rover/state']),
-        # Without any step its robots are unknown.
-        (True, {}, ['the recording lacks /lockstep/step']),
-    ],
-)
-def test_topics_of_each_step_that_are_missing_or_begin_late_are_gaps(session, joined, first, gaps):
+LATE, STATE = 'the recording lacks the first 6.0 s of /rover/state', '/rover/state'
+
+
+def test_topics_of_each_step_that_are_missing_or_begin_late_are_gaps(session):
     recorder = session.recorder
-    topics = {'step': STEP, 'state': '/rover/state'}
-    recorder.first = {topics[name]: time * 10**9 for name, time in first.items()}
-    recorder.robots = ['rover'] if first else []
     recorder.time = 40 * 10**9
-    assert recorder.gaps(joined, patience=5.0) == gaps
+    for joined, first, gaps in (
+        (False, {STEP: 0, STATE: 0}, []),
+        (False, {STEP: 0, STATE: 6}, [LATE]),
+        (False, {STEP: 0}, [f'the recording lacks {STATE}']),
+        (True, {STEP: 30, STATE: 31}, []),
+        (True, {STEP: 30, STATE: 36}, [LATE]),
+        # Without any step its robots are unknown.
+        (True, {}, [f'the recording lacks {STEP}']),
+    ):
+        recorder.first = {topic: time * 10**9 for topic, time in first.items()}
+        recorder.robots = ['rover'] if first else []
+        assert recorder.gaps(joined, patience=5.0) == gaps
 
 
 def test_a_state_of_the_last_step_counts_also_after_the_end(session):
@@ -167,17 +174,6 @@ def test_a_state_of_the_last_step_counts_also_after_the_end(session):
     session.until(lambda: '/rover/state' in session.recorder.last_seen)
     record = session.recorder.observer.record(RunEnd('time_limit', 10.0, 1.0))
     assert [place[1] for place in record.trajectories['rover']] == pytest.approx([0.3])
-
-
-def test_a_publisher_that_is_known_but_not_connected_is_named(session):
-    session.connect()
-    assert session.recorder.unmatched() == []
-    loose = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-    other = session.node.create_publisher(Odometry, '/rover/odom', loose)
-    # The reader that is there already is reliable.
-    session.until(lambda: session.recorder.unmatched() == ['/rover/odom'])
-    session.node.destroy_publisher(other)
-    session.until(lambda: session.recorder.unmatched() == [])
 
 
 PEER = """

@@ -383,14 +383,3 @@ def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(ru
     assert spread @ axis == pytest.approx((large.width / 6.0) ** 2 * axis)
     (missed,) = [line for line in world.lines if line.get_label() == 'missed']
     assert sorted(zip(*missed.get_data())) == [(1.0, 1.5), (1.5, 0.5)]
-
-
-def test_legend_of_many_robots_and_obstacles_is_whole(tmp_path):
-    robots = {
-        f'a_robot_with_a_long_name_{n}': ROBOT | {'radius': 0.05, 'start': [0.1 + 0.18 * n, 0.5, 1]}
-        for n in range(10)
-    }
-    obstacles = [{'centre': [1.0, 1.0], 'radius': 0.1}]
-    environment = PLAIN['environment'] | {'obstacles': obstacles}
-    run = Run(scenario_of(tmp_path, TARGETS, robots=robots, environment=environment))
-    assert {*robots, 'obstacle'} <= labels_of(plot_report(run.record()))

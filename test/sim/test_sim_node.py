@@ -62,8 +62,8 @@ LINKED = {
         },
     },
     'events': [
-        {'at': 6.0, 'robot': 'drone', 'do': 'leave'},
-        {'at': 9.0, 'robot': 'drone', 'do': 'back'},
+        {'at': 2.0, 'robot': 'drone', 'do': 'leave'},
+        {'at': 5.0, 'robot': 'drone', 'do': 'back'},
     ],
 }
 FORWARD = (0.2, 0.0, 0.0, 0.0)
@@ -250,37 +250,32 @@ def test_every_topic_comes_at_its_rate_with_the_stamps_of_the_steps(make_team):
     assert [marker.ns for marker in markers] == ['truth', 'truth', 'obstacles']
 
 
-def test_nothing_is_published_until_everybody_is_there(make_team, monkeypatch):
+def test_the_time_starts_only_when_everybody_is_there_and_would_miss_nothing(
+    make_team, monkeypatch
+):
     monkeypatch.setattr('maasi_sim.simulation.sim_node._PATIENCE', 0.0)
-    team = make_team(recorder=True)
-    team.settle()
-    assert team.sim.status()['waits for'] == '/recorder'
-    # What runs a recorder says who is missing.
-    assert team.sim._said == ''
-    assert not team.drivers['mambo'].of('odom') and not team.filter.steps
-    recorder = team.add('recorder')
-    recorder.say_ready()
-    team.run(5)
-    recorder.destroy_node()
-
-
-def test_the_time_starts_only_when_no_subscription_would_miss_it(make_team, monkeypatch):
-    team = make_team()
-    counts = {}
+    matched, counts = Publisher.get_subscription_count, {'/clock': 0}
 
     def late(publisher):
         # As if discovery had told of the subscriptions, and was still about to connect them.
         return counts.get(publisher.topic_name, matched(publisher))
 
-    matched = Publisher.get_subscription_count
     monkeypatch.setattr(Publisher, 'get_subscription_count', late)
-    counts['/clock'] = 0
+    team = make_team(recorder=True)
     team.settle()
-    assert team.sim.status()['waits for'] == '' and team.sim.step < 0
+    assert team.sim.status()['waits for'] == '/recorder'
+    # What runs a recorder says who is missing.
+    assert team.sim._said == ''
+    recorder = team.add('recorder')
+    recorder.say_ready()
+    team.spin_until(lambda: team.sim.status()['waits for'] == '')
+    team.settle()
+    assert team.sim.step < 0 and not team.drivers['mambo'].of('odom')
     assert not team.filter.steps and not team.filter.seen['/clock']
     del counts['/clock']
-    team.run(2)
+    team.run(5)
     assert seconds(team.filter.seen['/clock'][0].clock) == 0.0
+    recorder.destroy_node()
 
 
 def test_a_step_waits_for_everybody_and_for_every_command(make_team):
@@ -372,19 +367,17 @@ def test_lockstep_keeps_to_the_rate_that_is_asked_for(make_team):
     assert time.monotonic() - begin > 0.18
 
 
-@pytest.mark.parametrize(
-    ('content', 'parameters', 'text'),
-    [
+def test_wrong_parameters_are_refused_with_what_is_wrong(make_team):
+    follow = 'follow_clock: read true, allowed is false in lockstep'
+    for content, parameters, text in (
         (SCENARIO, {'lockstep': False, 'rate': 0.0}, 'parameter rate: read 0'),
         (SCENARIO, {'rate': -1.0}, 'rate'),
-        (SCENARIO, {'follow_clock': True}, 'follow_clock: read true, allowed is false in lockstep'),
+        (SCENARIO, {'follow_clock': True}, follow),
         (SCENARIO, {'step': 0.03}, 'whole multiples of step'),
         (LINKED, {'lockstep': False, 'rate': 2.0}, r'drone\.link: .* runs in real time'),
-    ],
-)
-def test_wrong_parameters_are_refused_with_what_is_wrong(make_team, content, parameters, text):
-    with pytest.raises(AssertionError, match=text):
-        make_team(content, **parameters)
+    ):
+        with pytest.raises(AssertionError, match=text):
+            make_team(content, **parameters)
 
 
 def test_a_linked_robot_is_cut_off_while_it_is_away(make_team, tmp_path):

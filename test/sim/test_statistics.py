@@ -7,8 +7,7 @@ import pytest
 from scipy import stats
 
 from maasi_sim.experiments import statistics
-from maasi_sim.experiments.statistics import Difference, mean_interval
-from maasi_sim.experiments.tables import verdict
+from maasi_sim.experiments.statistics import mean_interval
 
 GENERATOR = np.random.default_rng(3)
 FIRST, SECOND, OTHER = (GENERATOR.normal(5.0, 2.0, number) for number in (12, 12, 7))
@@ -44,6 +43,11 @@ def test_intervals_of_few_values():
     result = statistics.independent_difference(ours, statistics.from_published(2.0, None, 10))
     assert result.half_width == pytest.approx(ours.half_width * math.sqrt(1.3))
     assert result.mean == pytest.approx(ours.mean - 2.0)
+    assert math.isnan(statistics.bootstrap_difference([], []).mean)
+    one = statistics.bootstrap_difference([3.0], [1.0])
+    assert one.mean == 2.0 and math.isnan(one.low) and not one.told_from_zero
+    same = statistics.bootstrap_difference([1.0, 2.0], [1.0, 2.0])
+    assert (same.mean, same.low, same.high, same.needed) == (0.0, 0.0, 0.0, None)
 
 
 @pytest.mark.parametrize(('effect', 'expected'), [(0.2, 199), (0.5, 34), (0.8, 15)])
@@ -62,20 +66,3 @@ def test_bootstrap_interval_of_normal_differences_is_near_students():
     assert (gap.low, gap.high) == pytest.approx((low, high), abs=0.1)
     assert gap.told_from_zero
     assert statistics.bootstrap_difference(first, second) == gap
-
-
-def test_bootstrap_of_few_or_equal_values():
-    assert math.isnan(statistics.bootstrap_difference([], []).mean)
-    one = statistics.bootstrap_difference([3.0], [1.0])
-    assert one.mean == 2.0 and math.isnan(one.low) and not one.told_from_zero
-    same = statistics.bootstrap_difference([1.0, 2.0], [1.0, 2.0])
-    assert (same.mean, same.low, same.high, same.needed) == (0.0, 0.0, 0.0, None)
-
-
-def test_verdict_says_when_the_seeds_are_too_few():
-    few = Difference(-2.0, -6.0, 2.0, -1.0, 10, 85)
-    assert 'too few' in verdict('a', 'b', few) and 'about 85' in verdict('a', 'b', few)
-    none = Difference(0.0, 0.0, 0.0, 0.0, 10, None)
-    assert 'no difference on any of 10 seeds' in verdict('a', 'b', none)
-    clear = Difference(-2.0, -3.0, -1.0, -2.0, 10, 7)
-    assert 'sooner' in verdict('a', 'b', clear) and 'too few' not in verdict('a', 'b', clear)

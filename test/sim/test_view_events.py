@@ -17,8 +17,7 @@ from maasi_msgs import msg
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog, line, thin
 from maasi_sim.run.view.event_maker import ENDED, LEFT, SILENT, EventMaker
-from maasi_sim.run.view.messages import MessageEvents, is_shown
-from maasi_sim.run.view.page_file import REPLAY, empty_page
+from maasi_sim.run.view.messages import MessageEvents
 from maasi_sim.run.view.scene import empty_scene, scene_of, scene_of_facts
 from maasi_sim.search import search
 
@@ -177,19 +176,6 @@ def test_time_that_jumps_back_begins_another_run():
     assert [event[0] for event in taken.events] == [0.0, 30.0, 0.0]
 
 
-def test_topics_are_known_by_type_and_name():
-    topics = {
-        '/team/rover/state': 'maasi_msgs/msg/AgentState',
-        '/rover/plan': 'nav_msgs/msg/Path',
-        '/rover/local_path': 'nav_msgs/msg/Path',
-        '/found_targets/kept': 'maasi_msgs/msg/FoundTargetArray',
-        '/search/_action/state': 'maasi_msgs/msg/AgentState',
-        '/rover/odom': 'nav_msgs/msg/Odometry',
-    }
-    shown = [topic for topic, kind in topics.items() if is_shown(topic, kind)]
-    assert shown == ['/team/rover/state', '/rover/plan']
-
-
 def unpacked(text):
     scene, *events = gzip.decompress(base64.b64decode(text)).decode().split('\n')
     return json.loads(scene), [json.loads(item) for item in events]
@@ -291,12 +277,3 @@ def test_the_objective_is_made_of_its_terms_with_the_weights_of_the_scene(result
         gain = weights['alpha'] * refinement + weights['beta'] * exploration
         expected = (gain - weights['control'] * control) / length
         assert objective == pytest.approx(expected, rel=1e-3, abs=1e-6)
-
-
-def test_the_page_is_one_file_without_addresses(result, tmp_path):
-    result.save_replay(tmp_path / REPLAY)
-    assert (tmp_path / REPLAY).stat().st_size < 1_000_000
-    for page in (empty_page(), (tmp_path / REPLAY).read_text()):
-        assert 'http' not in page.replace('http-equiv', '')
-        assert 'import ' not in page.partition('<script type="module">')[2]
-        assert '/*RUN*/' not in page

@@ -6,14 +6,11 @@ import math
 import cv2
 import numpy as np
 import pytest
-from browsers import chromium, needs_chromium
 
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.run.view.scene import scene_of
-
-pytestmark = needs_chromium
 
 PLANE = {'name': 'plane', 'robots': {}, 'bounds': [[0, 4], [0, 4]]}
 SPACE = {'name': 'space', 'robots': {}, 'bounds': [[0, 4], [0, 4], [0, 4]]}
@@ -57,7 +54,7 @@ def opened(tmp_path):
     return open_run
 
 
-def test_the_belief_is_a_heat_map_that_can_be_switched_on_from_above_and_in_space(opened):
+def test_the_belief_is_a_heat_map_that_can_be_switched_on_from_above_and_in_space(chromium, opened):
     # Of two filters the one that expects more counts.
     broad = [0.0, 'filter', 'a', 0.6, [[3.0, 1.0, 0.0, 0.6, 0.25, 0.0, 0.0, 0.25, 0.0, 0.0]], 1]
     less = [0.0, 'filter', 'b', 0.1, [[3.0, 1.0, 0.0, 0.1, 0.25, 0.0, 0.0, 0.25, 0.0, 0.0]], 1]
@@ -102,7 +99,9 @@ def moving(sensor):
     return {**PLANE, 'robots': {'rover': {'view': sensor}}}, [*events, [0.5, 'found', '', found]]
 
 
-def test_the_dark_goes_as_the_field_of_view_moves_and_stays_away_where_it_was_measured(opened):
+def test_the_dark_goes_as_the_field_of_view_moves_and_stays_away_where_it_was_measured(
+    chromium, opened
+):
     corners = {'lower': [-0.3, -0.3], 'upper': [0.3, 0.3], 'edge': 0.0}
     scene, events = moving({'kind': 'box', 'turns': True, 'gain': 0.8, **corners})
     unseen = '(x) => maasi.map.unexplored.mean(Math.round(10 * x), 20)'
@@ -127,7 +126,7 @@ def test_the_dark_goes_as_the_field_of_view_moves_and_stays_away_where_it_was_me
         assert sum(here) > sum(beside) + 30
 
 
-def test_a_ring_runs_out_from_what_is_found_unless_motion_is_to_be_reduced(opened):
+def test_a_ring_runs_out_from_what_is_found_unless_motion_is_to_be_reduced(chromium, opened):
     run = moving({'kind': 'exponential', 'turns': False, 'gain': 0.9, 'size': [0.3, 0.3]})
     green = {}
     for motion in ('reduce', 'no-preference'):
@@ -142,7 +141,7 @@ def test_a_ring_runs_out_from_what_is_found_unless_motion_is_to_be_reduced(opene
     assert green['reduce', 'later'] == pytest.approx(green['reduce'], abs=10)
 
 
-def test_cells_say_how_unexplored_they_are_in_perspective(opened):
+def test_cells_say_how_unexplored_they_are_in_perspective(chromium, opened):
     grid = [0.0, 'map', '', [0, 0, 0], [2, 2, 2], [3, 3, 3], '0' * 13 + '6' + '0' * 13, 0.9]
     floor = [0.0, 'map', '', [0, 0, 0], [1, 1, 0], [5, 5, 1], '0' * 12 + '9' + '0' * 12, 0.9]
     with chromium() as shown:
@@ -160,7 +159,7 @@ def test_cells_say_how_unexplored_they_are_in_perspective(opened):
         assert numbers == pytest.approx([3.3, 0.7], abs=0.02)
 
 
-def test_faces_of_buildings_fill_and_what_the_log_offers_is_there(opened):
+def test_faces_of_buildings_fill_and_what_the_log_offers_is_there(chromium, opened):
     scene = scene_of('buildings', load_mission('buildings_four').scenario)
     owner, face, part = scene['cells'][5]
     own = [index for index, cell in enumerate(scene['cells']) if cell[:2] == [owner, face]]
@@ -208,7 +207,7 @@ def test_faces_of_buildings_fill_and_what_the_log_offers_is_there(opened):
 
 
 @pytest.mark.parametrize('width', [1280, 390])
-def test_a_strip_for_each_robot_has_the_scale_of_the_time_line(opened, width):
+def test_a_strip_for_each_robot_has_the_scale_of_the_time_line(chromium, opened, width):
     # On the way to 4 s, waits to 6 s, cannot go on to 8 s, and has left.
     statuses = [(0.0, 1), (4.0, 2), (6.0, 5), (8.0, 6)]
     events = [

@@ -7,7 +7,6 @@ import os
 import pty
 import re
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -15,20 +14,13 @@ import urllib.request
 from urllib.parse import urlsplit
 
 import pytest
-from browsers import chromium, needs_chromium
 from waiting import PATIENCE, wait_until
 
 from maasi_sim.run.view import live_view
+from maasi_sim.run.view import server as server_module
 from maasi_sim.run.view.event_log import STATE_PERIOD
 from maasi_sim.run.view.live_view import LiveView
-from maasi_sim.run.view.server import (
-    LARGEST_BODY,
-    MOST_BROWSERS,
-    MOST_IDLE,
-    Hub,
-    ViewServer,
-    _Handler,
-)
+from maasi_sim.run.view.server import LARGEST_BODY, Hub, ViewServer
 
 SCENE = {'name': 'test', 'robots': {}, 'bounds': [[0, 1], [0, 1]]}
 
@@ -85,10 +77,10 @@ class Browser:
 
 def test_a_browser_that_reads_nothing_holds_up_nobody_and_a_late_one_gets_everything(server):
     stuck = Browser(server)
-    for index in range(50_000):
-        server.hub.put([float(index), 'log', '', 'team', 'rover', 'x' * 300])
+    for index in range(5_000):
+        server.hub.put([float(index), 'log', '', 'team', 'rover', 'x' * 3000])
     late = Browser(server)
-    late.until(50_000)
+    late.until(5_000)
     assert late.scenes == [SCENE]
     server.hub.close()
     late.until()
@@ -112,18 +104,20 @@ def test_a_long_run_is_thinned_and_browsers_begin_anew():
 
 def test_there_are_only_so_many_browsers_and_half_open_connections_make_room(server, monkeypatch):
     # None is closed because it is slow.
-    monkeypatch.setattr(_Handler, 'timeout', None)
-    browsers = [Browser(server) for _ in range(MOST_BROWSERS)]
+    monkeypatch.setattr(server_module._Handler, 'timeout', None)
+    monkeypatch.setattr(server_module, 'MOST_BROWSERS', 4)
+    monkeypatch.setattr(server_module, 'MOST_IDLE', 8)
+    browsers = [Browser(server) for _ in range(4)]
     assert all(b' 200 ' in browser.head[0] for browser in browsers)
     assert b' 503 ' in Browser(server).head[0]
     for browser in browsers[1:]:
         browser.close()
     threads = threading.active_count()
     place = ('127.0.0.1', server.port)
-    held = [socket.create_connection(place, timeout=PATIENCE) for _ in range(3 * MOST_IDLE)]
+    held = [socket.create_connection(place, timeout=PATIENCE) for _ in range(24)]
     # The oldest were closed, and their threads ended.
-    assert held[0].recv(1) == b'' and held[MOST_IDLE].recv(1) == b''
-    wait_until(lambda: threading.active_count() <= threads + MOST_IDLE)
+    assert held[0].recv(1) == b'' and held[8].recv(1) == b''
+    wait_until(lambda: threading.active_count() <= threads + 8)
     # One that breaks off harms nothing.
     held[-1].sendall(b'POST /control HTTP/1.1\r\nContent-Le')
     for connection in held:
@@ -159,14 +153,6 @@ def test_other_machines_need_the_whole_link(public, capsys):
     assert ask(server, 'POST', '/control', '{}', {'X-Maasi-Token': server.token})[0] == 403
 
 
-@needs_chromium
-def test_a_browser_on_another_machine_gets_the_events_by_the_whole_link(public):
-    public.hub.put(state(3))
-    with chromium() as shown:
-        shown.open(public.server.address)
-        shown.until("maasi.log.robots().includes('rover')")
-
-
 def test_where_a_port_is_in_use_the_next_one_is_taken_and_said(server, capsys):
     view = LiveView(SCENE, server.port)
     view.announce(print)
@@ -187,10 +173,8 @@ print('gone')
 """
 
 
-def test_a_finished_page_stays_in_a_terminal_until_enter_and_not_without_one():
+def test_a_finished_page_stays_in_a_terminal_until_enter():
     command = [sys.executable, '-c', STAYING]
-    said = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True).stdout
-    assert 'stays' not in said and said.endswith('gone\n')
     child, terminal = pty.fork()
     if child == 0:
         os.execv(command[0], command)
