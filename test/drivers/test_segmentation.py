@@ -85,6 +85,13 @@ def test_a_disc_is_one_blob_at_its_centre(rule, tolerance, x, y, radius):
     assert abs(blobs.areas[0] / (np.pi * radius**2) - 1) < largest
 
 
+@pytest.mark.parametrize('gains', [(1.25, 1.0, 0.75), (0.8, 1.0, 1.25), (0.4, 0.4, 0.4)])
+def test_the_robust_rule_does_not_mind_white_balance_and_exposure(gains):
+    image = draw_disc(floor(), 70.3, 50.8, 4.0)
+    blobs = segment(np.clip(image * np.array(gains), 0, 255).astype(np.uint8), ROBUST)
+    assert_allclose(blobs.centroids, [[70.3, 50.8]], atol=0.05)
+
+
 @pytest.mark.parametrize(
     'colour', [(150, 170, 200), (105, 30, 125), (90, 140, 155), (160, 40, 20), (10, 10, 10)]
 )
@@ -95,6 +102,14 @@ def test_the_robust_rule_leaves_out_other_colours(colour):
 def test_the_robust_rule_leaves_out_what_is_darker_than_the_blue_around_it():
     image = draw_disc(floor(), 70.0, 50.0, 14.0, (150, 160, 220))
     assert len(segment(draw_disc(image, 70.0, 50.0, 4.0, (5, 8, 30)), ROBUST)) == 0
+
+
+def test_the_robust_rule_leaves_out_lines_and_rings_and_keeps_the_disc_beside():
+    image = draw_disc(floor(), 30.0, 30.0, 4.0)
+    image[60:62, 20:90] = BLUE
+    draw_disc(draw_disc(image, 110.0, 80.0, 9.0), 110.0, 80.0, 6.5, (120, 120, 120))
+    blobs = segment(image, ROBUST)
+    assert_allclose(blobs.centroids, [[30.0, 30.0]], atol=0.05)
 
 
 def test_the_robust_rule_under_noise_says_how_far_centroids_may_be_off():

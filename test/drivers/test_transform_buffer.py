@@ -1,10 +1,11 @@
 """The buffer of transforms: chains, times, and what it refuses."""
 
+import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from maasi_drivers.agent.transform_buffer import TransformBuffer, TransformError
-from maasi_filter.models.pose import Pose
+from maasi_filter.models.pose import Pose, compose
 
 SECOND = 1_000_000_000
 MAP_FROM_ODOM = Pose.from_yaw([1.0, 2.0, 0.0], 0.5)
@@ -25,12 +26,41 @@ def buffer():
     return made
 
 
+def test_chains_are_composed_up_and_down(buffer):
+    base = compose(MAP_FROM_ODOM, Pose.from_yaw([2.0, 0.0, 0.0], 0.6))
+    found = buffer.pose('map', 'camera')
+    assert_allclose(found.position, compose(base, MOUNT).position, atol=1e-12)
+    assert_allclose(found.rotation(), compose(base, MOUNT).rotation(), atol=1e-12)
+    both = compose(buffer.pose('camera', 'map'), found)
+    assert_allclose(both.position, np.zeros(3), atol=1e-12)
+    assert_allclose(both.rotation(), np.eye(3), atol=1e-12)
+    # Two branches of the tree.
+    buffer.add('map', 'dock', Pose.from_yaw([0.0, 1.0, 0.0], np.pi), static=True)
+    seen = buffer.pose('dock', 'base').position
+    assert_allclose(seen, [-base.position[0], 1.0 - base.position[1], 0.0])
+    assert buffer.latest('map', 'camera') == 2 * SECOND
+    assert buffer.latest('map', 'dock') is None
+    assert buffer.pose('nowhere', 'nowhere') == Pose(np.zeros(3))
+
+
 def test_times_between_are_interpolated_and_nothing_is_extrapolated(buffer):
     found = buffer.pose('odom', 'base', round(1.3 * SECOND))
     assert_allclose([found.position[0], found.yaw], [1.3, 0.32], atol=1e-6)
     for stamp in (SECOND - 1, 2 * SECOND + 1):
         with pytest.raises(TransformError, match=f'{SECOND} to {2 * SECOND}'):
             buffer.pose('map', 'base', stamp)
+
+
+def test_the_latest_is_what_all_transforms_are_known_at():
+    buffer = TransformBuffer()
+    buffer.add('map', 'odom', MAP_FROM_ODOM, 3 * SECOND)
+    robot(buffer, 3 * SECOND - 5, 0.0)
+    with pytest.raises(TransformError):
+        buffer.pose('map', 'base')
+    robot(buffer, 3 * SECOND + 5, 1.0)
+    assert buffer.latest('map', 'base') == 3 * SECOND
+    expected = compose(MAP_FROM_ODOM, Pose([0.5, 0.0, 0.0])).position
+    assert_allclose(buffer.pose('map', 'base').position, expected, atol=1e-12)
 
 
 def test_frames_that_make_no_sense_are_named_and_change_nothing(buffer):
