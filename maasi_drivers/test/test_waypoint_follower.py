@@ -17,8 +17,8 @@ def at(x, y=0.0, z=1.0):
     return RobotState.at_rest([x, y, z])
 
 
-def goal(x, step=0, number=1, tolerance=0.0):
-    return Goal(number, step, np.array([x, 0.0, 1.0]), tolerance)
+def goal(x, tolerance=0.0):
+    return Goal(1, 0, np.array([x, 0.0, 1.0]), tolerance)
 
 
 def test_a_ground_robot_reaches_its_goal_in_the_step_in_which_it_is_there():
@@ -46,22 +46,6 @@ def test_a_goal_may_bring_its_own_tolerance(tolerance, place, status):
     follower.take(goal(1.0, tolerance=tolerance))
     follower.update(place)
     assert follower.status.name == status
-
-
-def test_a_goal_of_a_step_acts_from_the_next_one_on_unless_it_is_replaced_or_ended_before():
-    follower = follower_of()
-    first, second = goal(1.0, step=7), goal(-1.0, step=8, number=2)
-    follower.take(first)
-    assert_array_equal(follower.update(at(0.0), 7)[0], np.zeros(4))
-    assert follower.status == GoalStatus.IDLE
-    assert follower.update(at(0.0), 8)[0][0] > 0.1
-    assert follower.status == GoalStatus.MOVING
-    assert follower.take(second) is first
-    assert (first.status, first.reason) == (GoalStatus.ABORTED, 'replaced')
-    assert follower.end(GoalStatus.CANCELED, 'cancelled') is second
-    assert follower.end(GoalStatus.CANCELED, 'again') is None
-    assert_array_equal(follower.update(at(0.0), 9)[0], np.zeros(4))
-    assert follower.status == GoalStatus.CANCELED and second.reason == 'cancelled'
 
 
 def test_a_flying_robot_holds_where_it_was_where_it_arrived_or_where_its_goal_is_cancelled():

@@ -127,7 +127,7 @@ def test_limits_hold_under_any_command(settings):
     rng = np.random.default_rng(11)
     fast = settings.speed > 1.0
     exact = settings.model == 'constant_speed'
-    for k in range(4000):
+    for k in range(2000):
         if k % 40 == 0 and fast:
             command = np.append(rng.choice([-4.0, 4.0], size=2), [rng.normal(), 0.0])
         elif k % 12 == 0 and not fast:

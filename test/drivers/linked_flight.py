@@ -48,7 +48,7 @@ class LinkedFlight:
 
     program, make = 'mambo_driver', MamboDriver
     start, far = FLYING['start'], [2.3, -0.2, 0.5]
-    outside = ([1.7, 0.8, 1.8], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5])
+    outside = ([1.7, 0.8, 2.1], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5])
     # Two waypoints, how near it is to them when the next one is sent, and its least speed.
     way, near, least_speed = ([1.0, 0.4, 0.4], [1.0, -0.1, 0.4]), 0.4, 0.1
 

@@ -60,7 +60,7 @@ def test_an_event_corrects_the_time_that_it_is_of():
 
 
 # Drag [1/s] and delay [s]; test/drivers/mambo_table.py prints more.
-@pytest.mark.parametrize(('drag', 'delay'), [(0.3, 0.0), (0.3, 0.3), (3.0, 0.0), (3.0, 0.3)])
+@pytest.mark.parametrize(('drag', 'delay'), [(0.3, 0.3), (3.0, 0.0)])
 def test_it_stays_inside_the_field_with_what_the_measuring_flight_says(drag, delay):
     flown = measure_and_fly(drag, delay)
     assert_allclose(flown.measured.full_speed, full_speed(drag), rtol=0.1)

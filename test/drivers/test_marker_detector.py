@@ -108,11 +108,6 @@ def test_the_pose_covariance_of_the_message_wins_over_the_settings():
     assert variances[2] > 0.05**2
 
 
-def test_an_image_of_another_size_is_refused():
-    with pytest.raises(ValueError, match='image: got 80 x 60 px, allowed is the size'):
-        MarkerDetector(drone_camera()).detect(np.zeros((60, 80, 3), np.uint8), DOWN)
-
-
 def test_blobs_above_the_horizon_are_no_detections():
     settings = drone_camera(mount={'position': [0, 0, 0.2], 'rpy': [0, 0, 0]}, distortion=[])
     image = np.full((120, 160, 3), 120, dtype=np.uint8)

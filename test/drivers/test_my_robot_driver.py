@@ -59,8 +59,7 @@ class Rover:
         return report | {'forward': forward, 'turn': state.angular_velocity[2]} | self.extra
 
 
-@pytest.fixture
-def rover_and_team(play):
+def test_it_goes_where_it_is_sent_and_is_stopped_if_silent_or_talking_nonsense(play):
     spec = importlib.util.spec_from_file_location('my_robot_driver', FILE)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -69,28 +68,17 @@ def rover_and_team(play):
     made = partial(AgentDriver, {'topics': module.RoverLink}, CameraInput)
     driver, team = play((made, unflatten(DriverSettings, PARAMETERS)), deaf=True)
     rover.start, rover.body = team.start, team.body
-    team.until(lambda: rover.live() or team.states, 'the rover was not heard')
-    yield rover, team, driver
-    driver.halt()
-    rover.link.close()
 
+    def until(condition):
+        team.until(lambda: rover.live() or condition())
 
-def test_it_goes_where_it_is_sent(rover_and_team):
-    rover, team, _ = rover_and_team
+    until(lambda: team.states)
     assert_allclose(pose_from_ros(team.state.pose.pose).position, team.start.position, atol=0.01)
     assert team.state.battery == pytest.approx(0.8)
     waypoint = team.start.position + np.array([0.35, 0.15, 0.0])
     _, result = team.send_accepted(waypoint, live=rover.live)
     assert team.ended(result, rover.live)[0] == GoalStatus.STATUS_SUCCEEDED
     assert np.linalg.norm(rover.body.robot_state().pose.position - waypoint) < 0.08
-
-
-def test_a_rover_that_is_silent_or_talks_nonsense_is_stopped_and_said(rover_and_team):
-    rover, team, driver = rover_and_team
-
-    def until(condition):
-        team.until(lambda: rover.live() or condition())
-
     far = team.start.position + np.array([1.0, 0.8, 0.0])
     for fault in ({'extra': {'x': math.nan}}, {'talks': False}):
         _, result = team.send_accepted(far, live=rover.live)
@@ -109,3 +97,4 @@ def test_a_rover_that_is_silent_or_talks_nonsense_is_stopped_and_said(rover_and_
     rover.command = (0.2, 0.0)
     driver.halt()
     until(lambda: rover.command == (0.0, 0.0))
+    rover.link.close()

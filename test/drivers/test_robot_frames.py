@@ -55,7 +55,7 @@ class Listener:
         return made
 
 
-def test_frames_agree_with_the_state(play):
+def test_frames_agree_with_the_state_and_who_comes_late_hears_the_static_ones(play):
     driver, team = play(tf_rate=10.0)
     heard = Listener(team)
     team.until(lambda: driver.count_subscribers('/tf') == 2)
@@ -85,11 +85,7 @@ def test_frames_agree_with_the_state(play):
         for info in team.get_publishers_info_by_topic('/tf')
     ]
     assert hashes == [expected]
-
-
-def test_who_comes_late_hears_static_frames_and_description(play):
-    _, team = play()
-    team.move(3)
+    # The description, too.
     heard, texts = Listener(team), []
     team.create_subscription(String, 'robot_description', texts.append, LATCHED)
     team.until(lambda: heard.static and texts)

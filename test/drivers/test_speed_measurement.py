@@ -4,7 +4,9 @@ import math
 import signal
 import subprocess
 import sys
+from contextlib import ExitStack, closing
 
+import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from simulated_mambo import TILT, Flight, full_speed
@@ -13,7 +15,11 @@ from waiting import PATIENCE, wait_until
 from maasi_drivers.measure_mambo import Leg, MeasurementError, MeasuringFlight, fit_speed, main
 from maasi_filter.models.pose import Pose
 from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
-from maasi_sim.simulation.emulators.mambo.firmware import FlyingState, MamboFirmware
+from maasi_sim.simulation.emulators.mambo.firmware import (
+    FirmwareSettings,
+    FlyingState,
+    MamboFirmware,
+)
 
 
 @pytest.mark.parametrize(
@@ -58,23 +64,27 @@ def test_what_says_too_little_or_does_not_fit_is_refused(places, text):
 # ---- the command -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('ends', [True, False])
-def test_the_command_measures_through_pyparrot_and_lands(ends):
-    fake = FakeMambo(MamboFirmware(Pose.from_yaw([0.0, 0.0, 0.0], 0.0)), free_address())
-    firmware, options = fake.firmware, ['--address', fake.address, '--port', str(free_port())]
-    command = [sys.executable, '-m', 'maasi_drivers.measure_mambo', '--fly', '--legs', '2']
-    with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True) as process:
-        if not ends:
-            wait_until(lambda: firmware.flying_state == FlyingState.HOVERING)
-            process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == (0 if ends else 1), output
-    assert firmware.flying_state == FlyingState.LANDED and firmware.take_offs == 1
-    fake.close()
-    if ends:
-        lines = dict(line.split(': ') for line in output.splitlines() if line.startswith('mambo.'))
-        measured = float(lines['mambo.full_speed'].split()[0])
-        assert_allclose(measured, full_speed(firmware.settings.drag), rtol=0.3)
+def test_the_command_measures_through_pyparrot_and_lands():
+    """And lands where it is interrupted: both fly at the same time."""
+    program = [sys.executable, '-m', 'maasi_drivers.measure_mambo', '--fly', '--legs', '2']
+    with ExitStack() as stack:
+        flights = []
+        for _ in range(2):
+            firmware = MamboFirmware(Pose(np.zeros(3)), FirmwareSettings(take_off_height=0.3))
+            fake = stack.enter_context(closing(FakeMambo(firmware, free_address())))
+            command = [*program, '--address', fake.address, '--port', str(free_port())]
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            flights.append((firmware, stack.enter_context(process)))
+        (measured, whole), (firmware, interrupted) = flights
+        wait_until(lambda: firmware.flying_state == FlyingState.HOVERING)
+        interrupted.send_signal(signal.SIGINT)
+        outputs = [process.communicate(timeout=PATIENCE)[0] for _, process in flights]
+    assert (whole.returncode, interrupted.returncode) == (0, 1), outputs
+    for firmware, _ in flights:
+        assert firmware.flying_state == FlyingState.LANDED and firmware.take_offs == 1
+    lines = dict(line.split(': ') for line in outputs[0].splitlines() if line.startswith('mambo.'))
+    speed = float(lines['mambo.full_speed'].split()[0])
+    assert_allclose(speed, full_speed(measured.settings.drag), rtol=0.3)
 
 
 def test_the_command_says_what_it_would_do_and_what_cannot_be(capsys):

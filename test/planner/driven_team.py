@@ -1,10 +1,14 @@
 """A planner, two real drivers and the robots that they drive, over real topics."""
 
+import gc
+import io
 import os
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, redirect_stdout
+from unittest.mock import patch
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -226,14 +230,31 @@ class World(Player):
         assert future.result().accepted
         return future.result(), future.result().get_result_async()
 
+    @property
+    def _domain(self):
+        return {'ROS_DOMAIN_ID': str(self.context.get_domain_id())}
+
     def run(self, *words):
         return subprocess.Popen(
             [sys.executable, *words],
-            env={**os.environ, 'ROS_DOMAIN_ID': str(self.context.get_domain_id())},
+            env=os.environ | self._domain,
             stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
             text=True,
         )
+
+    def command(self, main, *words):
+        """Return exit code and output of a command that runs here, while the robots go on."""
+        with (
+            patch.dict(os.environ, self._domain),
+            # Only the main thread has signals.
+            patch('signal.signal'),
+            redirect_stdout(io.StringIO()) as said,
+            ThreadPoolExecutor() as pool,
+        ):
+            ended = pool.submit(main, words)
+            self.until(ended.done, 'the command does not end')
+        gc.collect()
+        return ended.result(), said.getvalue()
 
     def ended(self, process):
         """Return exit code and output of a process, while the robots go on."""

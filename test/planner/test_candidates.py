@@ -6,43 +6,24 @@ import pytest
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_planner import CandidateSet, CandidateSettings, Viewer, unseen_parts
-from maasi_planner.candidates import Unseen
 
 FLOOR = np.array([[-0.3, 2.4], [-0.3, 2.4]])
 CUBE = np.array([[0.0, 260.0]] * 3)
 ORIGIN = np.zeros(3)
 
 
+PAPER_GRID = {'grid': [3, 3, 3], 'spacing': 80.0, 'corner': [10.0, 10.0, 10.0]}
+CENTRED = {'grid': [2, 3], 'spacing': [1.0, 0.5]}
+# Up to rounding.
+ON_BOUNDS = {'points': [[-0.3, 1.0], [2.4 + 1e-12, 0.5]]}
+
+
 @pytest.mark.parametrize(
     ('settings', 'bounds', 'height', 'number', 'first', 'last'),
     [
-        # The papers' grid.
-        (
-            {'grid': [3, 3, 3], 'spacing': 80.0, 'corner': [10.0, 10.0, 10.0]},
-            CUBE,
-            0.0,
-            27,
-            [10.0, 10.0, 10.0],
-            [170.0, 170.0, 170.0],
-        ),
-        # Centred without a corner.
-        (
-            {'grid': [2, 3], 'spacing': [1.0, 0.5]},
-            FLOOR,
-            1.0,
-            6,
-            [0.55, 0.55, 1.0],
-            [1.55, 1.55, 1.0],
-        ),
-        # On the bounds, up to rounding.
-        (
-            {'points': [[-0.3, 1.0], [2.4 + 1e-12, 0.5]]},
-            FLOOR,
-            0.7,
-            2,
-            [-0.3, 1, 0.7],
-            [2.4, 0.5, 0.7],
-        ),
+        (PAPER_GRID, CUBE, 0.0, 27, [10.0] * 3, [170.0] * 3),
+        (CENTRED, FLOOR, 1.0, 6, [0.55, 0.55, 1.0], [1.55, 1.55, 1.0]),
+        (ON_BOUNDS, FLOOR, 0.7, 2, [-0.3, 1, 0.7], [2.4, 0.5, 0.7]),
     ],
 )
 def test_grids_and_lists(settings, bounds, height, number, first, last):
@@ -93,12 +74,3 @@ def test_grids_of_the_paper_leave_parts_unseen():
     assert 0.3 < unseen.fraction < 0.6
     assert 'can never be seen' in unseen.describe()
     assert unseen.boxes[0][0] == pytest.approx([-0.3, 2.4], abs=0.03)
-
-
-@pytest.mark.parametrize(
-    ('share', 'text'),
-    [(0.996, '100 %'), (0.25, '25 %'), (0.0316, '3.2 %'), (1e-5, 'less than 0.01 %')],
-)
-def test_shares_are_said_in_plain_numbers(share, text):
-    unseen = Unseen(share, [np.array([[0.0, 1.0], [0.0, 1.0]])])
-    assert unseen.describe().startswith(f'{text} of the environment can never be seen')

@@ -1,18 +1,24 @@
 """Nothing moves before `start`; the services of a search, and the command-line tools."""
 
 import signal
+import subprocess
+import sys
+from functools import partial
 
 import pytest
 from driven_team import driven
 from rclpy.action import ActionServer
+from rclpy.node import Node
+from waiting import PATIENCE, wait_until
 
+from maasi_drivers import robot_command
 from maasi_drivers.agent.agent_driver import STOPPED
-from maasi_drivers.robot_command import DONE, FAILED, INTERRUPTED, build_parser
+from maasi_drivers.robot_command import DONE, FAILED, INTERRUPTED
 from maasi_filter.ros.qos import SENSOR
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
+from maasi_planner import search_command
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_planner.search_command import wanted
 
 
 @pytest.fixture
@@ -20,15 +26,6 @@ def world():
     """Return a world whose planner has not been given any command."""
     with driven(search_on_start=False) as made:
         yield made
-
-
-def search(world, *words):
-    """Return exit code and output of search_command."""
-    return world.ended(world.run('-m', 'maasi_planner.search_command', *words))
-
-
-def robot(world, *words):
-    return world.run('-m', 'maasi_drivers.robot_command', *words)
 
 
 def test_nothing_moves_without_start_and_each_service_does_what_it_says(world):
@@ -107,26 +104,28 @@ def test_nothing_moves_without_start_and_each_service_does_what_it_says(world):
 
 def test_search_command_reaches_planner_and_drivers(world):
     a, b = world.robots.values()
+    search = partial(world.command, search_command.main)
     answer = '/search/pause: a, b: waiting for start; pause changes nothing\n'
-    assert search(world, 'pause') == (1, answer)
-    assert search(world, 'start', '--robot', 'a') == (0, '/a/search/start: start: a\n')
+    process = world.run('-m', 'maasi_planner.search_command', 'pause')
+    assert world.ended(process) == (1, answer)
+    assert search('start', '--robot', 'a') == (0, '/a/search/start: start: a\n')
     world.until(lambda: a.moves)
     assert b.state.goal_id == 0
     assert world.call('search/start').success
     world.until(world.moving)
-    code, text = search(world, 'stop', '--robot', 'b')
+    code, text = search('stop', '--robot', 'b')
     assert code == 0 and '/b/search/stop: stop: b' in text and '/b/stop: ' in text
     assert '/a' not in text
     world.until(lambda: b.stands and b.state.reason == STOPPED)
     assert a.state.reason != STOPPED
     # Without a planner the drivers are reached all the same.
     world.end_planner()
-    code, text = search(world, 'stop')
+    code, text = search('stop')
     assert code == 0 and '/a/stop: ' in text and '/b/stop: ' in text
     world.until(lambda: a.stands and a.state.reason == STOPPED)
-    code, text = search(world, 'pause', '--timeout', '2')
+    code, text = search('pause', '--timeout', '2')
     assert code == 2 and text.startswith('no service for pause within 2 s')
-    assert search(world, 'release')[0] == 0
+    assert search('release')[0] == 0
     for item in (a, b):
         world.until(lambda item=item: item.state.goal_status != AgentState.UNAVAILABLE)
 
@@ -164,33 +163,31 @@ SERVICES |= {'/a/search/pause': TRIGGER, '/b/search/pause': TRIGGER}
     ],
 )
 def test_search_command_calls_what_was_asked_for(word, name, team, called):
-    assert wanted(SERVICES, word, name, team) == called
+    assert search_command.wanted(SERVICES, word, name, team) == called
 
 
 def test_robot_command_shows_sends_and_stops_a_robot(world):
-    a = world.robots['a']
-    code, said = world.ended(robot(world, 'a', 'state'))
+    a, robot = world.robots['a'], partial(world.command, robot_command.main)
+    code, said = robot('a', 'state')
     assert code == DONE, said
     assert said.startswith('a: no goal; at (') and 'in map, battery' in said
 
     x, y = a.place[0] + 0.1, a.place[1]
-    code, said = world.ended(robot(world, 'a', 'go', f'{x}', f'{y}'))
+    code, said = robot('a', 'go', f'{x}', f'{y}')
     assert code == DONE and said.startswith('reached; it stands at'), said
     assert abs(a.place[0] - x) < 0.05
 
-    code, said = world.ended(robot(world, 'a', 'go', '100', '0'))
+    code, said = robot('a', 'go', '100', '0')
     assert code == FAILED and ('refused' in said or 'not reached' in said), said
 
-    process = robot(world, 'a', 'go', f'{x - 0.6}', f'{y}')
+    process = world.run('-m', 'maasi_drivers.robot_command', 'a', 'go', f'{x - 0.6}', f'{y}')
     world.until(lambda: a.moves, 'it does not move')
     process.send_signal(signal.SIGINT)
     code, said = world.ended(process)
     assert code == FAILED and 'not reached: cancelled' in said, said
     world.until(lambda: not a.moves, 'it still moves')
 
-
-@pytest.mark.parametrize(('words', 'height'), [(['1', '2'], 5.0), (['1', '2', '3'], 3.0)])
-def test_a_robot_that_flies_keeps_its_height_unless_it_is_told_another(world, words, height):
+    # One that flies keeps its height unless another is given.
     goals = []
 
     def take(handle):
@@ -203,23 +200,28 @@ def test_a_robot_that_flies_keeps_its_height_unless_it_is_told_another(world, wo
     state = AgentState(robot='drone')
     state.pose.pose.position.z = 5.0
     timer = world.node.create_timer(0.05, lambda: publisher.publish(state))
-    code, said = world.ended(robot(world, 'drone', 'go', *words))
-    assert code == DONE, said
-    assert [(goal.x, goal.y, goal.z) for goal in goals] == [(1.0, 2.0, height)]
+    for words in (['1', '2'], ['1', '2', '3']):
+        code, said = robot('drone', 'go', *words)
+        assert code == DONE, said
+    assert [(goal.x, goal.y, goal.z) for goal in goals] == [(1.0, 2.0, 5.0), (1.0, 2.0, 3.0)]
     for entity in (timer, publisher, server):
         entity.destroy()
 
 
-@pytest.mark.parametrize('words', [['state'], ['go', '1', '2']])
-def test_robot_command_that_waits_for_a_driver_ends_at_once(world, words):
-    process = robot(world, '--timeout', '1000', 'nobody', *words)
-    # A node of it is in the graph: it waits.
-    world.until(lambda: 'robot_command' in world.node.get_node_names(), 'it does not start')
-    process.send_signal(signal.SIGINT)
-    assert world.ended(process) == (INTERRUPTED, '')
+def test_robot_command_that_waits_for_a_driver_ends_at_once(context):
+    node = Node('observer', context=context)
+    command = [sys.executable, '-m', 'maasi_drivers.robot_command', '--timeout', '1000']
+    command += ['nobody', 'go', '1', '2']
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        # A node of it is in the graph: it waits.
+        wait_until(lambda: 'robot_command' in node.get_node_names(), what='it does not start')
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, said) == (INTERRUPTED, '')
+    node.destroy_node()
 
 
 @pytest.mark.parametrize('words', [[], ['a'], ['a', 'go'], ['a', 'go', '1', 'nan'], ['a', 'fly']])
 def test_wrong_arguments_of_robot_command_end_with_2(words):
     with pytest.raises(SystemExit, match='2'):
-        build_parser().parse_args(words)
+        robot_command.build_parser().parse_args(words)

@@ -190,21 +190,14 @@ def test_a_failed_solve_flies_the_plan_before_then_brakes(monkeypatch):
         agent.dynamics.control_for([8.0, 0.0, -2.0], np.zeros(3))
     )
     assert agent.failed == 2
-
-
-def test_a_missed_step_forgets_the_plan():
-    agent = make_agent()
-    agent.observe(0, HOME, np.zeros(3))
-    agent.decide([], random())
+    # A missed step forgets the plan.
     message = agent.observe(7, HOME, np.zeros(3))
     assert message is not None and message.plan == {}
 
 
 CAGE = [
-    {'centre': [166, 225], 'size': [40, 2, 80]},
-    {'centre': [166, 245], 'size': [40, 2, 80]},
-    {'centre': [150, 235], 'size': [2, 40, 80]},
-    {'centre': [182, 235], 'size': [2, 40, 80]},
+    *({'centre': [166, y], 'size': [40, 2, 80]} for y in (225, 245)),
+    *({'centre': [x, 235], 'size': [2, 40, 80]} for x in (150, 182)),
 ]
 
 
@@ -277,12 +270,8 @@ def test_a_decision_has_its_snapshots_and_markers(agent):
     assert len(set(visited)) == 1
     assert visited[0] != markers[0].color.r
     assert len(mission_markers(agent.mission, Header()).markers) == 2
-
-
-def test_markers_have_the_colour_that_the_robot_has_in_its_team(agent):
+    # The colour is that which the robot has in its team.
     agent.name = 'walker'
-    agent.observe(1, agent.mission.centres[4], np.zeros(3))
-    plan = agent.decide([], random(1))
     for team, number in (([], 0), (['climber', 'rover', 'walker'], 2)):
         markers = agent_markers(agent, plan, HEADER, team).markers
         (robot,) = (marker for marker in markers if marker.ns == 'walker/robot')

@@ -1,6 +1,5 @@
 """The planner of buildings moves its robot only after `start`, and stops it by the services."""
 
-import pytest
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from player import Player
@@ -77,16 +76,17 @@ class Flight(Player):
         return [linear.x, linear.y, linear.z]
 
 
-@pytest.fixture
-def flight(context):
+def test_a_robot_among_buildings_moves_only_while_it_searches(context):
     flight = Flight(context)
-    yield flight
-    flight.close()
 
-
-def test_a_robot_among_buildings_moves_only_while_it_searches(flight):
     def moves():
         return any(command != STILL for command in flight.fly(3))
+
+    def shots():
+        """Return the cuboids whose snapshots a step's decision has."""
+        flight.fly(1)
+        flight.until(lambda: flight.decisions and flight.decisions[-1].step == flight.step)
+        return [shot.cuboid for shot in flight.decisions[-1].snapshots]
 
     assert not moves()
     assert flight.states[-1].goal_status == AgentState.IDLE
@@ -113,14 +113,7 @@ def test_a_robot_among_buildings_moves_only_while_it_searches(flight):
     assert not moves()
     assert not flight.call('rover/search/resume').success
 
-
-def test_a_snapshot_of_a_step_without_decision_is_in_the_next_decision(flight):
-    def shots():
-        """Return the cuboids whose snapshots a step's decision has."""
-        flight.fly(1)
-        flight.until(lambda: flight.decisions and flight.decisions[-1].step == flight.step)
-        return [shot.cuboid for shot in flight.decisions[-1].snapshots]
-
+    # A snapshot of a step without decision is in the next decision.
     assert flight.call('rover/search/start').success
     assert shots() == []
     centre = flight.tested.agent.mission.centres[0]
@@ -130,3 +123,4 @@ def test_a_snapshot_of_a_step_without_decision_is_in_the_next_decision(flight):
     assert flight.decisions[-1].step < flight.step
     assert 0 in shots()
     assert 0 not in shots()
+    flight.close()

@@ -30,11 +30,11 @@ def same_optimum(solver, problem):
 
 
 def test_same_optimum_as_scip_on_problems_of_missions():
-    solver, problems = problems_of_missions(3, 40, seed=0)
+    solver, problems = problems_of_missions(3, 20, seed=0)
     assert all(same_optimum(solver, problem) for problem in problems)
 
 
-@pytest.mark.parametrize('part', range(5))
+@pytest.mark.parametrize('part', range(4))
 def test_same_optimum_as_scip_among_obstacles(part):
     rng = np.random.default_rng(part)
     horizon, discount = 4 if part == 0 else 3, 1.0 if part % 2 else 0.9
@@ -42,9 +42,9 @@ def test_same_optimum_as_scip_among_obstacles(part):
     solvers = [solver_for(horizon, discount, **way) for way in ways]
     solved = sum(
         same_optimum(solvers[number % 3], random_problem(rng, 6, int(rng.integers(1, 3))))
-        for number in range(12)
+        for number in range(6 if part == 0 else 9)
     )
-    assert solved >= 6
+    assert solved >= (3 if part == 0 else 5)
 
 
 def problem_at(position, velocity, target, cuboids=(), obstacles=(), **others):

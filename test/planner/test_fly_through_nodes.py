@@ -38,39 +38,43 @@ def test_robots_whose_planner_dies_while_they_pass_a_waypoint_stop_at_the_last_o
     assert a.is_near(last.x, last.y, 0.06)
 
 
-@pytest.mark.parametrize('cleaned', [False, True])
-def test_a_planner_that_ends_stops_robots_whose_next_goal_is_on_its_way(world, cleaned):
-    planner, waiting = world.planner, world.planner._goals.waiting
-
+def test_a_planner_that_ends_stops_robots_whose_next_goal_is_on_its_way(world):
     def turn():
         """Do a step of the robots, up to a goal that no driver has answered yet."""
         world.step += 1
         for robot in world.robots.values():
             robot.move(world.step)
         for _ in range(10):
-            if not waiting:
+            if not world.planner._goals.waiting:
                 world.executor.spin_once(timeout_sec=0.001)
                 world.own.spin_once(0.001)
 
-    wait_until(lambda: waiting, turn)
-    if cleaned:
-        # The drivers answer after that.
-        assert planner.trigger_deactivate().name == 'SUCCESS'
-        assert planner.trigger_cleanup().name == 'SUCCESS'
-    else:
-        # As its process does it; the drivers answer meanwhile.
-        end = threading.Thread(target=lambda: (planner.halt(), world.end_planner()))
-        end.start()
-        while end.is_alive():
-            world.executor.spin_once(timeout_sec=0.01)
-    places = [robot.place for robot in world.robots.values()]
-    world.until(world.standing)
-    for robot, place in zip(world.robots.values(), places, strict=True):
-        assert robot.state.goal_status == AgentState.CANCELED
-        assert robot.is_near(*place[:2], 0.3)
+    def cancelled():
+        places = [robot.place for robot in world.robots.values()]
+        world.until(world.standing)
+        for robot, place in zip(world.robots.values(), places, strict=True):
+            assert robot.state.goal_status == AgentState.CANCELED
+            assert robot.is_near(*place[:2], 0.3)
+
+    wait_until(lambda: world.planner._goals.waiting, turn)
+    # The drivers answer after that.
+    for transition in ('deactivate', 'cleanup'):
+        assert getattr(world.planner, f'trigger_{transition}')().name == 'SUCCESS'
+    cancelled()
+    for transition in ('configure', 'activate'):
+        assert getattr(world.planner, f'trigger_{transition}')().name == 'SUCCESS'
+    world.until(world.moving)
+    wait_until(lambda: world.planner._goals.waiting, turn)
+    # As its process does it; the drivers answer meanwhile.
+    planner = world.planner
+    end = threading.Thread(target=lambda: (planner.halt(), world.end_planner()))
+    end.start()
+    while end.is_alive():
+        world.executor.spin_once(timeout_sec=0.01)
+    cancelled()
 
 
-def test_a_robot_that_refuses_the_next_waypoint_is_stopped_and_planned_anew(world):
+def test_robots_that_refuse_waypoints_are_stopped_and_planned_for_again(world, monkeypatch):
     a, goals = world.robots['a'], world.drivers[0].goals
     problem, refused = goals.problem, []
 
@@ -80,26 +84,22 @@ def test_a_robot_that_refuses_the_next_waypoint_is_stopped_and_planned_anew(worl
             return 'tested'
         return problem(request)
 
-    goals.problem = refuses
+    # One that refuses the next waypoint is stopped, and gets another one.
+    monkeypatch.setattr(goals, 'problem', refuses)
     world.until(lambda: refused and a.moves and a.state.goal_id > refused[0])
     stopped = [state.goal_status for state in a.states if state.goal_id == refused[0] - 1]
     assert AgentState.CANCELED in stopped
     assert not world.logged('of another client')
-
-
-def test_robots_that_refuse_every_goal_are_an_error(world, monkeypatch):
+    # Robots that refuse every goal are an error.
     monkeypatch.setattr('maasi_planner.planner_node._REFUSAL_PATIENCE', 1.0)
     with monkeypatch.context() as patch:
         for driver in world.drivers:
             patch.setattr(driver.goals, 'problem', lambda request: 'tested')
         world.until(lambda: world.planner.fault().startswith('no goal accepted for '))
     world.until(lambda: world.moving() and not world.planner.fault())
-
-
-def test_a_driver_that_is_ended_is_no_warning(world):
-    goals, warnings = world.planner._goals, []
-    goals._logger = SimpleNamespace(warning=warnings.append)
-    sent = goals._sent['a']
-    assert world.drivers[0].trigger_deactivate().name == 'SUCCESS'
+    # A driver that is ended is no warning.
+    warnings, sent = [], world.planner._goals._sent['b']
+    monkeypatch.setattr(world.planner._goals, '_logger', SimpleNamespace(warning=warnings.append))
+    assert world.drivers[1].trigger_deactivate().name == 'SUCCESS'
     world.until(lambda: sent.reason == 'the driver stops')
     assert warnings == []

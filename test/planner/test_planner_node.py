@@ -199,7 +199,7 @@ def test_wrong_states_and_updates_are_refused_by_their_field(check, changes, wor
         check(**changes)
 
 
-def test_wrong_states_are_dropped_counted_and_told_and_nobody_is_sent_anywhere(team):
+def test_wrong_states_and_updates_are_dropped_counted_and_told_and_change_nothing(team):
     for number in (1, 2, 3):
         team.states['a'].publish(state_of('a', header__frame_id='odom'))
         team.until(lambda number=number: team.tested.dropped['bad state'] == number)
@@ -223,10 +223,7 @@ def test_wrong_states_are_dropped_counted_and_told_and_nobody_is_sent_anywhere(t
 
     team.until(lambda: team.status() and values().get('dropped: bad state') == '4')
     assert team.status().level == DiagnosticStatus.WARN
-
-
-def test_updates_count_once_and_wrong_ones_not(team):
-    team.begin()
+    # Updates count once, and wrong ones not.
     coordinator, dropped = team.tested.coordinator, team.tested.dropped
     batch, members = team.batches[0].id, team.batches[0].members
     before = coordinator.exploration.explored_fraction()
@@ -275,9 +272,9 @@ def test_a_step_that_comes_again_brings_the_batch_again_and_no_other():
         assert len(team.goals['a']) == 1
 
 
-def test_wrong_destinations_and_searches_are_dropped():
-    with running(others={'c': OtherRobotSettings(start=[0.2, 1.8, 0.0])}) as team:
-        publisher = team.node.create_publisher(PointStamped, 'c/destination', RELIABLE)
+def test_other_robots_have_colours_of_the_team_and_wrong_destinations_are_dropped():
+    with running(others={'aa': OtherRobotSettings(start=[0.2, 1.8, 0.0])}) as team:
+        publisher = team.node.create_publisher(PointStamped, 'aa/destination', RELIABLE)
         team.until(lambda: publisher.get_subscription_count() == 1)
         cases = ({'point__x': math.nan}, {'header__frame_id': 'odom'})
         for number, changes in enumerate(cases, start=1):
@@ -293,17 +290,12 @@ def test_wrong_destinations_and_searches_are_dropped():
             team.until(answer.done)
             assert not answer.result().accepted
         assert team.tested.dropped['bad goal'] == 2
-
-
-def test_markers_have_the_colours_of_the_whole_team():
-    with running(others={'aa': OtherRobotSettings(start=[0.2, 1.8, 0.0])}) as team:
         arrays = team.hear(MarkerArray, 'markers')
         team.begin()
         for step in (20, 40):
             team.tell(step)
         team.until(lambda: any(len(of_robots(array)) == len(ROBOTS) for array in arrays))
-        shown = of_robots(arrays[-1])
-        for marker, index in zip(shown, (0, 2)):
+        for marker, index in zip(of_robots(arrays[-1]), (0, 2)):
             wanted, tint = colour_of(colours.ROBOTS[index]), marker.color
             assert (tint.r, tint.g, tint.b) == pytest.approx((wanted.r, wanted.g, wanted.b))
 

@@ -1,6 +1,5 @@
 """The action `search`: states of its goal, clients that die, ends, and a new search."""
 
-import pytest
 from action_msgs.msg import GoalStatus
 from driven_team import driven
 
@@ -24,12 +23,6 @@ rclpy.spin(node)
 """
 
 
-@pytest.fixture
-def world():
-    with driven(search_on_start=False) as made:
-        yield made
-
-
 def find(world, number):
     """Publish an update of the filter that has found so many targets."""
     message = FilterUpdate(batch_id=world.planner._batches.last, found=number)
@@ -44,7 +37,31 @@ def end_of(world, result, status):
     return result.result().result
 
 
-def test_a_goal_is_executing_and_ends_as_it_says(world):
+def a_client_that_was_killed_does_not_block_the_next(world):
+    client = world.run('-c', CLIENT)
+    try:
+        world.until(world.moving)
+        assert 'accepted\n' in iter(client.stdout.readline, '')
+    finally:
+        client.kill()
+        client.communicate()
+    world.pass_steps(10)
+    handle, result = world.ask()
+    world.until(lambda: world.logged('search ended: replaced by another goal'))
+    world.until(lambda: handle.status == GoalStatus.STATUS_EXECUTING)
+    world.until(world.moving)
+    # A living client learns that its goal was replaced.
+    second, second_result = world.ask()
+    end = end_of(world, result, GoalStatus.STATUS_ABORTED)
+    assert end.message == 'replaced by another goal'
+    world.until(lambda: second.status == GoalStatus.STATUS_EXECUTING)
+    assert not second_result.done()
+    second.cancel_goal_async()
+    world.until(second_result.done)
+    world.until(world.standing)
+
+
+def a_goal_is_executing_and_ends_as_it_says(world):
     handle, result = world.ask(targets=12)
     world.until(world.moving)
     world.until(lambda: handle.status == GoalStatus.STATUS_EXECUTING)
@@ -86,22 +103,7 @@ def test_a_goal_is_executing_and_ends_as_it_says(world):
         world.until(world.standing)
 
 
-def test_a_client_that_was_killed_does_not_block_the_next(world):
-    client = world.run('-c', CLIENT)
-    try:
-        world.until(world.moving)
-        assert 'accepted\n' in iter(client.stdout.readline, '')
-    finally:
-        client.kill()
-        client.communicate()
-    world.pass_steps(10)
-    handle, result = world.ask()
-    world.until(lambda: world.logged('search ended: replaced by another goal'))
-    world.until(lambda: handle.status == GoalStatus.STATUS_EXECUTING)
-    world.until(world.moving)
-    # A living client learns that its goal was replaced.
-    second, second_result = world.ask()
-    end = end_of(world, result, GoalStatus.STATUS_ABORTED)
-    assert end.message == 'replaced by another goal'
-    world.until(lambda: second.status == GoalStatus.STATUS_EXECUTING)
-    assert not second_result.done()
+def test_goals_are_executing_until_they_are_replaced_or_end_as_they_say():
+    with driven(search_on_start=False) as world:
+        a_client_that_was_killed_does_not_block_the_next(world)
+        a_goal_is_executing_and_ends_as_it_says(world)
