@@ -64,20 +64,6 @@ def test_lines_are_short_and_links_and_paths_exist(document):
     assert (long_lines(text), dead_links(text, document.parent), dead_paths(text)) == ([], [], [])
 
 
-def test_what_is_wrong_is_found(tmp_path):
-    (tmp_path / 'there.md').write_text('# A heading: here\n')
-    text = '# Here\n[a](there.md#a-heading-here) [b](#here) [c](https://x.org/y)\n'
-    text += '[a](gone.md) [b](there.md#gone) [c](#gone)\n'
-    assert dead_links(text, tmp_path) == ['gone.md', 'there.md#gone', '#gone']
-    text = '`test/test_documents.py` `./scripts/test -k x` `docs/` `maasi_msgs/Detection` `a/b`\n'
-    assert dead_paths(text + '`test/gone.py` `./scripts/gone`') == [
-        'test/gone.py',
-        './scripts/gone',
-    ]
-    long = 'word ' * 30
-    assert long_lines(f'{long}\n| {long} |\n    {long}\n```\n{long}\n```\n- {long}\n') == [1, 7]
-
-
 def table_rows(heading):
     """Return the cells of the table under a heading of the architecture, without its head."""
     section = (ROOT / 'docs' / 'architecture.md').read_text().split(f'## {heading}\n')[1]

@@ -28,11 +28,11 @@ def prefix(tmp_path_factory):
             ROOT / name, sources / name, ignore=shutil.ignore_patterns('build', '*.egg-info')
         )
     prefix = tmp_path_factory.mktemp('prefix')
-    offline = ['--no-deps', '--no-build-isolation', '--no-index', '--prefix', str(prefix)]
-    pip = [sys.executable, '-m', 'pip', 'install', '-q', '--disable-pip-version-check', *offline]
+    pip = [sys.executable, '-m', 'pip', 'install', '-q', '--disable-pip-version-check']
+    pip += ['--no-deps', '--no-build-isolation', '--no-index', '--no-compile', '--prefix', prefix]
     # Modules of these packages in the path would be taken for installed ones.
     environment = {key: value for key, value in os.environ.items() if key != 'PYTHONPATH'}
-    subprocess.run([*pip, *(str(sources / name) for name in PACKAGES)], check=True, env=environment)
+    subprocess.run([*pip, *(sources / name for name in PACKAGES)], check=True, env=environment)
     return prefix
 
 

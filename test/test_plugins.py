@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_code_blocks import BLOCKS
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.marker_detector import MarkerDetector
@@ -210,57 +211,28 @@ def test_parameters_of_a_plugin(folder):
     assert PlannerSettings(name='one_by_one:OneByOne').settings.stride == 1
 
 
-STEP_MODEL = '''
-import numpy as np
+def documented(name):
+    """Return the code of a class in the documents."""
+    return next(block.text for block in BLOCKS if f'class {name}(' in block.text)
+
+
+GAINED = """
 from pydantic import BaseModel, Field
 
-from maasi_drivers.vision.detector import Detector, blobs_at
-from maasi_filter.models.pose import Pose
-from maasi_planner.motion.base import Body, MotionModel, RobotState
 
-
-class Settings(BaseModel):
-    gain: float = Field(default=1.0, gt=0.0)
-
-
-class Cart(Body):
-    def __init__(self, state):
-        self.state = state
-
-    def step(self, velocity_command, dt):
-        place = self.state.pose.position + dt * np.asarray(velocity_command)[:3]
-        self.state = RobotState(Pose.from_yaw(place, 0.0), np.asarray(velocity_command)[:3])
-
-    def robot_state(self):
-        return self.state
-
-
-class Straight(MotionModel):
-    Settings = Settings
+class Gained(Cart):
+    class Settings(BaseModel):
+        gain: float = Field(default=1.0, gt=0.0)
 
     def command(self, state, waypoint):
-        way = np.asarray(waypoint, float) - state.pose.position
-        length = np.linalg.norm(way)
-        speed = min(self.settings.speed, self.settings.settings.gain * length)
-        return np.array([*(speed * way / max(length, 1e-9)), 0.0])
-
-    def body(self, state):
-        return Cart(state)
-
-
-class Brightest(Detector):
-    """Takes the brightest pixel for a target."""
-
-    def detect(self, image):
-        v, u = np.unravel_index(image.sum(axis=2).argmax(), image.shape[:2])
-        return blobs_at([[u, v]], deviation=0.3)
-'''
+        return self.settings.settings.gain * super().command(state, waypoint)
+"""
 
 
 def test_motion_model_of_ones_own(folder):
-    (folder / 'cart.py').write_text(STEP_MODEL)
+    (folder / 'cart.py').write_text(documented('Cart') + GAINED)
     changes = {
-        'model': (('robots', 'rover', 'motion', 'model'), 'cart:Straight'),
+        'model': (('robots', 'rover', 'motion', 'model'), 'cart:Gained'),
         'gain': (('robots', 'rover', 'motion', 'settings'), {'gain': 2.0}),
     }
     scenario = load_scenario(folder / 'search.yaml', changes)
@@ -273,9 +245,9 @@ def test_motion_model_of_ones_own(folder):
 
 
 def test_detector_of_ones_own(folder):
-    (folder / 'cart.py').write_text(STEP_MODEL)
+    (folder / 'bright.py').write_text(documented('Brightest'))
     plugins.add_folders([folder])
-    settings = CameraSettings.model_validate({'segmentation': {'rule': 'cart:Brightest'}})
+    settings = CameraSettings.model_validate({'segmentation': {'rule': 'bright:Brightest'}})
     image = np.zeros((120, 160, 3), np.uint8)
     image[40, 100] = 255
     seen = MarkerDetector(settings).detect(image, Pose.from_yaw([1.0, 1.0, 1.0], 0.0))

@@ -1,7 +1,9 @@
 """The commands in scripts/, as a user calls them."""
 
 import os
+import re
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -38,18 +40,18 @@ def test_python_runs_a_file_from_any_folder(tmp_path):
 
 
 def test_shell_runs_commands_and_executables_and_gives_their_exit_code(tmp_path):
-    result = call(SHELL, 'bash', '-c', 'echo $ROS_DISTRO; exit 7', folder=tmp_path)
-    assert (result.returncode, result.stdout) == (7, 'jazzy\n')
-    result = call(SHELL, 'filter_node', '--help', folder=tmp_path)
-    assert result.returncode == 0 and 'measurement_batch' in result.stdout, result.stderr
-    # Their help may be cut.
-    help_of_node = f'{SHELL} filter_node --help | true; echo ${{PIPESTATUS[0]}}'
-    result = call('bash', '-c', help_of_node, folder=tmp_path)
-    assert (result.stdout, result.stderr) == ('0\n', '')
-    node = [SHELL, 'filter_node', '--ros-args', '--params-file', 'none.yaml']
-    result = call(*node, folder=tmp_path)
+    script = (
+        'echo $ROS_DISTRO; filter_node --help; echo help $?; '
+        # Their help may be cut.
+        'filter_node --help 2> cut | true; echo cut ${PIPESTATUS[0]} $(< cut); '
+        'filter_node --ros-args --params-file none.yaml; echo wrong $?; exit 7'
+    )
+    result = call(SHELL, 'bash', '-c', script, folder=tmp_path)
+    lines = result.stdout.splitlines()
+    assert (result.returncode, lines[0], lines[-3:]) == (7, 'jazzy', ['help 0', 'cut 0', 'wrong 2'])
+    assert 'measurement_batch' in result.stdout
     line = result.stderr.splitlines()[-1]
-    assert result.returncode == 2 and line.startswith('error: ') and 'none.yaml' in line
+    assert line.startswith('error: ') and 'none.yaml' in line
     assert 'Traceback' not in result.stderr
 
 
@@ -82,9 +84,10 @@ def test_the_build_of_the_site_says_how_far_it_is_and_fails_as_sphinx_does():
     stubs += (
         'sphinx-build() { sleep 3; echo "reading sources... [ 12%] a .. b"; return $STATUS; }\n'
     )
-    for status in (0, 2):
-        script = f'STATUS={status}; {stubs} source scripts/docs'
-        result = call('bash', '-c', script)
+    scripts = {status: f'STATUS={status}; {stubs} source scripts/docs' for status in (0, 2)}
+    with ThreadPoolExecutor() as pool:
+        results = pool.map(lambda script: call('bash', '-c', script), scripts.values())
+    for status, result in zip(scripts, results):
         assert result.stderr.splitlines()[-1] == 'docs: reading pages, 12 %'
         assert result.returncode == status
         assert result.stdout.endswith('docs/index.html\n') == (status == 0)
@@ -93,18 +96,17 @@ def test_the_build_of_the_site_says_how_far_it_is_and_fails_as_sphinx_does():
 
 
 def test_property_tests_draw_the_same_examples_each_time(tmp_path):
-    file = tmp_path / 'test_draws.py'
-    file.write_text(
-        'from hypothesis import given, strategies\n'
-        '@given(strategies.integers())\n'
-        "def test_draws(number): print('drew', number)\n"
-    )
+    # In two files, as in two runs.
+    files = [tmp_path / 'test_first.py', tmp_path / 'test_second.py']
+    for file in files:
+        file.write_text(
+            'from hypothesis import given, strategies\n'
+            '@given(strategies.integers())\n'
+            "def test_draws(number): print(__name__, 'drew', number)\n"
+        )
     # The tests alone.
     script = 'ruff() { :; }; codespell() { :; }; mypy() { :; }; source scripts/test "$@"'
-    command = ['bash', '-c', script, 'test', file, '-n', '0', '-s', '-p', 'no:cacheprovider']
-    draws = []
-    for _ in range(2):
-        result = call(*command)
-        assert result.returncode == 0, result.stdout
-        draws.append([line for line in result.stdout.splitlines() if 'drew' in line])
-    assert len(draws[0]) > 50 and draws[0] == draws[1]
+    result = call('bash', '-c', script, 'test', *files, '-n', '0', '-s', '-p', 'no:cacheprovider')
+    assert result.returncode == 0, result.stdout
+    first, second = (re.findall(rf'{file.stem} drew (.*)', result.stdout) for file in files)
+    assert len(first) > 50 and first == second

@@ -23,7 +23,7 @@ from maasi_sim.scenario.layering import ScenarioError
 
 pytestmark = pytest.mark.system
 NEAR, FAR = [[1.9, 1.9]], [[0.0, 0.0]]
-# A planner that fails, or ends the search, as soon as it is asked.
+# A planner that is never ready, or fails as soon as it is asked.
 SCRIPTED = """
 import time
 from pydantic import BaseModel
@@ -38,9 +38,6 @@ class Scripted(Planner):
         super().__init__(settings)
         if self.own.fault == 'waits':
             time.sleep(1e6)
-
-    def finished(self, team):
-        return 'a scripted end' if self.own.fault == 'ends' else None
 
     def decide(self, team):
         raise RuntimeError('a scripted fault')
@@ -67,22 +64,6 @@ def scripted(folder, fault, **changes):
     return write_scenario(folder / 'search.yaml', FAR, planner=planner, **changes)
 
 
-def test_a_run_without_a_home_folder_in_a_poor_environment(tmp_path, monkeypatch):
-    for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR', 'XDG_RUNTIME_DIR', 'XDG_CACHE_HOME'):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv('LC_ALL', 'C')
-    path = write_scenario(tmp_path / 'near.yaml', NEAR)
-    mask = os.umask(0o077)
-    try:
-        run = run_scenario(path, tmp_path / """it's "here" """, '--lockstep')
-    finally:
-        os.umask(mask)
-    assert run.code == 0, run.output
-    assert '1 of 1 targets found' in run.output
-    assert run.report['end_reason'] == 'all_found'
-    assert run.processes() == []
-
-
 def test_a_node_that_dies_again_and_again_is_given_up(tmp_path):
     limits = {'time': 60.0, 'restarts': 1}
     path = scripted(tmp_path, 'raises', on_exit='respawn', limits=limits)
@@ -98,38 +79,24 @@ def test_a_node_that_dies_again_and_again_is_given_up(tmp_path):
     ]
 
 
-def test_a_node_that_never_gets_ready_is_named(tmp_path):
-    run = run_scenario(scripted(tmp_path, 'waits', limits={'start': 10.0}), tmp_path / 'run')
-    assert run.code == 3, run.output
-    assert '/planner_node is not ready' in run.output
-    assert run.report['end_reason'] == 'not_ready'
-
-
-def test_a_free_run_waits_for_the_guards(tmp_path):
-    path = write_scenario(tmp_path / 'far.yaml', FAR, limits={'start': 10.0})
+def test_nodes_that_never_get_ready_are_named(tmp_path):
+    path = scripted(tmp_path, 'waits', limits={'start': 10.0})
     with start(path, tmp_path / 'run') as run:
+        # A free run waits for the guards as well.
         wait_for(lambda: run.processes('/mambo/guard'), 'no guard')
         os.kill(run.processes('/mambo/guard')[0], signal.SIGSTOP)
         run.finish()
     assert run.code == 3, run.output
-    assert 'ended: /mambo/guard is not ready after 10 s' in run.output
+    (line,) = re.findall('ended: (.*) is not ready after 10 s', run.output)
+    # On a busy machine others may be late as well.
+    assert {'/mambo/guard', '/planner_node'} <= set(line.split(' is not ready, '))
     assert run.report['end_reason'] == 'not_ready'
 
 
-def test_the_planner_may_end_a_run_before_all_is_found(tmp_path):
-    run = run_scenario(scripted(tmp_path, 'ends'), tmp_path / 'run', '--lockstep', '--no-record')
-    assert run.code == 1, run.output
-    assert 'ended: a scripted end' in run.output
-    assert run.report['end_reason'] == 'planner_done'
-
-
-@pytest.mark.parametrize(
-    ('number', 'moment'), [(signal.SIGINT, 'nodes in ROS domain'), (signal.SIGTERM, 'measurements')]
-)
-def test_an_interrupt_leaves_no_process_and_a_readable_recording(tmp_path, number, moment):
+def test_a_start_that_is_ended_leaves_no_process_and_a_readable_recording(tmp_path):
     with start(write_scenario(tmp_path / 'far.yaml', FAR), tmp_path / 'run') as run:
-        run.wait_for(moment)
-        run.process.send_signal(number)
+        run.wait_for('nodes in ROS domain')
+        run.process.send_signal(signal.SIGTERM)
         run.finish()
     assert run.code == 130, run.output
     assert 'Traceback' not in run.output
@@ -156,7 +123,10 @@ def test_report_and_replay_of_a_long_run_may_be_skipped(tmp_path):
 
 
 def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(tmp_path):
-    path = write_scenario(tmp_path / 'near.yaml', NEAR)
+    """The run has no home folder, and a poor environment."""
+    names = ('HOME', 'ROS_HOME', 'ROS_LOG_DIR', 'XDG_RUNTIME_DIR', 'XDG_CACHE_HOME')
+    poor = ['env', *(f'--unset={name}' for name in names), 'LC_ALL=C']
+    path, folder = write_scenario(tmp_path / 'near.yaml', NEAR), tmp_path / """it's "here" """
     with beside() as operator:
         # The simulation of another run.
         other = Node('sim_node', namespace='/other', context=operator.context)
@@ -164,9 +134,12 @@ def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(tmp_path)
         times = []
         other.create_subscription(Clock, '/clock', times.append, 10)
         # Slow enough to discover the follower before the end.
-        with start(path, tmp_path / 'run', *operator.options, '--rate', '0.1') as run:
+        options = (*operator.options, '--rate', '0.1')
+        words = [*poor, *command(path, folder, *options)]
+        with started(words, folder, umask=0o077) as run:
             run.wait_for('report: ')
             run.wait_for('the clock keeps running for /other')
+            assert '1 of 1 targets found' in run.output
             assert run.report['end_reason'] == 'all_found'
             with Bag(run.folder) as bag:
                 assert bag.counts['/mambo/state'] > 0

@@ -82,15 +82,18 @@ def test_a_launch_records_reports_and_ends_with_the_run(launch, tmp_path):
     assert list((tmp_path / TEMPORARY).iterdir()) == []
 
 
-def test_an_interrupted_launch_ends_the_run(launch, tmp_path):
+def test_an_interrupted_launch_leaves_no_process_and_a_readable_recording(launch, tmp_path):
     path = write_scenario(tmp_path / 'far.yaml', [[0.0, 0.0]])
-    run = launch(scenario=path, out=tmp_path / 'run', record='false', rate='1.0')
+    run = launch(scenario=path, out=tmp_path / 'run', rate='1.0')
     run.wait_for('measurements')
     os.killpg(run.process.pid, signal.SIGINT)
     assert run.finish().code == code(130), run.output
     assert run.report['end_reason'] == 'interrupted'
-    assert not run.bag.exists()
+    assert 'Traceback' not in run.output
     assert run.processes() == []
+    with Bag(run.folder) as bag:
+        assert bag.scenario()['name'] == 'far'
+        assert bag.counts['/mambo/state'] > 0
 
 
 def test_a_wrong_argument_ends_the_launch_with_one_clear_error(launch):

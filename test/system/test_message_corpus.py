@@ -34,7 +34,7 @@ from maasi_msgs.msg import (
 )
 from maasi_sim.run.processes import NodeProcess
 
-ROUNDS = 24
+ROUNDS = 12
 DRIVERS = ('turtlebot', 'mambo', 'ranging', 'mavlink')
 NODES = ('filter', 'planner', 'cuboid_planner', 'guard', 'sim', 'cuboid_sim', *DRIVERS)
 # Nobody plays their sensors at the end.

@@ -1,4 +1,4 @@
-"""Drivers of a user's own through separate processes: by module and class, and installed."""
+"""Drivers and a planner of a user's own: by module and class, and installed."""
 
 import math
 import os
@@ -42,14 +42,24 @@ class BlindDriver(AgentDriver):
     def __init__(self, **options):
         super().__init__({'topics': TopicLink}, Blind, **options)
 """
+# A planner that ends the search before all is found.
+ENDING = """
+from maasi_planner.planners.lawnmower import Lawnmower
 
 
-def test_robots_with_drivers_of_their_own(tmp_path):
+class Ending(Lawnmower):
+    def finished(self, team):
+        return 'a scripted end' if team.step >= 20 else None
+"""
+
+
+def test_robots_with_drivers_of_their_own_and_a_planner_that_ends_the_run(tmp_path):
     scenario = yaml.safe_load((EXAMPLES / 'own_planner' / 'search.yaml').read_text())
-    scenario['planner'] = {'name': 'lawnmower'}
+    scenario['planner'] = {'name': 'ending:Ending'}
+    (tmp_path / 'ending.py').write_text(ENDING)
     # Each robot has targets around it.
     scenario['targets'] = {'positions': [[0.8, 0.5], [0.5, 0.8], [3.2, 0.5], [3.5, 0.8]]}
-    scenario['limits'] = {'time': 8.0}
+    scenario['limits'] = {'time': 60.0}
     scenario['robots']['left']['driver'] = 'slow_driver:SlowDriver'
     scenario['robots']['right']['driver'] = 'blind'
     (tmp_path / 'robots').symlink_to(EXAMPLES / 'robots')
@@ -64,7 +74,8 @@ def test_robots_with_drivers_of_their_own(tmp_path):
     path = f'{info.parent}{os.pathsep}{os.environ.get("PYTHONPATH", "")}'
     run = run_scenario(scenario, tmp_path / 'run', '--lockstep', environment={'PYTHONPATH': path})
     assert run.code == 1, run.output
-    assert run.report['end_reason'] == 'time_limit'
+    assert 'ended: a scripted end' in run.output
+    assert run.report['end_reason'] == 'planner_done'
     fastest, seen = {}, {}
     for robot in ('left', 'right'):
         speeds = [

@@ -19,9 +19,9 @@ def test_the_others_plan_on_when_a_robot_leaves(tmp_path):
     scenario = load_scenario('mambo_turtlebot').content()
     scenario['events'] = [
         {'at': 3.0, 'robot': 'mambo', 'do': 'leave'},
-        {'at': 22.0, 'robot': 'mambo', 'do': 'back'},
+        {'at': 10.0, 'robot': 'mambo', 'do': 'back'},
     ]
-    scenario['limits']['time'] = 27.0
+    scenario['limits']['time'] = 15.0
     run = run_scenario(scenario, tmp_path / 'run', '--seed', 1, '--lockstep')
     assert run.code in (0, 1), run.output
     events = {(item['agent'], item['event']) for item in run.report['events']}
@@ -29,7 +29,7 @@ def test_the_others_plan_on_when_a_robot_leaves(tmp_path):
     alone, later = set(), set()
     for decision in of_topic(run, '/decisions'):
         robots = {robot['robot'] for robot in decision['robots']}
-        if decision['step'] >= 22.0 / 0.05:
+        if decision['step'] >= 10.0 / 0.05:
             later |= robots
         elif decision['step'] > 3.0 / 0.05:
             alone |= robots
