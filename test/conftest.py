@@ -28,6 +28,8 @@ def domain(monkeypatch, request):
         yield reserved
         # See `own_context`. What fixtures returned may hold nodes, and is held by the test.
         request.node.funcargs.clear()
+        # A command that a test has called may have frozen what existed.
+        gc.unfreeze()
         gc.collect()
 
 

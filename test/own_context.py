@@ -14,6 +14,7 @@ def own_context():
     """Yield a context; nodes of earlier tests are gone from domain and /rosout."""
     # Actions and life cycle of a destroyed node are held by cycles. rcl unregisters /rosout by the
     # name of the logger: one that is collected later takes the log of a new node with it.
+    gc.unfreeze()
     gc.collect()
     with Domain() as domain:
         context = Context()

@@ -6,6 +6,7 @@ import gc
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,8 @@ def executor_of(node: Node, context: Context | None = None) -> Executor:
 
 # Period of the check for signals [s].
 _SIGNAL_PERIOD = 0.1
+# From the last message to the end of the context [s].
+_FAREWELL = 0.05
 
 
 def run(
@@ -118,6 +121,8 @@ def run(
             if rclpy.ok() and node.configured:
                 node.halt()
             node.destroy_node()
+            # A context takes with it what nobody has received yet.
+            time.sleep(_FAREWELL)
         rclpy.try_shutdown()
         # Explicit: a forked process ends with `os._exit`, without clean-up by the interpreter.
         get_default_context(shutting_down=True).destroy()
