@@ -1,5 +1,6 @@
 """State estimation of the team: sensors, exploration, filters and found targets."""
 
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.make_filter import load_filter, make_filter, warm_up
 from maasi_filter.metrics import Gospa, Match, gospa, match_targets
@@ -21,13 +22,7 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.search_filter import SearchFilter
-from maasi_filter.settings import (
-    DetectionSettings,
-    EnvironmentSettings,
-    FilterSettings,
-    NoiseSettings,
-    SensorSettings,
-)
+from maasi_filter.settings import DetectionSettings, FilterSettings, NoiseSettings, SensorSettings
 from maasi_filter.state_file import StateFileError
 from maasi_filter.unexplored_map import UnexploredMap
 

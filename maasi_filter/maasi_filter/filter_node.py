@@ -15,6 +15,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from maasi_filter.area import Area
 from maasi_filter.make_filter import Progress, load_state, make_filter, warm_up
 from maasi_filter.measurement_check import FOUND, REPEATED
 from maasi_filter.node.batch_assembly import BatchAssembly, PendingBatch
@@ -96,7 +97,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     def _begin_anew(self) -> None:
         settings = self.settings
         self.filter = make_filter(
-            settings.filter, settings.environment.array(), np.random.default_rng(settings.seed)
+            settings.filter, Area(settings.environment), np.random.default_rng(settings.seed)
         )
         warning = unsuitable_lengths(settings.filter, settings.environment.array())
         if warning:
@@ -123,11 +124,10 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         settings = self.settings
         try:
             saved, progress = load_state(file)
-            bounds = settings.environment.array()
-            if not np.array_equal(saved.bounds, bounds):
+            if saved.environment != settings.environment:
                 raise SettingsError(
-                    f'{file}: bounds: got {saved.bounds.tolist()}, allowed are those of the '
-                    f'environment, {bounds.tolist()}'
+                    f'{file}: environment: got {saved.environment}, allowed is that of the '
+                    f'parameters, {settings.environment}'
                 )
         except (StateFileError, SettingsError) as error:
             if not settings.save_batches:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import ByteArray
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.models.pose import Pose
@@ -26,14 +27,14 @@ from maasi_filter.state_file import StateFileError, read_state
 
 
 def make_filter(
-    settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
+    settings: FilterSettings, area: Area | ArrayLike, generator: np.random.Generator
 ) -> SearchFilter:
     """Return a new filter of the method that the settings name.
 
     Parameters
     ----------
-    bounds : (d, 2) array
-        Of the environment, metres; d = 2 or 3.
+    area : Area or (d, 2) array
+        Where targets may be, or the bounds of a box, metres; d = 2 or 3.
     generator : numpy.random.Generator
         Every random draw comes from it.
 
@@ -43,8 +44,8 @@ def make_filter(
         If the bounds or the spacing of the exploration grid are not usable.
     """
     if settings.method == 'pmb':
-        return PmbFilter(settings, bounds, generator)
-    return IcPhdFilter(settings, bounds, generator)
+        return PmbFilter(settings, area, generator)
+    return IcPhdFilter(settings, area, generator)
 
 
 @dataclass

@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
 from typing_extensions import Self
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.found_targets import FoundTargets
 from maasi_filter.measurement_check import check_taken
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
@@ -23,7 +25,7 @@ from maasi_filter.unexplored_map import UnexploredMap
 # What of every filter is saved, with its type, beside e.
 _SAVED: dict[str, Any] = {
     'settings': FilterSettings,
-    'bounds': FloatArray,
+    'environment': EnvironmentSettings,
     'generator': SavedGenerator,
     'clusters': list[Cluster],
 }
@@ -36,8 +38,10 @@ class SearchFilter(ABC):
     ----------
     settings : FilterSettings
         As given.
+    area : Area
+        Where targets may be.
     bounds : (d, 2) array
-        Of the environment, metres.
+        Around the area, metres.
     dimension : int
         2 or 3.
     exploration : UnexploredMap
@@ -51,11 +55,13 @@ class SearchFilter(ABC):
     saved: ClassVar[dict[str, Any]]
 
     def __init__(
-        self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
+        self, settings: FilterSettings, area: Area | ArrayLike, generator: np.random.Generator
     ) -> None:
         self.settings = settings
-        self.exploration = UnexploredMap(bounds, settings.exploration_spacing)
-        self.bounds = self.exploration.bounds
+        self.exploration = UnexploredMap(area, settings.exploration_spacing)
+        self.area = self.exploration.area
+        self.environment = self.area.settings
+        self.bounds = self.area.bounds
         self.dimension = self.exploration.dimension
         self.generator = generator
         self.clusters: list[Cluster] = []
@@ -161,7 +167,7 @@ class SearchFilter(ABC):
         """Return a saved filter; it continues bit for bit as the saved one would have."""
         kinds = {**_SAVED, **cls.saved}
         state = {name: TypeAdapter(kinds[name]).validate_python(saved[name]) for name in kinds}
-        search = cls(state['settings'], state['bounds'], state['generator'])
+        search = cls(state['settings'], Area(state['environment']), state['generator'])
         search.exploration.values[...] = saved['exploration']
         for name in ('clusters', *cls.saved):
             setattr(search, name, state[name])

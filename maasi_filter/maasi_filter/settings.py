@@ -189,40 +189,6 @@ class SensorSettings(Settings):
         )
 
 
-class Obstacle(Settings):
-    """Obstacle: a cylinder (2D: a disc) or, with three coordinates, a sphere."""
-
-    centre: list[Finite] = Field(min_length=2, max_length=3, description='Centre [m, map]')
-    radius: float = Field(gt=0.0, description='Radius [m]')
-
-
-class EnvironmentSettings(Settings):
-    """Where the targets are."""
-
-    bounds: list[Annotated[list[Finite], Field(min_length=2, max_length=2)]] = Field(
-        min_length=2, max_length=3, description='Lower and upper bound on each map axis [m]'
-    )
-    obstacles: list[Obstacle] = Field(default_factory=list, description='Obstacles')
-
-    @model_validator(mode='after')
-    def _ordered(self) -> EnvironmentSettings:
-        for axis, pair in enumerate(self.bounds):
-            if not pair[0] < pair[1]:
-                raise ValueError(
-                    f'bounds[{axis}]: got {pair}, allowed is [lower, upper] with lower < upper'
-                )
-        return self
-
-    @property
-    def dimension(self) -> int:
-        """2 or 3."""
-        return len(self.bounds)
-
-    def array(self) -> FloatArray:
-        """Return the bounds, (d, 2)."""
-        return np.array(self.bounds, dtype=float)
-
-
 class OffsetSettings(Settings):
     """Errors of the robots' positions that last; both 0: their errors are independent."""
 
@@ -315,9 +281,6 @@ class FilterSettings(Settings):
     )
     preset: Preset = Field(
         default='paper_000', description='ic_phd: where values left None come from'
-    )
-    expected_targets: float = Field(
-        default=12.0, gt=0.0, description='N0, targets expected in all before the search [1]'
     )
     found_radius: float | None = Field(
         default=None,

@@ -1,7 +1,7 @@
 """The exploration function e(x): how much of each place is still unseen.
 
-e is kept at the nodes of a grid that spans the bounds, starts at 1 and is multiplied by 1 - pi at
-each measurement (000, eq. (20), (30)).
+e is kept at the nodes of a grid that spans the bounds of the area, starts at 1 and is multiplied by
+1 - pi at each measurement (000, eq. (20), (30)).
 """
 
 from __future__ import annotations
@@ -12,10 +12,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 
+# Places along each axis at which the density of a cell is sampled.
+_PARTS = 5
 # Cells along the mean side of the environment, in 2D and 3D.
 CELLS = {2: 54, 3: 13}
 MAXIMUM_NODES = 20_000_000
@@ -62,18 +65,6 @@ def _interpolate_many(
     return out
 
 
-def check_bounds(bounds: ArrayLike) -> FloatArray:
-    """Return bounds as a (d, 2) array; ValueError if not finite, or not lower < upper."""
-    array = np.array(bounds, dtype=float)
-    if array.shape not in ((2, 2), (3, 2)):
-        raise ValueError(f'bounds: got shape {array.shape}, allowed are (2, 2) and (3, 2)')
-    if not np.isfinite(array).all() or not (array[:, 0] < array[:, 1]).all():
-        raise ValueError(
-            f'bounds: got {array.tolist()}, allowed are finite [lower, upper] with lower < upper'
-        )
-    return array
-
-
 def default_spacing(bounds: FloatArray) -> float:
     """Return the spacing of the grid where none is given, metres."""
     size = bounds[:, 1] - bounds[:, 0]
@@ -85,8 +76,8 @@ class UnexploredMap:
 
     Parameters
     ----------
-    bounds : (d, 2) array
-        Lower and upper bound on each axis, metres; d = 2 or 3.
+    area : Area or (d, 2) array
+        Where targets may be, or lower and upper bound on each axis, metres; d = 2 or 3.
     spacing : float, optional
         Wanted spacing of the nodes, metres; none: `default_spacing`. On each axis the largest
         spacing up to this one is used that puts nodes on both bounds.
@@ -98,7 +89,7 @@ class UnexploredMap:
     step : (d,) array
         Spacing used on each axis, metres.
     volume : float
-        Of the environment, m^d.
+        Of the area, m^d.
 
     Raises
     ------
@@ -106,8 +97,9 @@ class UnexploredMap:
         If the bounds or the spacing are not usable, or the grid would be too large.
     """
 
-    def __init__(self, bounds: ArrayLike, spacing: float | None = None) -> None:
-        self.bounds = check_bounds(bounds)
+    def __init__(self, area: Area | ArrayLike, spacing: float | None = None) -> None:
+        self.area = Area.of(area)
+        self.bounds = self.area.bounds
         if spacing is None:
             spacing = default_spacing(self.bounds)
         if not (math.isfinite(spacing) and spacing > 0.0):
@@ -121,7 +113,7 @@ class UnexploredMap:
                 f'spacing: got {spacing}, which needs {np.prod(cells + 1.0):.3g} nodes, '
                 f'allowed are at most {MAXIMUM_NODES}'
             )
-        self.volume = float(np.prod(size))
+        self.volume = self.area.volume
         self.step = size / cells
         shape = [int(number) + 1 for number in cells]
         self._values = np.ones(shape + [1] * (3 - self.dimension))
@@ -136,6 +128,24 @@ class UnexploredMap:
             lengths = np.full(number, step)
             lengths[[0, -1]] *= 0.5
             self._volumes = np.multiply.outer(self._volumes, lengths)
+        #: Prior times inside at the nodes, (nx, ny, 1), with mean 1 over the area; 1: uniform.
+        self.density = np.ones((1, 1, 1))
+        if not self.area.uniform:
+            self._weigh()
+
+    def _weigh(self) -> None:
+        """Multiply the volumes of the nodes with the mean of the density around each."""
+        parts = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
+        x, y = (
+            np.clip(axis[:, None] + parts * step, low, high)
+            for axis, step, (low, high) in zip(self.axes()[:2], self.step, self.bounds)
+        )
+        places = np.stack(np.meshgrid(x.ravel(), y.ravel(), indexing='ij'), axis=-1)
+        density = self.area.density(places.reshape(-1, 2)).reshape(*x.shape, *y.shape)
+        self.density = density.mean(axis=(1, 3))[:, :, None]
+        self._volumes = (self._volumes.reshape(self._values.shape) * self.density).reshape(
+            self.values.shape
+        )
 
     @property
     def values(self) -> FloatArray:
@@ -188,9 +198,10 @@ class UnexploredMap:
         return _interpolate_many(self._values, self._lower, self._step, array)
 
     def cell_volumes(self) -> FloatArray:
-        """Return the volume (2D: area) each node stands for, same shape as `values`.
+        """Return the volume (2D: area) each node stands for times its density, as `values`.
 
-        The trapezoid rule: half a step at the ends of each axis. They sum to the volume.
+        The trapezoid rule: half a step at the ends of each axis. The density is prior times inside,
+        with mean 1 over the area.
         """
         return self._volumes
 
@@ -200,6 +211,6 @@ class UnexploredMap:
 
     def copy(self) -> UnexploredMap:
         """Return an independent copy."""
-        other = UnexploredMap(self.bounds, self.spacing)
+        other = UnexploredMap(self.area, self.spacing)
         other._values[...] = self._values
         return other

@@ -5,7 +5,6 @@ from __future__ import annotations
 from maasi_planner.candidates import CandidateSet, Unseen, Viewer, unseen_parts
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, Trajectories, make_motion
-from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import Planner, make_planner
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
@@ -18,7 +17,6 @@ __all__ = [
     'MeasurementTrigger',
     'MotionModel',
     'MotionSettings',
-    'Obstacles',
     'Planner',
     'PlannerSettings',
     'RobotDecision',

@@ -10,22 +10,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.models.detection import BOX, CUSTOM, detection_probability_at
 from maasi_filter.models.sensor import Sensor
-from maasi_filter.unexplored_map import UnexploredMap, check_bounds
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.objective.predicted_measurements import reach_of
 from maasi_planner.settings import CandidateSettings
-
-# Of coordinates, also of those that are large [m].
-_ROUNDING = 1e-6
-
-
-def in_bounds(points: FloatArray, bounds: FloatArray) -> BoolArray:
-    """Return which points (n, d or more) are finite and within bounds (d, 2), up to rounding."""
-    places = points[:, : len(bounds)]
-    inside = (places >= bounds[:, 0] - _ROUNDING) & (places <= bounds[:, 1] + _ROUNDING)
-    return np.asarray(inside.all(axis=1) & np.isfinite(points).all(axis=1))
 
 
 class CandidateSet:
@@ -35,20 +26,24 @@ class CandidateSet:
     ----------
     settings : CandidateSettings
         Grid, ring or list.
-    bounds : (d, 2) array
-        Of the environment, metres.
+    area : Area or (d, 2) array
+        Where robots may go, or the bounds of a box, metres.
     height : float
         z of the waypoints in 2D problems, metres (the flying height, or 0).
 
     Raises
     ------
     ValueError
-        If a waypoint of a grid or list lies outside the bounds, or the numbers of axes differ.
+        If a waypoint of a grid lies outside the bounds, or one of a list outside the area, or the
+        numbers of axes differ.
     """
 
-    def __init__(self, settings: CandidateSettings, bounds: ArrayLike, height: float = 0.0) -> None:
+    def __init__(
+        self, settings: CandidateSettings, area: Area | ArrayLike, height: float = 0.0
+    ) -> None:
         self.settings = settings
-        self.bounds = check_bounds(bounds)
+        self.area = Area.of(area)
+        self.bounds = self.area.bounds
         self.dimension = len(self.bounds)
         self.height = float(height)
         if not math.isfinite(self.height):
@@ -90,12 +85,14 @@ class CandidateSet:
                 f'points: got shape {points.shape}, allowed in {self.dimension}D are '
                 f'(n, {self.dimension})'
             )
-        outside = points[~in_bounds(points, self.bounds)]
+        inside = self.area.inside(points)
+        outside = points[~(Area(self.bounds).inside(points) if self.settings.grid else inside)]
         if len(outside):
             raise ValueError(
                 f'candidates: got a waypoint at {outside[0].tolist()}, allowed are waypoints '
                 f'inside {self.bounds.tolist()}'
             )
+        points = points[inside]
         complete = np.full((len(points), 3), self.height)
         complete[:, : points.shape[1]] = points
         return complete
@@ -103,14 +100,14 @@ class CandidateSet:
     def at(self, position: ArrayLike) -> FloatArray:
         """Return the candidates of a robot at `position` (3,), as a (W, 3) array.
 
-        A ring loses what would lie outside the bounds.
+        Grids and rings lose what would lie outside the area.
         """
         if self._fixed is not None:
             return self._fixed.copy()
         points = np.asarray(position, dtype=float)[None, :] + self._ring
         if self.dimension == 2:
             points[:, 2] = self.height
-        return points[in_bounds(points, self.bounds)]
+        return points[self.area.inside(points)]
 
 
 @dataclass
@@ -168,19 +165,20 @@ class Viewer:
 
 
 def unseen_parts(
-    bounds: ArrayLike,
+    area: Area | ArrayLike,
     viewers: Iterable[Viewer],
     margin: float = 0.0,
     probability: float = 0.01,
     cells: int = 80,
 ) -> Unseen:
     """Return what can never be seen on the straight ways between the candidates."""
-    box = check_bounds(bounds)
-    box = np.stack([box[:, 0] + margin, box[:, 1] - margin], axis=1)
+    area = Area.of(area)
+    box = np.stack([area.bounds[:, 0] + margin, area.bounds[:, 1] - margin], axis=1)
     size = float((box[:, 1] - box[:, 0]).max())
     grid = UnexploredMap(box, size / (cells if len(box) == 2 else min(cells, 40)))
     values, lower, step = grid.kernel()
-    seen = np.zeros(values.shape, dtype=np.bool_)
+    # Where no target can be, nothing needs to be seen.
+    seen = np.ascontiguousarray(area.density(grid.nodes()).reshape(values.shape) <= 0.0)
     for viewer in viewers:
         places, yaws = _poses(viewer, size)
         detection = viewer.sensor.detection

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
@@ -19,7 +20,6 @@ from maasi_planner.candidates import CandidateSet, half_view
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import Planner, make_planner
 from maasi_planner.planners.base import check_decision
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
@@ -175,10 +175,9 @@ class Coordinator:
         self.settings = settings
         environment = settings.environment
         self.dimension = environment.dimension
-        bounds = environment.array()
-        spacing = settings.exploration_spacing or default_spacing(bounds)
-        self.exploration = UnexploredMap(bounds, spacing)
-        self.obstacles = Obstacles.from_settings(environment.obstacles)
+        self.area = Area(environment)
+        spacing = settings.exploration_spacing or default_spacing(self.area.bounds)
+        self.exploration = UnexploredMap(self.area, spacing)
         self.clusters: list[Cluster] = []
         self.finished: str | None = None
         self.planner = make_planner(settings.planner.name, settings.planner)
@@ -188,12 +187,12 @@ class Coordinator:
         own = planner.name in ('maas', 'as') and planner.agent_exploration == 'own'
         for name in sorted(settings.robots):
             robot = settings.robots[name]
-            motion = make_motion(robot.motion, self.obstacles, robot.radius)
+            motion = make_motion(robot.motion, self.area, robot.radius)
             sensor = robot.sensor.build(name, self.dimension)
             self.plans[name] = RobotPlan(
                 motion=motion,
                 sensor=sensor,
-                candidates=CandidateSet(robot.candidates, bounds, height=robot.start[2]),
+                candidates=CandidateSet(robot.candidates, self.area, height=robot.start[2]),
                 period=max(1, round(robot.sensor.period / settings.step)),
                 radius=robot.radius,
                 arrival_radius=arrival_radius(motion, sensor, self.planner),
@@ -253,7 +252,7 @@ class Coordinator:
             for name in sorted(robots)
         }
         knowledge = self.clusters, self.exploration
-        team = TeamView(step, self.settings.step, views, *knowledge, self.obstacles, taken)
+        team = TeamView(step, self.settings.step, views, *knowledge, taken)
         finished = self.planner.finished(team)
         if finished is not None:
             for name in planning:

@@ -7,8 +7,9 @@ from typing import ClassVar
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.ros.node_settings import NodeSettings
-from maasi_filter.settings import EnvironmentSettings, SensorSettings, Settings, Vector3
+from maasi_filter.settings import SensorSettings, Settings, Vector3
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 
 

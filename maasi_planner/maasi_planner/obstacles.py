@@ -1,79 +1,35 @@
-"""Circular obstacles and ways around them.
+"""Obstacles, keep-outs and the border of the area, and ways around them.
 
-An obstacle with two coordinates is a cylinder of any height (in 2D a disc), one with three is a
-sphere. A robot's `KeepOut` holds them inflated by its radius. Ways around cylinders come from a
+They are cylinders of any height (in 2D discs), spheres, and walls: the edges of polygons. A robot's
+`KeepOut` holds them inflated by its radius. Ways around cylinders and between walls come from a
 visibility graph, so that several of them close together are no trap.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numba import njit
 from numpy.typing import ArrayLike
+from shapely.ops import nearest_points
 
-from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.settings import Obstacle
+from maasi_filter.area import Area, edges_of
+from maasi_filter.arrays import FloatArray
 
 CORNERS = 12
 
 Vector = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Obstacles:
-    """Obstacles in their own size.
-
-    Parameters
-    ----------
-    centres : (n, 3) array
-        Metres, frame `map`; z counts for spheres only.
-    radii : (n,) array
-        Metres.
-    spheres : (n,) array of bool
-        Which are spheres; the others are cylinders.
-    """
-
-    centres: FloatArray
-    radii: FloatArray
-    spheres: BoolArray
-
-    @classmethod
-    def from_settings(cls, obstacles: Sequence[Obstacle]) -> Obstacles:
-        """Return the obstacles of an environment file."""
-        centres = np.zeros((len(obstacles), 3))
-        for index, obstacle in enumerate(obstacles):
-            centres[index, : len(obstacle.centre)] = obstacle.centre
-        return cls(
-            centres,
-            np.array([obstacle.radius for obstacle in obstacles], dtype=float),
-            np.array([len(obstacle.centre) == 3 for obstacle in obstacles], dtype=bool),
-        )
-
-    @classmethod
-    def none(cls) -> Obstacles:
-        """Return no obstacles."""
-        return cls(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=bool))
-
-    def __len__(self) -> int:
-        return len(self.radii)
-
-    def distances(self, position: ArrayLike) -> FloatArray:
-        """Return the distance of a position (3,) from each surface, (n,), negative inside."""
-        offset = np.asarray(position, dtype=float)[None, :] - self.centres
-        offset[~self.spheres, 2] = 0.0
-        return np.sqrt((offset * offset).sum(axis=1)) - self.radii
-
-
 class Surroundings(NamedTuple):
     """Obstacles of a robot, inflated by its radius.
 
-    circles (n, 5): x, y, z, radius [m, map], 1 for a sphere; vertices (m, 2): of the visibility
-    graph [m, map]; clearance: kept beyond the radius by planned ways [m].
+    circles (n, 7): x, y, z, radius [m, map], 1 for a sphere, and x and y from there to the other
+    end of a wall [m]; vertices (m, 2): of the visibility graph [m, map]; clearance: kept beyond the
+    radius by planned ways [m].
     """
 
     circles: FloatArray
@@ -108,14 +64,56 @@ def norm(a: Vector) -> float:
 # Inlined: counting references to array arguments costs more than these functions themselves.
 @njit(cache=True, forceinline=True)
 def from_centre(point: Vector, circles: FloatArray, i: int) -> Vector:
-    """Return the offset of a point from the centre of a circle, level for a cylinder."""
+    """Return the offset of a point from a circle's centre or a wall, level but for a sphere."""
     height = point[2] - circles[i, 2] if circles[i, 4] > 0.5 else 0.0
-    return point[0] - circles[i, 0], point[1] - circles[i, 1], height
+    x, y = point[0] - circles[i, 0], point[1] - circles[i, 1]
+    dx, dy = circles[i, 5], circles[i, 6]
+    if dx != 0.0 or dy != 0.0:
+        part = min(max((x * dx + y * dy) / (dx * dx + dy * dy), 0.0), 1.0)
+        x, y = x - part * dx, y - part * dy
+    return x, y, height
+
+
+@njit(cache=True)
+def _wall_distance(start: Vector, end: Vector, circles: FloatArray, i: int) -> float:
+    """Return the level distance of a wall from a segment."""
+    ax, ay = circles[i, 0] - start[0], circles[i, 1] - start[1]
+    dx, dy = circles[i, 5], circles[i, 6]
+    ex, ey = end[0] - start[0], end[1] - start[1]
+    # They cross where each has its ends on both sides of the other.
+    one = (ex * ay - ey * ax) * (ex * (ay + dy) - ey * (ax + dx))
+    other = (dy * ax - dx * ay) * (dx * (ey - ay) - dy * (ex - ax))
+    if one < 0.0 and other > 0.0:
+        return 0.0
+    square = ex * ex + ey * ey
+    nearest = min(norm(from_centre(start, circles, i)), norm(from_centre(end, circles, i)))
+    if square > 0.0:
+        for x, y in ((ax, ay), (ax + dx, ay + dy)):
+            part = min(max((x * ex + y * ey) / square, 0.0), 1.0)
+            nearest = min(nearest, math.hypot(x - part * ex, y - part * ey))
+    return nearest
+
+
+@njit(cache=True)
+def beyond_walls(point: Vector, circles: FloatArray) -> bool:
+    """Return whether a point is outside of the room that the walls enclose, if there are any."""
+    any_wall, inside = False, False
+    for i in range(circles.shape[0]):
+        dx, dy = circles[i, 5], circles[i, 6]
+        if dx != 0.0 or dy != 0.0:
+            any_wall = True
+            y = point[1] - circles[i, 1]
+            # Whether a ray along x crosses it.
+            if (y < 0.0) != (y < dy) and (point[0] - circles[i, 0] < dx * y / dy):
+                inside = not inside
+    return any_wall and not inside
 
 
 @njit(cache=True, forceinline=True)
 def segment_distance(start: Vector, end: Vector, circles: FloatArray, i: int) -> float:
-    """Return the distance of the centre of a circle from a segment."""
+    """Return the distance of the centre of a circle, or of a wall, from a segment."""
+    if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
+        return _wall_distance(start, end, circles, i)
     way = minus(end, start)
     if circles[i, 4] <= 0.5:
         way = (way[0], way[1], 0.0)
@@ -232,6 +230,21 @@ def _beside_sphere(
 
 
 @njit(cache=True)
+def _back_inside(position: Vector, goal: Vector, around: Surroundings) -> Vector:
+    """Return the point inside of the nearest wall, to which a robot beyond the walls leaves."""
+    circles, nearest, out = around.circles, np.inf, position
+    for i in range(circles.shape[0]):
+        if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
+            offset = from_centre(position, circles, i)
+            away = norm(offset)
+            if away < nearest:
+                nearest = away
+                reach = -(circles[i, 3] + around.clearance) / max(away, 1e-9)
+                out = plus(minus(position, offset), reach, offset)
+    return out[0], out[1], goal[2]
+
+
+@njit(cache=True)
 def next_point(
     position: Vector, goal: Vector, to_goal: FloatArray, around: Surroundings
 ) -> tuple[Vector, float]:
@@ -242,6 +255,8 @@ def next_point(
     circles = around.circles
     way = minus(goal, position)
     left, target = norm(way), goal
+    if beyond_walls(position, circles):
+        return _back_inside(position, goal, around), left + around.clearance
     for i in range(circles.shape[0]):
         # A robot that was pushed into a circle leaves it.
         offset = from_centre(position, circles, i)
@@ -250,7 +265,7 @@ def next_point(
             if distance < 1e-9:
                 offset, distance = (1.0, 0.0, 0.0), 1.0
             reach = (circles[i, 3] + around.clearance) / distance
-            target = plus((circles[i, 0], circles[i, 1], circles[i, 2]), reach, offset)
+            target = plus(minus(position, offset), reach, offset)
             if circles[i, 4] <= 0.5:
                 target = (target[0], target[1], goal[2])
             return target, left + around.clearance
@@ -282,15 +297,15 @@ def hold_back(position: Vector, circles: FloatArray, rate: float, velocity: Vect
     """Return `velocity` with limits on its part that points into circles.
 
     Towards a circle at distance d at most `rate` * d is left, and inside of one at least that
-    much outwards.
+    much outwards. Walls do not hold back who is beyond them.
     """
-    shrink = 1.0
+    shrink, beyond = 1.0, beyond_walls(position, circles)
     for attempt in range(9):
         changed = False
         for i in range(circles.shape[0]):
             offset = from_centre(position, circles, i)
             size = norm(offset)
-            if size < 1e-9:
+            if size < 1e-9 or (beyond and (circles[i, 5] != 0.0 or circles[i, 6] != 0.0)):
                 continue
             outwards = dot(velocity, offset) / size
             least = -rate * (size - circles[i, 3])
@@ -308,44 +323,65 @@ def hold_back(position: Vector, circles: FloatArray, rate: float, velocity: Vect
 
 
 class KeepOut:
-    """Obstacles as one robot must see them: inflated by its radius, with ways around.
+    """What one robot must keep out of: inflated by its radius, with ways around.
 
-    obstacles: in their own size; radius: of the robot, metres; clearance: kept beyond that by
-    planned ways and by waypoints, metres; circles (n, 5): x, y, z, inflated radius with a tenth of
-    the clearance, and 1 for a sphere; around: the same with the ways. Robots stop short of
-    `circles`, so that rounding does not put them into an obstacle.
+    area: where robots may go; None: anywhere; radius: of the robot, metres; clearance: kept beyond
+    that by planned ways and by waypoints, metres; circles (n, 7): as of `Surroundings`, with the
+    inflated radius and a tenth of the clearance; around: the same with the ways. Robots stop short
+    of `circles`, so that rounding does not put them into an obstacle.
     """
 
-    def __init__(self, obstacles: Obstacles, radius: float, clearance: float) -> None:
+    def __init__(self, area: Area | None, radius: float, clearance: float) -> None:
         if not (math.isfinite(radius) and radius >= 0.0):
             raise ValueError(f'radius: got {radius}, allowed are finite numbers from 0')
-        self.obstacles = obstacles
         self.radius = radius
         self.clearance = float(clearance)
-        number = len(obstacles)
-        self.circles = np.zeros((number, 5))
-        self.circles[:, :3] = obstacles.centres
-        self.circles[:, 3] = obstacles.radii + radius + 0.1 * clearance
-        self.circles[:, 4] = obstacles.spheres
-        corners = []
-        for circle in self.circles[self.circles[:, 4] < 0.5]:
-            reach = (circle[3] + 0.9 * clearance) / math.cos(math.pi / CORNERS)
-            for corner in range(CORNERS):
-                angle = 2.0 * math.pi * corner / CORNERS
-                x, y = circle[0] + reach * math.cos(angle), circle[1] + reach * math.sin(angle)
-                if is_clear((x, y, 0.0), (x, y, 0.0), self.circles, 0.5 * clearance, True):
-                    corners.append((x, y))
-        vertices = np.array(corners, dtype=float).reshape(-1, 2)
+        round_ones = np.zeros((0, 5)) if area is None else area.circles
+        room = None if area is None else area.room(radius + clearance)
+        walls = edges_of([] if room is None else [room])
+        self.circles = np.zeros((len(round_ones) + len(walls), 7))
+        self.circles[: len(round_ones), :5] = round_ones
+        self.circles[len(round_ones) :, [0, 1, 5, 6]] = walls
+        self.circles[:, 3] += radius + 0.1 * clearance
+        # Where waypoints may be; None: anywhere beside round ones.
+        self._places = (
+            None if room is None else room.buffer(-radius - clearance, join_style='mitre')
+        )
+        self._round = len(round_ones)
+        vertices = self._vertices()
         self.around = Surroundings(self.circles, vertices, self.clearance)
         self._pairs = _all_pairs(vertices, self.circles, 0.4 * clearance)
 
     def __len__(self) -> int:
         return len(self.circles)
 
+    def _vertices(self) -> FloatArray:
+        """Return the vertices of the visibility graph, (m, 2): around cylinders and walls."""
+        corners = []
+        angles = 2.0 * math.pi * np.arange(CORNERS) / CORNERS
+        for circle in self.circles[: self._round]:
+            if circle[4] < 0.5:
+                reach = (circle[3] + 0.9 * self.clearance) / math.cos(math.pi / CORNERS)
+                corners += [
+                    (circle[0] + reach * math.cos(angle), circle[1] + reach * math.sin(angle))
+                    for angle in angles.tolist()
+                ]
+        if self._places is not None:
+            outline = self._places.simplify(0.3 * self.clearance)
+            corners += shapely.get_coordinates(outline.boundary).tolist()
+        clear = [
+            (x, y)
+            for x, y in corners
+            if is_clear((x, y, 0.0), (x, y, 0.0), self.circles, 0.5 * self.clearance, True)
+            and not beyond_walls((x, y, 0.0), self.circles)
+        ]
+        return np.array(clear, dtype=float).reshape(-1, 2)
+
     def is_free(self, position: ArrayLike) -> bool:
-        """Return whether a robot at `position` (3,) touches no obstacle."""
+        """Return whether a robot at `position` (3,) touches no obstacle and is inside."""
         x, y, z = (float(value) for value in np.asarray(position, dtype=float))
-        return bool(is_clear((x, y, z), (x, y, z), self.circles, 0.0, False))
+        clear = is_clear((x, y, z), (x, y, z), self.circles, 0.0, False)
+        return bool(clear and not beyond_walls((x, y, z), self.circles))
 
     def to_goal(self, goal: Vector) -> FloatArray:
         """Return the table that `next_point` needs for a goal."""
@@ -354,17 +390,25 @@ class KeepOut:
     def moved_out(self, robot: ArrayLike, waypoint: ArrayLike) -> FloatArray | None:
         """Return a waypoint moved to the minimum admissible distance (001, section 4.3).
 
-        It moves along the line that joins robot and waypoint, towards the robot.
+        It moves away from walls to the nearest place, and then out of round obstacles along the
+        line that joins robot and waypoint, towards the robot.
         """
         start = np.asarray(robot, dtype=float)
         point = np.array(waypoint, dtype=float)
+        if self._places is not None:
+            if self._places.is_empty:
+                return None
+            near = nearest_points(self._places, shapely.Point(point[:2]))[0]
+            if near.distance(shapely.Point(point[:2])) > 1e-9:
+                point[:2] = near.x, near.y
         line = point - start
         part = 1.0
-        least = self.circles[:, 3] + 0.9 * self.clearance
-        for _ in range(len(self.circles) + 1):
+        round_ones = self.circles[: self._round]
+        least = round_ones[:, 3] + 0.9 * self.clearance
+        for _ in range(len(round_ones) + 1):
             here = start + part * line
             changed = False
-            for circle, reach in zip(self.circles, least):
+            for circle, reach in zip(round_ones, least):
                 keep = np.array([1.0, 1.0, circle[4]])
                 offset = (here - circle[:3]) * keep
                 if float(offset @ offset) >= reach * reach * (1.0 - 1e-12):
@@ -380,7 +424,7 @@ class KeepOut:
                 here = start + part * line
                 changed = True
             if not changed:
-                return point if part == 1.0 else here
+                return point if part == 1.0 else here if self.is_free(here) else None
             if part <= 0.0:
                 return None
         return None

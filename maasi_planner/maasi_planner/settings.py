@@ -247,9 +247,6 @@ class PlannerSettings(Settings):
         default=None,
         description='Whether cluster centres are candidates too; none: only information',
     )
-    expected_targets: float = Field(
-        default=12.0, gt=0.0, description='N0, targets expected before the search [1]'
-    )
     exploration_nodes: int = Field(
         default=1000, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
     )

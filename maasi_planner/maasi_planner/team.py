@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
-from maasi_planner.obstacles import Obstacles
 
 
 @dataclass
@@ -27,7 +27,7 @@ class RobotView:
     candidates : (W, 3) array
         Waypoints to choose from, metres, frame `map`; used when `planning`.
     motion : MotionModel
-        Predicts trajectories; knows the obstacles.
+        Predicts trajectories; knows where it may go.
     sensor : Sensor
         With its probability of detection and noise.
     period_steps : int
@@ -87,8 +87,6 @@ class TeamView:
         Potential targets now.
     exploration : UnexploredMap
         e after the last measurements.
-    obstacles : Obstacles, optional
-        In true size, not inflated.
     taken : sequence of (3,) array and float
         Present or final positions of robots of other planners, metres, and their radii.
     """
@@ -98,12 +96,16 @@ class TeamView:
     robots: dict[str, RobotView]
     clusters: list[Cluster]
     exploration: UnexploredMap
-    obstacles: Obstacles | None = None
     taken: Sequence[tuple[FloatArray, float]] = ()
 
     def __post_init__(self) -> None:
         if not 0.0 < self.step_time < math.inf:
             raise ValueError(f'step_time: got {self.step_time}, allowed are numbers above 0 [s]')
+
+    @property
+    def area(self) -> Area:
+        """Where targets may be and robots may go."""
+        return self.exploration.area
 
     @property
     def bounds(self) -> FloatArray:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from maasi_filter.area import Area
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import RobotState, make_motion
-from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import make_planner
 from maasi_planner.settings import MotionSettings, PlannerSettings
 from maasi_planner.team import RobotView, TeamView
@@ -39,7 +40,9 @@ def _decide(team: TeamView) -> None:
 
 def warm_up() -> None:
     """Run small decisions of every kind, so that the first real one does not compile."""
-    obstacles = Obstacles(np.array([[1.0, 1.0, 0.0]]), np.array([0.1]), np.array([False]))
+    zone = {'centre': [1.0, 1.0], 'radius': 0.1}
+    bounds = [[0.0, 2.0], [0.0, 2.0]]
+    area = Area(EnvironmentSettings.model_validate({'bounds': bounds, 'obstacles': [zone]}))
     for dimension, models in ((2, ('mambo', 'unicycle')), (3, ('constant_speed', 'quadrotor'))):
         exploration = UnexploredMap(np.array([[0.0, 2.0]] * dimension), 0.25)
         clusters = [Cluster(np.full(dimension, 0.6), 0.01 * np.eye(dimension), 0.1, 0.5)]
@@ -49,7 +52,7 @@ def warm_up() -> None:
             robots = {}
             for index, model in enumerate(models):
                 settings = MotionSettings(model=model, speed=0.4)
-                motion = make_motion(settings, obstacles, 0.05)
+                motion = make_motion(settings, area, 0.05)
                 state = RobotState.at_rest([0.2 + index, 0.2, 0.3])
                 motion.body(state).step(motion.command(state, [0.5, 0.5, 0.3]), 0.05)
                 robots[f'{index}'] = RobotView(

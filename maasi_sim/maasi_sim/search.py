@@ -20,7 +20,6 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.records import AgentMeasurement, FoundTarget
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState, make_motion
-from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import Planner
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.compiling import compiling_said
@@ -106,9 +105,7 @@ class _Search:
                 space,
                 names,
                 Coordinator(planner_settings(scenario, names, common)),
-                make_filter(
-                    scenario.filter, scenario.environment.array(), np.random.default_rng(seed)
-                ),
+                make_filter(scenario.filter, self.world.area, np.random.default_rng(seed)),
             )
             for space, names in scenario.namespaces().items()
         ]
@@ -287,8 +284,8 @@ class _Robot:
         self.name = body.name
         self.sensor = settings.sensor.build(self.name, scenario.dimension)
         self.body = body
-        obstacles = Obstacles.from_settings(scenario.environment.obstacles)
-        self.follower = WaypointFollower(make_motion(settings.motion, obstacles, settings.radius))
+        area = body.world.area
+        self.follower = WaypointFollower(make_motion(settings.motion, area, settings.radius))
         self.odometry = MapOdometry(Pose.from_yaw(settings.start, settings.yaw))
         self.detector = (
             None if settings.camera is None else MarkerDetector(settings.camera, scenario.dimension)

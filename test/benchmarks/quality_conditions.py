@@ -144,8 +144,8 @@ CONDITIONS = {
     '40 targets': [{'targets': {'count': 40}}],
     '100 targets': [{'targets': {'count': 100}}],
     'radians, 40 targets': [RADIANS, {'targets': {'count': 40}}],
-    'N0 ten times too small': [{'filter': {'expected_targets': 1.2}}],
-    'N0 ten times too large': [{'filter': {'expected_targets': 120.0}}],
+    'N0 ten times too small': [{'environment': {'expected_targets': 1.2}}],
+    'N0 ten times too large': [{'environment': {'expected_targets': 120.0}}],
     'four tight groups of three': [
         {'targets': {'distribution': 'clustered', 'clusters': 4, 'spread': 4.0, 'separation': 3.0}}
     ],

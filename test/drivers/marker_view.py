@@ -10,9 +10,9 @@ import numpy as np
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.models.measurement import RangeBearing
 from maasi_filter.models.pose import Pose, quaternion_product
-from maasi_filter.settings import EnvironmentSettings
 from maasi_sim.simulation.camera import CameraRenderer
 from maasi_sim.simulation.floor import RenderSettings, scene_of
 from maasi_sim.simulation.world import TargetSettings, World

@@ -41,14 +41,14 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     search, simulated = read_back(plans['/filter_node'], FilterNodeSettings)
     assert simulated
     assert (search.step, search.seed, search.lockstep) == (scenario.step, 4, lockstep)
-    assert search.environment == scenario.environment.of_nodes()
+    assert search.environment == scenario.environment
     # With what the preset stands for.
     assert search.filter == scenario.filter.resolved()
     # Nothing moves in lockstep while a driver hangs.
     assert not (lockstep and any(plan.role == 'guard' for plan in plans.values()))
     planner, simulated = read_back(plans['/planner_node'], PlannerNodeSettings)
     assert simulated
-    assert planner.environment == scenario.environment.of_nodes()
+    assert planner.environment == scenario.environment
     assert planner.planner == scenario.planner
     for robot, settings in scenario.robots.items():
         assert search.robots[robot].sensor == settings.sensor
@@ -58,7 +58,7 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
         assert simulated
         for key in ('start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'link', 'mambo'):
             assert getattr(driver, key) == getattr(settings, key)
-        assert driver.environment == scenario.environment.of_nodes()
+        assert driver.environment == scenario.environment
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from maasi_drivers.agent.odometry import MapOdometry
 from maasi_drivers.settings.camera import CameraSettings
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.models.pose import Pose
-from maasi_filter.settings import EnvironmentSettings, SensorSettings
+from maasi_filter.settings import SensorSettings
 from maasi_planner.motion import RobotState
 from maasi_planner.settings import MotionSettings
 from maasi_sim.scenario.schema import BatterySettings, RobotSettings

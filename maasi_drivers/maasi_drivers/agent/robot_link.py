@@ -15,9 +15,9 @@ import numpy as np
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import MotionModel, RobotState, make_motion
-from maasi_planner.obstacles import Obstacles
 
 
 class RobotLink(ABC):
@@ -119,8 +119,7 @@ class RobotLink(ABC):
     def make_motion(self) -> MotionModel:
         """Return the controller."""
         settings = self.driver.settings
-        obstacles = Obstacles.from_settings(settings.environment.obstacles)
-        return make_motion(settings.motion, obstacles, settings.radius)
+        return make_motion(settings.motion, Area(settings.environment), settings.radius)
 
     def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
         """Return the command (4,) and the goal reached; see `WaypointFollower.update`."""

@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.settings.driver import ScanSettings
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import RobotState, Unicycle
 from maasi_planner.motion.base import check_waypoint
 from maasi_planner.motion.dynamic_window import window_command
-from maasi_planner.obstacles import Obstacles, is_clear, next_point
+from maasi_planner.obstacles import is_clear, next_point
 from maasi_planner.settings import MotionSettings
 
 # Size of the cells in which points count as one [m].
@@ -128,9 +129,9 @@ class ScanUnicycle(Unicycle):
     """
 
     def __init__(
-        self, settings: MotionSettings, obstacles: Obstacles, radius: float, scan: ScanSettings
+        self, settings: MotionSettings, area: Area, radius: float, scan: ScanSettings
     ) -> None:
-        super().__init__(settings, obstacles, radius)
+        super().__init__(settings, area, radius)
         self.scan = scan
         self.points = np.zeros((0, 2))
         self._heading = math.nan
@@ -152,7 +153,7 @@ class ScanUnicycle(Unicycle):
             return super().command(state, waypoint)
         goal = tuple(check_waypoint(waypoint).tolist())
         target, left = next_point((x, y, goal[2]), goal, self.table(goal), self.keep_out.around)
-        seen = np.zeros((int(near.sum()), 5))
+        seen = np.zeros((int(near.sum()), 7))
         seen[:, :2] = self.points[near]
         seen[:, 3] = np.minimum(
             self.keep_out.radius + 0.5 * self.keep_out.clearance, away[near] - _SKIN

@@ -16,13 +16,13 @@ from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.scan_motion import ScanUnicycle, scan_points
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
 from maasi_drivers.links.topic_link import TopicLink
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.clocks import Silence
 from maasi_filter.ros.conversions import point_to_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.qos import sensor_reader
 from maasi_planner.motion import MotionModel, RobotState
-from maasi_planner.obstacles import Obstacles
 
 # Kind of fault.
 _SCAN = 'scan'
@@ -53,8 +53,8 @@ class TurtlebotLink(TopicLink):
         settings = self.driver.settings
         if settings.scan is None:
             return super().make_motion()
-        obstacles = Obstacles.from_settings(settings.environment.obstacles)
-        self._motion = ScanUnicycle(settings.motion, obstacles, settings.radius, settings.scan)
+        area = Area(settings.environment)
+        self._motion = ScanUnicycle(settings.motion, area, settings.radius, settings.scan)
         return self._motion
 
     def connect(self) -> None:

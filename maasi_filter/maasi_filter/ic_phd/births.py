@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.measurement_check import CheckedMeasurement
 
@@ -15,17 +16,17 @@ from maasi_filter.measurement_check import CheckedMeasurement
 def measurement_births(
     member: CheckedMeasurement,
     before: Sequence[CheckedMeasurement],
-    bounds: FloatArray,
-    expected_targets: float,
+    area: Area,
     number: int,
     generator: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
     """Return J births at each of m measurements, x = g^-1(z + N(0, R)), (m J, d), and b (m, J).
 
-    Their intensity is N0 / V. Divided by the density of the draw and multiplied by the probability
-    that robots `before` missed them, b = (N0 / V) pi(x, q) |dx/dz| prod(1 - pi_before) / J, where
-    |dx/dz| = r in 2D and r^2 cos(elevation) in 3D; 0 outside E. b / C(z) is the posterior weight. A
-    birth counts for its own measurement only: the sum of its b is <psi_z, Y>.
+    Their intensity is N0 / V, times the prior. Divided by the density of the draw and multiplied by
+    the probability that robots `before` missed them, b = (N0 / V) pi(x, q) |dx/dz|
+    prod(1 - pi_before) / J, where |dx/dz| = r in 2D and r^2 cos(elevation) in 3D; 0 outside E.
+    b / C(z) is the posterior weight. A birth counts for its own measurement only: the sum of its b
+    is <psi_z, Y>.
     """
     sensor, pose = member.sensor, member.pose
     count, d = member.values.shape
@@ -36,10 +37,10 @@ def measurement_births(
     level = z[:, 0] * (np.cos(z[:, 2]) if d == 3 else 1.0)
     jacobian = level * z[:, 0] if d == 3 else level
     inside = (z[:, 0] > 0.0) & (level > 0.0)
-    for place, (low, high) in zip(particles.T, bounds):
+    for place, (low, high) in zip(particles.T, area.bounds):
         inside &= (place >= low) & (place <= high)
-    volume = float(np.prod(bounds[:, 1] - bounds[:, 0]))
-    intensity = (expected_targets / volume / number) * jacobian
+    intensity = (area.expected_targets / area.volume / number) * jacobian
+    intensity *= area.density(particles)
     intensity *= sensor.detection.probability(particles, pose)
     for other in before:
         intensity *= 1.0 - other.sensor.detection.probability(particles, other.pose)
@@ -47,29 +48,31 @@ def measurement_births(
 
 
 def uniform_births(
-    bounds: FloatArray, expected: float, number: int, generator: np.random.Generator
+    area: Area, expected: float, number: int, generator: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return uniform births: particles (J, d) and weights Y V / J (001, (A1))."""
-    size = bounds[:, 1] - bounds[:, 0]
-    particles = bounds[:, 0] + size * generator.random((number, len(bounds)))
-    return particles, np.full(number, expected / number)
+    """Return uniform births: particles (J, d) and weights Y V / J (001, (A1)), times the prior."""
+    low, high = area.bounds.T
+    particles = low + (high - low) * generator.random((number, len(low)))
+    share = float(np.prod(high - low)) / area.volume
+    return particles, expected / number * share * area.density(particles)
 
 
 def gaussian_births(
     centres: FloatArray,
     spread: FloatArray,
-    bounds: FloatArray,
+    area: Area,
     expected: float,
     number: int,
     generator: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
     """Return births from one Gaussian over all measured positions (003, section 3.3).
 
-    Weights are Y / (J p(x)) with p the Gaussian density; draws outside the bounds are left out.
+    Weights are Y / (J p(x)), times the prior, with p the Gaussian density; draws outside the bounds
+    are left out.
     The covariance of the noise, `spread`, is added to the empirical one, which is singular for few
     measurements: a deviation from the paper.
     """
-    d = len(bounds)
+    d = area.dimension
     mean = centres.mean(axis=0)
     offset = centres - mean
     root = np.linalg.cholesky(offset.T @ offset / len(centres) + spread)
@@ -80,11 +83,12 @@ def gaussian_births(
         - 0.5 * d * math.log(2.0 * math.pi)
         - np.log(np.diagonal(root)).sum()
     )
-    volume = float(np.prod(bounds[:, 1] - bounds[:, 0]))
     # Bound the weight of a draw far out in the tails by the total birth mass.
-    weights = np.minimum(expected / volume / number * np.exp(-log_density), expected)
-    inside = ((particles >= bounds[:, 0]) & (particles <= bounds[:, 1])).all(axis=1)
-    return particles[inside], weights[inside]
+    weights = np.minimum(expected / area.volume / number * np.exp(-log_density), expected)
+    low, high = area.bounds.T
+    inside = ((particles >= low) & (particles <= high)).all(axis=1)
+    particles = particles[inside]
+    return particles, weights[inside] * area.density(particles)
 
 
 def noise_in_space(member: CheckedMeasurement) -> FloatArray:

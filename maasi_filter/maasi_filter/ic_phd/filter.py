@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
 from maasi_filter.ic_phd.births import (
@@ -66,9 +67,9 @@ class IcPhdFilter(SearchFilter):
     }
 
     def __init__(
-        self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
+        self, settings: FilterSettings, area: Area | ArrayLike, generator: np.random.Generator
     ) -> None:
-        super().__init__(settings, bounds, generator)
+        super().__init__(settings, area, generator)
         # Nothing is None in it.
         self._numbers: Any = settings.resolved()
         self.particles = np.empty((0, self.dimension))
@@ -143,8 +144,7 @@ class IcPhdFilter(SearchFilter):
             return np.empty((0, self.dimension)), np.zeros((count, 0))
         room = numbers.particles // (2 * count)
         number = max(LEAST_BIRTHS, min(numbers.birth_particles, room))
-        expected = numbers.expected_targets
-        return measurement_births(member, before, self.bounds, expected, number, self.generator)
+        return measurement_births(member, before, self.area, number, self.generator)
 
     def _born_anywhere(
         self, members: Sequence[CheckedMeasurement]
@@ -153,14 +153,14 @@ class IcPhdFilter(SearchFilter):
         numbers = self._numbers
         expected, number = numbers.birth_targets, numbers.birth_particles
         if numbers.births == 'uniform' and members:
-            return uniform_births(self.bounds, expected, number, self.generator)
+            return uniform_births(self.area, expected, number, self.generator)
         seen = [member for member in members if len(member.values)]
         if numbers.births == 'uniform' or not seen:
             return np.empty((0, self.dimension)), np.empty(0)
         centres = np.concatenate([m.sensor.measurement.inverse(m.values, m.pose) for m in seen])
         spreads = [noise_in_space(m) for m in seen]
         spread = np.average(spreads, axis=0, weights=[len(m.values) for m in seen])
-        return gaussian_births(centres, spread, self.bounds, expected, number, self.generator)
+        return gaussian_births(centres, spread, self.area, expected, number, self.generator)
 
     def _append(self, particles: FloatArray, weights: FloatArray) -> None:
         self.particles = np.concatenate([self.particles, particles])

@@ -140,7 +140,7 @@ class Density:
     weights: FloatArray  # (n,): They sum to 1
     heads: FloatArray  # (k, HEAD): Of the factors, at least one
     terms: FloatArray  # (l, TERM): Of all factors
-    grid: FloatArray  # (nx, ny, nz): e at birth, a factor too, not written to; empty: none
+    grid: FloatArray  # (nx, ny, nz): prior e at birth, a factor too, not written to; or empty
     frame: FloatArray  # (3, 3): Lower and upper bounds of the environment, and the step of the grid
     mean: FloatArray = field(init=False)  # (d,): Of the particles
     covariance: FloatArray = field(init=False)  # (d, d)

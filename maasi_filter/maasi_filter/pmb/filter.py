@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.found_targets import FoundTargets, nearest
 from maasi_filter.measurement_check import (
@@ -76,9 +77,9 @@ class PmbFilter(SearchFilter):
     }
 
     def __init__(
-        self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
+        self, settings: FilterSettings, area: Area | ArrayLike, generator: np.random.Generator
     ) -> None:
-        super().__init__(settings, bounds, generator)
+        super().__init__(settings, area, generator)
         self._numbers = settings.resolved()
         self.components: list[Component] = []
         self._learnt: dict[str, Learnt] = {}
@@ -150,7 +151,7 @@ class PmbFilter(SearchFilter):
         # kappa: clutter per unit of measurement space; N0 / V.
         space = member.sensor.measurement_space(self.bounds)
         kappa = learnt.clutter_per_scan(member.sensor.clutter * space) / space
-        unseen = self._numbers.expected_targets / self.exploration.volume
+        unseen = self.area.expected_targets / self.area.volume
         # Errors of the robot's position, those that last and those that the scan tells.
         member = self._offsets.localise(member, components, kappa, unseen)
         error = learnt.learn_error(member, components, kappa, unseen)
@@ -195,8 +196,10 @@ class PmbFilter(SearchFilter):
         self, member: CheckedMeasurement, scan: Scan, existence: FloatArray, radius: float
     ) -> None:
         """Add a component of r = `existence` (m,) for each detection."""
-        e, error, robot = self.exploration.kernel()[0], member.pose_error, member.robot
-        for j, density in scan.born(existence >= LEAST_EXISTENCE, e, self._frame):
+        error, robot = member.pose_error, member.robot
+        # A copy: e changes.
+        grid = self.exploration.kernel()[0] * self.exploration.density
+        for j, density in scan.born(existence >= LEAST_EXISTENCE, grid, self._frame):
             item = Component(float(existence[j]), density, 1.0, self._scans, error, radius, robot)
             if member.labels:
                 item.labels = LabelTally.of(member.labels[j])

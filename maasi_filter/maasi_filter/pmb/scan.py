@@ -55,23 +55,21 @@ class Scan:
     #: (m, n): pi(x) |dx/dz|, 0 outside the bounds: with it a mean over the draws is an
     #: integral of pi(x) g(z | x).
     volume: FloatArray
-    weights: FloatArray  # (m, n): The same times e(x)
+    weights: FloatArray  # (m, n): The same times e(x) and the prior
     means: FloatArray  # (m, d): Of the draws
     covariances: FloatArray  # (m, d, d): Of the draws
-    #: (m,): lambda_j = (N0 / V) int e pi g(z_j | x) dx, of targets not seen before.
+    #: (m,): lambda_j = (N0 / V) int prior e pi g(z_j | x) dx, of targets not seen before.
     intensity: FloatArray
 
     def born(
         self, wanted: BoolArray, grid: FloatArray, frame: FloatArray
     ) -> list[tuple[int, Density]]:
-        """Return the density e pi g_j of each detection that is wanted, by its number.
+        """Return the density prior e pi g_j of each detection that is wanted, by its number.
 
         A detection near or beyond the bounds has few draws inside, and none is made.
         """
         total, squares = self.weights.sum(axis=1), np.square(self.weights).sum(axis=1)
         wanted = wanted & (np.square(total) > LEAST_SUPPORT * squares)
-        # One copy for all of them: e changes.
-        grid = grid.copy() if wanted.any() else grid
         head = self.head.copy()
         head[MISS], head[FIRST], head[TERMS] = 0.0, 0.0, 1.0
         densities = []
@@ -139,6 +137,7 @@ def make_scan(
     probability = np.minimum(detection.probability(flat, pose), MOST_PROBABLE)
     volume *= probability.reshape(count, number)
     weights = np.maximum(exploration.at(flat), LEAST_UNEXPLORED).reshape(count, number) * volume
+    weights *= exploration.area.density(flat).reshape(count, number)
     means, spreads = np.empty((count, d)), np.empty((count, d, d))
     even = np.full(number, 1.0 / number)
     for j in range(count):
@@ -156,7 +155,7 @@ def make_scan(
         weights,
         means,
         spreads,
-        settings.expected_targets / exploration.volume * (weights.sum(axis=1) / number),
+        exploration.area.expected_targets / exploration.volume * (weights.sum(axis=1) / number),
     )
 
 

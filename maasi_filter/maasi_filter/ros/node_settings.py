@@ -7,8 +7,9 @@ from typing import Annotated, ClassVar
 from pydantic import AfterValidator, Field
 from typing_extensions import Self
 
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.plugins import add_folders
-from maasi_filter.settings import EnvironmentSettings, FilterSettings, SensorSettings, Settings
+from maasi_filter.settings import FilterSettings, SensorSettings, Settings
 
 # Time without asserted liveliness after which a guard considers its driver dead [s].
 LIVELINESS_LEASE = 0.5

@@ -142,25 +142,20 @@ def _as_parameter(value: Any, annotation: Any) -> Any:
 
 
 def _as_row(item: Any) -> Any:
-    """Return the numbers of a list, or of settings of a list and a number, such as a circle."""
+    """Return the numbers of a list, or the text of settings, such as a zone."""
     if isinstance(item, BaseModel):
-        first, last = (value for _, value in item)
-        item = [*first, last]
+        return str(item)
     return [float(number) for number in item] if isinstance(item, (list, tuple)) else item
 
 
 def _from_list(value: Sequence[Any], annotation: Any) -> list[Any]:
     element, width = _argument(annotation, list), _width(annotation)
-    model = _nested(element)
-    if model is None and _argument(element, list) is None:
+    # Small settings read their own texts.
+    if _nested(element) is not None or _argument(element, list) is None:
         return list(value)
     if width is not None and not any(isinstance(item, str) for item in value):
         return list(np.reshape(value, (-1, width)).tolist())
-    rows = [[float(word) for word in text.split()] for text in value]
-    if model is None:
-        return rows
-    first, last = model.model_fields
-    return [{first: row[:-1], last: row[-1]} for row in rows]
+    return [[float(word) for word in text.split()] for text in value]
 
 
 # Types of fields.

@@ -9,8 +9,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.ros.node_settings import NodeSettings
-from maasi_filter.settings import EnvironmentSettings, Finite, Settings, Vector3
+from maasi_filter.settings import Finite, Settings, Vector3
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Face = Literal['west', 'east', 'south', 'north', 'bottom', 'top']

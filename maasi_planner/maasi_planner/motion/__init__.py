@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from maasi_filter.area import Area
 from maasi_planner.motion.base import Body, MotionModel, RobotState, Trajectories
 from maasi_planner.motion.models import ConstantSpeed, Mambo, Quadrotor, Unicycle
-from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MOTIONS, MotionSettings
 
 __all__ = [
@@ -22,7 +22,7 @@ __all__ = [
 
 def make_motion(
     settings: MotionSettings,
-    obstacles: Obstacles | None = None,
+    area: Area | None = None,
     radius: float = 0.0,
 ) -> MotionModel:
     """Return the motion model that `settings.model` names.
@@ -31,10 +31,10 @@ def make_motion(
     ----------
     settings : MotionSettings
         Model, limits and controller.
-    obstacles : Obstacles, optional
-        What its ways lead around.
+    area : Area, optional
+        Where it may go: its ways lead around what is not in it; none: anywhere.
     radius : float
         Of the robot, metres.
     """
-    model: MotionModel = MOTIONS.load(settings.model)(settings, obstacles, radius)
+    model: MotionModel = MOTIONS.load(settings.model)(settings, area, radius)
     return model

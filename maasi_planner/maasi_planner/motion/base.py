@@ -13,9 +13,10 @@ from numba import njit
 from numpy.typing import ArrayLike
 from pydantic import BaseModel
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.obstacles import KeepOut, Obstacles
+from maasi_planner.obstacles import KeepOut
 from maasi_planner.settings import MotionSettings
 
 STEPS_LIMIT = 20_000
@@ -119,8 +120,8 @@ class MotionModel(ABC):
     ----------
     settings : MotionSettings
         Limits and controller.
-    obstacles : Obstacles, optional
-        To avoid.
+    area : Area, optional
+        Where it may go; none: anywhere.
     radius : float
         Of the robot, metres; obstacles are inflated by it.
 
@@ -136,10 +137,10 @@ class MotionModel(ABC):
     Settings: ClassVar[type[BaseModel] | None] = None
 
     def __init__(
-        self, settings: MotionSettings, obstacles: Obstacles | None = None, radius: float = 0.0
+        self, settings: MotionSettings, area: Area | None = None, radius: float = 0.0
     ) -> None:
         self.settings = settings
-        self.keep_out = KeepOut(obstacles or Obstacles.none(), radius, settings.clearance)
+        self.keep_out = KeepOut(area, radius, settings.clearance)
         # Way table of a waypoint, remembered until the waypoint changes.
         self.table = lru_cache(maxsize=1)(self.keep_out.to_goal)
 
@@ -226,7 +227,9 @@ class MotionModel(ABC):
         farthest = math.sqrt(gaps.max(initial=0.0))
         around = 0.0
         if len(self.keep_out.circles):
-            around = 2.0 * math.pi * float(self.keep_out.circles[:, 3].sum())
+            circles = self.keep_out.circles
+            around = 2.0 * math.pi * float(circles[:, 3].sum())
+            around += 2.0 * float(np.hypot(circles[:, 5], circles[:, 6]).sum())
         seconds = 2.0 * (farthest + around) / self.settings.speed + 30.0
         return min(math.ceil(seconds / step), STEPS_LIMIT)
 

@@ -14,7 +14,7 @@ from numba import njit
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion.steering import Steering, wrapped
-from maasi_planner.obstacles import Vector
+from maasi_planner.obstacles import Vector, from_centre
 
 # Seconds until the next command at which the window is taken, and for which arcs are followed.
 WINDOW = 0.2
@@ -22,6 +22,14 @@ LOOK_AHEAD = 1.2
 ARC_STEPS = 8
 FORWARD_SAMPLES = 6
 TURN_SAMPLES = 13
+
+
+@njit(cache=True, forceinline=True)
+def _before_disc(along: float, across: float, radius: float) -> float:
+    """Return how far straight ahead a disc is; infinite: not there."""
+    if along > 0.0 and abs(across) < radius:
+        return max(along - math.sqrt(radius * radius - across * across), 0.0)
+    return np.inf
 
 
 @njit(cache=True)
@@ -36,8 +44,19 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray)
         along = ox * cos_yaw + oy * sin_yaw
         across = ox * sin_yaw - oy * cos_yaw
         radius = circles[i, 3]
-        if along > 0.0 and abs(across) < radius:
-            free = min(free, max(along - math.sqrt(radius * radius - across * across), 0.0))
+        free = min(free, _before_disc(along, across, radius))
+        if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
+            ahead = circles[i, 5] * cos_yaw + circles[i, 6] * sin_yaw
+            aside = circles[i, 5] * sin_yaw - circles[i, 6] * cos_yaw
+            free = min(free, _before_disc(along + ahead, across + aside, radius))
+            # Both long sides of the wall, where it lies across the way.
+            length = math.hypot(ahead, aside)
+            for side in (-radius / length, radius / length):
+                start, start_across = along - side * aside, across + side * ahead
+                if aside != 0.0 and 0.0 <= -start_across / aside <= 1.0:
+                    hit = start - start_across / aside * ahead
+                    if hit > 0.0:
+                        free = min(free, hit)
     return free
 
 
@@ -59,7 +78,8 @@ def _arc(
         heading += 0.5 * w * dt
         travelled = v * dt * (k + 1)
         for c in range(circles.shape[0]):
-            gap = math.hypot(px - circles[c, 0], py - circles[c, 1]) - circles[c, 3]
+            ox, oy, _ = from_centre((px, py, 0.0), circles, c)
+            gap = math.hypot(ox, oy) - circles[c, 3]
             room = min(room, gap)
             if gap < 0.0 and v > 0.0 and travelled <= stopping + v * dt:
                 return px, py, heading, -np.inf

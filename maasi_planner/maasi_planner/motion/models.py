@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import mambo, quadrotor
@@ -28,7 +29,7 @@ from maasi_planner.motion.obstacle_term import TERMS, ObstacleTerm, with_obstacl
 from maasi_planner.motion.quadrotor import quadrotor_step
 from maasi_planner.motion.steering import Command, Steering, fly_among, fly_freely, turned
 from maasi_planner.motion.unicycle import K_RHO, drive_among, drive_freely, unicycle_step
-from maasi_planner.obstacles import Obstacles, Surroundings, Vector, dot, norm
+from maasi_planner.obstacles import Surroundings, Vector, dot, norm
 from maasi_planner.settings import MotionSettings
 
 POINT, UNICYCLE, MAMBO, QUADROTOR = range(4)
@@ -235,9 +236,9 @@ class CompiledMotion(MotionModel):
     steering: Steering
 
     def __init__(
-        self, settings: MotionSettings, obstacles: Obstacles | None = None, radius: float = 0.0
+        self, settings: MotionSettings, area: Area | None = None, radius: float = 0.0
     ) -> None:
-        super().__init__(settings, obstacles, radius)
+        super().__init__(settings, area, radius)
         self.parameters = np.zeros(0)
         self.kernel = lru_cache(maxsize=4)(self._make_kernel)
         speed, barrier, acceleration = self._limits()

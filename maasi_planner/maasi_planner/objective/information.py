@@ -84,7 +84,7 @@ def _unseen(
     left = np.bincount(block.ravel(), (values * volumes).ravel()).astype(float)
     start = lower + 0.5 * (stride - 1) * step
     places = start[:, None] + (stride * step)[:, None] * np.indices(shape).reshape(3, -1)
-    return places, left * (settings.expected_targets / float(volumes.sum()))
+    return places, left * (team.area.expected_targets / float(volumes.sum()))
 
 
 @njit(cache=True)

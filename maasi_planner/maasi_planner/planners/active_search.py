@@ -16,7 +16,6 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.candidates import in_bounds
 from maasi_planner.planners.base import (
     Planner,
     all_apart,
@@ -62,7 +61,7 @@ class Sequences:
                 following = places[-1] + steps
                 free = [
                     place
-                    for place, inside in zip(following, in_bounds(following, team.bounds))
+                    for place, inside in zip(following, team.area.inside(following))
                     if inside and view.motion.keep_out.is_free(place)
                 ]
                 # Extend a dead end by staying, so that the sequence is kept.

@@ -11,10 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import BaseModel
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
-from maasi_planner.candidates import in_bounds
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import (
     Decision,
@@ -95,12 +95,12 @@ def check_decision(planner: Planner, team: TeamView, decision: Decision) -> None
     for name, robot in decision.robots.items():
         if not isinstance(robot, RobotDecision):
             raise PluginError(f'{origin}: {name}: got {robot!r:.80}, allowed is a RobotDecision')
-        problem = _problem_of(robot, team.bounds)
+        problem = _problem_of(robot, team.area)
         if problem:
             raise PluginError(f'{origin}: {name}: {problem}')
 
 
-def _problem_of(robot: RobotDecision, bounds: FloatArray) -> str:
+def _problem_of(robot: RobotDecision, area: Area) -> str:
     """Return what is wrong with a decision for one robot; empty if nothing is."""
     terms = ('control_cost', 'target_refinement', 'exploration', 'objective')
     rows, steps = np.shape(robot.candidates)[:1], np.shape(robot.positions)[:1]
@@ -116,8 +116,9 @@ def _problem_of(robot: RobotDecision, bounds: FloatArray) -> str:
             return f'{field}: got a number that is not finite'
     if not (isinstance(robot.chosen, int | np.integer) and -1 <= robot.chosen < rows[0]):
         return f'chosen: got {robot.chosen!r:.80}, allowed are -1 (stay) to {rows[0] - 1}'
-    if not robot.stays and not in_bounds(robot.waypoint[None, :], bounds).all():
-        return f'waypoint: got {robot.waypoint.tolist()}, allowed is inside {bounds.tolist()} [m]'
+    if not robot.stays and not area.inside(robot.waypoint[None, :]).all():
+        allowed = f'inside the area, in {area.bounds.tolist()} [m]'
+        return f'waypoint: got {robot.waypoint.tolist()}, allowed is {allowed}'
     return ''
 
 
@@ -128,16 +129,16 @@ def usable_candidates(
     view = team.robots[name]
     points = np.asarray(view.candidates, dtype=float).reshape(-1, 3)
     dropped: list[str] = []
-    inside = in_bounds(points, team.bounds)
+    inside = team.area.inside(points)
     if not inside.all():
         finite = np.isfinite(points).all(axis=1)
-        for wrong, reason in ((~finite, 'not finite'), (finite & ~inside, 'outside the bounds')):
+        for wrong, reason in ((~finite, 'not finite'), (finite & ~inside, 'outside the area')):
             if wrong.any():
                 dropped.append(f'{np.count_nonzero(wrong)} {reason}')
         points = points[inside]
     number = len(points)
     if extra is not None and len(extra):
-        points = np.vstack([points, extra[in_bounds(extra, team.bounds)]])
+        points = np.vstack([points, extra[team.area.inside(extra)]])
     if len(view.motion.keep_out):
         here = view.state.pose.position
         moved = [view.motion.keep_out.moved_out(here, point) for point in points]
@@ -146,7 +147,7 @@ def usable_candidates(
             dropped.append(f'{lost} in obstacles')
         points = np.array([point for point in moved if point is not None]).reshape(-1, 3)
         # They move towards the robot, which may be outside.
-        points = points[in_bounds(points, team.bounds)]
+        points = points[team.area.inside(points)]
     return points, ', '.join(dropped)
 
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import PLANNERS
 from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Quantity
 from maasi_sim.experiments.figures import draw_comparison
@@ -185,14 +185,14 @@ def run_among_obstacles(settings: dict[str, Any], seed: int) -> Outcome:
     scenario = scenario_from_values(settings['scenario'], 'settings')
     result = search(scenario, seed, settings['most_measurements'])
     outcome = outcome_of(result, settings['most_measurements'], scenario.limits.time)
-    obstacles = Obstacles.from_settings(scenario.environment.obstacles)
+    area = Area(scenario.environment)
     share = np.linspace(0.0, 1.0, 5)[:, None, None]
     ways = [
         (places[:-1] + share * np.diff(places, axis=0)).reshape(-1, 3)
         for places in result.trace.positions().values()
     ]
-    nearest = [obstacles.distances(place).min(initial=np.inf) for way in ways for place in way]
-    outcome.summary['clearance'] = float(min(nearest)) if len(obstacles) else None
+    nearest = [area.distances(place).min(initial=np.inf) for way in ways for place in way]
+    outcome.summary['clearance'] = float(min(nearest)) if scenario.environment.obstacles else None
     return outcome
 
 

@@ -63,7 +63,7 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Meas
             f'robots.{name}.camera: got nothing, allowed with --replay is a robot with a camera'
         )
     settings = DriverSettings(
-        environment=scenario.environment.of_nodes(),
+        environment=scenario.environment,
         start=robot.start,
         yaw=robot.yaw,
         sensor=robot.sensor,

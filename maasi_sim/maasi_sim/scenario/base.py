@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.plugins import add_folders
-from maasi_filter.settings import EnvironmentSettings, Finite, Settings
+from maasi_filter.settings import Settings
 from maasi_sim.arguments import LARGEST
 from maasi_sim.scenario.layering import to_yaml
 
@@ -46,26 +47,6 @@ class LimitSettings(Settings):
     )
 
 
-class OriginSettings(Settings):
-    """Where x = y = z = 0 of the map lies, on WGS 84; x points east, y north, z up."""
-
-    latitude: float = Field(ge=-90.0, le=90.0, description='North of the equator [degrees]')
-    longitude: float = Field(ge=-180.0, le=180.0, description='East of Greenwich [degrees]')
-    altitude: Finite = Field(default=0.0, description='Over the ellipsoid [m]')
-
-
-class ScenarioEnvironment(EnvironmentSettings):
-    """Where the search takes place, with its position on the earth."""
-
-    origin: OriginSettings | None = Field(
-        default=None, description='Of the map on the earth, for found_targets.geojson'
-    )
-
-    def of_nodes(self) -> EnvironmentSettings:
-        """Return what the nodes need of it."""
-        return EnvironmentSettings(bounds=self.bounds, obstacles=self.obstacles)
-
-
 class RecordSettings(Settings):
     """What the recording holds."""
 
@@ -84,7 +65,7 @@ class BaseScenario(Settings):
         'file; its own folder and the current one need not be named',
     )
     description: str = Field(default='', description='What it shows, in words')
-    environment: ScenarioEnvironment = Field(description='Where the search takes place')
+    environment: EnvironmentSettings = Field(description='Where the search takes place')
     step: float = Field(default=0.05, gt=0.0, le=10.0, description='Between what nodes see [s]')
     seed: int = Field(
         default=1, ge=0, le=LARGEST, description='Of all random numbers, unless given otherwise'

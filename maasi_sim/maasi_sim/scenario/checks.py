@@ -11,6 +11,7 @@ import numpy as np
 
 from maasi_drivers.settings.driver import DRIVERS
 from maasi_drivers.settings.vehicles import MamboSettings
+from maasi_filter.area import Area
 from maasi_filter.plugins import unknown
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.schema import RobotSettings, Scenario, SimulatedSettings
@@ -61,12 +62,6 @@ def problems_of(scenario: Scenario) -> Problems:
 
 
 def _world_problems(scenario: Scenario) -> Problems:
-    for index, obstacle in enumerate(scenario.environment.obstacles):
-        if len(obstacle.centre) > scenario.dimension:
-            yield (
-                f'environment.obstacles[{index}].centre: read {obstacle.centre}, allowed are '
-                f'{scenario.dimension} coordinates, as in environment.bounds'
-            )
     most, count = _room_for_targets(scenario), scenario.targets.count or 0
     if count > most:
         yield (
@@ -97,24 +92,21 @@ def _room_for_targets(scenario: Scenario) -> int:
 
 def _place_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
     """Yield problems of where it starts and may be sent."""
-    bounds = scenario.environment.array()
-    point = robot.start[: len(bounds)]
-    if not ((point >= bounds[:, 0]) & (point <= bounds[:, 1])).all():
+    area = Area(scenario.environment)
+    if not area.inside([robot.start])[0]:
         yield (
-            f'start: read {robot.start}, allowed is what lies inside environment.bounds, '
-            f'{bounds.tolist()}'
+            f'start: read {robot.start}, allowed is what lies inside the environment and outside '
+            f'of its keep_outs, within {area.bounds.tolist()}'
         )
-    for index, obstacle in enumerate(scenario.environment.obstacles):
-        distance = math.dist(robot.start[: len(obstacle.centre)], obstacle.centre)
-        if distance < obstacle.radius + robot.radius:
-            yield (
-                f'start: read {robot.start}, {distance:.3g} m from the centre of '
-                f'environment.obstacles[{index}], allowed is at least its radius and the '
-                f"robot's, {obstacle.radius + robot.radius:g} m"
-            )
+    gap = area.distances(robot.start).min(initial=math.inf)
+    if gap < robot.radius:
+        yield (
+            f'start: read {robot.start}, {gap:.3g} m from one of environment.obstacles, allowed is '
+            f'at least the radius, {robot.radius:g} m'
+        )
     try:
         if not len(robot_candidates(robot, scenario.environment).at(robot.start)):
-            yield 'candidates: leave no waypoint inside environment.bounds'
+            yield 'candidates: leave no waypoint inside the environment'
     except ValueError as error:
         yield f'candidates.{error}'.replace('candidates.candidates: ', 'candidates: ')
 

@@ -11,8 +11,9 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, TypeVar
 
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.plugins import is_reference, unknown
-from maasi_sim.scenario.base import BaseScenario, ScenarioEnvironment
+from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.checks import Problems, doubts_about, problems_of
 from maasi_sim.scenario.layering import (
     Key,
@@ -154,7 +155,7 @@ def _give_candidates(layer: Layer) -> None:
             # Errors are reported when all is validated.
             with suppress(ValueError):
                 robot = RobotSettings.model_validate(values)
-                environment = ScenarioEnvironment.model_validate(layer.data.get('environment'))
+                environment = EnvironmentSettings.model_validate(layer.data.get('environment'))
                 values['candidates'] = covering_grid(name, robot, environment)
 
 

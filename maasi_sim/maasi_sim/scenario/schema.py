@@ -250,7 +250,7 @@ def planner_settings(
     return PlannerNodeSettings.model_validate(
         {
             **common,
-            'environment': scenario.environment.of_nodes(),
+            'environment': scenario.environment,
             'planner': scenario.planner,
             # As the filter has it.
             'exploration_spacing': scenario.filter.exploration_spacing,

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from maasi_filter.settings import EnvironmentSettings
+from maasi_filter.area import Area
+from maasi_filter.environment import EnvironmentSettings
 from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_parts
 from maasi_planner.settings import CandidateSettings
 from maasi_sim.scenario.schema import RobotSettings, Scenario
@@ -19,7 +20,7 @@ _MOST_CANDIDATES = 400
 
 def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> CandidateSet:
     """Return a robot's candidate waypoints; in 2D at the height of its start."""
-    return CandidateSet(robot.candidates, environment.array(), height=robot.start[2])
+    return CandidateSet(robot.candidates, Area(environment), height=robot.start[2])
 
 
 def never_seen(scenario: Scenario) -> str:
@@ -27,18 +28,18 @@ def never_seen(scenario: Scenario) -> str:
     if any(robot.candidates.ring is not None for robot in scenario.robots.values()):
         # Candidates that move with the robot can reach every place.
         return ''
-    bounds = scenario.environment.array()
+    area = Area(scenario.environment)
     margin = scenario.targets.margin if scenario.targets.positions is None else 0.0
     # What is seen from the waypoints need not be checked on the paths between them.
     standing = [_viewer(scenario, name, _FAR) for name in scenario.names()]
     steady = [viewer for viewer in standing if viewer.yaw is not None]
-    if steady and not unseen_parts(bounds, steady, margin):
+    if steady and not unseen_parts(area, steady, margin):
         return ''
     moving = [
         _viewer(scenario, name, robot.motion.speed * max(robot.sensor.period, scenario.step))
         for name, robot in scenario.robots.items()
     ]
-    return unseen_parts(bounds, moving, margin).describe()
+    return unseen_parts(area, moving, margin).describe()
 
 
 def covering_grid(
@@ -49,7 +50,8 @@ def covering_grid(
     Its spacing is at most the width of what the sensor sees; where that takes too many waypoints,
     it is a coarser grid, and `never_seen` warns.
     """
-    bounds = environment.array()
+    area = Area(environment)
+    bounds = area.bounds
     sides = bounds[:, 1] - bounds[:, 0]
     sensor = robot.sensor.build(name, environment.dimension)
     start = np.array(robot.start)
@@ -68,9 +70,9 @@ def covering_grid(
             'spacing': spacing.tolist(),
             'corner': (bounds[:, 0] + 0.5 * spacing).tolist(),
         }
-        candidates = CandidateSet(CandidateSettings.model_validate(grid), bounds, robot.start[2])
+        candidates = CandidateSet(CandidateSettings.model_validate(grid), area, robot.start[2])
         yaw = robot.yaw if robot.motion.heading == 'keep' else None
-        if not unseen_parts(bounds, [Viewer(candidates.at(start), start, sensor, _FAR, yaw)]):
+        if not unseen_parts(area, [Viewer(candidates.at(start), start, sensor, _FAR, yaw)]):
             return grid
         first = first or grid
         width *= 0.8

@@ -179,8 +179,7 @@ def scene_of(world: World, settings: RenderSettings, seed: int) -> list[Shape]:
     """Return the objects on the floor, bottom first: distractors, obstacles, markers."""
     shapes = draw_distractors(settings, world, noise_stream(seed, purpose='distractors'))
     shapes += [
-        disc(centre, float(radius), (0.25, 0.24, 0.23))
-        for centre, radius in zip(world.obstacles.centres, world.obstacles.radii)
+        disc(centre, radius, (0.25, 0.24, 0.23)) for *centre, radius, _ in world.area.solid.tolist()
     ]
     radius = 0.5 * settings.marker_diameter
     return shapes + [disc(target, radius, settings.marker_colour) for target in world.targets]

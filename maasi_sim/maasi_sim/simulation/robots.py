@@ -96,10 +96,7 @@ class SimulatedRobot:
             self.ranging = RangingSensor(sensor, world.targets_3d_at(0), seed, name, reach)
         self.laser: LaserScanner | None = None
         if settings.laser is not None:
-            obstacles = world.obstacles
-            self.laser = LaserScanner(
-                settings.laser, world.bounds, obstacles.centres, obstacles.radii, seed, name
-            )
+            self.laser = LaserScanner(settings.laser, world.area, seed, name)
 
     def command(self, velocity: ArrayLike) -> None:
         """Set the velocity command (4,), which holds until the next one.
@@ -188,5 +185,5 @@ class SimulatedRobot:
         self.state = self._body.robot_state()
 
     def _hits(self, position: FloatArray) -> bool:
-        distances = self.world.obstacles.distances(position)
+        distances = self.world.area.distances(position)
         return bool(len(distances) and distances.min() < self.settings.radius)

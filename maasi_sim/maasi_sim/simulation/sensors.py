@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.measurement import wrap_angle
 from maasi_filter.models.pose import Pose
@@ -96,8 +97,9 @@ class LaserSettings(Settings):
 
 
 @njit(cache=True)
-def _cast(x, y, yaw, count, circles, walls, ranges):  # type: ignore[no-untyped-def]
-    """Ranges (count,) of beams from yaw on, anticlockwise, to circles (n, 3) and walls (4,)."""
+def _cast(x, y, yaw, count, things, ranges):  # type: ignore[no-untyped-def]
+    """Ranges (count,) of beams from yaw on, anticlockwise, to circles, edges (n, 4), walls (4,)."""
+    circles, edges, walls = things
     for beam in range(count):
         angle = yaw + 2.0 * math.pi * beam / count
         dx, dy = math.cos(angle), math.sin(angle)
@@ -111,6 +113,12 @@ def _cast(x, y, yaw, count, circles, walls, ranges):  # type: ignore[no-untyped-
             nearest = min(nearest, (walls[3] - y) / dy)
         elif dy < 0.0 and y > walls[2]:
             nearest = min(nearest, (walls[2] - y) / dy)
+        for i in range(edges.shape[0]):
+            ox, oy, ex, ey = edges[i, 0] - x, edges[i, 1] - y, edges[i, 2], edges[i, 3]
+            across = dx * ey - dy * ex
+            if across != 0.0 and 0.0 <= (ox * dy - oy * dx) / across <= 1.0:
+                along = (ox * ey - oy * ex) / across
+                nearest = min(nearest, along) if along >= 0.0 else nearest
         for i in range(circles.shape[0]):
             ox, oy = circles[i, 0] - x, circles[i, 1] - y
             along = ox * dx + oy * dy
@@ -128,25 +136,18 @@ def _cast(x, y, yaw, count, circles, walls, ranges):  # type: ignore[no-untyped-
 class LaserScanner:
     """One robot's laser scanner, at its origin, first beam straight ahead; walls around the bounds.
 
-    Shapes and units: bounds (d, 2); centres (n, 2 or 3) and radii (n,) of the obstacles [m].
+    It sees the area's solid things, and other robots.
     """
 
-    def __init__(
-        self,
-        settings: LaserSettings,
-        bounds: FloatArray,
-        centres: ArrayLike,
-        radii: ArrayLike,
-        seed: int,
-        robot: str,
-    ) -> None:
+    def __init__(self, settings: LaserSettings, area: Area, seed: int, robot: str) -> None:
         self.settings = settings
         self.seed = seed
         self.robot = robot
         margin = settings.wall_margin
-        low, high = bounds[:2, 0] - margin, bounds[:2, 1] + margin
+        low, high = area.bounds[:2, 0] - margin, area.bounds[:2, 1] + margin
         self._walls = np.array([low[0], high[0], low[1], high[1]])
-        self._circles = _circles(centres, radii)
+        self._circles = area.solid[:, [0, 1, 3]]
+        self._edges = area.solid_edges()
 
     def scan(
         self, pose: Pose, step: int, centres: ArrayLike = (), radii: ArrayLike = ()
@@ -160,7 +161,7 @@ class LaserScanner:
         circles = np.concatenate([self._circles, _circles(centres, radii)])
         ranges = np.empty(settings.beams)
         x, y = float(pose.position[0]), float(pose.position[1])
-        _cast(x, y, pose.yaw, settings.beams, circles, self._walls, ranges)
+        _cast(x, y, pose.yaw, settings.beams, (circles, self._edges, self._walls), ranges)
         noise = noise_stream(self.seed, self.robot, step, 'laser').standard_normal(settings.beams)
         ranges += settings.noise * noise
         ranges[ranges > settings.maximum_range] = np.inf

@@ -210,16 +210,13 @@ def publish_truth(node: Node, world: World, frame: str) -> None:
         sphere_marker(header, 'truth', number, target, size, colour(0.0, 0.3, 1.0, 0.7))
         for number, target in enumerate(world.targets_3d_at(0), start=1)
     ]
-    obstacles = world.obstacles
-    for number, (centre, radius, sphere) in enumerate(
-        zip(obstacles.centres, obstacles.radii, obstacles.spheres), start=1
-    ):
+    for number, (*centre, radius, sphere) in enumerate(world.area.solid.tolist(), start=1):
         shape = sphere_marker(
-            header, 'obstacles', number, centre, 2.0 * float(radius), colour(0.3, 0.3, 0.3)
+            header, 'obstacles', number, centre, 2.0 * radius, colour(0.3, 0.3, 0.3)
         )
         if not sphere:
             shape.type = Marker.CYLINDER
-            low, high = world.bounds[2] if world.dimension == 3 else (0.0, float(radius))
+            low, high = world.bounds[2] if world.dimension == 3 else (0.0, radius)
             shape.pose.position = point_to_ros([*centre[:2], 0.5 * (low + high)])
             shape.scale.z = float(high - low)
         shapes.append(shape)

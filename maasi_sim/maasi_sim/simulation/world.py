@@ -1,4 +1,4 @@
-"""The true world: bounds, targets, obstacles; and the streams of random numbers in it."""
+"""The true world: area and targets; and the streams of random numbers in it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from zlib import crc32
 import numpy as np
 from pydantic import Field, model_validator
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.records import Label
-from maasi_filter.settings import EnvironmentSettings, Finite, Settings
-from maasi_planner.obstacles import Obstacles
+from maasi_filter.settings import Finite, Settings
 
 
 def noise_stream(
@@ -35,8 +36,9 @@ class TargetSettings(Settings):
     """Where the targets are: drawn at random, or given."""
 
     count: int | None = Field(default=None, ge=0, le=100_000, description='How many are drawn [1]')
-    distribution: Literal['uniform', 'clustered'] = Field(
-        default='uniform', description='Drawn anywhere, or around random centres'
+    distribution: Literal['uniform', 'prior', 'clustered'] = Field(
+        default='uniform',
+        description="Drawn anywhere, as the environment's prior says, or around random centres",
     )
     positions: list[list[Finite]] | None = Field(
         default=None, description='Given positions, instead of drawn ones [m, map]'
@@ -77,19 +79,23 @@ class TargetSettings(Settings):
 
 @dataclass(frozen=True)
 class World:
-    """The true world: bounds (d, 2), targets (n, d) [m, map], obstacles in their own size.
+    """The true world: its area, targets (n, d) [m, map].
 
     `walk` is the deviation of the targets' random walk on each axis in one step [m], `seed` that of
     the walk. `labels` are what sensors report for each target; empty: none.
     """
 
-    bounds: FloatArray
+    area: Area
     targets: FloatArray
-    obstacles: Obstacles = field(default_factory=Obstacles.none)
     walk: float = 0.0
     seed: int = 0
     labels: tuple[Label, ...] = ()
     _way: list[FloatArray] = field(default_factory=list, compare=False, repr=False)
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Around the area, (d, 2) [m]."""
+        return self.area.bounds
 
     @property
     def dimension(self) -> int:
@@ -119,8 +125,8 @@ class World:
         cls, environment: EnvironmentSettings, targets: TargetSettings, seed: int, step: float = 1.0
     ) -> World:
         """Build the world of a run: the same for the same seed; `step` is its length [s]."""
-        bounds = environment.array()
-        obstacles = Obstacles.from_settings(environment.obstacles)
+        area = Area(environment)
+        bounds = area.bounds
         if targets.positions is not None:
             positions = np.empty((len(targets.positions), len(bounds)))
             for index, row in enumerate(targets.positions):
@@ -129,16 +135,14 @@ class World:
                         f'targets.positions[{index}]: got {len(row)} coordinates, allowed '
                         f'{len(bounds)}'
                     )
-                if not np.all((row >= bounds[:, 0]) & (row <= bounds[:, 1])):
+                if not area.inside([row])[0]:
                     raise ValueError(
-                        f'targets.positions[{index}]: got {row}, allowed within the bounds '
-                        f'{bounds.tolist()}'
+                        f'targets.positions[{index}]: got {row}, allowed within the area, in the '
+                        f'bounds {bounds.tolist()}'
                     )
                 positions[index] = row
         else:
-            positions = draw_targets(
-                targets, bounds, noise_stream(seed, purpose='targets'), obstacles
-            )
+            positions = draw_targets(targets, area, noise_stream(seed, purpose='targets'))
         labels = tuple(
             Label(
                 targets.classes[i % len(targets.classes)] if targets.classes else '',
@@ -147,17 +151,14 @@ class World:
             )
             for i in range(len(positions) if targets.identified or targets.classes else 0)
         )
-        return cls(bounds, positions, obstacles, targets.walk * step**0.5, seed, labels)
+        return cls(area, positions, targets.walk * step**0.5, seed, labels)
 
 
 def draw_targets(
-    settings: TargetSettings,
-    bounds: FloatArray,
-    generator: np.random.Generator,
-    obstacles: Obstacles,
+    settings: TargetSettings, area: Area, generator: np.random.Generator
 ) -> FloatArray:
     """Draw target positions (count, d) [m], each at least ``margin`` outside of all obstacles."""
-    count = settings.count or 0
+    count, bounds = settings.count or 0, area.bounds
     low, high = bounds[:, 0] + settings.margin, bounds[:, 1] - settings.margin
     if np.any(low > high):
         raise ValueError(
@@ -165,7 +166,7 @@ def draw_targets(
             f'{0.5 * float((bounds[:, 1] - bounds[:, 0]).min()):g}'
         )
     for _ in range(_RESTARTS):
-        drawn = _draw(settings, count, low, high, generator, obstacles)
+        drawn = _draw(settings, area, low, high, generator)
         if drawn is not None:
             return drawn
     raise ValueError(
@@ -176,12 +177,12 @@ def draw_targets(
 
 def _draw(
     settings: TargetSettings,
-    count: int,
+    area: Area,
     low: FloatArray,
     high: FloatArray,
     generator: np.random.Generator,
-    obstacles: Obstacles,
 ) -> FloatArray | None:
+    count = settings.count or 0
     centres = np.empty((0, len(low)))
     spread = settings.spread or float((high - low).mean()) / 15.0
     if settings.distribution == 'clustered':
@@ -194,16 +195,21 @@ def _draw(
                 position = generator.normal(centres[index % len(centres)], spread)
                 if np.any((position < low) | (position > high)):
                     continue
+                if not area.inside(position[None, :])[0]:
+                    continue
             else:
-                position = generator.uniform(low, high)
+                by_prior = settings.distribution == 'prior'
+                place = area.draw(generator, low, high, by_prior)
+                if place is None:
+                    continue
+                position = place
             if index and np.linalg.norm(drawn[:index] - position, axis=1).min() < (
                 settings.separation
             ):
                 continue
-            if len(obstacles):
-                place = np.pad(position, (0, 3 - len(position)))
-                if obstacles.distances(place).min() < settings.margin:
-                    continue
+            solid = area.distances(np.pad(position, (0, 3 - len(position))))
+            if solid.min(initial=np.inf) < settings.margin:
+                continue
             drawn[index] = position
             break
         else:

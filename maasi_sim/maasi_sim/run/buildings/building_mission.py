@@ -69,7 +69,7 @@ def _planner_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -
     settings = CuboidPlannerSettings.model_validate(
         {
             **common,
-            'environment': scenario.environment.of_nodes(),
+            'environment': scenario.environment,
             'team': scenario.names(),
             'start': robot.start,
             'yaw': robot.yaw,

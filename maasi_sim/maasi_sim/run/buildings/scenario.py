@@ -8,11 +8,12 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
+from maasi_filter.environment import EnvironmentSettings
 from maasi_planner.buildings.agent import SearchAgent
 from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
 from maasi_planner.buildings.settings import CuboidSettings, DynamicsSettings, SearcherSettings
 from maasi_sim.run.buildings.mission import CuboidMission
-from maasi_sim.scenario.base import BaseScenario, ScenarioEnvironment
+from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.checks import Problems, event_problems, name_problems
 from maasi_sim.scenario.layering import Key, Layer, ScenarioError
 from maasi_sim.scenario.loading import checked, read_scenario
@@ -53,7 +54,7 @@ class CuboidPlanner(CuboidSettings):
 class CuboidScenario(BaseScenario):
     """A scenario file of a search of buildings, all layers merged."""
 
-    environment: ScenarioEnvironment = Field(description='Where robots may be, in 3D')
+    environment: EnvironmentSettings = Field(description='Where robots may be, in 3D')
     step: float = Field(default=1.0, gt=0.0, le=10.0, description='dT [s]')
     robots: dict[str, SearchRobotSettings] = Field(min_length=1, description='Robots by name')
     planner: CuboidPlanner = Field(description='Planner of each robot, and what is searched')

@@ -109,7 +109,7 @@ def _team_plans(
     filter_settings = FilterNodeSettings.model_validate(
         {
             **common,
-            'environment': scenario.environment.of_nodes(),
+            'environment': scenario.environment,
             'filter': scenario.filter,
             'robots': {name: {'sensor': scenario.robots[name].sensor} for name in names},
             'share_with': others,
@@ -156,7 +156,7 @@ def _robot_plans(
     settings = DriverSettings.model_validate(
         {
             **common,
-            'environment': scenario.environment.of_nodes(),
+            'environment': scenario.environment,
             **{name: getattr(robot, name) for name in _OF_THE_DRIVER},
             **({'tf_rate': _LOCKSTEP_TF_RATE} if common['lockstep'] else {}),
             'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,

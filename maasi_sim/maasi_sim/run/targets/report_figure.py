@@ -11,6 +11,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.colours import FOUND, robot_colours
 from maasi_filter.models.detection import DetectionModel
@@ -39,7 +40,7 @@ def plot_report(record: TargetRecord) -> Figure:
         for name in colours
     }
     # After all measurements of the robots.
-    explored = UnexploredMap(bounds, scenario.filter.exploration_spacing)
+    explored = UnexploredMap(Area(scenario.environment), scenario.filter.exploration_spacing)
     for name, poses in record.measured_from.items():
         for pose in poses:
             explored.update(detections[name], pose)

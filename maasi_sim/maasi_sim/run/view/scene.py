@@ -48,7 +48,7 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
         ],
         'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},
         'targets': len(truth),
-        'expected_targets': scenario.planner.expected_targets,
+        'expected_targets': scenario.environment.expected_targets,
         **_objective(scenario.planner),
         'scoring_radius': scoring_radius(scenario, truth) if len(truth) else None,
         'scoring_order': scenario.scoring.order,

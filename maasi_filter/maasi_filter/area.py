@@ -1,0 +1,266 @@
+"""The area of a search: where targets may be, how likely they are, and where robots may go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike
+from shapely.geometry import box
+from shapely.geometry.base import BaseGeometry
+
+from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.environment import EnvironmentSettings, PriorSettings, Zone, read_shape
+
+# Of coordinates, also of those that are large [m].
+_ROUNDING = 1e-6
+# Cells of the raster along the longer side.
+_CELLS = 512
+
+
+class Area:
+    """Where targets may be and robots may go, and how likely targets are, from settings.
+
+    Parameters
+    ----------
+    environment : EnvironmentSettings or (d, 2) array
+        Settings; or the bounds of a box [m], with nothing in it.
+
+    Attributes
+    ----------
+    bounds : (d, 2) array
+        Around the area, metres.
+    region : shapely geometry or None
+        Level shape of what may hold targets: the area without keep-outs; None: all of `bounds`.
+    volume : float
+        Of the region, m^d.
+    circles : (n, 5) array
+        Of all round zones: x, y, z, radius [m, map], 1 for a sphere, 0 for a cylinder.
+
+    Raises
+    ------
+    ValueError
+        If bounds are not usable, a prior cannot be read, or nothing of the area is left.
+    """
+
+    def __init__(self, environment: EnvironmentSettings | ArrayLike) -> None:
+        if not isinstance(environment, EnvironmentSettings):
+            bounds = check_bounds(environment).tolist()
+            environment = EnvironmentSettings.model_construct(bounds=bounds)
+        self.settings = environment
+        self.bounds = check_bounds(environment.bounds)
+        self.dimension = len(self.bounds)
+        self.expected_targets = environment.expected_targets
+        self.circles = _circles([*environment.obstacles, *environment.keep_outs])
+        #: (n, 5): The same of solid ones.
+        self.solid = _circles(environment.obstacles)
+        self._solid_polygons = _polygons(environment.obstacles)
+        self._fence = read_shape(environment.area) if environment.area else None
+        closed = [*_polygons(environment.keep_outs)]
+        closed += [
+            shapely.Point(zone.centre).buffer(zone.radius or 0.0, quad_segs=32)
+            for zone in environment.keep_outs
+            if zone.centre
+        ]
+        self.region: BaseGeometry | None = None
+        if self._fence is not None or closed:
+            whole = self._fence or box(*self.bounds[:2].T.ravel())
+            self.region = whole.difference(shapely.union_all(closed))
+            if self.region.area <= 0.0:
+                raise ValueError('environment: nothing of the area is left outside of keep_outs')
+            shapely.prepare(self.region)
+        size = self.bounds[:, 1] - self.bounds[:, 0]
+        self.volume = float(np.prod(size))
+        self._density: FloatArray | None = None
+        prior = environment.prior
+        if self.region is not None or prior.polygons or prior.raster:
+            self._density, share = self._rasterised(prior)
+            self.volume *= share
+
+    @classmethod
+    def of(cls, area: Area | EnvironmentSettings | ArrayLike) -> Area:
+        """Return an area as it is, or of settings or bounds."""
+        return area if isinstance(area, Area) else cls(area)
+
+    @property
+    def uniform(self) -> bool:
+        """Whether targets are equally likely in all of the bounds."""
+        return self._density is None
+
+    def inside(self, points: ArrayLike) -> BoolArray:
+        """Return which points (n, d or more) are finite and in the area, up to rounding."""
+        array = np.asarray(points, dtype=float)
+        places = array[:, : self.dimension]
+        within = (places >= self.bounds[:, 0] - _ROUNDING).all(axis=1)
+        within &= (places <= self.bounds[:, 1] + _ROUNDING).all(axis=1)
+        within &= np.isfinite(array).all(axis=1)
+        if self.region is not None and within.any():
+            near = shapely.points(places[within, :2])
+            within[within] = shapely.dwithin(self.region, near, _ROUNDING)
+        return np.asarray(within)
+
+    def density(self, points: FloatArray) -> FloatArray:
+        """Return how likely targets are at points (n, d or more), (n,): prior times inside.
+
+        Relative to evenly over the region: its mean there is 1.
+        """
+        if self._density is None:
+            return np.ones(len(points))
+        low, high = self.bounds[:2].T
+        shape_of = np.array(self._density.shape)
+        cell = np.floor((points[:, :2] - low) / (high - low) * shape_of).astype(int)
+        cell = np.clip(cell, 0, shape_of - 1)
+        return np.asarray(self._density[cell[:, 0], cell[:, 1]])
+
+    def draw(
+        self,
+        generator: np.random.Generator,
+        low: FloatArray,
+        high: FloatArray,
+        by_prior: bool = False,
+    ) -> FloatArray | None:
+        """Return a random place (d,) between corners if it is in the area, else None.
+
+        It is drawn evenly or, `by_prior`, as likely as targets are.
+        """
+        place = generator.uniform(low, high)
+        if self._density is None:
+            return np.asarray(place)
+        density = float(self.density(place[None, :])[0])
+        if by_prior and generator.uniform(0.0, float(self._density.max())) > density:
+            return None
+        return np.asarray(place) if density > 0.0 and self.inside(place[None, :])[0] else None
+
+    def distances(self, position: ArrayLike) -> FloatArray:
+        """Return the distances of a position (3,) from solid things, negative inside round ones."""
+        offset = np.asarray(position, dtype=float)[None, :] - self.solid[:, :3]
+        offset[:, 2] *= self.solid[:, 4]
+        gaps = np.sqrt((offset * offset).sum(axis=1)) - self.solid[:, 3]
+        if not self._solid_polygons:
+            return np.asarray(gaps)
+        point = shapely.Point(np.asarray(position)[:2])
+        return np.append(gaps, shapely.distance(self._solid_polygons, point))
+
+    def solid_edges(self) -> FloatArray:
+        """Return the edges of solid polygons, (n, 4): x, y, and from there to the other end [m]."""
+        return edges_of(self._solid_polygons)
+
+    def room(self, reach: float) -> BaseGeometry | None:
+        """Return where robots that keep `reach` metres from its border may be; None: anywhere.
+
+        Round zones are not in it, and the sides of a box need no distance.
+        """
+        polygons = _polygons([*self.settings.obstacles, *self.settings.keep_outs])
+        if self._fence is None and not polygons:
+            return None
+        whole = self._fence
+        if whole is None:
+            whole = box(*self.bounds[:2].T.ravel()).buffer(reach, join_style='mitre')
+        return whole.difference(shapely.union_all(polygons))
+
+    def _rasterised(self, prior: PriorSettings) -> tuple[FloatArray, float]:
+        """Return the density in cells (nx, ny), and the share of the bounds that is inside."""
+        low, high = self.bounds[:2].T
+        size = high - low
+        number = np.maximum(np.ceil(_CELLS * size / size.max()), 8).astype(int)
+        axes = [a + (np.arange(n) + 0.5) * s / n for a, n, s in zip(low, number, size)]
+        x, y = np.meshgrid(*axes, indexing='ij')
+        inside = np.ones(x.shape)
+        if self.region is not None:
+            inside = shapely.contains_xy(self.region, x, y).astype(float)
+        if not inside.any():
+            raise ValueError('environment: the area is too narrow for its bounds')
+        likely = np.ones(x.shape)
+        for part in prior.polygons:
+            shape_of = read_shape(part.polygon)
+            shapely.prepare(shape_of)
+            likely[shapely.contains_xy(shape_of, x, y)] = part.weight
+        if prior.raster is not None:
+            extent = np.array(prior.extent or self.bounds[:2])
+            likely *= _sampled(read_raster(prior.raster), extent, x, y)
+        promised = float((likely * inside).sum() / inside.sum())
+        if not promised > 0.0:
+            raise ValueError('environment.prior: promises nothing inside the area')
+        density = (prior.floor + (1.0 - prior.floor) * likely / promised) * inside
+        return density, float(inside.mean())
+
+
+def edges_of(polygons: Iterable[BaseGeometry]) -> FloatArray:
+    """Return the edges of polygons, (n, 4): x, y, and from there to the other end [m]."""
+    rows = [np.zeros((0, 4))]
+    for ring in shapely.get_parts(shapely.get_rings(list(polygons))):
+        corners = shapely.get_coordinates(ring)
+        rows.append(np.hstack([corners[:-1], np.diff(corners, axis=0)]))
+    edges = np.concatenate(rows)
+    return np.asarray(edges[(edges[:, 2:] != 0.0).any(axis=1)])
+
+
+def check_bounds(bounds: ArrayLike) -> FloatArray:
+    """Return bounds as a (d, 2) array; ValueError if not finite, or not lower < upper."""
+    array = np.array(bounds, dtype=float)
+    if array.shape not in ((2, 2), (3, 2)):
+        raise ValueError(f'bounds: got shape {array.shape}, allowed are (2, 2) and (3, 2)')
+    if not np.isfinite(array).all() or not (array[:, 0] < array[:, 1]).all():
+        raise ValueError(
+            f'bounds: got {array.tolist()}, allowed are finite [lower, upper] with lower < upper'
+        )
+    return array
+
+
+def _circles(zones: Iterable[Zone]) -> FloatArray:
+    rows = [
+        [*[*zone.centre, 0.0][:3], zone.radius, float(len(zone.centre) == 3)]
+        for zone in zones
+        if zone.centre is not None
+    ]
+    return np.array(rows, dtype=float).reshape(-1, 5)
+
+
+def _polygons(zones: Iterable[Zone]) -> list[BaseGeometry]:
+    return [read_shape(zone.polygon) for zone in zones if zone.polygon is not None]
+
+
+def read_raster(path: str) -> FloatArray:
+    """Return the densities of a raster (rows from north, columns from west).
+
+    ValueError if it cannot be read, or is not of finite numbers from 0.
+    """
+    suffix = Path(path).suffix.lower()
+    try:
+        if suffix == '.npy':
+            found = np.load(path)
+        elif suffix in ('.tif', '.tiff'):
+            import rasterio  # type: ignore[import-not-found]
+
+            with rasterio.open(path) as file:
+                found = file.read(1)
+        else:
+            import cv2
+
+            found = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+            if found is None:
+                raise ValueError('is no image')
+    except ImportError as error:
+        raise ValueError(f'prior.raster: {path} needs the package {error.name}') from None
+    except (OSError, ValueError) as error:
+        raise ValueError(f'prior.raster: {path}: {error}') from None
+    raster = np.asarray(found, dtype=float)
+    if raster.ndim != 2 or not np.isfinite(raster).all() or (raster < 0.0).any():
+        raise ValueError(
+            f'prior.raster: {path}: got shape {raster.shape}, allowed are two axes of finite '
+            'numbers from 0'
+        )
+    return raster
+
+
+def _sampled(raster: FloatArray, extent: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the values of a raster at places, 0 outside of it."""
+    rows, columns = raster.shape
+    (west, east), (south, north) = extent
+    column = np.floor((x - west) / (east - west) * columns).astype(int)
+    row = np.floor((north - y) / (north - south) * rows).astype(int)
+    known = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    row, column = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
+    return np.asarray(np.where(known, raster[row, column], 0.0))

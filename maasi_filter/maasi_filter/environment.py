@@ -1,0 +1,289 @@
+"""The settings of where a search takes place: area, keep-outs, obstacles, prior, position on earth.
+
+Shapes are given in metres of the map, as GeoJSON (degrees, RFC 7946), or as well-known text.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from pydantic import Field, field_validator, model_validator
+from shapely.geometry import MultiPolygon, Polygon, shape
+
+from maasi_filter.arrays import FloatArray
+from maasi_filter.settings import Finite, Positive, Settings, Vector2
+
+
+class OriginSettings(Settings):
+    """Where x = y = z = 0 of the map lies, on WGS 84; x points east, y north, z up."""
+
+    latitude: float = Field(ge=-90.0, le=90.0, description='North of the equator [degrees]')
+    longitude: float = Field(ge=-180.0, le=180.0, description='East of Greenwich [degrees]')
+    altitude: Finite = Field(default=0.0, description='Over the ellipsoid [m]')
+
+    def reference(self) -> tuple[float, float, float]:
+        """Return latitude, longitude [degrees] and altitude [m]."""
+        return self.latitude, self.longitude, self.altitude
+
+
+class Zone(Settings):
+    """A zone: a polygon, a cylinder (2D: a disc) or, with three coordinates, a sphere."""
+
+    centre: list[Finite] | None = Field(
+        default=None, min_length=2, max_length=3, description='Centre of a round one [m, map]'
+    )
+    radius: Positive | None = Field(default=None, description='Radius of a round one [m]')
+    polygon: str | None = Field(
+        default=None,
+        description='Corners [m, map], GeoJSON or the name of its file; kept as well-known text',
+    )
+
+    @model_validator(mode='before')
+    @classmethod
+    def _from_text(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        if value[:1].isalpha():
+            return {'polygon': value}
+        *centre, radius = value.split()
+        return {'centre': centre, 'radius': radius}
+
+    @model_validator(mode='after')
+    def _one_kind(self) -> Zone:
+        round_one = self.centre is not None and self.radius is not None
+        if (self.polygon is None) != round_one or (self.centre is None) != (self.radius is None):
+            raise ValueError('allowed are centre and radius, or polygon')
+        return self
+
+    def __str__(self) -> str:
+        if self.polygon is not None:
+            return self.polygon
+        return ' '.join(map(repr, [*(self.centre or []), self.radius]))
+
+
+class PriorPart(Settings):
+    """A polygon in which targets are more or less likely than elsewhere."""
+
+    polygon: str = Field(description='As of a zone')
+    weight: float = Field(ge=0.0, description='How likely, against 1 outside of all polygons [1]')
+
+    @model_validator(mode='before')
+    @classmethod
+    def _from_text(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        weight, polygon = value.split(maxsplit=1)
+        return {'polygon': polygon, 'weight': weight}
+
+    def __str__(self) -> str:
+        return f'{self.weight!r} {self.polygon}'
+
+
+class PriorSettings(Settings):
+    """Where targets are likely: polygons with weights, or a raster, not normalised."""
+
+    polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
+    raster: str | None = Field(
+        default=None,
+        description='File of densities, first row north: .npy, an image, or GeoTIFF (extra geo)',
+    )
+    extent: list[Vector2] | None = Field(
+        default=None,
+        min_length=2,
+        max_length=2,
+        description='Lower and upper bound of the raster on x and y; none: of the area [m, map]',
+    )
+    floor: float = Field(
+        default=0.02,
+        ge=0.0,
+        le=1.0,
+        description='Share of the targets that may be anywhere, whatever the prior promises [1]',
+    )
+
+
+class EnvironmentSettings(Settings):
+    """Where the targets are, and where robots may go: `bounds`, or an `area` with its altitudes."""
+
+    bounds: list[Vector2] = Field(
+        min_length=2, max_length=3, description='Lower and upper bound on each map axis [m]'
+    )
+    area: str | None = Field(
+        default=None,
+        description='Polygons in place of bounds: corners or rings [m, map], GeoJSON or its file; '
+        'kept as well-known text',
+    )
+    altitude: Vector2 | None = Field(
+        default=None, description='With area: lowest and highest z of targets; none: 2D [m]'
+    )
+    keep_outs: list[Zone] = Field(
+        default_factory=list, description='No target is expected there, and no robot goes there'
+    )
+    obstacles: list[Zone] = Field(default_factory=list, description='Solid things in the way')
+    prior: PriorSettings = Field(
+        default_factory=PriorSettings, description='Where targets are likely'
+    )
+    expected_targets: float = Field(
+        default=12.0, gt=0.0, description='N0, targets expected in all before the search [1]'
+    )
+    origin: OriginSettings | None = Field(
+        default=None, description='Of the map on the earth; with GeoJSON, none: amid its area'
+    )
+
+    @model_validator(mode='before')
+    @classmethod
+    def _in_metres(cls, value: Any) -> Any:
+        """Turn all shapes into well-known text in the map, and derive the bounds of an area."""
+        return _in_metres(value) if isinstance(value, Mapping) else value
+
+    @field_validator('bounds')
+    @classmethod
+    def _ordered(cls, value: list[list[float]]) -> list[list[float]]:
+        for axis, pair in enumerate(value):
+            if not pair[0] < pair[1]:
+                raise ValueError(f'[{axis}]: got {pair}, allowed is [lower, upper], lower < upper')
+        return value
+
+    @model_validator(mode='after')
+    def _fitting(self) -> EnvironmentSettings:
+        for key in ('keep_outs', 'obstacles'):
+            most = 2 if key == 'keep_outs' else self.dimension
+            for index, zone in enumerate(getattr(self, key)):
+                if len(zone.centre or ()) > most:
+                    raise ValueError(
+                        f'{key}[{index}].centre: got {zone.centre}, allowed are {most} coordinates'
+                    )
+        return self
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return len(self.bounds)
+
+    def array(self) -> FloatArray:
+        """Return the bounds, (d, 2)."""
+        return np.array(self.bounds, dtype=float)
+
+
+def read_shape(value: Any, to_map: Callable[[FloatArray], FloatArray] | None = None) -> Any:
+    """Return the polygons of a value: rings [m], well-known text, GeoJSON, or a file of it.
+
+    to_map: from longitudes and latitudes (n, 2) [degrees] to the map [m]; ValueError where
+    GeoJSON has to do without it, or what is read is no valid polygon.
+    """
+    if isinstance(value, str) and value.lstrip().upper().startswith(('POLYGON', 'MULTIPOLYGON')):
+        found = shapely.from_wkt(value)
+    elif isinstance(value, (list, tuple)):
+        rings = value if value and np.ndim(value[0][0]) else [value]
+        found = Polygon(rings[0], rings[1:])
+    else:
+        parts = [shape(feature['geometry']) for feature in features_of(value)]
+        if to_map is None:
+            raise ValueError('GeoJSON needs environment.origin')
+        found = shapely.transform(shapely.union_all(parts), to_map)
+    if not isinstance(found, (Polygon, MultiPolygon)) or found.is_empty:
+        raise ValueError(f'got {str(value)[:60]}, allowed are polygons')
+    if not found.is_valid:
+        raise ValueError(f'got {str(value)[:60]}, {shapely.is_valid_reason(found)}')
+    return found
+
+
+def features_of(value: Any) -> list[dict[str, Any]]:
+    """Return the features of GeoJSON, given as values or as the name of a file."""
+    if isinstance(value, str):
+        value = json.loads(Path(value).read_text(encoding='utf-8'))
+    if not isinstance(value, Mapping):
+        raise ValueError(f'got {str(value)[:60]}, allowed is GeoJSON')
+    if value.get('type') == 'FeatureCollection':
+        return list(value['features'])
+    return [dict(value) if value.get('type') == 'Feature' else {'geometry': dict(value)}]
+
+
+def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of an environment with all shapes as well-known text in the map."""
+    import pymap3d
+
+    values = dict(given)
+    roles: dict[str, list[dict[str, Any]]] = {'area': [], 'keep_out': [], 'prior': []}
+    if _is_geojson(values.get('area')):
+        for feature in features_of(values['area']):
+            role = (feature.get('properties') or {}).get('role', 'area')
+            roles.setdefault(role, []).append(feature)
+        if unknown := roles.keys() - {'area', 'keep_out', 'prior'}:
+            raise ValueError(f'area: got role {min(unknown)}, allowed are area, keep_out, prior')
+        values['area'] = {'type': 'FeatureCollection', 'features': roles['area']}
+        if not values.get('origin'):
+            whole = shapely.union_all([shape(item['geometry']) for item in roles['area']])
+            west, south, east, north = whole.bounds
+            values['origin'] = OriginSettings(
+                latitude=0.5 * (south + north), longitude=0.5 * (west + east)
+            )
+    origin = values.get('origin')
+    if origin:
+        origin = values['origin'] = OriginSettings.model_validate(origin)
+
+    def to_map(degrees: FloatArray) -> FloatArray:
+        assert origin is not None
+        places = degrees[:, 1], degrees[:, 0], np.full(len(degrees), origin.altitude)
+        return np.stack(pymap3d.geodetic2enu(*places, *origin.reference())[:2], axis=1)
+
+    def text(value: Any, key: str) -> str:
+        try:
+            found = read_shape(value, to_map if origin else None)
+        except (ValueError, TypeError, KeyError, OSError, shapely.errors.ShapelyError) as error:
+            raise ValueError(f'{key}: {error}') from None
+        return str(shapely.to_wkt(found, rounding_precision=4))
+
+    def zones(key: str, more: Iterable[Any] = ()) -> list[Any]:
+        out: list[Any] = []
+        for index, item in enumerate([*(values.get(key) or []), *more]):
+            round_one = isinstance(item, Zone) or (isinstance(item, Mapping) and 'centre' in item)
+            row = isinstance(item, str) and not item[:1].isalpha() and not _is_geojson(item)
+            if not (round_one or row):
+                inner = item['polygon'] if isinstance(item, Mapping) and 'polygon' in item else item
+                item = {'polygon': text(inner, f'{key}[{index}]')}
+            out.append(item)
+        return out
+
+    if values.get('area'):
+        values['area'] = text(values['area'], 'area')
+        west, south, east, north = shapely.from_wkt(values['area']).bounds
+        values['bounds'] = [[west, east], [south, north]]
+        if values.get('altitude') is not None:
+            values['bounds'].append(values['altitude'])
+    elif values.get('altitude') is not None:
+        raise ValueError('altitude: allowed with area; bounds have the heights themselves')
+    for key, more in (('keep_outs', roles['keep_out']), ('obstacles', [])):
+        if values.get(key) or more:
+            values[key] = zones(key, more)
+    prior = values.get('prior')
+    if isinstance(prior, str):
+        suffix = Path(prior).suffix
+        prior = features_of(prior) if suffix in ('.json', '.geojson') else {'raster': prior}
+    if isinstance(prior, list):
+        roles['prior'] += prior
+        prior = {}
+    if isinstance(prior, Mapping) or roles['prior']:
+        prior = dict(prior or {})
+        parts = list(prior.get('polygons') or [])
+        for item in roles['prior']:
+            weight = (item.get('properties') or {}).get('weight', 1.0)
+            parts.append({'polygon': item, 'weight': weight})
+        prior['polygons'] = [
+            {**item, 'polygon': text(item['polygon'], f'prior.polygons[{index}]')}
+            if isinstance(item, Mapping)
+            else item
+            for index, item in enumerate(parts)
+        ]
+        values['prior'] = prior
+    return values
+
+
+def _is_geojson(value: Any) -> bool:
+    if isinstance(value, str):
+        return Path(value).suffix in ('.json', '.geojson')
+    return isinstance(value, Mapping) and 'type' in value
