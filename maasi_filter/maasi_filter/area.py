@@ -190,7 +190,7 @@ class Area:
 def edges_of(polygons: Iterable[BaseGeometry]) -> FloatArray:
     """Return the edges of polygons, (n, 4): x, y, and from there to the other end [m]."""
     rows = [np.zeros((0, 4))]
-    for ring in shapely.get_parts(shapely.get_rings(list(polygons))):
+    for ring in shapely.get_rings(shapely.get_parts(list(polygons))):
         corners = shapely.get_coordinates(ring)
         rows.append(np.hstack([corners[:-1], np.diff(corners, axis=0)]))
     edges = np.concatenate(rows)

@@ -83,7 +83,7 @@ def _wall_distance(start: Vector, end: Vector, circles: FloatArray, i: int) -> f
     # They cross where each has its ends on both sides of the other.
     one = (ex * ay - ey * ax) * (ex * (ay + dy) - ey * (ax + dx))
     other = (dy * ax - dx * ay) * (dx * (ey - ay) - dy * (ex - ax))
-    if one < 0.0 and other > 0.0:
+    if one < 0.0 and other < 0.0:
         return 0.0
     square = ex * ex + ey * ey
     nearest = min(norm(from_centre(start, circles, i)), norm(from_centre(end, circles, i)))
@@ -334,7 +334,7 @@ class KeepOut:
     def __init__(self, area: Area | None, radius: float, clearance: float) -> None:
         if not (math.isfinite(radius) and radius >= 0.0):
             raise ValueError(f'radius: got {radius}, allowed are finite numbers from 0')
-        self.radius = radius
+        self.area, self.radius = area, radius
         self.clearance = float(clearance)
         round_ones = np.zeros((0, 5)) if area is None else area.circles
         room = None if area is None else area.room(radius + clearance)

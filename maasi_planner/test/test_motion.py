@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from maasi_planner import MotionSettings, Obstacles, RobotState, make_motion
+from maasi_filter.area import Area
+from maasi_filter.environment import EnvironmentSettings
+from maasi_planner import MotionSettings, RobotState, make_motion
 from maasi_planner.motion.mambo import (
     GRAVITY,
     INERTIA,
@@ -167,10 +169,17 @@ def test_control_cost_counts_what_it_says():
     )
 
 
+def among(*rows):
+    """Return an area with round obstacles: x, y, radius, or x, y, z, radius of a sphere."""
+    zones = [{'centre': list(row[:-1]), 'radius': row[-1]} for row in rows]
+    bounds = [[-1e3, 1e3]] * 3
+    return Area(EnvironmentSettings.model_validate({'bounds': bounds, 'obstacles': zones}))
+
+
 @pytest.mark.parametrize('kind', ['printed', 'away'])
 def test_obstacle_term_of_the_paper(kind):
     """(14), (15): nothing beyond d_l; within it k_obs off the inputs, or along the way out."""
-    obstacles = Obstacles(np.array([[1.0, 0.0, 0.0]]), np.array([0.2]), np.array([False]))
+    obstacles = among([1.0, 0.0, 0.2])
     common = {'model': 'mambo', 'obstacle_distance': 0.12, 'obstacle_gain': 0.002}
     term = make_motion(MotionSettings(**common, obstacle_term=kind, clearance=1e-6), obstacles)
     plain = make_motion(MotionSettings(**common))
@@ -193,7 +202,7 @@ UNICYCLE = {'model': 'unicycle', 'speed': 0.2, 'obstacle_distance': 0.12, 'obsta
 )
 def test_obstacle_term_of_a_ground_robot(kind, change):
     """It acts on forward speed and turn rate: an obstacle to the right turns it to the left."""
-    disc = Obstacles(np.array([[1.0, -0.3, 0.0]]), np.array([0.2]), np.array([False]))
+    disc = among([1.0, -0.3, 0.2])
     term = make_motion(MotionSettings(**UNICYCLE, obstacle_term=kind), disc)
     goal, near = [3.0, 0.0, 0.0], RobotState.at_rest([1.0, 0.0, 0.0])
     plain = make_motion(MotionSettings(**UNICYCLE))
@@ -204,7 +213,7 @@ def test_ground_robot_keeps_away_by_the_obstacle_term():
     """It gets by a disc with more room than without the term, or stays before the disc."""
     start, goal = RobotState.at_rest([0.0, 0.0, 0.0]), [[2.0, 0.0, 0.0]]
     for side, gets_by, gain in ((-0.21, True, 0.01), (-0.05, False, 0.2)):
-        disc = Obstacles(np.array([[1.0, side, 0.0]]), np.array([0.15]), np.array([False]))
+        disc = among([1.0, side, 0.15])
         term = make_motion(MotionSettings(**UNICYCLE, obstacle_term='away'), disc)
         plain = make_motion(MotionSettings(**UNICYCLE))
         room = {}
@@ -217,7 +226,7 @@ def test_ground_robot_keeps_away_by_the_obstacle_term():
 
 @pytest.mark.parametrize('model', ['constant_speed', 'quadrotor'])
 def test_obstacle_term_pushes_away_in_every_model(model):
-    sphere = Obstacles(np.array([[0.0, 0.3, 1.0]]), np.array([0.2]), np.array([True]))
+    sphere = among([0.0, 0.3, 1.0, 0.2])
     settings = {'model': model, 'obstacle_distance': 0.12, 'obstacle_gain': 0.1}
     near, goal = RobotState.at_rest([0.0, 0.0, 1.0]), [3.0, 0.0, 1.0]
     term = make_motion(MotionSettings(**settings, obstacle_term='away'), sphere)

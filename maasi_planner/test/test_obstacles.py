@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+import shapely
 
-from maasi_planner import MotionSettings, Obstacles, RobotState, make_motion
+from maasi_filter.area import Area
+from maasi_filter.environment import EnvironmentSettings
+from maasi_planner import MotionSettings, RobotState, make_motion
 from maasi_planner.obstacles import KeepOut
 
 UNICYCLE = {
@@ -23,11 +26,17 @@ ROBOTS = [
 SPACE = {'speed': 4.0, 'tolerance': 1.0, 'clearance': 3.0}
 
 
+def among(*rows):
+    """Return an area with round obstacles: x, y, radius, or x, y, z, radius of a sphere."""
+    zones = [{'centre': list(row[:-1]), 'radius': row[-1]} for row in rows]
+    bounds = [[-1e3, 1e3]] * 3
+    return Area(EnvironmentSettings.model_validate({'bounds': bounds, 'obstacles': zones}))
+
+
 def discs(centres, radii):
     """Return cylinders with centres (n, 2) and radii, one for all or (n,)."""
-    places = np.zeros((len(centres), 3))
-    places[:, :2] = centres
-    return Obstacles(places, np.full(len(centres), radii), np.zeros(len(centres), dtype=bool))
+    radii = np.broadcast_to(radii, len(centres))
+    return among(*([*map(float, c), float(r)] for c, r in zip(centres, radii)))
 
 
 def random_discs(rng):
@@ -38,14 +47,12 @@ def random_discs(rng):
 def random_spheres(rng):
     number = int(rng.integers(1, 8))
     centres, radii = rng.uniform(20, 240, (number, 3)), rng.uniform(5, 40, number)
-    return Obstacles(centres, radii, np.ones(number, dtype=bool))
+    return among(*np.column_stack([centres, radii]).tolist())
 
 
 def least_room(motion, prediction):
-    obstacles = motion.keep_out.obstacles
-    offsets = prediction.positions.reshape(-1, 1, 3) - obstacles.centres
-    offsets[:, ~obstacles.spheres, 2] = 0.0
-    return (np.linalg.norm(offsets, axis=2) - obstacles.radii).min()
+    places = prediction.positions.reshape(-1, 3)
+    return min(motion.keep_out.area.distances(place).min() for place in places)
 
 
 def check_way(motion, state, goals, step, room):
@@ -64,7 +71,7 @@ def check_random(settings, obstacles, seed, number, bounds, height, radius):
         return np.append(found[:2], height) if flat else found
 
     start = place()
-    while motion.keep_out.obstacles.distances(start).min() <= radius + motion.settings.clearance:
+    while motion.keep_out.area.distances(start).min() <= radius + motion.settings.clearance:
         start = place()
     moved = [motion.keep_out.moved_out(start, place()) for _ in range(number)]
     goals = np.array([goal for goal in moved if goal is not None]).reshape(-1, 3)
@@ -115,6 +122,54 @@ def test_waypoint_in_an_obstacle_is_moved_towards_the_robot():
         line, part = point - start, moved - start
         assert abs(line[0] * part[1] - line[1] * part[0]) < 1e-9
         assert float(part @ line) <= float(line @ line) + 1e-9
+
+
+def random_rooms(rng):
+    """Return a polygon with a hole, and keep-outs that may touch each other and its border."""
+    angles = 2.0 * np.pi * (np.arange(9) + rng.uniform(-0.3, 0.3, 9)) / 9
+    rim = 40.0 * rng.uniform(0.6, 1.0, 9)[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
+    hole = [[-4.0, -4.0], [4.0, -4.0], [0.0, 5.0]]
+    keep_outs = []
+    for _ in range(4):
+        x, y = rng.uniform(-35.0, 35.0, 2).tolist()
+        keep_outs.append([[x, y], [x + 8.0, y + 2.0], [x + 3.0, y + 9.0], [x + 4.0, y + 3.0]])
+    keep_outs.append({'centre': rng.uniform(-30.0, 30.0, 2).tolist(), 'radius': 4.0})
+    values = {'area': [rim.tolist(), hole], 'keep_outs': keep_outs}
+    return Area(EnvironmentSettings.model_validate(values))
+
+
+@pytest.mark.parametrize('settings', ROBOTS)
+def test_no_robot_leaves_the_area_or_enters_a_keep_out(settings):
+    rng = np.random.default_rng(3)
+    reached = 0
+    for _ in range(12):
+        area = random_rooms(rng)
+        scaled = settings | {'speed': 2.0, 'clearance': 0.5, 'tolerance': 0.3}
+        motion = make_motion(MotionSettings(**scaled), area, 0.5)
+        places = np.zeros((300, 3))
+        places[:, :2] = rng.uniform(-40.0, 40.0, (300, 2))
+        free = [place for place in places if motion.keep_out.is_free(place)]
+        goals = [motion.keep_out.moved_out(free[0], place) for place in free[1:6]]
+        goals = np.array([goal for goal in goals if goal is not None])
+        prediction = motion.predict(RobotState.at_rest(free[0]), goals, 0.1)
+        reached += prediction.reached.sum()
+        for way in prediction.positions.reshape(-1, 3):
+            point = shapely.Point(way[:2])
+            assert area.region.covers(point) and area.region.boundary.distance(point) >= 0.5
+    assert reached >= 50
+
+
+def test_robot_in_a_keep_out_leaves_by_the_shortest_way():
+    square = [[0.0, 0.0], [20.0, 0.0], [20.0, 20.0], [0.0, 20.0]]
+    values = {'bounds': [[-50.0, 50.0]] * 2, 'keep_outs': [square]}
+    area = Area(EnvironmentSettings.model_validate(values))
+    motion = make_motion(MotionSettings(speed=2.0, clearance=0.5), area, 0.5)
+    prediction = motion.predict(RobotState.at_rest([17.0, 9.0, 0.0]), [[-30.0, 9.0, 0.0]], 0.1)
+    way = prediction.positions[0]
+    assert prediction.reached[0]
+    assert np.abs(way[:15, 1] - 9.0).max() < 1e-6 and way[15, 0] > 19.5
+    out = ~area.region.covers(shapely.points(way[:, :2]))
+    assert not out[np.argmin(out) :].any()
 
 
 def test_robot_between_two_obstacles_has_no_way():

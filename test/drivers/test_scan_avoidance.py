@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.scan_motion import ScanUnicycle, scan_points
 from maasi_drivers.settings.driver import ScanSettings
+from maasi_filter.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
-from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
 from maasi_sim.simulation.sensors import LaserScanner, LaserSettings
 
@@ -49,7 +49,7 @@ def test_beams_are_placed_in_the_map():
 
 def drive(goal, centres, radii, seconds=60.0, yaw=0.0, margin=0.0):
     """Drive under scans at 5 Hz with noise, and touch nothing; return whether it arrives."""
-    model = ScanUnicycle(MOTION, Obstacles.none(), RADIUS, ScanSettings())
+    model = ScanUnicycle(MOTION, Area([[-99.0, 99.0]] * 2), RADIUS, ScanSettings())
     centres, radii = np.reshape(centres, (-1, 2)), np.array(radii)
     body = model.body(RobotState.at_rest([0.0, 0.0, 0.0], yaw))
     scanner = LaserScanner(LaserSettings(), BOUNDS, centres, radii, 3, 'rover')
@@ -91,7 +91,7 @@ def test_a_robot_touches_nothing_whatever_stands_there(seed):
 
 
 def test_a_robot_that_touches_something_may_leave():
-    model = ScanUnicycle(MOTION, Obstacles.none(), RADIUS, ScanSettings())
+    model = ScanUnicycle(MOTION, Area([[-99.0, 99.0]] * 2), RADIUS, ScanSettings())
     for place, leaves in ((-0.1, True), (0.1, False)):
         model.see([[place, 0.0]])
         command = model.command(RobotState.at_rest([0.0, 0.0, 0.0]), [1.0, 0.0, 0.0])

@@ -12,6 +12,8 @@ from maasi_filter import (
     SensorSettings,
     wrap_angle,
 )
+from maasi_filter.area import Area
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.measurement_check import check_measurements
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.state_file import pack
@@ -94,16 +96,16 @@ def plane_sensor(probability=0.9, clutter=0.0, range_noise=3.0, bearing=0.08):
     ).build('robot', 2)
 
 
-def plane_filter(seed=0, particles=1000, **settings):
+def plane_filter(seed=0, particles=1000, expected_targets=3.0, **settings):
     """Return a filter on the plane, e on nodes 2 m apart."""
     return PmbFilter(
         FilterSettings(
             method='pmb',
             exploration_spacing=2.0,
             pmb={'particles': particles},
-            **{'expected_targets': 3.0, **settings},
+            **settings,
         ),
-        PLANE,
+        Area(EnvironmentSettings(bounds=PLANE.tolist(), expected_targets=expected_targets)),
         np.random.default_rng(seed),
     )
 

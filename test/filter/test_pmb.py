@@ -21,9 +21,7 @@ TARGET = np.array([[60.0, 45.0]])
 PLACES = [(30.0, 30.0), (50.0, 70.0), (80.0, 20.0), (40.0, 50.0)]
 # Enough for one target not to be taken for another.
 PRECISE = plane_sensor(range_noise=0.5, bearing=0.01)
-MANY_DRAWS = FilterSettings(
-    method='pmb', expected_targets=3.0, pmb={'particles': 20_000}
-).resolved()
+MANY_DRAWS = FilterSettings(method='pmb', pmb={'particles': 20_000}).resolved()
 
 
 def observe(generator, sensor, targets, position):

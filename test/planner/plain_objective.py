@@ -128,6 +128,6 @@ def plain_information_terms(team, settings, options, choice):
             detection = team.robots[name].sensor.detection
             missed *= 1.0 - detection.probability(explored.nodes(), shot.pose)
         share = (explored.cell_volumes() * explored.values).ravel() / explored.volume
-        exploration = settings.expected_targets * float(share @ (1.0 - missed))
+        exploration = team.area.expected_targets * float(share @ (1.0 - missed))
         out[name] = objective_of(team, weights, options, choice, name, refinement, exploration)
     return out

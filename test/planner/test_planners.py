@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from planner_helpers import random_team
 
+from maasi_filter.area import Area
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,
-    Obstacles,
     PlannerSettings,
     RobotState,
     make_motion,
@@ -310,8 +311,10 @@ def test_idle_robots_and_goals_of_others_count(name):
 )
 def test_robots_without_a_usable_candidate_stay(name, start, candidates, chosen, reason):
     team, view = one_robot()
-    obstacles = Obstacles(np.array([[1.6, 1.0, 0.0]]), np.array([0.5]), np.array([False]))
-    view.motion = make_motion(view.motion.settings, obstacles, 0.1)
+    zone = {'centre': [1.6, 1.0], 'radius': 0.5}
+    place = {'bounds': [[0.0, 9.0]] * 2, 'obstacles': [zone]}
+    area = Area(EnvironmentSettings.model_validate(place))
+    view.motion = make_motion(view.motion.settings, area, 0.1)
     view.state = at(*start)
     view.candidates = np.array(candidates).reshape(-1, 3)
     robot = decide(name, team)

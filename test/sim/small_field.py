@@ -4,7 +4,7 @@ from typing import Any
 
 SMALL_FIELD: dict[str, Any] = {
     'version': 1,
-    'environment': {'bounds': [[0.0, 60.0], [0.0, 60.0]]},
+    'environment': {'bounds': [[0.0, 60.0], [0.0, 60.0]], 'expected_targets': 2.0},
     'step': 0.1,
     'targets': {'count': 2, 'separation': 10.0, 'margin': 5.0},
     'robots': {
@@ -14,7 +14,7 @@ SMALL_FIELD: dict[str, Any] = {
             'candidates': {'grid': [4, 4], 'spacing': 15.0, 'corner': [7.0, 7.0]},
         }
     },
-    'filter': {'method': 'pmb', 'expected_targets': 2.0},
+    'filter': {'method': 'pmb'},
     'planner': {'name': 'nearest_widest'},
     'limits': {'time': 15.0},
 }
