@@ -48,7 +48,7 @@ class Area:
     def __init__(self, environment: EnvironmentSettings | ArrayLike) -> None:
         if not isinstance(environment, EnvironmentSettings):
             bounds = check_bounds(environment).tolist()
-            environment = EnvironmentSettings.model_construct(bounds=bounds)
+            environment = EnvironmentSettings(bounds=bounds)
         self.settings = environment
         self.bounds = check_bounds(environment.bounds)
         self.dimension = len(self.bounds)
@@ -58,12 +58,15 @@ class Area:
         self.solid = _circles(environment.obstacles)
         self._solid_polygons = _polygons(environment.obstacles)
         self._fence = read_shape(environment.area) if environment.area else None
-        closed = [*_polygons(environment.keep_outs)]
-        closed += [
+        closed = [
             shapely.Point(zone.centre).buffer(zone.radius or 0.0, quad_segs=32)
-            for zone in environment.keep_outs
             if zone.centre
+            else read_shape(zone.polygon)
+            for zone in environment.keep_outs
         ]
+        #: Of what is shown: level shapes by what they are, but for round obstacles.
+        self.shapes = {'area': [self._fence] if self._fence else [], 'keep_out': closed}
+        self.shapes['obstacle'] = self._solid_polygons
         self.region: BaseGeometry | None = None
         if self._fence is not None or closed:
             whole = self._fence or box(*self.bounds[:2].T.ravel())

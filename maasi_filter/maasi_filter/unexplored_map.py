@@ -205,6 +205,14 @@ class UnexploredMap:
         """
         return self._volumes
 
+    def expected(self) -> FloatArray:
+        """Return the intensity of unseen targets at the nodes, prior inside e, 1 at most.
+
+        It is e where no prior is given. Of the shape of `values`.
+        """
+        shown = self._values * (self.density / self.density.max())
+        return np.asarray(shown.reshape(self.values.shape))
+
     def explored_fraction(self) -> float:
         """Return 1 - mean of e over the environment, in [0, 1]."""
         return 1.0 - float((self._volumes * self.values).sum() / self._volumes.sum())

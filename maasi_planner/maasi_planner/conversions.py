@@ -10,11 +10,13 @@ import math
 from collections.abc import Collection
 
 import numpy as np
+import shapely
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
@@ -111,8 +113,8 @@ def path_to_ros(positions: FloatArray, header: Header, most: int = 50) -> Path:
 
 
 def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyGrid:
-    """Return e in 2D as a grid: 100 is unseen, 0 explored; cells are centred on the nodes."""
-    values = np.asarray(exploration.values)
+    """Return prior and e in 2D as a grid: 100 is unseen, 0 explored; nodes are centres of cells."""
+    values = exploration.expected()
     step = [float(axis[1] - axis[0]) for axis in exploration.axes()]
     grid = OccupancyGrid(header=header)
     grid.info.map_load_time = header.stamp
@@ -154,6 +156,21 @@ def planner_markers(
         line.points = [point_to_ros(point) for point in thinned]
         line.action = Marker.ADD if len(line.points) > 1 else Marker.DELETE
         markers.append(line)
+    return MarkerArray(markers=markers)
+
+
+def area_markers(area: Area, header: Header, size: float) -> MarkerArray:
+    """Return markers of the rings of area, keep-outs and solid polygons, in the map."""
+    tints = {'area': '#1B1F24', 'keep_out': '#B84A00', 'obstacle': '#59636E'}
+    markers = []
+    for kind, shapes in area.shapes.items():
+        for ring in shapely.get_rings(shapely.get_parts(shapes)):
+            line = Marker(header=header, ns=kind, id=len(markers), type=Marker.LINE_STRIP)
+            line.pose.orientation.w = 1.0
+            line.scale.x = 0.1 * size
+            line.color = colour_of(tints[kind])
+            line.points = [point_to_ros([x, y, 0.0]) for x, y in shapely.get_coordinates(ring)]
+            markers.append(line)
     return MarkerArray(markers=markers)
 
 

@@ -5,6 +5,7 @@ import pytest
 from searches import log_density
 
 from maasi_filter import AgentMeasurement, ExponentialDetection, Pose, Sensor
+from maasi_filter.area import Area
 from maasi_filter.found_targets import FoundTargets
 from maasi_filter.ic_phd.births import (
     gaussian_births,
@@ -28,11 +29,11 @@ def sensor_of(dimension):
 @pytest.mark.parametrize('dimension', [2, 3])
 def test_births_weigh_what_the_constant_intensity_predicts(dimension):
     """Sum of b is the integral of (N0 / V) (1 - pi_before) pi p(z | x), here over a fine grid."""
-    bounds = np.array([[0.0, 100.0]] * dimension)
+    area = Area([[0.0, 100.0]] * dimension)
     sensor, before = sensor_of(dimension), Pose([70.0, 60.0, 50.0])
     z = np.array([[25.0, 0.6, 0.3][:dimension]])
     member, other = (AgentMeasurement('any', pose, sensor, z) for pose in (POSE, before))
-    _, births = measurement_births(member, [other], bounds, 12.0, 40_000, np.random.default_rng(0))
+    _, births = measurement_births(member, [other], area, 40_000, np.random.default_rng(0))
     axis = np.linspace(0.5, 99.5, 100)
     grid = np.stack(np.meshgrid(*[axis] * dimension, indexing='ij'), -1).reshape(-1, dimension)
     likelihood = np.exp(log_density(sensor, z, grid, POSE))
@@ -44,15 +45,15 @@ def test_births_weigh_what_the_constant_intensity_predicts(dimension):
 
 def test_gaussian_births_stand_for_a_constant_intensity():
     """Weights Y / (J p(x)) estimate Y times any volume, here that of a ball in the middle."""
-    bounds = np.array([[0.0, 100.0]] * 2)
+    area = Area([[0.0, 100.0]] * 2)
     centres = np.array([[40.0, 40.0], [60.0, 55.0]])
     particles, weights = gaussian_births(
-        centres, 30.0 * np.eye(2), bounds, 2.0, 200_000, np.random.default_rng(0)
+        centres, 30.0 * np.eye(2), area, 2.0, 200_000, np.random.default_rng(0)
     )
     near = np.linalg.norm(particles - [50.0, 47.0], axis=1) < 5.0
     assert weights[near].sum() == pytest.approx(2.0 / 1e4 * np.pi * 25.0, rel=0.05)
     single, _ = gaussian_births(
-        centres[:1], 4.0 * np.eye(2), bounds, 2.0, 1000, np.random.default_rng(0)
+        centres[:1], 4.0 * np.eye(2), area, 2.0, 1000, np.random.default_rng(0)
     )
     np.testing.assert_allclose(np.cov(single.T), 4.0 * np.eye(2), atol=0.8)
 

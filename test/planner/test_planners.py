@@ -300,7 +300,7 @@ def test_idle_robots_and_goals_of_others_count(name):
     ('start', 'candidates', 'chosen', 'reason'),
     [
         ((0.2, 1.2), [], None, 'no candidates'),
-        ((0.2, 1.2), [[3.0, 1.0, 0.0]], None, 'outside the bounds'),
+        ((0.2, 1.2), [[3.0, 1.0, 0.0]], None, 'outside the area'),
         ((0.2, 1.2), [[0.2, 1.2, 0.0]], None, 'already'),
         # At the edge of the obstacle.
         ((0.997, 1.0), [[1.6, 1.0, 0.0], [1.7, 1.0, 0.0]], None, 'in obstacles'),

@@ -13,11 +13,11 @@ import pytest
 import yaml
 from small_field import SMALL_FIELD
 
+from maasi_filter.environment import OriginSettings
 from maasi_filter.records import FoundTarget, Label
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.targets.tables import csv_text, found_rows, geodetic, geojson_text
-from maasi_sim.scenario.base import OriginSettings
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search

@@ -14,7 +14,7 @@ from maasi_filter.colours import robot_colours
 from maasi_filter.ros.conversions import MarkerBoard, particles_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED
-from maasi_planner.conversions import exploration_to_ros, planner_markers
+from maasi_planner.conversions import area_markers, exploration_to_ros, planner_markers
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.node_settings import PlannerNodeSettings
 
@@ -53,7 +53,7 @@ class PlannerViews:
             self._exploration.publish(exploration_to_ros(exploration, header))
         else:
             self._exploration.publish(
-                particles_to_ros(exploration.nodes(), np.ravel(exploration.values), header)
+                particles_to_ros(exploration.nodes(), np.ravel(exploration.expected()), header)
             )
         shown = {}
         for name, robot in robots.items():
@@ -63,4 +63,5 @@ class PlannerViews:
         # Of the whole team, so that a robot that plans for itself has its colour of the team.
         tints = robot_colours([*coordinator.names, *self._node.settings.others])
         markers = planner_markers(shown, tints, header, self._size)
+        markers.markers += area_markers(coordinator.area, header, self._size).markers
         self._markers.publish(self._board.replace(markers))

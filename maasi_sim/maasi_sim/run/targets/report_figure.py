@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+import shapely
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
@@ -73,9 +74,10 @@ def plot_report(record: TargetRecord) -> Figure:
 
 
 def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -> None:
-    """Shade unexplored places: e, in 3D its mean along the line of sight."""
+    """Shade unexplored places: e and prior, in 3D its mean along the line of sight."""
     hidden = tuple(axis for axis in range(explored.dimension) if axis not in view.plane)
-    values = explored.values.mean(axis=hidden) if hidden else explored.values
+    shown = explored.expected()
+    values = shown.mean(axis=hidden) if hidden else shown
     if view.plane[0] < view.plane[1]:
         values = values.T
     right, up = (explored.axes()[axis] for axis in view.plane)
@@ -90,8 +92,14 @@ def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -
 
 def _draw_obstacles(view: MapView, record: TargetRecord, bounds: FloatArray) -> None:
     style: dict[str, Any] = {'fc': '#C9C3B8', 'ec': '#8A8478', 'zorder': 1, 'label': 'obstacle'}
-    for obstacle in record.scenario.environment.obstacles:
-        centre, radius = obstacle.centre, obstacle.radius
+    area = Area(record.scenario.environment)
+    for kind, shapes in area.shapes.items() if view.plane == (0, 1) else ():
+        for ring in shapely.get_rings(shapely.get_parts(shapes)):
+            colour = {'area': '#1B1F24', 'keep_out': '#B84A00', 'obstacle': '#8A8478'}[kind]
+            label = kind.replace('_', '-')
+            view.axes.plot(*shapely.get_coordinates(ring).T, color=colour, lw=1.2, label=label)
+    for *centre, radius, is_sphere in area.solid.tolist():
+        centre = centre if is_sphere else centre[:2]
         if max(view.plane) < len(centre):
             place = (centre[view.plane[0]], centre[view.plane[1]])
             view.axes.add_patch(Circle(place, radius, **style))

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.environment import OriginSettings
 from maasi_filter.records import FoundTarget
-from maasi_sim.scenario.base import OriginSettings
 
 Row = dict[str, Any]
 

@@ -262,7 +262,7 @@ class SearchTrace:
             self._last_maps[space] = time
             explored = coordinator.exploration
             # As coarse as it is shown.
-            ninths = np.rint(9.0 * explored.values).astype(np.uint8)
+            ninths = np.rint(9.0 * explored.expected()).astype(np.uint8)
             grid = explored.bounds[:, 0], explored.step, ninths
             self.add(EventMaker.map, time, space, *grid, explored.explored_fraction())
 

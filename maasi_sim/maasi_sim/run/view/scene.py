@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike
 
 from maasi_drivers.agent.flight_rules import make_fence
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
+from maasi_filter.area import Area
 from maasi_filter.settings import DETECTIONS
 from maasi_planner.buildings.settings import FACES
 from maasi_planner.settings import PlannerSettings
@@ -45,7 +47,9 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
         'obstacles': [
             [*map(float, obstacle.centre), float(obstacle.radius)]
             for obstacle in scenario.environment.obstacles
+            if obstacle.centre
         ],
+        'zones': zones_of(Area(scenario.environment)),
         'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},
         'targets': len(truth),
         'expected_targets': scenario.environment.expected_targets,
@@ -53,6 +57,15 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
         'scoring_radius': scoring_radius(scenario, truth) if len(truth) else None,
         'scoring_order': scenario.scoring.order,
     }
+
+
+def zones_of(area: Area) -> list[dict[str, Any]]:
+    """Return the shapes of an area: what each is, and its rings [m, map], the first the outer."""
+    return [
+        {'kind': kind, 'rings': [rounded(shapely.get_coordinates(ring)) for ring in rings]}
+        for kind, shapes in area.shapes.items()
+        for rings in map(shapely.get_rings, shapely.get_parts(shapes))
+    ]
 
 
 def scene_of_facts(facts: Mapping[str, Any]) -> Scene:

@@ -260,6 +260,10 @@ class Sheet:
             # The frame again, which the map covers.
             image = self._axes.imshow(values, extent=extent, **shades)
             self._drawn += [image, *self._axes.spines.values()]
+        for zone in now.scene.get('zones', []):
+            colour = {'area': '0.1', 'keep_out': AWAY, 'obstacle': _SOLID}[zone['kind']]
+            for ring in zone['rings']:
+                self._line(np.array(ring), '-', color=colour, lw=1.2)
         kept = max((robot.get('clearance', 0.0) for robot in self._robots.values()), default=0.0)
         for *centre, radius in now.scene.get('obstacles', []):
             self._drawn.append(self._axes.add_patch(Circle(centre[:2], radius, color=_SOLID)))

@@ -10,6 +10,7 @@ const HEAT = 'linear-gradient(90deg, rgba(var(--heat-low), .25), rgba(var(--heat
 function entries(log, time, selected, layers) {
   const isEmpty = !(log.potential.at(time) >= 0.005);
   const robots = Object.values(log.scene.robots);
+  const hasZone = (kind) => (log.scene.zones || []).some((zone) => zone.kind === kind);
   const cividis = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(scaleColour).join(', ')})`;
   const faceGradient = `linear-gradient(90deg, ${faceColour(0)}, ${faceColour(1)})`;
   const of = (...list) => list.filter(Boolean);
@@ -44,6 +45,8 @@ function entries(log, time, selected, layers) {
     ['text', '', 'true target', '✕'],
     (log.scene.obstacles || []).length && ['area', 'var(--quiet)', 'obstacle'],
     (log.scene.obstacles || []).length && ['dash', 'var(--text)', 'distance kept from it'],
+    hasZone('area') && ['line', 'var(--text)', 'border of the area'],
+    hasZone('keep_out') && ['area', 'color-mix(in srgb, var(--fault) 22%, transparent)', 'keep-out'],
     robots.some((robot) => robot.fence) && ['dash', '', 'geofence (dash and dot)'],
     selected && ['area', cividis, 'candidate of the selected robot: J from low to high'],
     selected && ['ring', 'var(--text)', 'candidate that is not allowed'],

@@ -55,6 +55,7 @@ export class MapView {
     this.unexplored.update(log, time);
     if (this.layers.unseen) this.unexplored.draw(this);
     if (this.layers.belief && !log.isOfBuildings) this.belief.draw(this, log, time);
+    this.drawZones(log);
     this.drawObstacles(log);
     this.drawFences(log);
     if (log.isOfBuildings || log.scene.objects) drawBuildings(this, log, time);
@@ -103,6 +104,27 @@ export class MapView {
     context.textAlign = 'right';
     context.fillText(`grid ${Number(step.toPrecision(2))} m`, camera.width - 10, camera.height - 6);
     context.textAlign = 'left';
+  }
+
+  // The border of the area, keep-outs and solid polygons.
+  drawZones(log) {
+    const { context, camera } = this;
+    for (const { kind, rings } of log.scene.zones || []) {
+      const colour = themed({ area: '--text', keep_out: '--fault', obstacle: '--quiet' }[kind]);
+      const heights = camera.spatial && log.isSpatial ? log.bounds[2] : [this.floor];
+      for (const z of heights) {
+        context.beginPath();
+        for (const ring of rings) trace(context, camera, ring.map(([x, y]) => [x, y, z]));
+        context.fillStyle = colour;
+        context.strokeStyle = colour;
+        context.globalAlpha = { area: 0, keep_out: 0.22, obstacle: 0.85 }[kind];
+        if (kind !== 'area') context.fill('evenodd');
+        context.globalAlpha = 1;
+        context.lineWidth = kind === 'area' ? 2 : 1;
+        context.stroke();
+      }
+    }
+    context.lineWidth = 1;
   }
 
   drawObstacles(log) {

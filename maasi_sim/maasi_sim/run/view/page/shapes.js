@@ -2,12 +2,17 @@
 
 export function path(context, camera, points, closed = false) {
   context.beginPath();
+  trace(context, camera, points);
+  if (closed) context.closePath();
+}
+
+// Add a line through points to the path.
+export function trace(context, camera, points) {
   points.forEach((point, index) => {
     const [x, y] = camera.project(point);
     if (index === 0) context.moveTo(x, y);
     else context.lineTo(x, y);
   });
-  if (closed) context.closePath();
 }
 
 // Return the matrix of a covariance given as xx, xy, xz, yy, yz, zz.
