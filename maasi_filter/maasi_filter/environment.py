@@ -18,6 +18,9 @@ from shapely.geometry import MultiPolygon, Polygon, shape
 from maasi_filter.arrays import FloatArray
 from maasi_filter.settings import Finite, Positive, Settings, Vector2
 
+# Of files that an environment names.
+FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff', '.yaml')
+
 
 class OriginSettings(Settings):
     """Where x = y = z = 0 of the map lies, on WGS 84; x points east, y north, z up."""

@@ -123,6 +123,21 @@ def segment_distance(start: Vector, end: Vector, circles: FloatArray, i: int) ->
     return norm(plus(offset, part, way))
 
 
+@njit(cache=True, forceinline=True)
+def is_far(start: Vector, end: Vector, circles: FloatArray, i: int, reach: float) -> bool:
+    """Return whether the boxes around a segment and a wall are more than `reach` apart."""
+    x, y = circles[i, 0], circles[i, 1]
+    dx, dy = circles[i, 5], circles[i, 6]
+    if dx == 0.0 and dy == 0.0:
+        return False
+    return bool(
+        min(start[0], end[0]) - max(x, x + dx) > reach
+        or min(x, x + dx) - max(start[0], end[0]) > reach
+        or min(start[1], end[1]) - max(y, y + dy) > reach
+        or min(y, y + dy) - max(start[1], end[1]) > reach
+    )
+
+
 @njit(cache=True)
 def is_clear(
     start: Vector, end: Vector, circles: FloatArray, extra: float, cylinders_only: bool
@@ -130,6 +145,8 @@ def is_clear(
     """Return whether a segment keeps `extra` beyond the radius from every circle."""
     for i in range(circles.shape[0]):
         if cylinders_only and circles[i, 4] > 0.5:
+            continue
+        if is_far(start, end, circles, i, circles[i, 3] + extra):
             continue
         if segment_distance(start, end, circles, i) < circles[i, 3] + extra:
             return False
@@ -170,7 +187,35 @@ def _goal_distances(
     return out
 
 
-@njit(cache=True, forceinline=True)
+@njit(cache=True)
+def _nearest_visible(
+    position: Vector, to_goal: FloatArray, around: Surroundings, least: float
+) -> tuple[int, float, float]:
+    """Return the visible vertex on the shortest way, at least `least` away: its distance, the way.
+
+    -1 where none is visible.
+    """
+    px, py, _ = position
+    before, rejected = -np.inf, -1
+    while True:
+        # The next one by length of the way, as to see a vertex costs more than all these sums.
+        best, index, away = np.inf, -1, 0.0
+        for i in range(around.vertices.shape[0]):
+            dx, dy = around.vertices[i, 0] - px, around.vertices[i, 1] - py
+            near = math.sqrt(dx * dx + dy * dy)
+            total = near + to_goal[i]
+            later = total > before or (total == before and i > rejected)
+            if near >= least and later and total < best:
+                best, index, away = total, i, near
+        if index < 0:
+            return -1, away, best
+        vertex = (around.vertices[index, 0], around.vertices[index, 1], 0.0)
+        if is_clear((px, py, 0.0), vertex, around.circles, 0.0, True):
+            return index, away, best
+        before, rejected = best, index
+
+
+@njit(cache=True)
 def _best_vertex(
     position: Vector, to_goal: FloatArray, around: Surroundings
 ) -> tuple[int, float, bool]:
@@ -179,24 +224,11 @@ def _best_vertex(
     A vertex that is as good as reached gives way to the next one, if that is visible already;
     otherwise it must be approached closely. -1 where no vertex is visible.
     """
-    px, py, _ = position
-    best = beyond = np.inf
-    index = beyond_index = -1
-    for i in range(around.vertices.shape[0]):
-        vx, vy = around.vertices[i, 0], around.vertices[i, 1]
-        near = math.sqrt((vx - px) * (vx - px) + (vy - py) * (vy - py))
-        total = near + to_goal[i]
-        far = near >= 0.5 * around.clearance
-        if total < best or (far and total < beyond):
-            if not is_clear((px, py, 0.0), (vx, vy, 0.0), around.circles, 0.0, True):
-                continue
-            if total < best:
-                best, index = total, i
-            if far and total < beyond:
-                beyond, beyond_index = total, i
-    if beyond_index == index:
+    index, away, best = _nearest_visible(position, to_goal, around, 0.0)
+    if away >= 0.5 * around.clearance:
         return index, best, False
-    if beyond <= best + 0.5 * around.clearance:
+    beyond_index, _, beyond = _nearest_visible(position, to_goal, around, 0.5 * around.clearance)
+    if index >= 0 and beyond <= best + 0.5 * around.clearance:
         return beyond_index, beyond, False
     return index, best, True
 

@@ -14,7 +14,7 @@ from numba import njit
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion.steering import Steering, wrapped
-from maasi_planner.obstacles import Vector, from_centre
+from maasi_planner.obstacles import Vector, from_centre, is_far
 
 # Seconds until the next command at which the window is taken, and for which arcs are followed.
 WINDOW = 0.2
@@ -37,7 +37,7 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray)
     """Return how far straight ahead is free of circles, at most `reach` metres."""
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
-    free = reach
+    free, here = reach, (x, y, 0.0)
     for i in range(circles.shape[0]):
         ox = circles[i, 0] - x
         oy = circles[i, 1] - y
@@ -45,7 +45,9 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray)
         across = ox * sin_yaw - oy * cos_yaw
         radius = circles[i, 3]
         free = min(free, _before_disc(along, across, radius))
-        if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
+        if (circles[i, 5] != 0.0 or circles[i, 6] != 0.0) and not is_far(
+            here, here, circles, i, reach + circles[i, 3]
+        ):
             ahead = circles[i, 5] * cos_yaw + circles[i, 6] * sin_yaw
             aside = circles[i, 5] * sin_yaw - circles[i, 6] * cos_yaw
             free = min(free, _before_disc(along + ahead, across + aside, radius))

@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, TypeVar
 
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.environment import FILES, EnvironmentSettings
 from maasi_filter.plugins import is_reference, unknown
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.checks import Problems, doubts_about, problems_of
@@ -83,7 +83,21 @@ def load_scenario(
 def read_scenario(path: str | Path) -> Layer:
     """Return the values of a scenario file with its layers, not checked yet."""
     path = find_scenario(path)
-    return _with_folders(_with_types(read_layer(path), path))
+    layer = _with_folders(_with_types(read_layer(path), path))
+    environment = layer.data.get('environment')
+    if isinstance(environment, dict):
+        layer.data['environment'] = _with_files(environment, path.parent)
+    return layer
+
+
+def _with_files(value: Any, folder: Path) -> Any:
+    """Return values of an environment in which names of files are absolute."""
+    if isinstance(value, dict):
+        return {key: _with_files(item, folder) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_with_files(item, folder) for item in value]
+    is_file = isinstance(value, str) and Path(value).suffix.lower() in FILES
+    return str((folder / value).absolute()) if is_file else value
 
 
 def _with_folders(layer: Layer) -> Layer:

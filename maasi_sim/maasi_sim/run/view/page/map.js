@@ -5,7 +5,7 @@ import { FOUND, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colo
 import { Labels } from './labels.js';
 import { drawRobot, drawWays } from './robots.js';
 import { LEFT } from './run_log.js';
-import { circle, cross, dropLine, ellipse, matrix, path } from './shapes.js';
+import { circle, cross, dropLine, ellipse, matrix, path, trace } from './shapes.js';
 import { number } from './text.js';
 import { Unexplored } from './unexplored.js';
 import { drawBuildings } from './buildings.js';
