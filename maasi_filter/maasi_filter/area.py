@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +103,12 @@ class Area:
             near = shapely.points(places[within, :2])
             within[within] = shapely.dwithin(self.region, near, _ROUNDING)
         return np.asarray(within)
+
+    def admits(self, position: Sequence[float]) -> bool:
+        """Return whether a place (3,) is outside of keep-outs and inside the area's border."""
+        if self.region is None:
+            return True
+        return bool(shapely.dwithin(self.region, shapely.Point(position[:2]), _ROUNDING))
 
     def density(self, points: FloatArray) -> FloatArray:
         """Return how likely targets are at points (n, d or more), (n,): prior times inside.

@@ -162,6 +162,10 @@ class EnvironmentSettings(Settings):
                     )
         return self
 
+    def without_keep_outs(self) -> EnvironmentSettings:
+        """Return the settings without what changes while a search runs."""
+        return self.model_copy(update={'keep_outs': []})
+
     @property
     def dimension(self) -> int:
         """2 or 3."""
@@ -196,8 +200,10 @@ def read_shape(value: Any, to_map: Callable[[FloatArray], FloatArray] | None = N
 
 
 def features_of(value: Any) -> list[dict[str, Any]]:
-    """Return the features of GeoJSON, given as values or as the name of a file."""
-    if isinstance(value, str):
+    """Return the features of GeoJSON, given as values, as text or as the name of a file."""
+    if isinstance(value, str) and value.startswith('{'):
+        value = json.loads(value)
+    elif _is_geojson(value) and isinstance(value, str):
         value = json.loads(Path(value).read_text(encoding='utf-8'))
     if not isinstance(value, Mapping):
         raise ValueError(f'got {str(value)[:60]}, allowed is GeoJSON')

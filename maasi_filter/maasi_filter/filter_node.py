@@ -29,6 +29,7 @@ from maasi_filter.ros.conversions import (
     particles_to_ros,
     stamp_to_ros,
 )
+from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.qos import LATCHED, RELIABLE, UPDATES
@@ -63,6 +64,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     ----------
     `measurement_batch` (maasi_msgs/MeasurementBatch): which robots measure;
     `<robot>/detections` (maasi_msgs/DetectionArray): their measurements;
+    `keep_outs` (maasi_msgs/KeepOuts, latched): that hold now, published again;
     `found_targets/kept` (maasi_msgs/FoundTargetArray, latched): targets found before a restart;
     `<robot>/found_targets` (maasi_msgs/FoundTargetArray) of robots with filters of their own
 
@@ -86,6 +88,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         }
         self._shared = SharedFoundTargets(self)
         bounds = settings.environment.array()
+        self.area = Area(settings.environment)
         self._marker_size = 0.01 * float((bounds[:, 1] - bounds[:, 0]).max())
         self._begin_anew()
         # Until when batches wait for the targets that the planner keeps for a restarted filter.
@@ -96,9 +99,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def _begin_anew(self) -> None:
         settings = self.settings
-        self.filter = make_filter(
-            settings.filter, Area(settings.environment), np.random.default_rng(settings.seed)
-        )
+        self.filter = make_filter(settings.filter, self.area, np.random.default_rng(settings.seed))
         warning = unsuitable_lengths(settings.filter, settings.environment.array())
         if warning:
             self.get_logger().warning(warning)
@@ -124,7 +125,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         settings = self.settings
         try:
             saved, progress = load_state(file)
-            if saved.environment != settings.environment:
+            if saved.environment.without_keep_outs() != settings.environment.without_keep_outs():
                 raise SettingsError(
                     f'{file}: environment: got {saved.environment}, allowed is that of the '
                     f'parameters, {settings.environment}'
@@ -140,6 +141,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             self.get_logger().warning(
                 f'{file} was saved with other settings of the filter; they go on'
             )
+        self._take_area(saved.area)
         self.filter = saved
         found = f'{len(saved.found_targets)} found targets'
         if progress is None or not settings.save_batches:
@@ -173,6 +175,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 RELIABLE,
             )
         self._shared.set_up()
+        KeepOutTopic(self, self._take_area, keep=True)
         # Subscribers: the filters of the others, and the planner that keeps the found targets.
         self.expect_subscribers(self._found_publisher, len(self._shared) + 1 if self._shared else 0)
         if not settings.lockstep:
@@ -190,6 +193,10 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._publish_found(update.header, self._progress.batch)
         # The process may have died before it sent this update; receivers ignore a duplicate.
         self._update_publisher.publish(update)
+
+    def _take_area(self, area: Area) -> None:
+        self.area = area
+        self.filter.take_area(area)
 
     def halt(self) -> None:
         """Save the state."""

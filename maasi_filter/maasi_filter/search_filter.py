@@ -59,12 +59,16 @@ class SearchFilter(ABC):
     ) -> None:
         self.settings = settings
         self.exploration = UnexploredMap(area, settings.exploration_spacing)
-        self.area = self.exploration.area
-        self.environment = self.area.settings
+        self.take_area(self.exploration.area)
         self.bounds = self.area.bounds
         self.dimension = self.exploration.dimension
         self.generator = generator
         self.clusters: list[Cluster] = []
+
+    def take_area(self, area: Area) -> None:
+        """Take another area within the same bounds, as with other keep-outs."""
+        self.area, self.environment = area, area.settings
+        self.exploration.take_area(area)
 
     @property
     @abstractmethod

@@ -98,8 +98,8 @@ class UnexploredMap:
     """
 
     def __init__(self, area: Area | ArrayLike, spacing: float | None = None) -> None:
-        self.area = Area.of(area)
-        self.bounds = self.area.bounds
+        area = Area.of(area)
+        self.bounds = area.bounds
         if spacing is None:
             spacing = default_spacing(self.bounds)
         if not (math.isfinite(spacing) and spacing > 0.0):
@@ -113,7 +113,6 @@ class UnexploredMap:
                 f'spacing: got {spacing}, which needs {np.prod(cells + 1.0):.3g} nodes, '
                 f'allowed are at most {MAXIMUM_NODES}'
             )
-        self.volume = self.area.volume
         self.step = size / cells
         shape = [int(number) + 1 for number in cells]
         self._values = np.ones(shape + [1] * (3 - self.dimension))
@@ -123,29 +122,32 @@ class UnexploredMap:
         grids = np.meshgrid(*self.axes(), indexing='ij')
         # One row for each axis, as kernels read them.
         self._nodes = np.array([grid.ravel() for grid in grids]).T
-        self._volumes = np.ones(())
+        cells = np.ones(())
         for number, step in zip(shape, self.step):
             lengths = np.full(number, step)
             lengths[[0, -1]] *= 0.5
-            self._volumes = np.multiply.outer(self._volumes, lengths)
+            cells = np.multiply.outer(cells, lengths)
+        self._cells = cells
+        self.take_area(area)
+
+    def take_area(self, area: Area) -> None:
+        """Take another area within the same bounds; e stays."""
+        self.area, self.volume = area, area.volume
         #: Prior times inside at the nodes, (nx, ny, 1), with mean 1 over the area; 1: uniform.
         self.density = np.ones((1, 1, 1))
-        if not self.area.uniform:
-            self._weigh()
-
-    def _weigh(self) -> None:
-        """Multiply the volumes of the nodes with the mean of the density around each."""
+        self._volumes = self._cells
+        if area.uniform:
+            return
         parts = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
         x, y = (
             np.clip(axis[:, None] + parts * step, low, high)
             for axis, step, (low, high) in zip(self.axes()[:2], self.step, self.bounds)
         )
         places = np.stack(np.meshgrid(x.ravel(), y.ravel(), indexing='ij'), axis=-1)
-        density = self.area.density(places.reshape(-1, 2)).reshape(*x.shape, *y.shape)
+        density = area.density(places.reshape(-1, 2)).reshape(*x.shape, *y.shape)
         self.density = density.mean(axis=(1, 3))[:, :, None]
-        self._volumes = (self._volumes.reshape(self._values.shape) * self.density).reshape(
-            self.values.shape
-        )
+        volumes = self._cells.reshape(self._values.shape) * self.density
+        self._volumes = volumes.reshape(self.values.shape)
 
     @property
     def values(self) -> FloatArray:

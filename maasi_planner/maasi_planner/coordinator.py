@@ -171,11 +171,10 @@ class Coordinator:
     measurements; finished: why no gain is left; None before.
     """
 
-    def __init__(self, settings: PlannerNodeSettings) -> None:
+    def __init__(self, settings: PlannerNodeSettings, area: Area | None = None) -> None:
         self.settings = settings
-        environment = settings.environment
-        self.dimension = environment.dimension
-        self.area = Area(environment)
+        self.dimension = settings.environment.dimension
+        self.area = area or Area(settings.environment)
         spacing = settings.exploration_spacing or default_spacing(self.area.bounds)
         self.exploration = UnexploredMap(self.area, spacing)
         self.clusters: list[Cluster] = []
@@ -203,6 +202,18 @@ class Coordinator:
     def names(self) -> list[str]:
         """Names of all robots, in order."""
         return list(self.plans)
+
+    def take_area(self, area: Area) -> None:
+        """Take another area within the same bounds, as with other keep-outs."""
+        self.area = area
+        self.exploration.take_area(area)
+        for name, plan in self.plans.items():
+            plan.motion.take_area(area, plan.radius)
+            plan.candidates = CandidateSet(
+                plan.candidates.settings, area, self.settings.robots[name].start[2]
+            )
+            if plan.exploration is not None:
+                plan.exploration.take_area(area)
 
     def begin_again(self) -> None:
         """Begin a new search with nothing explored; decision indices continue."""

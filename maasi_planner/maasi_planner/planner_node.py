@@ -13,11 +13,13 @@ from std_msgs.msg import Header
 from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.clocks import Silence, StampGate
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
+from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE
 from maasi_filter.ros.run_node import run
 from maasi_msgs.action import SearchTargets
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, PlanDecision
+from maasi_msgs.srv import SetKeepOuts
 from maasi_planner import warm_up
 from maasi_planner.conversions import checked_state, decision_to_ros, path_to_ros
 from maasi_planner.coordinator import Coordinator, PresentRobot
@@ -73,7 +75,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     Services
     --------
     `search/start`, `pause`, `resume`, `home`, `stop` (std_srvs/Trigger) for the team, and the same
-    below `<robot>/search/` for one robot
+    below `<robot>/search/` for one robot; `search/keep_outs` (maasi_msgs/SetKeepOuts): other
+    keep-outs, which it publishes on `keep_outs` (maasi_msgs/KeepOuts, latched)
     """
 
     def __init__(self, **options: Any) -> None:
@@ -142,6 +145,14 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._goals = self._orders.set_up(names, self._try_done)
         self._action = SearchAction(self, lambda: self._command('start', None), self._stand)
         offer_services(self, names, self._command)
+        self._keep_outs = KeepOutTopic(
+            self, lambda area: self.coordinator.take_area(area), keep=True
+        )
+        service = self.permanent(
+            'search/keep_outs',
+            lambda: self.create_service(SetKeepOuts, 'search/keep_outs', lambda _, answer: answer),
+        )
+        service.callback = self._set_keep_outs
         self.create_wall_timer(_CHECK_PERIOD, self._check_team)
 
     def start(self) -> None:
@@ -180,7 +191,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         for name in self.coordinator.names:
             self._goals.cancel(name)
         self._goals.waiting.clear()
-        self.coordinator = Coordinator(self.settings)
+        self.coordinator = Coordinator(self.settings, self.coordinator.area)
         self._orders.reset(self.coordinator)
         for part in (self._others, self._guard, self._views):
             part.reset()
@@ -221,6 +232,18 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 answer += f'; {name} follows goal {goal} of another client, which goes on'
         self.get_logger().info(answer)
         return True, answer
+
+    def _set_keep_outs(
+        self, request: SetKeepOuts.Request, response: SetKeepOuts.Response
+    ) -> SetKeepOuts.Response:
+        try:
+            if not self.active:
+                raise ValueError('the planner is not active')
+            self._keep_outs.change(request.zones)
+            response.success, response.message = True, f'{len(request.zones)} keep-outs hold now'
+        except ValueError as error:
+            response.message = str(error)
+        return response
 
     def status(self) -> dict[str, Any]:
         """Return the state of the search."""

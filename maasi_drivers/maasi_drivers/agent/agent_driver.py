@@ -19,7 +19,9 @@ from maasi_drivers.agent.robot_topics import PoseTopic
 from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
+from maasi_filter.area import Area
 from maasi_filter.models.pose import Pose
+from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.qos import LATCHED
 from maasi_filter.ros.run_node import run as run_node
@@ -116,6 +118,7 @@ class AgentDriver(RobotNode):
         self._responder = MeasurementResponder(self, self.sensor_input, self._watchdog)
         self._frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
         self.goals = GoalServer(self, self.link, self._frames)
+        KeepOutTopic(self, self._take_area, keep=False)
         if self._stop_latched:
             self.health.begin(STOP, STOPPED)
         self._opened.append(self.link)
@@ -216,6 +219,17 @@ class AgentDriver(RobotNode):
     def _take_localised(self, topic: str, stamp: int, pose: Pose) -> None:
         if self.active and self.is_new_pose(topic, stamp):
             self.take_pose(self._pose_speed.place(stamp, pose))
+
+    def _take_area(self, area: Area) -> None:
+        """Take other keep-outs; give a goal up whose way they cross: the robot stops."""
+        self.area, motion, latest = area, self._motion, self.history.latest
+        goal, ways = self.follower.current, None
+        if goal is not None and latest is not None:
+            state = RobotState(latest.pose, latest.velocity, latest.angular_velocity)
+            ways = motion.predict(state, goal.waypoint[None, :], 0.2).positions
+        motion.take_area(area, self.settings.radius)
+        if ways is not None and not all(map(motion.keep_out.is_free, ways[0])):
+            self.end_goal(GoalStatus.ABORTED, 'a keep-out lies on its way')
 
     def take_charge(self, charge: float) -> None:
         """Take the charge of the battery, 0 to 1; anything else is unknown."""

@@ -102,6 +102,11 @@ class GoalServer:
                     f'waypoint.pose.position.{"xyz"[axis]}: read {position[axis]}, '
                     f'allowed is {low - margin:g} to {high + margin:g} [m]'
                 )
+        if not driver.area.admits(position):
+            return (
+                f'waypoint.pose.position: read {list(position)}, allowed is what lies inside the '
+                'area and outside of its keep-outs'
+            )
         if not (np.isfinite(request.tolerance) and request.tolerance >= 0.0):
             return f'tolerance: read {request.tolerance}, allowed are finite numbers from 0 [m]'
         return self._link.goal_problem(position)

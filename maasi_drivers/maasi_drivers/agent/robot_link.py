@@ -15,7 +15,6 @@ import numpy as np
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 
@@ -119,7 +118,7 @@ class RobotLink(ABC):
     def make_motion(self) -> MotionModel:
         """Return the controller."""
         settings = self.driver.settings
-        return make_motion(settings.motion, Area(settings.environment), settings.radius)
+        return make_motion(settings.motion, self.driver.area, settings.radius)
 
     def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
         """Return the command (4,) and the goal reached; see `WaypointFollower.update`."""

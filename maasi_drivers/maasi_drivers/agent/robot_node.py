@@ -14,6 +14,7 @@ from std_srvs.srv import Trigger
 from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_drivers.settings.driver import DriverSettings
+from maasi_filter.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.clocks import JUMP, Silence, StampGate
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
@@ -146,7 +147,8 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         """Make the shared state."""
         settings = self.settings
         self.dimension = settings.environment.dimension
-        self.bounds = settings.environment.array()
+        self.area = Area(settings.environment)
+        self.bounds = self.area.bounds
         self.sensor = settings.sensor.build(self.robot, self.dimension)
         self.start_pose = Pose.from_yaw(settings.start, settings.yaw)
         self.history = PoseHistory()

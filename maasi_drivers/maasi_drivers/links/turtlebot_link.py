@@ -16,7 +16,6 @@ from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.scan_motion import ScanUnicycle, scan_points
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
 from maasi_drivers.links.topic_link import TopicLink
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.clocks import Silence
 from maasi_filter.ros.conversions import point_to_ros, stamp_from_ros, stamp_to_ros
@@ -53,7 +52,7 @@ class TurtlebotLink(TopicLink):
         settings = self.driver.settings
         if settings.scan is None:
             return super().make_motion()
-        area = Area(settings.environment)
+        area = self.driver.area
         self._motion = ScanUnicycle(settings.motion, area, settings.radius, settings.scan)
         return self._motion
 

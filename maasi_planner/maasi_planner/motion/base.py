@@ -140,7 +140,11 @@ class MotionModel(ABC):
         self, settings: MotionSettings, area: Area | None = None, radius: float = 0.0
     ) -> None:
         self.settings = settings
-        self.keep_out = KeepOut(area, radius, settings.clearance)
+        self.take_area(area, radius)
+
+    def take_area(self, area: Area | None, radius: float) -> None:
+        """Take where it may go, also another area while it moves."""
+        self.keep_out = KeepOut(area, radius, self.settings.clearance)
         # Way table of a waypoint, remembered until the waypoint changes.
         self.table = lru_cache(maxsize=1)(self.keep_out.to_goal)
 

@@ -240,7 +240,6 @@ class CompiledMotion(MotionModel):
     ) -> None:
         super().__init__(settings, area, radius)
         self.parameters = np.zeros(0)
-        self.kernel = lru_cache(maxsize=4)(self._make_kernel)
         speed, barrier, acceleration = self._limits()
         self.steering = Steering(
             self.rate,
@@ -252,6 +251,11 @@ class CompiledMotion(MotionModel):
             settings.heading == 'travel',
             settings.avoidance == 'dynamic_window',
         )
+
+    def take_area(self, area: Area | None, radius: float) -> None:
+        """See `MotionModel.take_area`."""
+        super().take_area(area, radius)
+        self.kernel = lru_cache(maxsize=4)(self._make_kernel)
 
     @abstractmethod
     def _limits(self) -> tuple[float, float, float]:

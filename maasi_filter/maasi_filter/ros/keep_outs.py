@@ -1,0 +1,75 @@
+"""Keep-outs that change while a search runs: the topic `keep_outs` of the team."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+from std_msgs.msg import Header
+
+from maasi_filter.area import Area
+from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
+from maasi_msgs.msg import KeepOuts
+
+
+class KeepOutTopic:
+    """The area with the keep-outs that hold now.
+
+    Filter and planner publish what they received again, so that it outlives either of them.
+
+    Parameters
+    ----------
+    node : LockstepLifecycleNode
+        With `environment` in its settings.
+    on_change : callable
+        Called with the new area.
+    keep : bool
+        Whether to publish again what was received.
+    """
+
+    def __init__(
+        self, node: LockstepLifecycleNode[Any], on_change: Callable[[Area], None], keep: bool
+    ) -> None:
+        self._node, self._on_change = node, on_change
+        self._latest = KeepOuts()
+        topic = node.team_topic('keep_outs')
+        self._publisher = node.create_publisher(KeepOuts, topic, LATCHED) if keep else None
+        node.create_subscription(KeepOuts, topic, self._take, LATCHED_ALL)
+
+    def change(self, zones: Sequence[str]) -> None:
+        """Publish other keep-outs; ValueError says which is wrong."""
+        frame, version = self._node.settings.frame, self._latest.version + 1
+        header = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=frame)
+        self._adopt(KeepOuts(header=header, version=version, zones=list(zones)))
+
+    def _take(self, message: KeepOuts) -> None:
+        if message.version <= self._latest.version:
+            return
+        try:
+            self._adopt(message)
+        except ValueError as error:
+            self._node.drop('bad keep-outs', f'keep_outs.zones: {error}')
+
+    def _adopt(self, message: KeepOuts) -> None:
+        area = with_keep_outs(self._node.settings.environment, message.zones)
+        message.zones = [str(zone) for zone in area.settings.keep_outs]
+        self._latest = message
+        self._node.get_logger().info(f'{len(message.zones)} keep-outs hold now')
+        if self._publisher is not None:
+            self._publisher.publish(message)
+        self._on_change(area)
+
+
+def with_keep_outs(environment: EnvironmentSettings, zones: Sequence[str]) -> Area:
+    """Return the area of an environment with other keep-outs, given as texts."""
+    values = environment.model_dump(exclude={'keep_outs'}, exclude_none=True)
+    try:
+        return Area(EnvironmentSettings.model_validate({**values, 'keep_outs': list(zones)}))
+    except ValueError as error:
+        # One line, without the type of error and the address that pydantic adds.
+        if not isinstance(error, ValidationError):
+            raise
+        raise ValueError('; '.join(item['msg'] for item in error.errors())) from None
