@@ -16,6 +16,7 @@ setup(
         'numba>=0.59',
         'numpy>=1.26,<3',
         'pydantic>=2.7',
+        'pymap3d>=2.9',
         'scipy>=1.11.4',
         'typing_extensions>=4.10',
     ],

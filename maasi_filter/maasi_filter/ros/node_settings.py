@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import AfterValidator, Field
 from typing_extensions import Self
 
+from maasi_filter.geodesy import OriginSettings
 from maasi_filter.plugins import add_folders
 from maasi_filter.settings import EnvironmentSettings, FilterSettings, SensorSettings, Settings
 
@@ -59,6 +60,10 @@ class FilterNodeSettings(NodeSettings):
     live: ClassVar[frozenset[str]] = frozenset({'batch_timeout', 'particles_rate', 'markers_rate'})
 
     environment: EnvironmentSettings = Field(description='Where the targets are')
+    origin: OriginSettings | None = Field(
+        default=None,
+        description='Of the map on the earth, for found_targets/fixes; none: unknown',
+    )
     filter: FilterSettings = Field(default_factory=FilterSettings, description='The filter')
     robots: dict[str, SensorOfRobot] = Field(min_length=1, description='Robots, by name')
     share_with: list[str] = Field(

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from maasi_filter.geodesy import OriginSettings
 from maasi_filter.plugins import add_folders
-from maasi_filter.settings import EnvironmentSettings, Finite, Settings
+from maasi_filter.settings import EnvironmentSettings, Settings
 from maasi_sim.arguments import LARGEST
 from maasi_sim.scenario.layering import to_yaml
 
@@ -46,19 +47,11 @@ class LimitSettings(Settings):
     )
 
 
-class OriginSettings(Settings):
-    """Where x = y = z = 0 of the map lies, on WGS 84; x points east, y north, z up."""
-
-    latitude: float = Field(ge=-90.0, le=90.0, description='North of the equator [degrees]')
-    longitude: float = Field(ge=-180.0, le=180.0, description='East of Greenwich [degrees]')
-    altitude: Finite = Field(default=0.0, description='Over the ellipsoid [m]')
-
-
 class ScenarioEnvironment(EnvironmentSettings):
     """Where the search takes place, with its position on the earth."""
 
     origin: OriginSettings | None = Field(
-        default=None, description='Of the map on the earth, for found_targets.geojson'
+        default=None, description='Of the map on the earth, for results on a map'
     )
 
     def of_nodes(self) -> EnvironmentSettings:
