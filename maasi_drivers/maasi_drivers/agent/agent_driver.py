@@ -225,6 +225,10 @@ class AgentDriver(RobotNode):
         """Take an image or sweep; see `RobotNode.take_frame`."""
         self._responder.take_frame(topic, stamp, data, repeated)
 
+    def frame_on_robot(self, frame: str, stamp: int) -> Pose:
+        """See `RobotNode.frame_on_robot`."""
+        return self._frames.on_robot(frame, stamp)
+
     def end_goal(self, status: GoalStatus, reason: str) -> None:
         """End the present goal, if there is one."""
         goal = self.follower.end(status, reason)

@@ -231,6 +231,10 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         """
 
     @abstractmethod
+    def frame_on_robot(self, frame: str, stamp: int) -> Pose:
+        """Return where a frame was on the robot by tf at a stamp [ns]; `ValueError`: unknown."""
+
+    @abstractmethod
     def end_goal(self, status: GoalStatus, reason: str) -> None:
         """End the present goal, if there is one."""
 
