@@ -162,9 +162,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._clusters_publisher = self.create_publisher(ClusterArray, 'clusters', 10)
         self._found_publisher = self.create_publisher(FoundTargetArray, 'found_targets', LATCHED)
         if settings.origin is not None:
-            self._fix_publisher = self.create_publisher(
-                FoundFixArray, 'found_targets/fixes', LATCHED
-            )
+            self._fixes = self.create_publisher(FoundFixArray, 'found_targets/fixes', LATCHED)
         self._particles_publisher = self.create_publisher(PointCloud2, 'particles', 2)
         self._markers_publisher = self.create_publisher(MarkerArray, 'markers', 10)
         kept = self.create_subscription(
@@ -362,9 +360,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     def _publish_found(self, header: Header, batch: int) -> None:
         self._found_published = True
         if self.settings.origin is not None:
-            fixes = found_fixes_to_ros(self.filter.found_targets, self.settings.origin, header)
-            fixes.batch_id = batch
-            self._fix_publisher.publish(fixes)
+            found, origin = self.filter.found_targets, self.settings.origin
+            self._fixes.publish(found_fixes_to_ros(found, origin, header, batch))
         self._found_publisher.publish(
             FoundTargetArray(
                 header=header,

@@ -224,7 +224,7 @@ def test_a_camera_that_turns_on_the_robot_is_where_tf_says(searching):
     team.until(lambda: driver.dropped['image'] == 1)
     # Once tf knows the frame, the next image answers.
     publisher.publish(message)
-    team.until(lambda: 'gimbal' in driver._frames._buffer._edges)
+    team.until(lambda: 'gimbal' in driver.frames._buffer._edges)
     team.move()
     mount = {'position': place, 'rpy': [0.0, 0.5 * math.pi, 0.5 * math.pi]}
     settings = DriverSettings.model_validate(

@@ -114,8 +114,8 @@ class AgentDriver(RobotNode):
         self._state = StatePublisher(self)
         self._watchdog = Watchdog(self, self.link, self.sensor_input, self._state)
         self._responder = MeasurementResponder(self, self.sensor_input, self._watchdog)
-        self._frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
-        self.goals = GoalServer(self, self.link, self._frames)
+        self.frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
+        self.goals = GoalServer(self, self.link)
         if self._stop_latched:
             self.health.begin(STOP, STOPPED)
         self._opened.append(self.link)
@@ -165,7 +165,7 @@ class AgentDriver(RobotNode):
             self.link.hold()
             self.health.begin(ODOMETRY, f'no {self.pose_name} since the time jumped back')
         self.history.clear()
-        self._frames.clear()
+        self.frames.clear()
         self._responder.reset()
         self._watchdog.reset()
         self.follower = WaypointFollower(self._motion)
@@ -225,10 +225,6 @@ class AgentDriver(RobotNode):
         """Take an image or sweep; see `RobotNode.take_frame`."""
         self._responder.take_frame(topic, stamp, data, repeated)
 
-    def frame_on_robot(self, frame: str, stamp: int) -> Pose:
-        """See `RobotNode.frame_on_robot`."""
-        return self._frames.on_robot(frame, stamp)
-
     def end_goal(self, status: GoalStatus, reason: str) -> None:
         """End the present goal, if there is one."""
         goal = self.follower.end(status, reason)
@@ -256,7 +252,7 @@ class AgentDriver(RobotNode):
         self._state.publish(placed, step)
         odometry = self.map_odometry
         origin = self.start_pose if odometry is None else odometry.map_from_odom
-        self._frames.publish(placed, origin)
+        self.frames.publish(placed, origin)
         self.link.send(placed, command.tolist())
         self.goals.publish_feedback(placed)
 

@@ -249,10 +249,8 @@ class RobotFrames:
         try:
             return self._buffer.pose(self._base, frame, stamp)
         except TransformError as error:
-            raise ValueError(
-                f'header.frame_id: read {frame[:40]!r}, allowed is a frame that tf connects with '
-                f'{self._base!r} at that stamp: {error}'
-            ) from error
+            allowed = f'allowed is a frame that tf connects with {self._base!r}: {error}'
+            raise ValueError(f'header.frame_id: read {frame[:40]!r}, {allowed}') from error
 
     def to_map(self, waypoint: PoseStamped, now: int) -> str | None:
         """Bring a waypoint into the map; return what is wrong where that is not possible.

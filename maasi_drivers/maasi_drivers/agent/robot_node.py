@@ -12,6 +12,7 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from std_srvs.srv import Trigger
 
 from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
+from maasi_drivers.agent.robot_frames import RobotFrames
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.models.pose import Pose
@@ -123,6 +124,8 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         Its faults.
     follower : WaypointFollower
         Its present goal.
+    frames : RobotFrames
+        Where frames are, by tf.
     silence : Silence
         Time since the last pose.
     arrivals : ArrivalClock
@@ -136,6 +139,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
     """
 
     follower: WaypointFollower
+    frames: RobotFrames
 
     def __init__(self, **options: Any) -> None:
         super().__init__('driver', DriverSettings, in_robot=True, **options)
@@ -229,10 +233,6 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         repeated : bool
             Whether it equals the one before to the bit, as from a sensor that hangs.
         """
-
-    @abstractmethod
-    def frame_on_robot(self, frame: str, stamp: int) -> Pose:
-        """Return where a frame was on the robot by tf at a stamp [ns]; `ValueError`: unknown."""
 
     @abstractmethod
     def end_goal(self, status: GoalStatus, reason: str) -> None:

@@ -133,9 +133,6 @@ class BoxSettings(Settings):
     classes: list[str] = Field(
         default=[], description='Classes (class_id) of which targets are; none: all'
     )
-    minimum_score: float = Field(
-        default=0.0, ge=0.0, le=1.0, description='Least score of a box that is used [1]'
-    )
     point: Literal['foot', 'centre'] = Field(
         default='foot',
         description="What of a box is on the floor: 'foot', the middle of its lower side, of "
@@ -211,8 +208,8 @@ class CameraSettings(Settings):
     )
     detections: BoxSettings | None = Field(
         default=None,
-        description='How boxes on the topic camera/detections (vision_msgs/Detection2DArray) are '
-        'used, in place of images; none: the driver finds markers in images itself',
+        description='What is taken of camera/detections (vision_msgs/Detection2DArray), in place '
+        'of images; none: the driver finds markers in images',
     )
 
     @model_validator(mode='after')

@@ -68,15 +68,6 @@ class CameraInput(SensorInput[Picture]):
                 'parameter camera: got nothing, allowed are the settings of a camera '
                 '(camera.width, ...)'
             )
-        if settings.camera.detections is not None:
-            try:
-                from vision_msgs.msg import Detection2DArray
-            except ImportError as error:
-                raise SettingsError(
-                    'parameter camera.detections: the package vision_msgs is not installed '
-                    '(sudo apt install ros-$ROS_DISTRO-vision-msgs); allowed without it is nothing'
-                ) from error
-            self._boxes_type = Detection2DArray
         if settings.image_source != 'topic':
             try:
                 self._source = self._open_source()
@@ -119,9 +110,14 @@ class CameraInput(SensorInput[Picture]):
         quality = sensor_reader(settings.lockstep)
         driver.create_subscription(CameraInfo, 'camera/camera_info', self._on_calibration, quality)
         if self.camera.detections is not None:
-            driver.create_subscription(
-                self._boxes_type, 'camera/detections', self._on_boxes, quality
-            )
+            try:
+                from vision_msgs.msg import Detection2DArray as Boxes
+            except ImportError as error:
+                raise SettingsError(
+                    'parameter camera.detections: the package vision_msgs is not installed '
+                    '(sudo apt install ros-$ROS_DISTRO-vision-msgs); allowed without it is nothing'
+                ) from error
+            driver.create_subscription(Boxes, 'camera/detections', self._on_boxes, quality)
             return
         if settings.image_source != 'topic':
             driver.create_wall_timer(0.01, self._poll_source)
@@ -265,7 +261,7 @@ class CameraInput(SensorInput[Picture]):
         camera = Camera.from_settings(self.camera)
         if frame in ('', f'{self.driver.robot}/camera_optical'):
             return camera
-        pose = self.driver.frame_on_robot(frame, stamp)
+        pose = self.driver.frames.on_robot(frame, stamp)
         return replace(camera, position=pose.position, rotation=pose.rotation())
 
     def _is_repeated(self, data: Any) -> bool:

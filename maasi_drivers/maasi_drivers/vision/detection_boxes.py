@@ -16,22 +16,22 @@ from maasi_filter.ros.conversions import label_problem
 def boxes_to_blobs(message: Any, camera: CameraSettings) -> tuple[Blobs, list[str]]:
     """Return the boxes of a `vision_msgs/Detection2DArray` that are used, and errors of others.
 
-    A box is at its foot or centre, as `camera.detections` says. Its label is its hypothesis with
-    the largest score. The id of a tracker is no identity: it is another one when a target is seen
-    again.
+    A box is labelled by its hypothesis with the largest score. The id of a tracker is no identity:
+    it is another one when a target is seen again.
     """
     settings, size = camera.detections, np.array([camera.width, camera.height], dtype=float)
     assert settings is not None
     corners, labels, problems = [], [], []
     for item in message.detections:
+        hypotheses = [result.hypothesis for result in item.results] or [UNLABELLED]
+        best = max(hypotheses, key=lambda hypothesis: float(hypothesis.score))
         try:
-            label = _label(item)
-            if label.score < settings.minimum_score:
-                continue
-            if settings.classes and label.class_id not in settings.classes:
-                continue
-            corners.append(_corners(item.bbox, size))
-            labels.append(label)
+            label = Label(best.class_id, best.score)
+            if (problem := label_problem(label)) is not None:
+                raise ValueError(problem)
+            if not settings.classes or label.class_id in settings.classes:
+                corners.append(_corners(item.bbox, size))
+                labels.append(label)
         except ValueError as error:
             problems.append(str(error))
     low, high = np.reshape(np.array(corners, dtype=float), (-1, 2, 2)).transpose(1, 0, 2)
@@ -54,24 +54,13 @@ def boxes_to_blobs(message: Any, camera: CameraSettings) -> tuple[Blobs, list[st
     return blobs, problems
 
 
-def _label(item: Any) -> Label:
-    results = [result.hypothesis for result in item.results]
-    if not results:
-        return UNLABELLED
-    best = max(results, key=lambda result: float(result.score))
-    label = Label(best.class_id, best.score)
-    if (problem := label_problem(label)) is not None:
-        raise ValueError(problem)
-    return label
-
-
 def _corners(box: Any, size: FloatArray) -> FloatArray:
     """Return the least and largest x and y of a box, which may be turned, in the image (2, 2)."""
     place, turn = box.center.position, box.center.theta
     numbers = np.array([place.x, place.y, box.size_x, box.size_y, turn])
     centre, extent = numbers[:2], numbers[2:4]
-    good = np.isfinite(numbers).all() and (extent > 0.0).all()
-    if not (good and (centre >= 0.0).all() and (centre <= size).all()):
+    inside = (centre >= 0.0).all() and (centre <= size).all()
+    if not (inside and np.isfinite(numbers).all() and (extent > 0.0).all()):
         raise ValueError(
             f'bbox: read centre, size and theta {numbers.tolist()}, allowed are a centre inside '
             f'{size[0]:g} x {size[1]:g} px, sizes above 0 and a finite theta'

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -50,14 +50,14 @@ class Blobs:
 
     def select(self, mask: BoolArray) -> Blobs:
         """Return the blobs where ``mask`` (n,) is true."""
-        return Blobs(
-            self.centroids[mask],
-            self.areas[mask],
-            self.extents[mask],
-            self.border_cut[mask],
-            self.covariances[mask],
-            tuple(label for label, kept in zip(self.labels, mask.tolist()) if kept),
-            self.frame,
+        return replace(
+            self,
+            centroids=self.centroids[mask],
+            areas=self.areas[mask],
+            extents=self.extents[mask],
+            border_cut=self.border_cut[mask],
+            covariances=self.covariances[mask],
+            labels=tuple(label for label, kept in zip(self.labels, mask.tolist()) if kept),
         )
 
 

@@ -157,7 +157,7 @@ def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundT
 
 
 def found_fixes_to_ros(
-    targets: Sequence[FoundTarget], origin: OriginSettings, header: Header
+    targets: Sequence[FoundTarget], origin: OriginSettings, header: Header, batch: int
 ) -> FoundFixArray:
     """Return found targets on the earth; in 2D at the altitude of the origin, with variance 0."""
     places = [geodetic(target.position[None], origin)[0].tolist() for target in targets]
@@ -173,7 +173,8 @@ def found_fixes_to_ros(
         )
         for target, (latitude, longitude, altitude) in zip(targets, places)
     ]
-    return FoundFixArray(header=header, ids=[target.id for target in targets], fixes=fixes)
+    ids = [target.id for target in targets]
+    return FoundFixArray(header=header, batch_id=batch, ids=ids, fixes=fixes)
 
 
 def detections_to_ros(

@@ -60,10 +60,7 @@ class FilterNodeSettings(NodeSettings):
     live: ClassVar[frozenset[str]] = frozenset({'batch_timeout', 'particles_rate', 'markers_rate'})
 
     environment: EnvironmentSettings = Field(description='Where the targets are')
-    origin: OriginSettings | None = Field(
-        default=None,
-        description='Of the map on the earth, for found_targets/fixes; none: unknown',
-    )
+    origin: OriginSettings | None = Field(default=None, description='Of the map on the earth')
     filter: FilterSettings = Field(default_factory=FilterSettings, description='The filter')
     robots: dict[str, SensorOfRobot] = Field(min_length=1, description='Robots, by name')
     share_with: list[str] = Field(

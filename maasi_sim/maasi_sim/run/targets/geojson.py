@@ -18,13 +18,11 @@ from maasi_sim.run.targets.tally import TargetRecord
 
 
 def found_geojson(rows: Sequence[Row]) -> str:
-    """Return rows with geodetic coordinates: a point each."""
+    """Return rows with geodetic coordinates: a point each, to a millimetre."""
     features = []
     for row in rows:
-        properties = dict(row)
-        place = [properties.pop(name) for name in ('longitude', 'latitude', 'altitude')]
-        # To a millimetre.
-        place = [round(place[0], 8), round(place[1], 8), round(place[2], 3)]
+        properties, digits = dict(row), {'longitude': 8, 'latitude': 8, 'altitude': 3}
+        place = [round(properties.pop(name), number) for name, number in digits.items()]
         features.append(_feature({'type': 'Point', 'coordinates': place}, properties))
     return _collection(features)
 
@@ -42,16 +40,15 @@ def _area(record: TargetRecord) -> list[Row]:
 def _explored(record: TargetRecord, origin: OriginSettings) -> Row:
     """Return where less than half is unseen, in 3D of the whole height."""
     explored = explored_after(record)
-    unseen = explored.values if explored.dimension == 2 else explored.values.mean(axis=2)
-    x, y = (
-        np.concatenate([nodes[:1], 0.5 * (nodes[1:] + nodes[:-1]), nodes[-1:]])
-        for nodes in explored.axes()[:2]
-    )
-    i, j = np.nonzero(unseen < 0.5)
-    seen = shapely.union_all(shapely.box(x[i], y[j], x[i + 1], y[j + 1]))
+    unseen = np.atleast_3d(explored.values).mean(axis=2)
+    nodes = explored.nodes().reshape(*unseen.shape, -1, explored.dimension)[:, :, 0, :2]
+    half, (low, high) = 0.5 * explored.step[:2], explored.bounds[:2].T
+    seen = np.clip([nodes[unseen < 0.5] - half, nodes[unseen < 0.5] + half], low, high)
+    # Cells that touch, to a micrometre, become one.
+    cells = shapely.union_all(shapely.box(*seen[0].T, *seen[1].T), grid_size=1e-6)
     # Outer rings run counterclockwise.
-    seen = shapely.reverse(shapely.normalize(seen))
-    placed = shapely.transform(seen, lambda points: _coordinates(points, origin)[:, :2])
+    cells = shapely.reverse(shapely.normalize(cells))
+    placed = shapely.transform(cells, lambda points: _coordinates(points, origin)[:, :2])
     share = round(explored.explored_fraction(), 6)
     return _feature(mapping(placed), {'kind': 'explored', 'share': share})
 
@@ -64,10 +61,9 @@ def _ways(record: TargetRecord, origin: OriginSettings) -> Iterator[Row]:
             continue
         lengths = np.linalg.norm(np.diff(way[:, 1:], axis=0), axis=1)
         passed = np.append(0.0, lengths.cumsum())
-        first = np.unique(passed // spacing, return_index=True)[1]
-        way, length = way[np.union1d(first, len(way) - 1)], float(passed[-1])
-        places = _coordinates(way[:, 1:], origin).tolist()
-        properties = {'kind': 'way', 'robot': robot, 'length': length, 'times': way[:, 0].tolist()}
+        way = way[np.union1d(np.unique(passed // spacing, return_index=True)[1], len(way) - 1)]
+        places, times = _coordinates(way[:, 1:], origin).tolist(), way[:, 0].tolist()
+        properties = {'kind': 'way', 'robot': robot, 'length': passed[-1], 'times': times}
         yield _feature({'type': 'LineString', 'coordinates': places}, properties)
 
 
