@@ -26,10 +26,10 @@ setup(
         'numpy>=1.26,<3',
         'opencv-python-headless>=4.7',
         'pydantic>=2.7',
-        'pymap3d>=2.9',
         'PyYAML>=6.0.1',
         'rosbags>=0.11.5',
         'scipy>=1.11.4',
+        'shapely>=2.0',
     ],
     extras_require={
         'experiments': ['distributed>=2024.1', 'matplotlib>=3.8'],

@@ -78,9 +78,13 @@ maasi_install() {
   echo "$key" > "$maasi_venv/.maasi_${what}_key"
 }
 
-# The wheels have no tf2_msgs; one that is installed is used as it is.
+# The wheels have neither tf2_msgs nor vision_msgs; what is installed is used as it is.
 maasi_own_interfaces() {
-  "$maasi_venv/bin/python" -c 'import tf2_msgs.msg' 2> /dev/null || echo scripts/interfaces/tf2_msgs
+  local package
+  for package in tf2_msgs vision_msgs; do
+    "$maasi_venv/bin/python" -c "import $package.msg" 2> /dev/null \
+      || echo "scripts/interfaces/$package"
+  done
 }
 
 maasi_build() {

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +17,11 @@ from pydantic import Field, field_validator, model_validator
 from shapely.geometry import MultiPolygon, Polygon, shape
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geodesy import OriginSettings, to_map
 from maasi_filter.settings import Finite, Positive, Settings, Vector2
 
 # Of files that an environment names.
 FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff', '.yaml')
-
-
-class OriginSettings(Settings):
-    """Where x = y = z = 0 of the map lies, on WGS 84; x points east, y north, z up."""
-
-    latitude: float = Field(ge=-90.0, le=90.0, description='North of the equator [degrees]')
-    longitude: float = Field(ge=-180.0, le=180.0, description='East of Greenwich [degrees]')
-    altitude: Finite = Field(default=0.0, description='Over the ellipsoid [m]')
-
-    def reference(self) -> tuple[float, float, float]:
-        """Return latitude, longitude [degrees] and altitude [m]."""
-        return self.latitude, self.longitude, self.altitude
 
 
 class Zone(Settings):
@@ -176,10 +166,10 @@ class EnvironmentSettings(Settings):
         return np.array(self.bounds, dtype=float)
 
 
-def read_shape(value: Any, to_map: Callable[[FloatArray], FloatArray] | None = None) -> Any:
+def read_shape(value: Any, project: Callable[[FloatArray], FloatArray] | None = None) -> Any:
     """Return the polygons of a value: rings [m], well-known text, GeoJSON, or a file of it.
 
-    to_map: from longitudes and latitudes (n, 2) [degrees] to the map [m]; ValueError where
+    project: from longitudes and latitudes (n, 2) [degrees] to the map [m]; ValueError where
     GeoJSON has to do without it, or what is read is no valid polygon.
     """
     if isinstance(value, str) and value.lstrip().upper().startswith(('POLYGON', 'MULTIPOLYGON')):
@@ -189,9 +179,9 @@ def read_shape(value: Any, to_map: Callable[[FloatArray], FloatArray] | None = N
         found = Polygon(rings[0], rings[1:])
     else:
         parts = [shape(feature['geometry']) for feature in features_of(value)]
-        if to_map is None:
+        if project is None:
             raise ValueError('GeoJSON needs environment.origin')
-        found = shapely.transform(shapely.union_all(parts), to_map)
+        found = shapely.transform(shapely.union_all(parts), project)
     if not isinstance(found, (Polygon, MultiPolygon)) or found.is_empty:
         raise ValueError(f'got {str(value)[:60]}, allowed are polygons')
     if not found.is_valid:
@@ -214,8 +204,6 @@ def features_of(value: Any) -> list[dict[str, Any]]:
 
 def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of an environment with all shapes as well-known text in the map."""
-    import pymap3d
-
     values = dict(given)
     roles: dict[str, list[dict[str, Any]]] = {'area': [], 'keep_out': [], 'prior': []}
     if _is_geojson(values.get('area')):
@@ -235,14 +223,9 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     if origin:
         origin = values['origin'] = OriginSettings.model_validate(origin)
 
-    def to_map(degrees: FloatArray) -> FloatArray:
-        assert origin is not None
-        places = degrees[:, 1], degrees[:, 0], np.full(len(degrees), origin.altitude)
-        return np.stack(pymap3d.geodetic2enu(*places, *origin.reference())[:2], axis=1)
-
     def text(value: Any, key: str) -> str:
         try:
-            found = read_shape(value, to_map if origin else None)
+            found = read_shape(value, partial(to_map, origin=origin) if origin else None)
         except (ValueError, TypeError, KeyError, OSError, shapely.errors.ShapelyError) as error:
             raise ValueError(f'{key}: {error}') from None
         return str(shapely.to_wkt(found, rounding_precision=4))

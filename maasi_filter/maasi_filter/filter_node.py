@@ -24,6 +24,7 @@ from maasi_filter.ros.conversions import (
     MarkerBoard,
     cluster_to_ros,
     filter_markers,
+    found_fixes_to_ros,
     found_target_from_ros,
     found_target_to_ros,
     particles_to_ros,
@@ -40,6 +41,7 @@ from maasi_msgs.msg import (
     ClusterArray,
     DetectionArray,
     FilterUpdate,
+    FoundFixArray,
     FoundTargetArray,
     MeasurementBatch,
 )
@@ -72,6 +74,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     ---------
     `filter_update` (maasi_msgs/FilterUpdate, latched): for every batch, in the order of their ids;
     `clusters` (maasi_msgs/ClusterArray), `found_targets` (maasi_msgs/FoundTargetArray, latched),
+    with an origin of the map `found_targets/fixes` (maasi_msgs/FoundFixArray, latched),
     `particles` (sensor_msgs/PointCloud2), `markers` (visualization_msgs/MarkerArray)
     """
 
@@ -160,6 +163,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._update_publisher = self.create_publisher(FilterUpdate, 'filter_update', UPDATES)
         self._clusters_publisher = self.create_publisher(ClusterArray, 'clusters', 10)
         self._found_publisher = self.create_publisher(FoundTargetArray, 'found_targets', LATCHED)
+        if settings.environment.origin is not None:
+            self._fixes = self.create_publisher(FoundFixArray, 'found_targets/fixes', LATCHED)
         self._particles_publisher = self.create_publisher(PointCloud2, 'particles', 2)
         self._markers_publisher = self.create_publisher(MarkerArray, 'markers', 10)
         kept = self.create_subscription(
@@ -361,6 +366,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def _publish_found(self, header: Header, batch: int) -> None:
         self._found_published = True
+        if self.settings.environment.origin is not None:
+            found, origin = self.filter.found_targets, self.settings.environment.origin
+            self._fixes.publish(found_fixes_to_ros(found, origin, header, batch))
         self._found_publisher.publish(
             FoundTargetArray(
                 header=header,

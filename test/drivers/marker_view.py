@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from maasi_drivers.settings.camera import CameraSettings
@@ -17,6 +18,7 @@ from maasi_sim.simulation.camera import CameraRenderer
 from maasi_sim.simulation.floor import RenderSettings, scene_of
 from maasi_sim.simulation.world import TargetSettings, World
 
+DISTORTION = [-0.21, 0.06, 0.002, -0.003, 0.01]
 BOX, GATE = 0.2, 0.03
 MODEL = RangeBearing()
 
@@ -117,3 +119,11 @@ def score(settings: CameraSettings, floor: RenderSettings, seed: int, images: in
                 nees.append(float(error @ np.linalg.solve(seen.covariances[best], error)))
     rmse = float(np.sqrt(np.mean(squares)))
     return Score(len(squares) / expected, false / images, rmse, float(np.mean(nees)))
+
+
+def turned(pose: Pose, change: np.ndarray) -> Pose:
+    """Return a pose moved by three coordinates, and turned by three small angles of the map."""
+    matrix = cv2.Rodrigues(np.array(change[3:]))[0] @ pose.rotation()
+    w = 0.5 * np.sqrt(1.0 + np.trace(matrix))
+    skew = (matrix - matrix.T)[[2, 0, 1], [1, 2, 0]]
+    return Pose(pose.position + change[:3], np.array([w, *skew / (4 * w)]))

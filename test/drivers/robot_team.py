@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import Twist, TwistStamped
+from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
 from marker_view import one_image
 from nav_msgs.msg import Odometry
 from player import parameters
@@ -280,4 +280,14 @@ def image_message(image, stamp=0):
 
 def stamped(message, stamp):
     message.header.stamp = stamp_to_ros(stamp)
+    return message
+
+
+def transform(parent, child, pose, stamp=0):
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = parent
+    message.header.stamp = stamp_to_ros(stamp)
+    place, turn = message.transform.translation, message.transform.rotation
+    place.x, place.y, place.z = pose.position.tolist()
+    turn.w, turn.x, turn.y, turn.z = pose.orientation.tolist()
     return message

@@ -1,10 +1,10 @@
 """From pixels to the floor and back."""
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from marker_view import DISTORTION, turned
 from numpy.testing import assert_allclose
 
 from maasi_drivers.agent.sensor_reading import measured
@@ -15,7 +15,6 @@ from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
 from maasi_filter.models.pose import Pose
 
-DISTORTION = [-0.21, 0.06, 0.002, -0.003, 0.01]
 DOWN = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
 # A camera on a mast behind a ground robot's middle, tilted to look at its front.
 TILTED = {
@@ -87,14 +86,6 @@ def test_derivatives_of_back_projection(seed):
     slopes = [(moved(step * axis) - moved(-step * axis)) / (2 * step) for axis in np.eye(8)]
     found = np.concatenate([by_pixel[0], by_pose[0]], axis=1)
     assert_allclose(found, np.transpose(slopes), rtol=1e-5, atol=1e-7)
-
-
-def turned(pose, change):
-    """Return a pose moved by three coordinates, and turned by three small angles of the map."""
-    matrix = cv2.Rodrigues(np.array(change[3:]))[0] @ pose.rotation()
-    w = 0.5 * np.sqrt(1.0 + np.trace(matrix))
-    skew = (matrix - matrix.T)[[2, 0, 1], [1, 2, 0]]
-    return Pose(pose.position + change[:3], np.array([w, *skew / (4 * w)]))
 
 
 def test_covariance_covers_the_noise_of_pixels_and_pose():

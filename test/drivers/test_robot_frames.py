@@ -8,10 +8,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped
 from numpy.testing import assert_allclose, assert_array_equal
 from rclpy.parameter import Parameter
-from robot_team import NANOSECONDS, STEP, stamped
+from robot_team import NANOSECONDS, STEP, stamped, transform
 from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
@@ -19,22 +19,12 @@ from tf2_msgs.msg import TFMessage
 from maasi_drivers.agent.transform_buffer import TransformBuffer
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose, compose, inverse
-from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE
 from maasi_msgs.msg import AgentState
 
 BASE = 'rover/base_link'
 DOCK = Pose.from_yaw([1.0, 1.2, 0.0], 2.0)
-
-
-def transform(parent, child, pose, stamp=0):
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id = parent
-    message.header.stamp = stamp_to_ros(stamp)
-    place, turn = message.transform.translation, message.transform.rotation
-    place.x, place.y, place.z = pose.position.tolist()
-    turn.w, turn.x, turn.y, turn.z = pose.orientation.tolist()
-    return message
 
 
 class Listener:

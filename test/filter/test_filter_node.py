@@ -12,12 +12,14 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from own_context import own_context
 from player import Player
+from pymap3d import geodetic2enu
 from rcl_interfaces.msg import Log
 from searches import same
 from waiting import PATIENCE
 
 from maasi_filter import FilterSettings, make_filter
 from maasi_filter.filter_node import FilterNode
+from maasi_filter.geodesy import OriginSettings
 from maasi_filter.ros.conversions import MOST_DETECTIONS
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
@@ -26,6 +28,7 @@ from maasi_msgs.msg import (
     Detection,
     DetectionArray,
     FilterUpdate,
+    FoundFixArray,
     FoundTargetArray,
     MeasurementBatch,
 )
@@ -137,6 +140,28 @@ def test_a_target_seen_again_and_again_is_found_with_class_and_identity(team):
     team.detections['b'].publish(late)
     team.until(lambda: len(team.updates) == 10)
     assert [item.robot for item in team.updates[9].members] == ['b']
+
+
+def test_found_targets_are_on_the_earth_where_the_map_has_an_origin(team):
+    team.step(1, {'a': SEEN})
+    assert not team.node.count_publishers('/found_targets/fixes')
+    origin = OriginSettings(latitude=-33.0, longitude=18.5, altitude=20.0)
+    environment = SETTINGS.environment.model_copy(update={'origin': origin})
+    with running(environment=environment) as team:
+        team.see(*range(1, 9))
+        team.until(lambda: team.found and len(team.found[-1].targets) == 2)
+        fixes = team.hear(FoundFixArray, 'found_targets/fixes', LATCHED)
+        team.until(lambda: fixes and list(fixes[-1].ids) == [1, 2])
+        latest, found = fixes[-1], team.found[-1]
+        assert (latest.header, latest.batch_id) == (found.header, found.batch_id)
+        for fix, target in zip(latest.fixes, found.targets):
+            place = fix.latitude, fix.longitude, fix.altitude
+            east, north, up = geodetic2enu(*place, -33.0, 18.5, 20.0)
+            assert (east, north, up) == pytest.approx(
+                (target.position.x, target.position.y, 0.0), abs=1e-6
+            )
+            assert np.array_equal(fix.position_covariance, target.covariance)
+            assert fix.header.stamp == target.stamp and fix.position_covariance_type == 3
 
 
 def test_the_filter_of_the_papers_counts_detections_of_found_targets_which_are_no_fault():

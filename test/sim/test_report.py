@@ -7,9 +7,11 @@ import math
 import cv2
 import numpy as np
 import pytest
+import shapely
 import yaml
 from geometry_msgs.msg import Point
 from matplotlib.colors import to_hex
+from pymap3d import geodetic2enu
 from rclpy.serialization import serialize_message
 from report_check import check_report
 from test_scenario import PLAIN
@@ -196,6 +198,49 @@ def test_report_of_a_complete_run(run, tmp_path):
     assert gospa['false'] == pytest.approx(0.5 * 0.15**2)
     assert gospa['missed'] == 0.0
     assert gospa['total'] == pytest.approx(math.sqrt(3e-4 + gospa['false']))
+
+
+def test_a_map_program_gets_ways_and_what_was_explored(tmp_path):
+    origin = {'latitude': 46.0, 'longitude': 23.5, 'altitude': 350.0}
+    environment = PLAIN['environment'] | {'origin': origin}
+    run = Run(scenario_of(tmp_path, TARGETS, environment=environment))
+    way = np.array([[0.5, 0.5, 1.0], [0.5, 1.3, 1.0], [1.1, 1.3, 1.2], [1.1, 1.3, 1.2]])
+    # A robot stands for a while, and each leg has a thousand states.
+    legs = np.concatenate([np.linspace(*way[i : i + 2], 1000) for i in range(3)])
+    for k, place in enumerate(legs.tolist()):
+        run.state(0.05 * k, 'mambo', place)
+    run.state(0.0, 'second', [1.5, math.nan, 1.0])
+    for k, place in enumerate(way[[0, 2]].tolist()):
+        seen = msg.DetectionArray(batch_id=k + 1, robot='mambo')
+        seen.pose.pose.position, seen.pose.pose.orientation.w = point(place), 1.0
+        run.send('/mambo/detections', seen, 0.5 + 0.05 * k)
+    run.update(0.5)
+    write(run.record('time_limit', 200.0), tmp_path)
+    explored, line = json.loads((tmp_path / 'ways.geojson').read_text())['features']
+
+    def placed(degrees):
+        lon, lat = np.array(degrees)[:, :2].T
+        return np.stack(geodetic2enu(lat, lon, 350.0, *origin.values())[:2], axis=1)
+
+    properties, places = line['properties'], np.array(line['geometry']['coordinates'])
+    assert (properties['kind'], properties['robot']) == ('way', 'mambo')
+    assert properties['length'] == pytest.approx(1.4 + math.hypot(0.6, 0.2) - 0.6, abs=1e-6)
+    assert len(places) == len(properties['times']) < 800
+    assert properties['times'][0] == 0.0 and properties['times'][-1] == pytest.approx(149.95)
+    assert places[[0, -1], 2] == pytest.approx([351.0, 351.2], abs=1e-3)
+    ends = placed(places[[0, -1]])
+    assert ends == pytest.approx(way[[0, -1], :2], abs=2e-3)
+    # No corner is cut.
+    assert np.linalg.norm(placed(places) - way[1, :2], axis=1).min() < 5e-3
+    # Two fields of view of 0.4 m by 0.4 m, to half a cell of the exploration function.
+    shape = shapely.transform(shapely.from_geojson(json.dumps(explored['geometry'])), placed)
+    bounds = np.array(environment['bounds'])
+    area = float(np.prod(np.ptp(bounds, axis=1)))
+    assert shape.area == pytest.approx(0.32, abs=0.06)
+    assert explored['properties']['share'] == pytest.approx(0.98 * shape.area / area, rel=0.02)
+    assert shapely.contains_xy(shape, *way[[0, 2], :2].T).all()
+    assert not shapely.contains_xy(shape, *way[1, :2])
+    assert all(part.exterior.is_ccw for part in shape.geoms)
 
 
 @pytest.fixture

@@ -13,11 +13,12 @@ import pytest
 import yaml
 from small_field import SMALL_FIELD
 
-from maasi_filter.environment import OriginSettings
+from maasi_filter.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget, Label
 from maasi_sim.run.run_options import Options
+from maasi_sim.run.targets.geojson import found_geojson
 from maasi_sim.run.targets.mission import TargetMission
-from maasi_sim.run.targets.tables import csv_text, found_rows, geodetic, geojson_text
+from maasi_sim.run.targets.tables import csv_text, found_rows
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
@@ -50,15 +51,14 @@ def test_csv_holds_what_was_found():
 def test_places_on_the_earth():
     """A degree of the meridian at the equator is 110.574 km, one of the equator 111.320 km."""
     equator = OriginSettings(latitude=0.0, longitude=10.0)
-    north = geodetic(np.array([0.0, 110.574]), equator)
-    assert north['latitude'] == pytest.approx(1e-3, rel=1e-5)
-    east = geodetic(np.array([111.320, 0.0, 5.0]), equator)
-    assert east['longitude'] == pytest.approx(10.001, abs=1e-8)
-    assert (east['latitude'], east['altitude']) == pytest.approx((0.0, 5.0), abs=2e-3)
+    assert geodetic(np.array([[0.0, 110.574]]), equator)[0, 0] == pytest.approx(1e-3, rel=1e-5)
+    (east,) = geodetic(np.array([[111.320, 0.0, 5.0]]), equator)
+    assert east[1] == pytest.approx(10.001, abs=1e-8)
+    assert east[[0, 2]] == pytest.approx((0.0, 5.0), abs=2e-3)
 
 
 def test_geojson_has_longitude_first():
-    content = json.loads(geojson_text(rows_of(2, ORIGIN)))
+    content = json.loads(found_geojson(rows_of(2, ORIGIN)))
     assert content['type'] == 'FeatureCollection'
     first, second = content['features']
     assert first['geometry']['type'] == 'Point'
@@ -75,10 +75,11 @@ def field(folder, **origin):
     return load_scenario(path)
 
 
-def test_nodes_are_not_told_the_origin_and_a_wrong_one_is_refused(tmp_path):
+def test_the_filter_alone_has_the_origin_and_a_wrong_one_is_refused(tmp_path):
     scenario = field(tmp_path, latitude=46.0, longitude=23.5)
     plans = TargetMission('field', scenario).plan_nodes(Options(), Path('/s.yaml'))
-    assert not any('environment.origin' in name for plan in plans for name in plan.parameters)
+    told = {plan.name: plan.parameters.get('origin.latitude') for plan in plans}
+    assert told.pop('filter_node') == 46.0 and set(told.values()) == {None}
     with pytest.raises(ScenarioError, match=r'field.yaml:.*environment.origin.latitude'):
         field(tmp_path, latitude=146.0, longitude=23.5)
 

@@ -40,6 +40,11 @@ NODES = ('filter', 'planner', 'cuboid_planner', 'guard', 'sim', 'cuboid_sim', *D
 # Nobody plays their sensors at the end.
 CHANGES = {kind: {'sensor_timeout': 0.0, 'odometry_timeout': 0.5} for kind in DRIVERS} | {
     'turtlebot': {'scan': {'timeout': 1e9}, 'sensor_timeout': 0.0, 'odometry_timeout': 0.5},
+    'mambo': {
+        'camera': {'focal_length': [120.0, 120.0], 'detections': {}},
+        'sensor_timeout': 0.0,
+        'odometry_timeout': 0.5,
+    },
     'filter': {'batch_timeout': 0.2},
 }
 # Values of fields by type, lengths of arrays, and stamps.

@@ -116,8 +116,8 @@ class AgentDriver(RobotNode):
         self._state = StatePublisher(self)
         self._watchdog = Watchdog(self, self.link, self.sensor_input, self._state)
         self._responder = MeasurementResponder(self, self.sensor_input, self._watchdog)
-        self._frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
-        self.goals = GoalServer(self, self.link, self._frames)
+        self.frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
+        self.goals = GoalServer(self, self.link)
         KeepOutTopic(self, self._take_area, keep=False)
         if self._stop_latched:
             self.health.begin(STOP, STOPPED)
@@ -168,7 +168,7 @@ class AgentDriver(RobotNode):
             self.link.hold()
             self.health.begin(ODOMETRY, f'no {self.pose_name} since the time jumped back')
         self.history.clear()
-        self._frames.clear()
+        self.frames.clear()
         self._responder.reset()
         self._watchdog.reset()
         self.follower = WaypointFollower(self._motion)
@@ -266,7 +266,7 @@ class AgentDriver(RobotNode):
         self._state.publish(placed, step)
         odometry = self.map_odometry
         origin = self.start_pose if odometry is None else odometry.map_from_odom
-        self._frames.publish(placed, origin)
+        self.frames.publish(placed, origin)
         self.link.send(placed, command.tolist())
         self.goals.publish_feedback(placed)
 

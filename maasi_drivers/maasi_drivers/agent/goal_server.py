@@ -8,7 +8,6 @@ import numpy as np
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
 
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.robot_frames import RobotFrames
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
@@ -27,10 +26,9 @@ class GoalServer:
     in a rejection.
     """
 
-    def __init__(self, driver: RobotNode, link: RobotLink, frames: RobotFrames) -> None:
+    def __init__(self, driver: RobotNode, link: RobotLink) -> None:
         self._driver = driver
         self._link = link
-        self._frames = frames
         self.away = False
         # Goals that have ended, until their results are sent.
         self._ended: dict[bytes, Goal] = {}
@@ -89,7 +87,7 @@ class GoalServer:
         if latest is None and not driver.settings.lockstep:
             return f'no {driver.pose_name} yet'
         now = driver.get_clock().now().nanoseconds if latest is None else latest.stamp
-        if problem := self._frames.to_map(request.waypoint, now):
+        if problem := self._driver.frames.to_map(request.waypoint, now):
             return problem
         point = request.waypoint.pose.position
         position = (point.x, point.y, point.z)

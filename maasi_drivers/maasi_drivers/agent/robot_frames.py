@@ -244,6 +244,14 @@ class RobotFrames:
             return
         self._on_pose(stamp, pose)
 
+    def on_robot(self, frame: str, stamp: int) -> Pose:
+        """Return where a frame was on the robot at a stamp [ns]; `ValueError` if tf cannot tell."""
+        try:
+            return self._buffer.pose(self._base, frame, stamp)
+        except TransformError as error:
+            allowed = f'allowed is a frame that tf connects with {self._base!r}: {error}'
+            raise ValueError(f'header.frame_id: read {frame[:40]!r}, {allowed}') from error
+
     def to_map(self, waypoint: PoseStamped, now: int) -> str | None:
         """Bring a waypoint into the map; return what is wrong where that is not possible.
 

@@ -12,6 +12,7 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from std_srvs.srv import Trigger
 
 from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
+from maasi_drivers.agent.robot_frames import RobotFrames
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.area import Area
@@ -124,6 +125,8 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         Its faults.
     follower : WaypointFollower
         Its present goal.
+    frames : RobotFrames
+        Where frames are, by tf.
     silence : Silence
         Time since the last pose.
     arrivals : ArrivalClock
@@ -137,6 +140,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
     """
 
     follower: WaypointFollower
+    frames: RobotFrames
 
     def __init__(self, **options: Any) -> None:
         super().__init__('driver', DriverSettings, in_robot=True, **options)

@@ -123,6 +123,30 @@ class MountSettings(Settings):
     )
 
 
+class BoxSettings(Settings):
+    """What is taken of the boxes that a detector of another package publishes.
+
+    Boxes of one object that overlap by three quarters, as two people draw them, are 7 to 14 % of
+    their size apart: the default of `error`.
+    """
+
+    classes: list[str] = Field(
+        default=[], description='Classes (class_id) of which targets are; none: all'
+    )
+    point: Literal['foot', 'centre'] = Field(
+        default='foot',
+        description="What of a box is on the floor: 'foot', the middle of its lower side, of "
+        "things that stand, seen from the side; 'centre', of what lies flat, or from above",
+    )
+    error: float = Field(
+        default=0.1,
+        gt=0.0,
+        le=0.5,
+        description='Deviation of that point, as a share of the width and height of its box; of a '
+        'box that the border cuts it is 0.5 [1]',
+    )
+
+
 class CameraSettings(Settings):
     """A camera that sees the floor.
 
@@ -181,6 +205,11 @@ class CameraSettings(Settings):
     )
     segmentation: SegmentationSettings = Field(
         default_factory=SegmentationSettings, description='How markers are segmented'
+    )
+    detections: BoxSettings | None = Field(
+        default=None,
+        description='What is taken of camera/detections (vision_msgs/Detection2DArray), in place '
+        'of images; none: the driver finds markers in images',
     )
 
     @model_validator(mode='after')

@@ -264,6 +264,8 @@ class DriverSettings(NodeSettings):
             raise wrong('link', 'in lockstep is topics: others run in real time')
         if lockstep and self.image_source != 'topic':
             raise wrong('image_source', 'in lockstep is topic: others run in real time')
+        if self.camera is not None and self.camera.detections and self.image_source != 'topic':
+            raise wrong('image_source', 'with camera.detections is topic')
         if (self.image_source == 'video') != bool(self.video):
             raise wrong('video', 'is a source with image_source video, and nothing with others')
         if lockstep and self.command_type == 'twist':

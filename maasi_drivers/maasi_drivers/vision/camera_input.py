@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 from zlib import crc32
 
@@ -15,7 +16,8 @@ from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.sensor_reading import SensorReading
 from maasi_drivers.settings.camera import CameraSettings, load_calibration
-from maasi_drivers.vision.camera_model import box_view_margin
+from maasi_drivers.vision.camera_model import Camera, box_view_margin
+from maasi_drivers.vision.detection_boxes import boxes_to_blobs
 from maasi_drivers.vision.detector import Blobs
 from maasi_drivers.vision.images import ImageSourceError, VideoSource, decode_image, image_to_array
 from maasi_drivers.vision.marker_detector import MarkerDetector, read_markers
@@ -38,11 +40,14 @@ class CameraInput(SensorInput[Picture]):
     a `camera_info` with a focal length replaces either.
 
     Images come from a topic, or by the parameter `image_source` from a video (a stream, a device
-    or a file), or as blobs that were found on board (measurement feed).
+    or a file), or as blobs that were found on board (measurement feed); with `camera.detections`
+    boxes come instead. These are seen by the camera whose optical frame their header names: that
+    of the settings (`<robot>/camera_optical`, or no name), or one that tf connects with the robot.
 
     Subscribes
     ----------
-    `camera/image_raw` (sensor_msgs/Image) or `camera/image_raw/compressed`;
+    `camera/image_raw` (sensor_msgs/Image) or `camera/image_raw/compressed`, or
+    `camera/detections` (vision_msgs/Detection2DArray);
     `camera/camera_info` (sensor_msgs/CameraInfo), whose calibration replaces the parameters'
     """
 
@@ -104,6 +109,16 @@ class CameraInput(SensorInput[Picture]):
         self._detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0))
         quality = sensor_reader(settings.lockstep)
         driver.create_subscription(CameraInfo, 'camera/camera_info', self._on_calibration, quality)
+        if self.camera.detections is not None:
+            try:
+                from vision_msgs.msg import Detection2DArray as Boxes
+            except ImportError as error:
+                raise SettingsError(
+                    'parameter camera.detections: the package vision_msgs is not installed '
+                    '(sudo apt install ros-$ROS_DISTRO-vision-msgs); allowed without it is nothing'
+                ) from error
+            driver.create_subscription(Boxes, 'camera/detections', self._on_boxes, quality)
+            return
         if settings.image_source != 'topic':
             driver.create_wall_timer(0.01, self._poll_source)
             return
@@ -128,6 +143,8 @@ class CameraInput(SensorInput[Picture]):
     def detect(self, data: Picture, pose: StampedPose) -> SensorReading:
         """Decode an image, and return the markers in it."""
         picture = data()
+        if isinstance(picture, Blobs) and self.camera.detections is not None:
+            self._detector.camera = self._placed(picture.frame, pose.stamp)
         reading = read_markers(picture, pose, self._detector, self.driver.sensor)
         if isinstance(picture, Blobs):
             return reading
@@ -231,6 +248,21 @@ class CameraInput(SensorInput[Picture]):
             lambda: decode_image(message),
             repeated=self._is_repeated(message.data),
         )
+
+    def _on_boxes(self, message: Any) -> None:
+        blobs, problems = boxes_to_blobs(message, self.camera)
+        if problems:
+            self.driver.drop('box', f'camera/detections: {problems[0]}', len(problems))
+        stamp = stamp_from_ros(message.header.stamp)
+        self.driver.take_frame('camera/detections', stamp, lambda: blobs)
+
+    def _placed(self, frame: str, stamp: int) -> Camera:
+        """Return the camera, where its optical frame is on the robot at a stamp [ns]."""
+        camera = Camera.from_settings(self.camera)
+        if frame in ('', f'{self.driver.robot}/camera_optical'):
+            return camera
+        pose = self.driver.frames.on_robot(frame, stamp)
+        return replace(camera, position=pose.position, rotation=pose.rotation())
 
     def _is_repeated(self, data: Any) -> bool:
         """Return whether an image is the one before to the bit: noise never is."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from pydantic import BaseModel
 
 from maasi_filter.arrays import BoolArray, FloatArray, ImageArray
+from maasi_filter.records import Label
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,10 @@ class Blobs:
     covariances : ndarray, shape (n, 2, 2)
         Of the centroids, as far as image noise explains them; zero where the rule does not tell
         [px^2].
-    identities : tuple of str
-        Ids of fiducial markers; empty: the rule does not tell.
+    labels : tuple of Label
+        Class, score and identity (id of a fiducial marker) of each; empty: the rule does not tell.
+    frame : str
+        Optical frame in which the camera is where tf says; empty: it is at its mount.
     """
 
     centroids: FloatArray
@@ -39,20 +42,22 @@ class Blobs:
     extents: FloatArray
     border_cut: BoolArray
     covariances: FloatArray
-    identities: tuple[str, ...] = ()
+    labels: tuple[Label, ...] = ()
+    frame: str = ''
 
     def __len__(self) -> int:
         return len(self.areas)
 
     def select(self, mask: BoolArray) -> Blobs:
         """Return the blobs where ``mask`` (n,) is true."""
-        return Blobs(
-            self.centroids[mask],
-            self.areas[mask],
-            self.extents[mask],
-            self.border_cut[mask],
-            self.covariances[mask],
-            tuple(name for name, kept in zip(self.identities, mask.tolist()) if kept),
+        return replace(
+            self,
+            centroids=self.centroids[mask],
+            areas=self.areas[mask],
+            extents=self.extents[mask],
+            border_cut=self.border_cut[mask],
+            covariances=self.covariances[mask],
+            labels=tuple(label for label, kept in zip(self.labels, mask.tolist()) if kept),
         )
 
 
@@ -120,5 +125,5 @@ def blobs_at(pixels: ArrayLike, deviation: float = 0.5, identities: tuple[str, .
         np.ones((number, 2)),
         np.zeros(number, dtype=bool),
         np.tile(deviation**2 * np.eye(2), (number, 1, 1)),
-        identities,
+        tuple(Label(identity=name) for name in identities),
     )

@@ -14,7 +14,6 @@ from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.models.measurement import MeasurementModel, RangeBearing, RangeBearingElevation
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
-from maasi_filter.records import Label
 
 
 class MarkerDetector:
@@ -78,8 +77,9 @@ class MarkerDetector:
             parts = 4.0 / np.pi * blobs.areas * scale / settings.marker_diameter**2
             reach = blobs.extents.max(axis=1, initial=0.0) * np.sqrt(scale)
             reach /= settings.marker_diameter
-        sized = np.ones(len(blobs), dtype=bool)
-        if settings.segmentation.rule == 'robust':
+        # The size of a box says nothing about a marker's.
+        sized, boxes = np.ones(len(blobs), dtype=bool), settings.detections is not None
+        if settings.segmentation.rule == 'robust' and not boxes:
             least = settings.segmentation.minimum_diameter
             most = settings.segmentation.maximum_diameter
             # Of a marker that the border cuts enough must be left to tell it from other things.
@@ -94,7 +94,7 @@ class MarkerDetector:
         keep = on_floor & sized & whole
         blobs, positions = blobs.select(keep), positions[keep]
         pixel_covariances = blobs.covariances + settings.pixel_noise**2 * np.eye(2)
-        if blobs.border_cut.any():
+        if blobs.border_cut.any() and not boxes:
             # A cut marker's centroid is off by up to its radius: a uniform error, in any direction.
             middle = (camera.width - 1) / 2.0, (camera.height - 1) / 2.0
             area = np.abs(np.linalg.det(camera.back_project([middle], pose)[1][0]))
@@ -113,7 +113,7 @@ class MarkerDetector:
             *measured(self._model, places[:, used], spread[:, used, used], pose),
             places[:, used],
             dropped,
-            tuple(Label(identity=name) for name in blobs.identities),
+            blobs.labels,
         )
 
 

@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_drivers.settings.camera import DETECTORS, SegmentationSettings
-from maasi_drivers.vision.detector import Blobs
+from maasi_drivers.vision.detector import Blobs, blobs_at
 from maasi_filter.arrays import BoolArray, ImageArray, IntArray
 
 # Added to the mean of the channels before dividing by it: noise in the dark is not blue.
@@ -195,16 +195,8 @@ def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blob
         cv2.perspectiveTransform(middle, cv2.getPerspectiveTransform(_SQUARE, item))
         for item in corners
     ]
-    count = len(corners)
-    names = [] if ids is None else [f'{settings.dictionary}:{number}' for number in ids.ravel()]
-    return Blobs(
-        np.reshape(np.array(centres, dtype=float), (-1, 2)),
-        np.array([cv2.contourArea(item) for item in corners]),
-        np.ptp(corners, axis=1).astype(float),
-        np.zeros(count, np.bool_),
-        np.zeros((count, 2, 2)),
-        tuple(names),
-    )
+    numbers = [] if ids is None else ids.ravel()
+    return blobs_at(centres, 0.0, tuple(f'{settings.dictionary}:{number}' for number in numbers))
 
 
 @cache

@@ -10,17 +10,18 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Quaternion
 from geometry_msgs.msg import Pose as PoseMessage
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import NavSatFix, NavSatStatus, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.colours import FOUND, POTENTIAL
+from maasi_filter.geodesy import OriginSettings, geodetic
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor, is_covariance
 from maasi_filter.records import UNLABELLED, AgentMeasurement, Cluster, FoundTarget, Label
 from maasi_msgs.msg import Cluster as ClusterMessage
-from maasi_msgs.msg import Detection, DetectionArray, RangeMeasurement
+from maasi_msgs.msg import Detection, DetectionArray, FoundFixArray, RangeMeasurement
 from maasi_msgs.msg import FoundTarget as FoundTargetMessage
 
 #: Largest number of detections used of one message, against unbounded computation times; no sensor
@@ -155,6 +156,27 @@ def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundT
     )
 
 
+def found_fixes_to_ros(
+    targets: Sequence[FoundTarget], origin: OriginSettings, header: Header, batch: int
+) -> FoundFixArray:
+    """Return found targets on the earth; in 2D at the altitude of the origin, with variance 0."""
+    places = [geodetic(target.position[None], origin)[0].tolist() for target in targets]
+    fixes = [
+        NavSatFix(
+            header=Header(stamp=stamp_to_ros(round(target.time * 1e9)), frame_id=header.frame_id),
+            status=NavSatStatus(status=NavSatStatus.STATUS_FIX),
+            latitude=latitude,
+            longitude=longitude,
+            altitude=altitude,
+            position_covariance=covariance_to_ros(target.covariance),
+            position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN,
+        )
+        for target, (latitude, longitude, altitude) in zip(targets, places)
+    ]
+    ids = [target.id for target in targets]
+    return FoundFixArray(header=header, batch_id=batch, ids=ids, fixes=fixes)
+
+
 def detections_to_ros(
     values: FloatArray, covariances: FloatArray | None, labels: Sequence[Label] = ()
 ) -> list[Detection]:
@@ -180,7 +202,7 @@ def labels_of(messages: Sequence[Detection] | Sequence[RangeMeasurement]) -> tup
     return labels if any(label != UNLABELLED for label in labels) else ()
 
 
-def label_problem(message: Detection | RangeMeasurement) -> str | None:
+def label_problem(message: Detection | RangeMeasurement | Label) -> str | None:
     """Return the error of a class, score or identity: field, what was read, what is allowed."""
     if not 0.0 <= message.score <= 1.0:
         return f'score: read {message.score}, allowed is 0 to 1'

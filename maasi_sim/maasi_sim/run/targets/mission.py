@@ -21,9 +21,10 @@ from maasi_sim.run.node_plan import (
     sim_plan,
 )
 from maasi_sim.run.run_options import Options
+from maasi_sim.run.targets.geojson import found_geojson, ways_geojson
 from maasi_sim.run.targets.observer import TargetObserver
 from maasi_sim.run.targets.report import build_report, target_summary
-from maasi_sim.run.targets.tables import csv_text, found_rows, geojson_text
+from maasi_sim.run.targets.tables import csv_text, found_rows
 from maasi_sim.run.targets.tally import TargetRecord
 from maasi_sim.run.topics import BATCH, within
 from maasi_sim.scenario.layering import ScenarioError
@@ -88,7 +89,8 @@ class TargetMission:
         rows = found_rows(tally.found, tally.truth, tally.scores().match.pairs, origin)
         files = {'found_targets.csv': csv_text(rows, record.scenario.dimension, origin)}
         if origin is not None:
-            files['found_targets.geojson'] = geojson_text(rows)
+            files['found_targets.geojson'] = found_geojson(rows)
+            files['ways.geojson'] = ways_geojson(record, origin)
         return files
 
     def figure(self, record: TargetRecord) -> Figure:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from itertools import takewhile
 from typing import Any
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import finite, summary, whole_report
 from maasi_sim.run.targets.tally import TargetRecord
 
@@ -49,6 +51,17 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
         'scoring': {'radius': scores.radius, 'c': scores.radius, 'p': scores.order},
     }
     return whole_report(record, 'targets', content)
+
+
+def explored_after(record: TargetRecord) -> UnexploredMap:
+    """Return what is unexplored after all measurements of the robots."""
+    scenario = record.scenario
+    explored = UnexploredMap(Area(scenario.environment), scenario.filter.exploration_spacing)
+    for name, poses in record.measured_from.items():
+        detection = scenario.robots[name].sensor.build(name, scenario.dimension).detection
+        for pose in poses:
+            explored.update(detection, pose)
+    return explored
 
 
 def target_summary(report: dict[str, Any]) -> str:

@@ -20,7 +20,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import reason_of_end
 from maasi_sim.run.report_panels import MARGIN, PALE, UNSEEN, MapView, draw_report, ellipse
-from maasi_sim.run.targets.report import build_report, to_find_all
+from maasi_sim.run.targets.report import build_report, explored_after, to_find_all
 from maasi_sim.run.targets.tally import TargetRecord
 
 _TRUE, _MISSED, _FALSE = '#222222', '#D62728', '#E6007E'
@@ -40,11 +40,7 @@ def plot_report(record: TargetRecord) -> Figure:
         name: scenario.robots[name].sensor.build(name, scenario.dimension).detection
         for name in colours
     }
-    # After all measurements of the robots.
-    explored = UnexploredMap(Area(scenario.environment), scenario.filter.exploration_spacing)
-    for name, poses in record.measured_from.items():
-        for pose in poses:
-            explored.update(detections[name], pose)
+    explored = explored_after(record)
 
     def draw_map(view: MapView) -> None:
         _draw_explored(view, explored, bounds)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.environment import OriginSettings
+from maasi_filter.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget
 
 Row = dict[str, Any]
@@ -44,7 +43,7 @@ def _row(item: FoundTarget, origin: OriginSettings | None) -> Row:
         'time': float(item.time),
         'measurement': item.measurement,
         **{axis: float(value) for axis, value in zip(axes, item.position)},
-        **({} if origin is None else geodetic(item.position, origin)),
+        **({} if origin is None else _on_earth(item.position, origin)),
         **{
             second + first: float(item.covariance[j, i])
             for i, first in enumerate(axes)
@@ -62,14 +61,8 @@ def columns(dimension: int, origin: OriginSettings | None) -> list[str]:
     return [*_row(some, origin), 'target', 'error']
 
 
-def geodetic(position: FloatArray, origin: OriginSettings) -> Row:
-    """Return latitude, longitude [degrees] and altitude [m] on WGS 84 of a place [m, map]."""
-    # Deferred: only scenarios with an origin need it.
-    import pymap3d
-
-    east, north, up = [*map(float, position), 0.0][:3]
-    reference = origin.latitude, origin.longitude, origin.altitude
-    places = map(float, pymap3d.enu2geodetic(east, north, up, *reference))
+def _on_earth(position: FloatArray, origin: OriginSettings) -> Row:
+    places = geodetic(position[None], origin)[0].tolist()
     return dict(zip(('latitude', 'longitude', 'altitude'), places))
 
 
@@ -80,17 +73,3 @@ def csv_text(rows: Sequence[Row], dimension: int, origin: OriginSettings | None)
     writer.writeheader()
     writer.writerows(rows)
     return out.getvalue()
-
-
-def geojson_text(rows: Sequence[Row]) -> str:
-    """Return rows with geodetic coordinates as GeoJSON (RFC 7946): a point each."""
-    features = []
-    for row in rows:
-        properties = dict(row)
-        place = [properties.pop(name) for name in ('longitude', 'latitude', 'altitude')]
-        # To a millimetre.
-        place = [round(place[0], 8), round(place[1], 8), round(place[2], 3)]
-        geometry = {'type': 'Point', 'coordinates': place}
-        features.append({'type': 'Feature', 'geometry': geometry, 'properties': properties})
-    content = {'type': 'FeatureCollection', 'features': features}
-    return json.dumps(content, indent=1, allow_nan=False) + '\n'
