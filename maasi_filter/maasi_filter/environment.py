@@ -178,7 +178,7 @@ def read_shape(value: Any, project: Callable[[FloatArray], FloatArray] | None = 
         rings = value if value and np.ndim(value[0][0]) else [value]
         found = Polygon(rings[0], rings[1:])
     else:
-        parts = [shape(feature['geometry']) for feature in features_of(value)]
+        parts = [_geometry(feature) for feature in features_of(value)]
         if project is None:
             raise ValueError('GeoJSON needs environment.origin')
         found = shapely.transform(shapely.union_all(parts), project)
@@ -191,10 +191,15 @@ def read_shape(value: Any, project: Callable[[FloatArray], FloatArray] | None = 
 
 def features_of(value: Any) -> list[dict[str, Any]]:
     """Return the features of GeoJSON, given as values, as text or as the name of a file."""
-    if isinstance(value, str) and value.startswith('{'):
-        value = json.loads(value)
-    elif _is_geojson(value) and isinstance(value, str):
-        value = json.loads(Path(value).read_text(encoding='utf-8'))
+    try:
+        if isinstance(value, str) and value.startswith('{'):
+            value = json.loads(value)
+        elif isinstance(value, str) and _is_geojson(value):
+            value = json.loads(Path(value).read_text(encoding='utf-8'))
+    except OSError as error:
+        raise ValueError(f'{value}: {error.strerror}') from None
+    except ValueError as error:
+        raise ValueError(f'{value[:60]}: is not JSON: {error}') from None
     if not isinstance(value, Mapping):
         raise ValueError(f'got {str(value)[:60]}, allowed is GeoJSON')
     if value.get('type') == 'FeatureCollection':
@@ -202,19 +207,30 @@ def features_of(value: Any) -> list[dict[str, Any]]:
     return [dict(value) if value.get('type') == 'Feature' else {'geometry': dict(value)}]
 
 
+def _geometry(feature: Mapping[str, Any]) -> Any:
+    try:
+        return shape(feature['geometry'])
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, shapely.GEOSException):
+        raise ValueError(f'got {str(feature)[:60]}, allowed are features with geometry') from None
+
+
 def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of an environment with all shapes as well-known text in the map."""
     values = dict(given)
     roles: dict[str, list[dict[str, Any]]] = {'area': [], 'keep_out': [], 'prior': []}
     if _is_geojson(values.get('area')):
-        for feature in features_of(values['area']):
+        try:
+            features = features_of(values['area'])
+        except ValueError as error:
+            raise ValueError(f'area: {error}') from None
+        for feature in features:
             role = (feature.get('properties') or {}).get('role', 'area')
             roles.setdefault(role, []).append(feature)
         if unknown := roles.keys() - {'area', 'keep_out', 'prior'}:
             raise ValueError(f'area: got role {min(unknown)}, allowed are area, keep_out, prior')
         values['area'] = {'type': 'FeatureCollection', 'features': roles['area']}
         if not values.get('origin'):
-            whole = shapely.union_all([shape(item['geometry']) for item in roles['area']])
+            whole = shapely.union_all([_geometry(item) for item in roles['area']])
             west, south, east, north = whole.bounds
             values['origin'] = OriginSettings(
                 latitude=0.5 * (south + north), longitude=0.5 * (west + east)

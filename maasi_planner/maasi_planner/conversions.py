@@ -162,7 +162,7 @@ def planner_markers(
 def area_markers(area: Area, header: Header, size: float) -> MarkerArray:
     """Return markers of the rings of area, keep-outs and solid polygons, in the map."""
     tints = {'area': '#1B1F24', 'keep_out': '#B84A00', 'obstacle': '#59636E'}
-    markers = []
+    markers: list[Marker] = []
     for kind, shapes in area.shapes.items():
         for ring in shapely.get_rings(shapely.get_parts(shapes)):
             line = Marker(header=header, ns=kind, id=len(markers), type=Marker.LINE_STRIP)

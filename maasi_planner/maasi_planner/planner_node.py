@@ -240,7 +240,10 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             if not self.active:
                 raise ValueError('the planner is not active')
             self._keep_outs.change(request.zones)
-            response.success, response.message = True, f'{len(request.zones)} keep-outs hold now'
+            response.success, response.message = (
+                True,
+                f'keep-outs that hold now: {len(request.zones)}',
+            )
         except ValueError as error:
             response.message = str(error)
         return response

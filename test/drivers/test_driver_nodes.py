@@ -5,6 +5,7 @@ from functools import partial, reduce
 
 import numpy as np
 import pytest
+import shapely
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_allclose, assert_array_equal
 from rclpy.node import Node
@@ -12,8 +13,8 @@ from robot_team import NANOSECONDS, image_message, rendered, stamped
 from sensor_msgs.msg import CameraInfo
 
 from maasi_filter.ros.conversions import pose_from_ros, stamp_to_ros
-from maasi_filter.ros.qos import RELIABLE
-from maasi_msgs.msg import AgentState, DetectionArray, RangeArray, RangeMeasurement
+from maasi_filter.ros.qos import LATCHED, RELIABLE
+from maasi_msgs.msg import AgentState, DetectionArray, KeepOuts, RangeArray, RangeMeasurement
 
 
 @pytest.mark.parametrize(
@@ -93,6 +94,37 @@ def test_a_cancelled_goal_stops_the_robot(play, kind):
     team.move()
     assert team.state.goal_status == AgentState.CANCELED
     assert_allclose(team.command, np.zeros(4), atol=1e-9)
+
+
+def test_a_keep_out_on_the_way_stops_the_robot_and_goals_in_it_are_refused(play):
+    """What comes while it moves; then the way leads around."""
+    driver, team = play()
+    team.move()
+    publisher = team.create_publisher(KeepOuts, '/keep_outs', LATCHED)
+    team.until(lambda: publisher.get_subscription_count())
+    _, result = team.send_accepted([1.8, 0.3, 0.0])
+    team.move(5)
+    assert np.any(team.command != 0.0)
+    wall = 'POLYGON ((1 -0.1, 1.2 -0.1, 1.2 0.7, 1 0.7, 1 -0.1))'
+    publisher.publish(KeepOuts(version=2, zones=[wall]))
+    status, reason = team.ended(result)
+    assert status == GoalStatus.STATUS_ABORTED and 'keep-out' in reason
+    team.move()
+    assert_array_equal(team.command, np.zeros(4))
+    assert 'keep-outs' in team.refused([1.1, 0.3, 0.0])
+    # An older one, and one that is none, change nothing.
+    publisher.publish(KeepOuts(version=1, zones=[]))
+    publisher.publish(KeepOuts(version=3, zones=['0.5 0.5']))
+    team.until(lambda: driver.dropped['bad keep-outs'] == 1)
+    assert 'keep-outs' in team.refused([1.1, 0.3, 0.0])
+    team.send_accepted([1.8, 0.3, 0.0])
+    places = []
+    for _ in range(400):
+        team.move()
+        places.append(team.body.robot_state().pose.position)
+    assert np.hypot(*(places[-1] - [1.8, 0.3, 0.0])[:2]) < 0.1
+    zone = shapely.from_wkt(wall)
+    assert min(zone.distance(shapely.Point(place[:2])) for place in places) >= 0.11
 
 
 def test_a_goal_that_makes_no_sense_is_refused(play, capfd):

@@ -30,6 +30,7 @@ from maasi_msgs.msg import (
     FilterUpdate,
     FoundFixArray,
     FoundTargetArray,
+    KeepOuts,
     MeasurementBatch,
 )
 
@@ -140,6 +141,22 @@ def test_a_target_seen_again_and_again_is_found_with_class_and_identity(team):
     team.detections['b'].publish(late)
     team.until(lambda: len(team.updates) == 10)
     assert [item.robot for item in team.updates[9].members] == ['b']
+
+
+def test_keep_outs_outlive_their_publisher_and_nothing_is_born_in_them(team):
+    publisher = team.node.create_publisher(KeepOuts, 'keep_outs', LATCHED)
+    team.until(lambda: publisher.get_subscription_count())
+    # Around what is seen.
+    zone = '1.3 1.1 0.3'
+    publisher.publish(KeepOuts(version=4, zones=[zone]))
+    team.until(lambda: team.tested.area.region is not None)
+    team.node.destroy_publisher(publisher)
+    heard = team.hear(KeepOuts, 'keep_outs', LATCHED_ALL)
+    team.until(lambda: heard)
+    assert (heard[-1].version, list(heard[-1].zones)) == (4, ['1.3 1.1 0.3'])
+    for number in range(1, 6):
+        update = team.step(number, {'a': SEEN})
+        assert update.expected_number < 1e-3 and not update.newly_found
 
 
 def test_found_targets_are_on_the_earth_where_the_map_has_an_origin(team):

@@ -25,11 +25,13 @@ from maasi_msgs.msg import (
     FilterUpdate,
     FoundTarget,
     FoundTargetArray,
+    KeepOuts,
     LockstepDone,
     LockstepStep,
     MeasurementBatch,
     PlanDecision,
 )
+from maasi_msgs.srv import SetKeepOuts
 from maasi_planner.conversions import checked_state, checked_update
 from maasi_planner.node.filter_guard import FilterWatch
 from maasi_planner.node_settings import OtherRobotSettings
@@ -365,6 +367,31 @@ def test_robots_are_held_until_the_filter_answers_again(silent, planner):
         team.until(lambda: not team.tested._held)
         team.tell(80)
         team.until(lambda: len(team.decisions) > decisions)
+
+
+def test_keep_outs_are_taken_by_service_published_and_checked(team):
+    heard = team.hear(KeepOuts, 'keep_outs', LATCHED)
+    client = team.node.create_client(SetKeepOuts, 'search/keep_outs')
+    team.until(client.service_is_ready)
+
+    def ask(*zones):
+        answer = client.call_async(SetKeepOuts.Request(zones=zones))
+        team.until(answer.done)
+        return answer.result()
+
+    before = len(team.tested.coordinator.plans['a'].candidates.at([0.0, 0.0, 0.0]))
+    wrong = ask('0.5 0.5')
+    assert not wrong.success and 'keep_outs: 0: centre: ' in wrong.message
+    assert not heard
+    assert ask('POLYGON ((0 0, 1 0, 1 1, 0 1, 0 0))', '0.2 0.2 0.1').success
+    team.until(lambda: heard)
+    assert heard[-1].version == 1 and len(heard[-1].zones) == 2
+    coordinator = team.tested.coordinator
+    assert len(coordinator.plans['a'].candidates.at([0.0, 0.0, 0.0])) < before
+    assert not coordinator.plans['a'].motion.keep_out.is_free([0.5, 0.5, 0.0])
+    assert ask().success
+    team.until(lambda: heard[-1].version == 2)
+    assert not heard[-1].zones and coordinator.area.region is None
 
 
 def test_found_targets_are_kept_for_a_filter_that_starts_again(team):

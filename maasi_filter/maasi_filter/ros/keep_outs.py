@@ -57,7 +57,7 @@ class KeepOutTopic:
         area = with_keep_outs(self._node.settings.environment, message.zones)
         message.zones = [str(zone) for zone in area.settings.keep_outs]
         self._latest = message
-        self._node.get_logger().info(f'{len(message.zones)} keep-outs hold now')
+        self._node.get_logger().info(f'keep-outs that hold now: {len(message.zones)}')
         if self._publisher is not None:
             self._publisher.publish(message)
         self._on_change(area)
@@ -72,4 +72,5 @@ def with_keep_outs(environment: EnvironmentSettings, zones: Sequence[str]) -> Ar
         # One line, without the type of error and the address that pydantic adds.
         if not isinstance(error, ValidationError):
             raise
-        raise ValueError('; '.join(item['msg'] for item in error.errors())) from None
+        parts = [(*map(str, item['loc']), item['msg']) for item in error.errors()]
+        raise ValueError('; '.join(map(': '.join, parts))) from None

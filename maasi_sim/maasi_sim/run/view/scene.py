@@ -45,7 +45,7 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
     truth = np.asarray(scenario.world(seed).targets, dtype=float)
     return scene | {
         'obstacles': [
-            [*map(float, obstacle.centre), float(obstacle.radius)]
+            [*map(float, obstacle.centre), obstacle.radius]
             for obstacle in scenario.environment.obstacles
             if obstacle.centre
         ],
