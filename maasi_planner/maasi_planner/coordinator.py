@@ -21,7 +21,7 @@ from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
-from maasi_planner.planners.base import check_decision
+from maasi_planner.planners.base import check_decision, keep_apart
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
 
 
@@ -279,6 +279,7 @@ class Coordinator:
             return Decision(step=step, reason=finished)
         decision = self.planner.decide(team)
         check_decision(self.planner, team, decision)
+        keep_apart(team, decision)
         for name in planning:
             plan, chosen = self.plans[name], decision.robots[name]
             if name not in arrived and chosen.stays:

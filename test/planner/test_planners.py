@@ -21,6 +21,7 @@ from maasi_planner import (
     make_motion,
     make_planner,
 )
+from maasi_planner.planners.base import keep_apart
 from maasi_planner.planners.lawnmower import lanes
 from maasi_planner.planners.mutual_information import intensity, mutual_information
 from maasi_sim.scenario.loading import load_scenario
@@ -320,6 +321,37 @@ def test_robots_without_a_usable_candidate_stay(name, start, candidates, chosen,
     robot = decide(name, team)
     assert robot.stays == (chosen is None) and reason in robot.reason
     assert robot.waypoint == pytest.approx(chosen or [*start, 0.0])
+
+
+@pytest.mark.parametrize('name', ['maasi', 'nearest_widest', 'lawnmower'])
+def test_robots_keep_apart_on_their_ways(name):
+    """In 200 random teams: at no step nearer than their radii, or than they are now."""
+    waits = moves = 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        team = random_team(rng, planning=3, waiting=2, candidates=8, radius=0.04)
+        decision = make_planner(name).decide(team)
+        keep_apart(team, decision)
+        ways = {key: robot.positions for key, robot in decision.robots.items()}
+        moving = {key for key, robot in decision.robots.items() if not robot.stays}
+        for key, view in team.robots.items():
+            if not view.planning:
+                standing = view.state.pose.position[None, :]
+                ways[key] = standing if view.remaining_path is None else view.remaining_path
+        for one, other in itertools.combinations(ways, 2):
+            # Who stands, or is on its way, cannot make room now.
+            if not moving & {one, other}:
+                continue
+            steps = np.arange(max(len(ways[one]), len(ways[other])))
+            first, second = (
+                way[np.minimum(steps, len(way) - 1)] for way in (ways[one], ways[other])
+            )
+            gaps = np.linalg.norm(first - second, axis=1)
+            least = min(team.robots[one].radius + team.robots[other].radius, gaps[0])
+            assert gaps.min() >= least - 1e-9, (seed, one, other)
+        waits += sum('waits' in robot.reason for robot in decision.robots.values())
+        moves += sum(not robot.stays for robot in decision.robots.values())
+    assert moves > 400 and waits > 0
 
 
 def test_wrong_team_is_refused():

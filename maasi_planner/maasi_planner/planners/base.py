@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numba import njit
 from pydantic import BaseModel
 
 from maasi_filter.area import Area
@@ -196,6 +197,9 @@ def options_of(
     free = free_of_robots(points, view.radius, places)
     allowed = prediction.reached & free & (prediction.lengths > 0)
     if allowed.any():
+        allowed &= ways_apart(team, name, prediction.positions, {})
+        if not allowed.any():
+            return 'other robots are on all ways'
         return UsableCandidates(points, prediction, allowed)
     if not free.any():
         return 'other robots stand at all candidates'
@@ -231,6 +235,69 @@ def centres_of(team: TeamView, view: RobotView, clusters: Sequence[Cluster]) -> 
     for row, cluster in zip(centres, clusters):
         row[: team.dimension] = cluster.position[: team.dimension]
     return centres
+
+
+@njit(cache=True)
+def _gaps(ways: FloatArray, other: FloatArray) -> FloatArray:
+    """Return how near each of the ways (W, K, 3) comes to another (n, 3), step by step, (W,).
+
+    At their ends robots stand.
+    """
+    out = np.full(ways.shape[0], np.inf)
+    for w in range(ways.shape[0]):
+        for k in range(max(ways.shape[1], other.shape[0])):
+            here, there = min(k, ways.shape[1] - 1), min(k, other.shape[0] - 1)
+            square = 0.0
+            for axis in range(3):
+                square += (ways[w, here, axis] - other[there, axis]) ** 2
+            out[w] = min(out[w], square)
+    return np.sqrt(out)
+
+
+def ways_apart(
+    team: TeamView, name: str, ways: FloatArray, others: Mapping[str, FloatArray]
+) -> BoolArray:
+    """Return which predicted ways (W, K, 3) of a robot keep the radii away from those of others.
+
+    others: ways (n, 3) of robots that have just been decided, by name; the others are where they
+    stand, or on the rest of their ways. A robot that is too near already may not come nearer.
+    """
+    view = team.robots[name]
+    paths = [(place[None, :], radius) for place, radius in team.taken]
+    for other in team.names():
+        robot = team.robots[other]
+        if other in others:
+            paths.append((others[other], robot.radius))
+        elif other != name and not robot.planning:
+            path = robot.remaining_path
+            standing = path is None or not len(path)
+            paths.append((robot.state.pose.position[None, :] if standing else path, robot.radius))
+    free = np.ones(len(ways), dtype=bool)
+    for path, radius in paths:
+        if view.radius + radius > 0.0:
+            now = float(np.linalg.norm(view.state.pose.position - path[0]))
+            reach = min(view.radius + radius, now)
+            free &= _gaps(ways, np.ascontiguousarray(path, dtype=float)) >= reach - 1e-9
+    return free
+
+
+def keep_apart(team: TeamView, decision: Decision) -> None:
+    """Let robots wait whose ways would come too near to each other; the first by name has priority.
+
+    Who waits stands where it is, which may make others wait, too.
+    """
+    ways = {name: robot.positions for name, robot in decision.robots.items()}
+    changed = True
+    while changed:
+        changed = False
+        for name in sorted(ways, reverse=True):
+            others = {key: way for key, way in ways.items() if key != name}
+            chosen = decision.robots[name]
+            if chosen.stays or ways_apart(team, name, ways[name][None], others)[0]:
+                continue
+            decision.robots[name] = stay(team.robots[name], 'waits: others are on its way')
+            ways[name] = team.robots[name].state.pose.position[None]
+            changed = True
 
 
 def apart(point: FloatArray, radius: float, others: list[tuple[FloatArray, float]]) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.candidates import half_view
-from maasi_planner.planners.base import Planner, explain
+from maasi_planner.planners.base import Planner, explain, ways_apart
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 
@@ -133,10 +133,13 @@ class Lawnmower(Planner):
         if not self._started:
             self._start(team)
         for name in team.planning():
-            decision.robots[name] = self._decide_one(team, name)
+            decided = {key: robot.positions for key, robot in decision.robots.items()}
+            decision.robots[name] = self._decide_one(team, name, decided)
         return explain(decision)
 
-    def _decide_one(self, team: TeamView, name: str) -> RobotDecision:
+    def _decide_one(
+        self, team: TeamView, name: str, decided: dict[str, FloatArray]
+    ) -> RobotDecision:
         view = team.robots[name]
         here = view.state.pose.position
         while True:
@@ -149,6 +152,9 @@ class Lawnmower(Planner):
             prediction = view.motion.predict(view.state, point[None, :], team.step_time)
             if not prediction.reached[0] or prediction.lengths[0] == 0:
                 continue
+            if not ways_apart(team, name, prediction.positions, decided)[0]:
+                self._pending[name].insert(0, target)
+                return stay(view, 'waits: others are on its way')
             return single_choice(point[None, :], prediction, 0, 'next point of the lawnmower')
 
     def finished(self, team: TeamView) -> str | None:
