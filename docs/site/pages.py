@@ -23,7 +23,7 @@ DOCS = ROOT / 'docs'
 PARTS = {
     'Start': ['README', 'first_search', 'install'],
     'Tutorials': [
-        f'tutorials/{name}' for name in ('student', 'ros_engineer', 'researcher', 'field')
+        f'tutorials/{name}' for name in ('student', 'ros_engineer', 'researcher', 'area', 'field')
     ],
     'How to': [
         *(f'how_to/{name}' for name in ('detections', 'planner', 'robot', 'bags')),

@@ -1,5 +1,6 @@
 """State estimation of the team: sensors, exploration, filters and found targets."""
 
+from maasi_filter.area import Area
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.make_filter import load_filter, make_filter, warm_up
@@ -28,6 +29,7 @@ from maasi_filter.unexplored_map import UnexploredMap
 
 __all__ = [
     'AgentMeasurement',
+    'Area',
     'BoxDetection',
     'Cluster',
     'DetectionModel',

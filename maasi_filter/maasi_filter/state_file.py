@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, PlainValidator
 
 FORMAT = 'maasi_filter_state'
-VERSION = 4
+VERSION = 5
 
 
 class StateFileError(ValueError):
