@@ -43,7 +43,7 @@ class Zone(Settings):
             return value
         if value[:1].isalpha():
             return {'polygon': value}
-        *centre, radius = value.split()
+        *centre, radius = map(float, value.split())
         return {'centre': centre, 'radius': radius}
 
     @model_validator(mode='after')
@@ -71,7 +71,7 @@ class PriorPart(Settings):
         if not isinstance(value, str):
             return value
         weight, polygon = value.split(maxsplit=1)
-        return {'polygon': polygon, 'weight': weight}
+        return {'polygon': polygon, 'weight': float(weight)}
 
     def __str__(self) -> str:
         return f'{self.weight!r} {self.polygon}'
@@ -138,7 +138,9 @@ class EnvironmentSettings(Settings):
     def _ordered(cls, value: list[list[float]]) -> list[list[float]]:
         for axis, pair in enumerate(value):
             if not pair[0] < pair[1]:
-                raise ValueError(f'[{axis}]: got {pair}, allowed is [lower, upper], lower < upper')
+                raise ValueError(
+                    f'axis {axis}: got {pair}, allowed is [lower, upper], lower < upper'
+                )
         return value
 
     @model_validator(mode='after')

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from maasi_filter.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
 from maasi_planner.motion import RobotState
@@ -74,10 +75,10 @@ def test_constant_offset_has_its_length_and_is_reported():
 
 def test_targets_walk_as_told_the_same_each_time_and_stay_inside():
     inner = np.random.default_rng(0).uniform(100.0, 160.0, (400, 3))
-    first, again = (World(CUBE, inner, walk=0.5, seed=4).targets_at(100) for _ in range(2))
+    first, again = (World(Area(CUBE), inner, walk=0.5, seed=4).targets_at(100) for _ in range(2))
     assert_allclose(np.std(first - inner), 5.0, rtol=0.05)
     assert_array_equal(again, first)
-    small = World(np.array([[0.0, 3.0]] * 3), np.full((50, 3), 1.5), walk=0.5, seed=4)
+    small = World(Area([[0.0, 3.0]] * 3), np.full((50, 3), 1.5), walk=0.5, seed=4)
     places = small.targets_at(200)
     assert ((places >= 0.0) & (places <= 3.0)).all()
 

@@ -45,7 +45,7 @@ def test_no_target_lies_in_an_obstacle():
     environment = FLOOR | {'obstacles': [{'centre': [1.0, 1.0], 'radius': 0.8}]}
     built = world(environment, count=40, margin=0.1)
     assert np.linalg.norm(built.targets - 1.0, axis=1).min() >= 0.9
-    assert built.obstacles.radii.tolist() == [0.8]
+    assert built.area.solid[:, 3].tolist() == [0.8]
 
 
 def test_given_positions_are_taken():
@@ -61,7 +61,7 @@ def test_given_positions_are_taken():
     [
         ({'positions': [[0.5, 0.6, 0.7]]}, r'targets.positions\[0\]: got 3 coordinates'),
         ({'positions': [[0.5, 0.6], [0.5]]}, r'targets.positions\[1\]: got 1 coordinates'),
-        ({'positions': [[0.5, 2.6]]}, r'targets.positions\[0\]: got .* within the bounds'),
+        ({'positions': [[0.5, 2.6]]}, r'targets.positions\[0\]: got .* the bounds'),
         ({'count': 3, 'margin': 1.5}, 'targets.margin: got 1.5, allowed at most half'),
         ({'count': 30, 'separation': 1.0}, 'targets: got count 30 .* do not fit'),
     ],

@@ -85,7 +85,7 @@ def test_an_environment_survives_the_parameters_of_a_node():
         ({'area': RING, 'keep_outs': [{'centre': [1, 2, 3], 'radius': 1}]}, 'allowed are 2 coord'),
         ({'area': feature(RING, role='garden')}, 'got role garden, allowed are area'),
         ({'bounds': [[0, 1], [0, 1]], 'altitude': [0, 1]}, 'altitude: allowed with area'),
-        ({'bounds': [[0, 1], [1, 1]]}, r'\[1\]: got \[1.0, 1.0\]'),
+        ({'bounds': [[0, 1], [1, 1]]}, r'axis 1: got \[1.0, 1.0\]'),
     ],
 )
 def test_wrong_environments_are_refused_by_their_key(values, words):

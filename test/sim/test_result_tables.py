@@ -75,11 +75,11 @@ def field(folder, **origin):
     return load_scenario(path)
 
 
-def test_the_filter_alone_has_the_origin_and_a_wrong_one_is_refused(tmp_path):
+def test_nodes_have_the_origin_and_a_wrong_one_is_refused(tmp_path):
     scenario = field(tmp_path, latitude=46.0, longitude=23.5)
     plans = TargetMission('field', scenario).plan_nodes(Options(), Path('/s.yaml'))
-    told = {plan.name: plan.parameters.get('origin.latitude') for plan in plans}
-    assert told.pop('filter_node') == 46.0 and set(told.values()) == {None}
+    told = {plan.name: plan.parameters.get('environment.origin.latitude') for plan in plans}
+    assert told['filter_node'] == told['planner_node'] == told['driver'] == 46.0
     with pytest.raises(ScenarioError, match=r'field.yaml:.*environment.origin.latitude'):
         field(tmp_path, latitude=146.0, longitude=23.5)
 

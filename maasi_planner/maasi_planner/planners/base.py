@@ -270,8 +270,9 @@ def ways_apart(
             paths.append((others[other], robot.radius))
         elif other != name and not robot.planning:
             path = robot.remaining_path
-            standing = path is None or not len(path)
-            paths.append((robot.state.pose.position[None, :] if standing else path, robot.radius))
+            if path is None or not len(path):
+                path = robot.state.pose.position[None, :]
+            paths.append((path, robot.radius))
     free = np.ones(len(ways), dtype=bool)
     for path, radius in paths:
         if view.radius + radius > 0.0:

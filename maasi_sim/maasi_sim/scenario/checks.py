@@ -95,8 +95,8 @@ def _place_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
     area = Area(scenario.environment)
     if not area.inside([robot.start])[0]:
         yield (
-            f'start: read {robot.start}, allowed is what lies inside the environment and outside '
-            f'of its keep_outs, within {area.bounds.tolist()}'
+            f'start: read {robot.start}, allowed is what lies inside environment.bounds, or the '
+            f'area, and outside of keep_outs; bounds are {area.bounds.tolist()}'
         )
     gap = area.distances(robot.start).min(initial=math.inf)
     if gap < robot.radius:

@@ -137,8 +137,8 @@ class World:
                     )
                 if not area.inside([row])[0]:
                     raise ValueError(
-                        f'targets.positions[{index}]: got {row}, allowed within the area, in the '
-                        f'bounds {bounds.tolist()}'
+                        f'targets.positions[{index}]: got {row}, allowed inside the area, within '
+                        f'the bounds {bounds.tolist()}'
                     )
                 positions[index] = row
         else:

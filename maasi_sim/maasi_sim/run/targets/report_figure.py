@@ -82,7 +82,9 @@ def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -
         right, up, values, cmap=shades, vmin=0.0, vmax=1.0, shading='gouraud', zorder=0
     )
     low, high = bounds[list(view.plane)].T
-    view.axes.add_patch(Rectangle((low[0], low[1]), *(high - low), fc='none', ec='#B0B0B0', lw=1.0))
+    if not explored.area.shapes['area'] or 2 in view.plane:
+        frame = Rectangle((low[0], low[1]), *(high - low), fc='none', ec='#B0B0B0', lw=1.0)
+        view.axes.add_patch(frame)
     view.axes.plot([], [], 's', color=UNSEEN, ms=9, label='not explored')
 
 

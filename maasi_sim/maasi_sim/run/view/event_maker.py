@@ -271,7 +271,9 @@ class EventMaker:
         ninths = values if values.dtype == np.uint8 else np.clip(np.rint(9.0 * values), 0, 9)
         text = (ninths.astype(np.uint8) + ord('0')).tobytes().decode('ascii')
         steps = [significant(value) for value in padded(spacing)]
-        share = round(_explored(values) if explored is None else explored, 4)
+        if explored is None:
+            explored = 1.0 - (1.0 - _explored(values)) / self.scene.get('whole', 1.0)
+        share = round(explored, 4)
         self._put(time, 'map', space, self._place(corner), steps, shape, text, share)
 
     def truth(self, time: float, targets: ArrayLike) -> None:

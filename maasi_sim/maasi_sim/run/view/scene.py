@@ -13,6 +13,7 @@ from maasi_drivers.agent.flight_rules import make_fence
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.area import Area
 from maasi_filter.settings import DETECTIONS
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.buildings.settings import FACES
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.run.buildings.scenario import NAME as BUILDINGS
@@ -42,14 +43,18 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
     if isinstance(scenario, CuboidScenario):
         return scene | _buildings(scenario)
     assert isinstance(scenario, Scenario)
-    truth = np.asarray(scenario.world(seed).targets, dtype=float)
+    area, truth = scenario.world(seed).area, np.asarray(scenario.world(seed).targets, dtype=float)
+    unseen = UnexploredMap(area, scenario.filter.exploration_spacing)
+    whole = float(unseen.cell_volumes().sum() / np.ptp(area.bounds, axis=1).prod())
     return scene | {
         'obstacles': [
             [*map(float, obstacle.centre), obstacle.radius]
             for obstacle in scenario.environment.obstacles
             if obstacle.centre
         ],
-        'zones': zones_of(Area(scenario.environment)),
+        'zones': zones_of(area),
+        # Mean over the bounds of what is shown as unexplored, before the search.
+        'whole': round(whole / float(unseen.density.max()), 6),
         'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},
         'targets': len(truth),
         'expected_targets': scenario.environment.expected_targets,
