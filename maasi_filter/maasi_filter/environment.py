@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -238,12 +237,13 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
                 latitude=0.5 * (south + north), longitude=0.5 * (west + east)
             )
     origin = values.get('origin')
-    if origin:
-        origin = values['origin'] = OriginSettings.model_validate(origin)
+
+    def project(degrees: FloatArray) -> FloatArray:
+        return to_map(degrees, OriginSettings.model_validate(origin))
 
     def text(value: Any, key: str) -> str:
         try:
-            found = read_shape(value, partial(to_map, origin=origin) if origin else None)
+            found = read_shape(value, project if origin else None)
         except (ValueError, TypeError, KeyError, OSError, shapely.errors.ShapelyError) as error:
             raise ValueError(f'{key}: {error}') from None
         return str(shapely.to_wkt(found, rounding_precision=4))

@@ -124,7 +124,7 @@ WRONG = [
     ([(GRID, {'ring': 6, 'distance': 0.2})], f'{GRID}.ring', ['allowed in 2D']),
     ([('environment.bounds.0', [2.0, 0.0])], 'environment.bounds', ['lower < upper']),
     ([(DISCS, [{'centre': [0.5, 0.6], 'radius': 0.1}])], 'robots.mambo.start', [DISCS]),
-    ([(DISCS, [{'centre': [1, 1, 0], 'radius': 0.1}])], 'environment', ['obstacles[0].centre', '2 coordinates']),
+    ([(DISCS, [{'centre': [1, 1, 0], 'radius': 0.1}])], 'environment', ['[0].centre: got']),
     ([('targets.margin', 1.5)], 'targets.margin', ['at most half']),
     ([('targets.count', 500)], 'targets.separation', ['not 500']),
     ([('targets', {'positions': [[0.5, 3.0]]})], 'targets.positions[0]', ['the bounds']),
