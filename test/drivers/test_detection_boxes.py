@@ -48,7 +48,7 @@ def boxes(*items, frame='', stamp=0):
 @pytest.mark.parametrize(('point', 'sides'), [('foot', False), ('centre', False), ('foot', True)])
 def test_covariance_covers_the_noise_of_box_and_pose(point, sides):
     """A box is moved by its settings' error as a whole, or, less, each of its sides is."""
-    error = 0.05
+    error = 0.1
     settings = CameraSettings.model_validate(
         LEVEL | {'detections': {'point': point, 'error': error}}
     )
