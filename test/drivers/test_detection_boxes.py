@@ -3,27 +3,27 @@
 import math
 import re
 import sys
+from functools import partial
 
-import cv2
 import numpy as np
 import pytest
+from blue_detector import BlueDetector, box
 from marker_view import DISTORTION, turned
 from numpy.testing import assert_allclose
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from robot_team import NANOSECONDS, TURTLEBOT, rendered, stamped, transform
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo
 from tf2_msgs.msg import TFMessage
-from vision_msgs.msg import Detection2D, Detection2DArray, ObjectHypothesisWithPose
+from vision_msgs.msg import Detection2DArray
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.detection_boxes import boxes_to_blobs
-from maasi_drivers.vision.images import image_to_array
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.measurement import RangeBearing
 from maasi_filter.models.pose import Pose
-from maasi_filter.ros.qos import LATCHED, RELIABLE, SENSOR
+from maasi_filter.ros.qos import LATCHED
 
 # Of Detection2DArray in vision_msgs 4.1.1, the version of Jazzy.
 HASH = 'RIHS01_214274120007f4a683866481336b70310268cfa107aebe9d594a6acf75bda968'
@@ -39,18 +39,6 @@ LEVEL = {
 TALL, WIDE = 1.7, 0.5
 
 
-def box(centre, size, label=('person', 0.75), theta=0.0):
-    made = Detection2D(id='17')
-    made.bbox.center.position.x, made.bbox.center.position.y = map(float, centre)
-    made.bbox.size_x, made.bbox.size_y = map(float, size)
-    made.bbox.center.theta = theta
-    # The least likely class first.
-    for class_id, score in [('dog', 0.1), label] if label else []:
-        made.results.append(ObjectHypothesisWithPose())
-        made.results[-1].hypothesis.class_id, made.results[-1].hypothesis.score = class_id, score
-    return made
-
-
 def boxes(*items, frame='', stamp=0):
     message = Detection2DArray(detections=list(items))
     message.header.frame_id = frame
@@ -60,7 +48,7 @@ def boxes(*items, frame='', stamp=0):
 @pytest.mark.parametrize(('point', 'sides'), [('foot', False), ('centre', False), ('foot', True)])
 def test_covariance_covers_the_noise_of_box_and_pose(point, sides):
     """A box is moved by its settings' error as a whole, or, less, each of its sides is."""
-    error = 0.05
+    error = 0.1
     settings = CameraSettings.model_validate(
         LEVEL | {'detections': {'point': point, 'error': error}}
     )
@@ -108,6 +96,10 @@ def test_a_box_is_at_its_foot_or_centre_and_a_cut_one_is_less_exact():
     assert [(item.class_id, item.score) for item in blobs.labels] == [
         ('person', 0.75), ('', 0.0), ('person', 0.75),
     ]  # fmt: skip
+    # In 3D they are on the floor as well.
+    seen = MarkerDetector(settings, 3).detect(blobs, Pose(np.zeros(3)))
+    assert seen.values.shape == (3, 3) and not seen.positions[:, 2].any()
+    assert np.linalg.eigvalsh(seen.covariances).min() > 0.0
     # A tracker's id is none of the target's.
     assert not any(item.identity for item in blobs.labels)
     above = boxes(box((320, 20), (10, 10)))
@@ -136,25 +128,6 @@ def test_a_bad_box_is_named_and_the_others_are_used(item, said):
     assert re.search(said, problem)
 
 
-class BlueDetector(Node):
-    """A detector as others write them: boxes around what is blue, with the header of the image."""
-
-    def __init__(self, **options):
-        super().__init__('detector', **options)
-        self.frame = 'rover/camera_optical'
-        self.publisher = self.create_publisher(Detection2DArray, 'camera/detections', RELIABLE)
-        self.create_subscription(Image, 'camera/image_raw', self.on_image, SENSOR)
-
-    def on_image(self, message):
-        red, green, blue = np.moveaxis(image_to_array(message).astype(int), 2, 0)
-        mask = (blue - (red + green) // 2 > 60).astype(np.uint8)
-        _, _, stats, _ = cv2.connectedComponentsWithStats(mask)
-        found = boxes(*(box((x + w / 2, y + h / 2), (w, h)) for x, y, w, h, _ in stats[1:]))
-        found.detections.append(box((80, 60), (9, 9), ('dog', 0.9)))
-        found.header.stamp, found.header.frame_id = message.header.stamp, self.frame
-        self.publisher.publish(found)
-
-
 def with_boxes(**changes):
     detections = {'classes': ['person'], 'point': 'centre'} | changes
     return TURTLEBOT['camera'] | {'detections': detections}
@@ -163,7 +136,7 @@ def with_boxes(**changes):
 @pytest.fixture
 def searching(play, start_node):
     """Return a detector in the loop, the driver, the team, and how to look at targets."""
-    detector = start_node(BlueDetector)
+    detector = BlueDetector(start_node(partial(Node, 'detector')))
     driver, team = play(camera=with_boxes())
     team.until(detector.publisher.get_subscription_count)
     team.move(4)
@@ -187,6 +160,7 @@ def searching(play, start_node):
 
 def test_a_detector_of_another_package_needs_no_code(searching):
     detector, driver, team, look = searching
+    detector.frame = 'rover/camera_optical'
     places = [[0.12, 0.03], [0.02, -0.05]]
     answer, seen = look(*places)
     assert_allclose(sorted(seen), sorted(places), atol=4e-3)
