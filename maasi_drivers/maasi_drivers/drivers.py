@@ -1,7 +1,4 @@
-"""The drivers of the suite, each a link to its robot and a sensor; executables by their names.
-
-A link to vehicles is imported by the driver that uses it: MAVLink needs an extra of the package.
-"""
+"""The drivers of the suite by executable; MAVLink, an extra, is imported where it is used."""
 
 from __future__ import annotations
 

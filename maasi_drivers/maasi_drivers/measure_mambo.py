@@ -1,8 +1,7 @@
 """A command that measures how fast a Mambo flies at its largest tilt: `mambo.full_speed`.
 
-Each leg is the largest tilt one way and then the other for the same time T, from rest. Without
-drag a leg is g tan(tilt) T^2 long and ends at rest; with drag it is shorter, so that its length is
-bounded in advance for any drone. Then it hovers, and flies back.
+Each leg is the largest tilt one way and then the other for the same time T, from rest: without drag
+g tan(tilt) T^2 long, a bound for any drone. Then it hovers, and flies back.
 """
 
 from __future__ import annotations
@@ -52,11 +51,7 @@ class MeasuredSpeed:
 
 @dataclass
 class Leg:
-    """One leg: from rest, one way and back.
-
-    `tilts` are time since `begin` [s] and share of the largest tilt forward, `events` time since
-    `begin` and place forward of the take-off point [m].
-    """
+    """A leg from rest; tilts (share of the largest) and places forward [m] by time from begin."""
 
     begin: float  # monotonic clock [s]
     origin: float  # where it rested, forward of the take-off point [m]

@@ -20,12 +20,7 @@ _SETTLE_TIME, _LAST_TASKS = 0.3, 5
 
 
 class GoalServer:
-    """Takes goals of `go_to` (maasi_msgs/GoToWaypoint).
-
-    The newest goal replaces the one before, and the robot turns to it without a stop. One that
-    cannot be taken is aborted at once, with the reason in its result: the protocol has no reason
-    in a rejection.
-    """
+    """Takes goals of `go_to`, each in place of the one before; a bad one is aborted, with why."""
 
     def __init__(self, driver: RobotNode, link: RobotLink, frames: RobotFrames) -> None:
         self._driver = driver

@@ -59,10 +59,7 @@ def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
 
 
 def robot_description(robot: str, settings: DriverSettings) -> str:
-    """Return the URDF of a robot: a cylinder of its radius, and the frames of its sensors.
-
-    Links have the names of the frames. The height is not known: it is drawn as the radius.
-    """
+    """Return the URDF of a robot: a cylinder as high as its radius, and its sensors' frames."""
     root = ElementTree.Element('robot', name=robot)
     link = ElementTree.SubElement(root, 'link', name=base_frame(robot, settings))
     for part in ('visual', 'collision'):
@@ -81,10 +78,7 @@ def robot_description(robot: str, settings: DriverSettings) -> str:
 
 
 class RobotFrames:
-    """The frames of one robot, on the team's `tf` and `tf_static`.
-
-    In lockstep these are not read: only the robot's own frames are known.
-    """
+    """The frames of one robot, on the team's `tf` and `tf_static`, unread in lockstep."""
 
     def __init__(
         self,
@@ -245,12 +239,7 @@ class RobotFrames:
         self._on_pose(stamp, pose)
 
     def to_map(self, waypoint: PoseStamped, now: int) -> str | None:
-        """Bring a waypoint into the map; return what is wrong where that is not possible.
-
-        A waypoint without a stamp is one in its frame as it is now.
-
-        Units: now [ns].
-        """
+        """Bring a waypoint into the map at a time [ns]; return what is wrong where it cannot be."""
         header, settings = waypoint.header, self._settings
         frame = header.frame_id.strip('/')
         if header.frame_id == settings.frame:

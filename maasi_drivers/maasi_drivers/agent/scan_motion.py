@@ -35,10 +35,7 @@ def scan_points(
     placed: StampedPose,
     mount: ArrayLike,
 ) -> FloatArray:
-    """Return where the beams of a scan ended, (n, 2) in the map [m].
-
-    Shapes and units: angles [rad]; seconds_per_beam [s]; mount (3,) [m, rad].
-    """
+    """Return where the beams of a scan ended, (n, 2) in the map [m]."""
     distances = np.asarray(ranges, dtype=float)
     names = ('angle_min', 'angle_increment', 'range_min', 'range_max', 'time_increment')
     for name, value in zip(names, (*angles, *limits, seconds_per_beam), strict=True):
@@ -83,11 +80,10 @@ def way_around(
     reach: float,
     before: float,
 ) -> tuple[float, float, float]:
-    """
-    Return a point to head for that is free for `reach` metres or up to the target, and its heading.
+    """Return a free point towards the target, at most `reach` away [m], and the heading to it.
 
-    The target itself where the straight way is free, else the free heading that is nearest to it
-    and to the one chosen before (not a number: none was); the target where no heading is free.
+    Free headings near the straight way and the one chosen before are preferred; the target itself
+    where the straight way is free, or none is.
     """
     dx = target_x - x
     dy = target_y - y
@@ -119,13 +115,7 @@ def way_around(
 
 
 class ScanUnicycle(Unicycle):
-    """A ground robot that keeps clear of known obstacles and of what its scanner sees.
-
-    Ways around known obstacles are planned; what is seen beside them is avoided locally, so that
-    the robot can get stuck in a pocket: the driver gives up a waypoint that gets no nearer.
-
-    Units: radius [m].
-    """
+    """A ground robot that plans around known obstacles and avoids what its scanner sees locally."""
 
     def __init__(
         self, settings: MotionSettings, obstacles: Obstacles, radius: float, scan: ScanSettings

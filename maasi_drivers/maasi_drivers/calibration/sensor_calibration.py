@@ -31,28 +31,11 @@ class Observation:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """A sensor's noise.
+    """A sensor's R and bias of range [m] and angles [rad], and what they rest on.
 
-    Attributes
-    ----------
-    covariance : ndarray, shape (d, d)
-        R: of the errors of range [m], bearing and, in 3D, elevation [rad].
-    bias : ndarray, shape (d,)
-        Their mean.
-    target : ndarray, shape (d,)
-        Where the target is [m, map]: as given, or the mean of where it was seen.
-    ranges : tuple of float
-        Smallest and largest range of the observations that were used [m].
-    used : int
-        Observations from which R is estimated.
-    near : int
-        Observations left out because the target was too near for a bearing.
-    others : int
-        Detections of something else.
-    inside : int
-        Observations with the target in the field of view.
-    missed : int
-        Of those, the ones that did not show it.
+    Target as given, or where it was seen on average [m, map]; smallest and largest range;
+    observations used, too near for a bearing, of something else, with the target in view, and of
+    those missed.
     """
 
     covariance: FloatArray
@@ -82,12 +65,9 @@ def sensor_noise(
     target: ArrayLike | None = None,
     least_range: float = 0.05,
 ) -> SensorNoise:
-    """Return a sensor's noise.
+    """Return a sensor's noise by observations of a target (d,) [m, map].
 
-    In each observation the detection nearest to the target counts, unless it is eight times as far
-    as the median.
-
-    Shapes and units: target (d,) [m, map]; least_range [m].
+    The nearest detection counts, unless it is eight times as far from the target as the median.
     """
     model = sensor.measurement
     seen = [model.inverse(observation.values, observation.pose) for observation in observations]

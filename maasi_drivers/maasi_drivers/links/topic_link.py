@@ -27,10 +27,7 @@ _TYPES: dict[str, type] = {
 
 
 class CommandPublisher:
-    """Publishes commands as TwistStamped, as Twist, or as what is subscribed.
-
-    TurtleBot3s of Jazzy listen to TwistStamped, those of Humble to Twist, on the same topic.
-    """
+    """Publishes TwistStamped (TurtleBot3 of Jazzy), Twist (of Humble) or what is subscribed."""
 
     def __init__(self, node: Node, topic: str, kind: CommandType, lockstep: bool = False) -> None:
         self._node = node

@@ -107,11 +107,7 @@ class SegmentationSettings(Settings):
 
 
 class MountSettings(Settings):
-    """Where the camera sits on the robot (frames as in REP-103: x forward, y left, z up).
-
-    With ``rpy`` zero the camera looks along the robot's x axis, image top up. A pitch of pi/2 looks
-    straight down, the image's top towards the robot's front.
-    """
+    """Where the camera sits on the robot (REP-103); without rpy it looks forward, image top up."""
 
     position: Vector3 = Field(
         default=[0.0, 0.0, 0.0],

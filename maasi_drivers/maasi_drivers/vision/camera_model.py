@@ -93,10 +93,7 @@ class Camera:
         return np.reshape(pixels, (-1, 2)), np.reshape(slopes[:, 3:5], (-1, 2, 2))
 
     def undistort(self, pixels: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the ideal rays (n, 2) of pixels, and their derivatives (n, 2, 2) [1/px].
-
-        In normalised coordinates; not a number where the distortion has no inverse.
-        """
+        """Return rays (n, 2) of pixels, nan: no inverse; their derivatives (n, 2, 2) [1/px]."""
         given = np.reshape(np.asarray(pixels, float), (-1, 2))
         points = np.empty((0, 2))
         if len(given):

@@ -104,10 +104,7 @@ class VideoFrame:
 
 
 class VideoSource:
-    """Reads a source in a thread of its own, and keeps the newest frame.
-
-    A stream or device that breaks off is opened again. A file is played at its own rate, once.
-    """
+    """Keeps the newest frame; what breaks off is opened again, a file is played once."""
 
     def __init__(self, source: str) -> None:
         if not source:

@@ -215,11 +215,7 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
 def measurement_from_ros(
     message: DetectionArray, sensor: Sensor, drop: Callable[[str, str, int], None]
 ) -> AgentMeasurement:
-    """Return the measurement of a robot.
-
-    Invalid detections, equal ones, and those beyond `MOST_DETECTIONS` are left out: `drop` is
-    called with reason, text and number.
-    """
+    """Return a robot's measurement; invalid, equal and surplus detections go to `drop`."""
     pose = pose_from_ros(message.pose.pose)
     errors = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
     if not np.isfinite(errors).all():
@@ -333,12 +329,7 @@ def filter_markers(
 
 
 class MarkerBoard:
-    """Makes each array of markers replace the previous one.
-
-    The first array deletes all markers that a viewer still shows of an earlier process; later
-    arrays delete those that are no longer present. Other nodes on the same topic also lose their
-    markers with the first array, until they publish again.
-    """
+    """Makes each array of markers replace the previous one, the first all that are shown."""
 
     def __init__(self) -> None:
         self._shown: dict[tuple[str, int], Marker] | None = None

@@ -119,10 +119,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         """Stop all motion, in *deactivate* and at shutdown. May be called more than once."""
 
     def tear_down(self) -> None:
-        """Undo `prepare` and `set_up`, in *cleanup*; the base class destroys ROS entities.
-
-        Also called after a failed *configure*.
-        """
+        """Undo `prepare` and `set_up`, in *cleanup* and after a failed *configure*."""
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the parameters, compile, warm up and connect."""
@@ -284,10 +281,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], None], *others: Any, **options: Any
     ) -> Any:
-        """Return a timer that is never called after its destruction.
-
-        The executor may already have queued it.
-        """
+        """Return a timer that is never called after its destruction, as a queued call would be."""
 
         def call() -> None:
             if any(item is made for item in self.timers):
@@ -321,11 +315,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
-        """Return a subscription that drops messages with an invalid stamp, and far too large ones.
-
-        It is never called after its destruction; the executor may already have queued a message.
-        It has no event callbacks of rclpy; see `Endpoints`.
-        """
+        """Return a subscription that drops invalid stamps and sizes; silent once destroyed."""
         options.setdefault(
             'event_callbacks', SubscriptionEventCallbacks(use_default_callbacks=False)
         )
@@ -368,10 +358,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     # ---- diagnostics -------------------------------------------------------------------------
 
     def drop(self, reason: str, text: str, number: int = 1) -> None:
-        """Count discarded data by a short reason, and warn, throttled.
-
-        `text`: topic and field, what was read, what is allowed.
-        """
+        """Count discarded data by a reason, and warn, throttled: what was read, what is allowed."""
         self.dropped[reason] += number
         self.warn_throttled(reason, f'dropped: {text}')
 

@@ -38,10 +38,8 @@ class SettingsError(Exception):
 class NodeParameters(Generic[SettingsT]):
     """Declares the parameters of a node, and reads its settings from them.
 
-    Parameters that were not set have the defaults of the settings: once the node is configured,
-    the resolved ones (of a preset, for example), which depend on the parameters that were set.
-    The node has to allow undeclared parameters: optional ones are declared only if they have a
-    value, as a file of `ros2 param dump` cannot represent None.
+    Those that were not set have the settings' defaults, once configured those of a preset, too.
+    Optional ones are declared with a value only: a file of `ros2 param dump` cannot represent None.
     """
 
     def __init__(self, node: Node, model: type[SettingsT]) -> None:

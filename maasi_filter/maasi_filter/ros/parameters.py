@@ -103,10 +103,7 @@ def flatten(settings: BaseModel, prefix: str = '') -> dict[str, Any]:
 
 
 def unflatten(model: type[BaseModel], flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Return flat parameters as nested values for `model.model_validate`.
-
-    ValueError, if a list has no rows of numbers, names the parameter.
-    """
+    """Return flat parameters as nested values; a ValueError names the parameter without rows."""
     nested: dict[str, Any] = {}
     for item in parameter_fields(model, flat):
         # Parts without a value are made too, so that errors name what is missing in them.
@@ -204,10 +201,7 @@ def _by_name(annotation: Any) -> type[BaseModel] | None:
 
 
 def parameters_of(node: type) -> Iterator[ParameterField]:
-    """Yield the parameters of a class of nodes; those of each robot as of one named NAME.
-
-    Its settings are the type argument of one of its bases.
-    """
+    """Yield the parameters of a class of nodes, its type argument; each robot's as of NAME."""
     model = next(
         argument
         for kind in node.__mro__
@@ -220,10 +214,7 @@ def parameters_of(node: type) -> Iterator[ParameterField]:
 
 
 def node_help(node: type, name: str, base: type) -> str:
-    """Return the help of a class of nodes, whose executable has this name.
-
-    Topics are from the docstrings, up to that of `base`.
-    """
+    """Return the help of a class of nodes; topics are from docstrings, up to that of `base`."""
     text = [
         f'usage: {name} [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r __ns:=/TEAM] ...]'
     ]

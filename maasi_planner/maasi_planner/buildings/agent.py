@@ -62,11 +62,7 @@ def inflated(boxes: FloatArray, clearance: float) -> FloatArray:
 
 
 class SearchAgent:
-    """A robot with its own planner.
-
-    At each step: `observe` its state, send the returned message, and `decide` with the messages
-    received. `mission` is the same for all robots; steps take `step` seconds.
-    """
+    """A robot with its own planner: at each step it observes, sends, and decides."""
 
     def __init__(
         self,

@@ -1,10 +1,9 @@
 """The quadratic problem of one axis: rows, costs, and a dual active-set method.
 
-Once it is fixed which cuboids are visited at which step and which faces of obstacles are kept
-away from, P2 of 004 decomposes into one problem for each axis: choose T forces u such that
-positions, velocities, forces and the way to brake afterwards, all linear in u, stay in their
-bounds. The matrices are the same at every step of a mission; only bounds and the free motion
-change, so that the method works on the rows' Gram matrix alone.
+Once visits and faces of obstacles are fixed, P2 of 004 decomposes into one problem for each axis: T
+forces u such that positions, velocities, forces and the way to brake, all linear in u, stay in
+their bounds. Only bounds and free motion change from step to step: the method works on the rows'
+Gram matrix alone.
 """
 
 from __future__ import annotations
@@ -57,10 +56,7 @@ class AxisRows:
 def axis_rows(
     dynamics: Dynamics, horizon: int, pull: FloatArray, smoothness: float, rolling: FloatArray
 ) -> AxisRows:
-    """Return the rows of an axis; `pull` (T + 1,) and `smoothness` not scaled yet.
-
-    rolling (J,): ways to brake from a speed of 1, by air resistance alone [m]; none: no such rows.
-    """
+    """Return the rows of an axis for unscaled weights and ways to roll to a halt (J,) [m]."""
     forces = np.eye(horizon)
     gamma = dynamics.step / dynamics.mass
     velocities = np.zeros((horizon + 1, horizon))
@@ -91,11 +87,9 @@ def solve_axis(
     y: FloatArray,
     room: AxisRoom,
 ) -> float:
-    """Minimise over the rows' values y within their bounds: dual active-set method.
+    """Minimise over the rows' values y = free + gram lambda in their bounds (Goldfarb, Idnani).
 
-    The method of Goldfarb and Idnani, written in the values y = free + gram lambda. Returns the
-    objective above that of the free minimum; inf where there is no solution, or where the
-    objective is certain to exceed `cutoff`.
+    Returns the objective above that of the free minimum; inf: no solution, or above `cutoff`.
     """
     active, multipliers, factor, work = room
     m = free.shape[0]

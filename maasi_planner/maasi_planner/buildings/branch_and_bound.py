@@ -1,9 +1,8 @@
 """Exact branch and bound over visits and obstacle faces: 004, P2 for one robot.
 
-A node fixes visits in the order of their steps, and which faces of obstacles some segments of the
-trajectory stay beyond. Its relaxation is one quadratic problem for each axis. An *open* node
-stands for every plan that makes these visits and perhaps later ones, a *closed* one for those
-that make no other. Faces are branched on only where a trajectory crosses an obstacle.
+A node fixes visits in the order of their steps, and which faces of obstacles segments stay beyond;
+its relaxation is a quadratic problem for each axis. An *open* node stands for every plan with these
+visits and perhaps later ones, a *closed* one for those with no other.
 """
 
 from __future__ import annotations
@@ -123,10 +122,7 @@ def _position(instance: Instance, tree: Tree, node: int, a: int, k: int) -> floa
 
 @njit(cache=True)
 def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int) -> tuple[int, int]:
-    """Return the first segment from `begin` to `end`, and the obstacle in its way; (-1, -1): none.
-
-    Segment k joins P_{k-1} and P_k; segment T + 1 is the way to brake.
-    """
+    """Return the first segment from begin to end through an obstacle, and that; or (-1, -1)."""
     horizon = instance.horizon
     steps = instance.rise.shape[1]
     first = 3 * horizon - 1
@@ -273,10 +269,9 @@ def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
 
 @njit(cache=True)
 def search(instance: Instance, tree: Tree, most: int) -> int:
-    """Continue a search by at most `most` nodes.
+    """Continue a search by at most `most` nodes; return whether the best is the optimum (FOUND).
 
-    Returns FOUND: the best node is the optimum; EXHAUSTED: there is no plan; UNFINISHED: nodes are
-    left; FULL: there was no room for more, the best node may not be the optimum.
+    EXHAUSTED: there is no plan; UNFINISHED: nodes are left; FULL: there was no room for more.
     """
     horizon = instance.horizon
     end = horizon + 1

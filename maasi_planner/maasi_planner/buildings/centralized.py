@@ -1,8 +1,7 @@
 """Exact joint planning of all robots: 004, P1.
 
-Without (5j) the problem decomposes into one problem P2 per robot. A cuboid that two robots plan to
-visit counts once: best-first search branches by forbidding it to one or to the other robot. The
-first node without such a conflict is the optimum.
+Without (5j) it decomposes into one P2 per robot; best-first search forbids a cuboid that two robots
+plan to visit to one or the other, and the first node without one is the optimum.
 """
 
 from __future__ import annotations

@@ -72,10 +72,7 @@ class Plan:
 
 
 class PlanSolver:
-    """Solves the problems of one kind of robot; reuses its matrices and workspace.
-
-    After `node_limit` relaxations or `time_limit` [s of wall time] it returns the best plan so far.
-    """
+    """Solves the problems of one kind of robot, with at most so many nodes or seconds."""
 
     def __init__(self, dynamics: Dynamics, settings: CuboidMethodSettings) -> None:
         self.dynamics = dynamics
@@ -96,10 +93,7 @@ class PlanSolver:
         self._tree = make_tree(_ROOM, horizon, len(self._search.matrix))
 
     def solve(self, problem: Problem) -> Plan | None:
-        """Return the best plan; None if there is none.
-
-        Bounds are relaxed by `GIVE` if rounding has left the state outside.
-        """
+        """Return the best plan, or None; bounds give by `GIVE` if rounding left a state outside."""
         plan = self._solve(problem, 0.0)
         return plan if plan is not None else self._solve(problem, GIVE)
 
@@ -207,11 +201,9 @@ class PlanSolver:
     def _visits(
         self, problem: Problem, first: FloatArray, wanted: BoolArray
     ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return possible visits from P_1, and extreme motion.
+        """Return possible visits from P_1: step, cuboid, and corners of its part that is in reach.
 
-        A visit is possible only if its cuboid intersects the set reachable by extreme forces: step,
-        cuboid and lower and upper corner of the intersection. Extreme motion is the sum of the
-        lowest and highest velocities before each step, (3, T + 1) [m].
+        And the sums of the lowest and highest velocities before each step, (3, T + 1) [m].
         """
         dynamics, sums = self.dynamics, np.zeros((2, 3, self.settings.horizon + 1))
         for side, sign in enumerate((-1.0, 1.0)):

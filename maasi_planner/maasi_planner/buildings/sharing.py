@@ -36,10 +36,7 @@ class Broadcast:
 
 
 def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntArray) -> int | None:
-    """Return the cuboid assigned to robot `own` among robots at positions (m, 3): (10).
-
-    None if fewer cuboids than robots are left and this robot gets none.
-    """
+    """Return the cuboid assigned to robot `own` of robots at places (m, 3): (10); None: too few."""
     if not len(unvisited):
         return None
     # Deferred: SciPy takes long to import, and searches for targets do not need it.

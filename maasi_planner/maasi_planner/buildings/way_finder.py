@@ -27,10 +27,7 @@ class WayFinder:
         self._down = speed
 
     def first_corner(self, place: FloatArray, target: FloatArray) -> FloatArray:
-        """Return the next intermediate target on the path from a position (3,) to a target (3,).
-
-        The target itself if it is visible, or if there is no path.
-        """
+        """Return the next corner (3,) of the path to a target; without any, the target."""
         if not segment_cuts(place, target, self.solids).any():
             return target
         points = np.vstack([place, target, self._corners(place, target)])

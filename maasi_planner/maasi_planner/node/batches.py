@@ -23,9 +23,8 @@ _MEASUREMENTS_KEPT = 1000
 class Batches:
     """Requests measurements, and hands the filter's updates to the coordinator.
 
-    last: id of the last batch; used: largest id of an update that was used; waiting: whether the
-    update of the last batch has not come; published_at: when the last batch was published,
-    monotonic clock [s]; update: the last one that was used, and measurements of all of them.
+    Ids of the last batch and of the last update used; whether one is waited for; when the batch was
+    published [s, monotonic clock]; the update used last, and the measurements of all.
     """
 
     def __init__(

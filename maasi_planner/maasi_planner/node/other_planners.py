@@ -80,11 +80,7 @@ class OtherPlanners:
         self._heard()
 
     def missing(self, step: int, robots: Collection[str]) -> bool:
-        """Return whether destinations of other planners have not come yet, in lockstep.
-
-        Needed are those of this step from planners earlier by name, and of the previous step from
-        later ones.
-        """
+        """Return whether destinations are awaited, in lockstep: of later names the last step's."""
         for name, known in self._destinations.items():
             if name not in robots:
                 continue
@@ -96,10 +92,7 @@ class OtherPlanners:
         return False
 
     def taken(self, step: int, robots: Collection[str] | None) -> list[tuple[FloatArray, float]]:
-        """Return the known destinations of robots with their own planner, and their radii.
-
-        Those of `robots` at a step in lockstep; with None those heard recently.
-        """
+        """Return destinations of other planners' robots, and radii; recent ones if free running."""
         settings = self._node.settings
         taken = []
         for name, known in self._destinations.items():

@@ -29,10 +29,7 @@ _ALLOWED: dict[str, tuple[frozenset[Mode] | None, Mode]] = {
 
 
 class SearchModes:
-    """Mode of each robot, and its transitions by commands.
-
-    names: robots.
-    """
+    """Mode of each robot, and its transitions by commands."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.of = dict.fromkeys(sorted(names), Mode.WAITING)

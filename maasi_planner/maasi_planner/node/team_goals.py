@@ -71,12 +71,9 @@ class _Sent:
 
 
 class TeamGoals:
-    """Clients of the action `go_to` of all robots of a team.
+    """Clients of the action `go_to` of all robots of a team, in lockstep by their states only.
 
-    In lockstep only states are used: they belong to a step, while results arrive at any time.
-
-    node: owner of the clients; names: robots; on_answer: called with robot and number of an
-    answered goal, and whether it was accepted.
+    `on_answer` is called with robot and number of an answered goal, and whether it was accepted.
     """
 
     def __init__(

@@ -31,10 +31,9 @@ class OpenPoint:
 
 @dataclass(frozen=True)
 class Case:
-    """One configuration of an experiment, such as a method, that is run on every map.
+    """One configuration of an experiment, such as a method, that is run on at most `runs` maps.
 
-    `name` is unique within the experiment, `settings` is all that a run needs, as plain values. The
-    preset is the best reading of the paper, or our own choice; `runs` is the most maps.
+    The settings are all that a run needs; the preset is the best reading of the paper, or our own.
     """
 
     name: str
@@ -57,8 +56,7 @@ class Case:
 class Quantity:
     """A measured quantity: a key of `Outcome.summary` or `Outcome.timing`.
 
-    A restricted one is a duration that is None in unfinished runs; its mean is restricted to the
-    shortest of the limits, which have the key `limit`.
+    A restricted one is a duration, None in unfinished runs; its mean is up to the key `limit`.
     """
 
     name: str
@@ -75,10 +73,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Published:
-    """A number that the paper reports, as printed or (then the note says so) as read from a figure.
-
-    `half_width` is that of its 95 % confidence interval, and `note` its place in the paper.
-    """
+    """A number of the paper, half of its 95 % interval, and where it is printed or read from."""
 
     case: str
     quantity: str
@@ -99,11 +94,9 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Claim:
-    """Something that a paper says, and the cases here that it rests on.
+    """Something that a paper says of two cases, or (a number in `published`) of one.
 
-    Of two cases the paper expects the quantity of `first` to be less than, greater than or alike
-    that of `second`; of one `case` it prints a number, the one in `published`. `note` is added to
-    the words; `cause` says why it does not hold here, '' if no run has shown it.
+    `note` is added to the words; `cause` says why it does not hold here, '' if no run has shown it.
     """
 
     says: str
@@ -120,8 +113,7 @@ class Claim:
 class Outcome:
     """Results of one run: numbers, texts or None by quantity, and columns with a row for each step.
 
-    Details are other data of figures, such as true positions; timing is wall times, which differ
-    when a run is repeated.
+    Details are other data of figures; timing is wall times, which differ when a run is repeated.
     """
 
     summary: dict[str, Any]
@@ -132,11 +124,7 @@ class Outcome:
 
 @dataclass(kw_only=True)
 class Run(Outcome):
-    """The outcome of one run of one case on one map.
-
-    `number` is that of the map, from 0, `digest` that of the case's settings, and `machine` what
-    made it, see `this_machine`.
-    """
+    """The outcome of one run: number of the map, digest of its settings, and the machine."""
 
     experiment: str
     case: str

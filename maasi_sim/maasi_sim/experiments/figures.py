@@ -72,9 +72,8 @@ def draw_curves(
 ) -> None:
     """Draw the mean number of targets found, of four or more runs with its 95 % confidence.
 
-    Over measurements, triangles mark where the paper's methods have found all. `styles` has the
-    cases to draw with the key in `STYLES` of each, `path` is the case whose first run is drawn
-    beside the curves, and `by` the column of the horizontal axis, up to `end`.
+    `styles` has a key of `STYLES` by case; the first run of the case `path` is drawn beside the
+    curves. Over measurements, triangles mark where the paper's methods have found all.
     """
     if path is not None:
         figure.set_size_inches(10.5, 4.6)
@@ -211,10 +210,7 @@ def draw_against(
     label: str,
     quantities: Sequence[str],
 ) -> None:
-    """Draw means of quantities with their 95 % confidence against a number that cases differ in.
-
-    `setting` are the keys of the number in the scenario; each quantity has a picture.
-    """
+    """Draw means, with 95 % confidence, against the number of the scenario at keys `setting`."""
     figure.set_size_inches(4.6 * len(quantities), 3.8)
     for index, quantity in enumerate(map(results.experiment.quantity, quantities)):
         axes = figure.add_subplot(1, len(quantities), index + 1)
@@ -231,10 +227,7 @@ def draw_against(
 def draw_table(
     figure: Figure, results: Results, axes: Sequence[Sequence[str]], quantity: str
 ) -> None:
-    """Draw a table of means as the papers print theirs, the paper's number below ours.
-
-    `axes` are the heads of the rows and, if any, of the columns: joined they name the cases.
-    """
+    """Draw a table of means above the papers' as they print it; joined heads name the cases."""
     measured = results.experiment.quantity(quantity)
     rows = axes[0]
     columns = axes[1] if len(axes) > 1 else [textwrap.fill(measured.label, 20)]

@@ -1,8 +1,7 @@
 """Experiments of the papers, from the YAML files in `papers/`, one per paper.
 
-The settings of a case are its layers, merged one over the other, with its own values on top. The
-layers are those of the experiment, the one with the name of its preset, if any, and those of the
-case. A list of mappings of cases means all combinations of them.
+A case's settings are the layers of the experiment, of its preset and of the case, merged, and its
+own values on top. A list of mappings of cases means all combinations of them.
 """
 
 from __future__ import annotations

@@ -73,10 +73,9 @@ def markdown_table(rows: Iterable[Sequence[str]]) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One number of ours beside the paper's.
+    """One number of ours beside the paper's, and ours minus theirs.
 
-    `finished` of the `runs` have the quantity; `median` counts the others as longest, and is nan
-    if they are half or more. `difference` is ours minus the paper's.
+    `finished` runs have the quantity; the others count as longest in the median, nan if it is one.
     """
 
     case: str

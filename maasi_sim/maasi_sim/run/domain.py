@@ -32,14 +32,11 @@ class DomainError(RuntimeError):
 
 
 class Domain(contextlib.AbstractContextManager['Domain']):
-    """A ROS domain that no other run on this host uses, until `release`.
+    """A ROS domain that no other run on this host uses, until `release`; the first free one from 1.
 
-    A domain, and a namespace in it, is locked by the name of an abstract Unix socket: it is valid
-    for all users, makes no file, and ends with the process.
-
-    Without a number it is the first free one from 1 (0 is the ROS default). Locks of different
-    purposes are independent. If `shared`, other runs may use it as well, in other namespaces than
-    `team`.
+    It, and a namespace in it, is locked by the name of an abstract Unix socket: valid for all
+    users, without a file, until the process ends. Locks of different purposes are independent; of a
+    `shared` one, only the namespace `team` is locked.
     """
 
     def __init__(
@@ -88,10 +85,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         return ''
 
     def environment(self) -> dict[str, str]:
-        """Return the variables that keep nodes in this domain, and on this host.
-
-        Without a profile of the user for Fast DDS, one with faster discovery is set.
-        """
+        """Return variables for nodes of this domain, on this host, with fast discovery."""
         variables = {
             'ROS_DOMAIN_ID': str(self.number),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
@@ -128,12 +122,10 @@ def _port_used(port: int) -> bool:
 def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> list[str]:
     """Remove segments and ports of this user that no process has open; return the removed files.
 
-    They fill the memory, and a process that opens a port whose creator died before it was ready
-    waits for ever, on this host in all domains.
-
-    Of `domain`, which no process uses, all ports are removed; of others only those that were never
-    ready. New processes use the names of ports again, some of them in all domains: who opens a port
-    while it is removed shares it with nobody.
+    They fill the memory, and who opens a port whose creator died before it was ready waits for
+    ever. Of `domain`, which no process uses, all ports are removed; of others, whose names new
+    processes use again, only those that were never ready: an opener would share a removed one with
+    nobody.
     """
     parts: dict[str, list[Path]] = defaultdict(list)
     for path in folder.iterdir() if folder.is_dir() else ():
@@ -165,8 +157,7 @@ def _may_go(path: Path, domain: int | None) -> bool:
 def _is_unused(path: Path) -> bool:
     """Return whether no process, of any container, has this user's file open or mapped.
 
-    Owners keep their locks open and their memory mapped while they live, also in creation. Linux
-    grants a lease for writing on a file only that is not open elsewhere.
+    Owners keep them so while they live; Linux grants a lease for writing only where none has.
     """
     try:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)

@@ -27,11 +27,7 @@ UNAVAILABLE = 5
 
 @dataclass(frozen=True)
 class RunEnd:
-    """How a run ended.
-
-    `reason` is a key of `END_REASONS`, `time` simulated, `wall_time` from the first step [s].
-    Events are nodes that died, hung or were restarted.
-    """
+    """How a run ended: a key of `END_REASONS`, simulated and wall time [s], events of nodes."""
 
     reason: str
     time: float
@@ -41,11 +37,7 @@ class RunEnd:
 
 @dataclass
 class RunRecord:
-    """Data of the reports of all kinds of runs.
-
-    Trajectories are time [s], x, y, z [m] by robot, (n, 4). Events are robots lost and back, nodes
-    restarted or dead, in order of time.
-    """
+    """Data of the reports of all kinds of runs; trajectories are time [s], x, y, z [m], (n, 4)."""
 
     name: str
     scenario: Any

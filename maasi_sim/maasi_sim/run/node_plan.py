@@ -52,10 +52,7 @@ class NodePlan:
         return to_yaml({'/**': {'ros__parameters': dict(self.parameters)}})
 
     def process(self, folder: Path, team: str = '', log_level: str | None = None) -> NodeProcess:
-        """Write its parameter file, and return its process, not started yet, with its log there.
-
-        Topics of other teams are not remapped.
-        """
+        """Write its parameter file, and return its process, not started yet, with its log there."""
         name = within(team, self.full_name)
         file = name.strip('/').replace('/', '_')
         parameters = folder / 'parameters' / f'{file}.yaml'

@@ -1,7 +1,6 @@
 """Nodes as processes: found, forked from a server, watched, and stopped in bounded time.
 
-The fork server of `multiprocessing` has imported the modules and compiled the kernels that nodes
-share: a node starts in a tenth of the time.
+The fork server of `multiprocessing` has loaded what nodes share: they start in a tenth of the time.
 """
 
 from __future__ import annotations
@@ -123,10 +122,7 @@ def find_executable(package: str, executable: str) -> Path:
 
 
 def beside(function: Callable[..., None], *arguments: Any) -> Iterator[Any]:
-    """Run a function beside this process, which it cannot outlive, in what the server has loaded.
-
-    Returned is what it sends by its last argument, until it ends.
-    """
+    """Run a function in a fork of the server, and return what it sends by its last argument."""
     receives, sends = Pipe(duplex=False)
     words = (function, *arguments, sends.send)
     with sends, contextlib.suppress(OSError, EOFError):
@@ -148,11 +144,9 @@ def _received(connection: Connection) -> Iterator[Any]:
 class NodeProcess(ForkServerProcess):
     """A node that runs as a process and cannot outlive this one.
 
-    Its command is the path of its executable and its arguments, also shown by `ps`. Its log is kept
-    over restarts. A node of this suite inherits what the server has loaded.
-
-    Its executor publishes a heartbeat each second. Until the first one it is starting, which may
-    include compilation. Times are of the wall [s].
+    A node of this suite inherits what the server has loaded. Until the first heartbeat of its
+    executor, one a second, it is starting, which may include compilation. Times are of the wall
+    [s].
     """
 
     def __init__(self, name: str, command: list[str], log: Path) -> None:

@@ -13,10 +13,7 @@ _ERASE = '\r\x1b[K'
 
 
 class ProgressDisplay:
-    """Shows progress: on a terminal one line that changes, else lines now and then.
-
-    Without a terminal `period` is the time between lines without news [s].
-    """
+    """Shows progress: on a terminal a line that changes, else lines, at least each period [s]."""
 
     def __init__(self, stream: TextIO | None = None, period: float = 5.0) -> None:
         self._stream = stream or sys.stderr

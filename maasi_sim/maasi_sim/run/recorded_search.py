@@ -1,7 +1,6 @@
 """Search a recording of robots' cameras and poses, as `ros2 bag record` makes it of real robots.
 
-The scenario says what the recording lacks: sensors, start and filter. The robots went where they
-went: there are no decisions, and each robot measures once in each period of its sensor.
+Sensors, start and filter are the scenario's; each robot measures once in each sensor period.
 """
 
 from __future__ import annotations
@@ -100,10 +99,7 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Meas
 def search_measurements(
     scenario: Scenario, recorded: list[Measured]
 ) -> tuple[list[FoundTarget], float, SearchTrace]:
-    """Feed a filter with measurements in the order of their stamps.
-
-    Return what is found, the share explored, and the events.
-    """
+    """Feed a filter with measurements by stamp; return what is found, share explored, events."""
     common = {'step': scenario.step, 'seed': scenario.seed, 'lockstep': True}
     coordinator = Coordinator(planner_settings(scenario, scenario.names(), common))
     generator = np.random.default_rng(scenario.seed)

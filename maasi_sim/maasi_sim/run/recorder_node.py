@@ -310,10 +310,7 @@ class Recorder:
         self._record(taken)
 
     def _logged(self, before: int, topic: str, data: bytes) -> int:
-        """Return the time under which a message is recorded [ns]: its stamp, or now.
-
-        A stamp before `before` [ns] is too old, and one far ahead is not of this clock.
-        """
+        """Return a message's recorded time [ns]: now, if its stamp is far ahead or too old."""
         stamp = stamp_of(topic, self._subscriptions[topic].msg_type, data)
         known = 0 <= stamp <= self.time + self._lead
         return max(stamp, before) if known else self.time
@@ -360,10 +357,7 @@ class Recorder:
                 raise
 
     def gaps(self, joined: bool, patience: float) -> list[str]:
-        """Return what the recording lacks of the topics with a message at each step.
-
-        They may begin late by `patience` [s]; if `joined`, the clock ran before the run.
-        """
+        """Return topics of every step that are missing, or late by more than `patience` [s]."""
         topics = [STEP, *(f'/{name}/state' for name in self.robots)]
         times = [self.first.get(topic, self.time) for topic in topics]
         begin = min(times) if joined else 0
@@ -412,10 +406,7 @@ class Recorder:
         return steps
 
     def arm(self, robots: Iterable[str]) -> None:
-        """Call the service `arm` of drivers that are not ready, as a person does with real robots.
-
-        To be called again and again: the first call may come before a driver is active.
-        """
+        """Call the service `arm` of drivers that are not ready, now and then, as a person would."""
         if time.monotonic() - self._armed_at < _ARMING_PERIOD:
             return
         self._armed_at = time.monotonic()

@@ -55,10 +55,7 @@ REPLAYED = {
 
 @dataclass
 class Batch:
-    """One recorded update of a filter, in a namespace, and its serialised measurements in order.
-
-    `late` is a measurement that arrived after its batch, or without a request.
-    """
+    """One recorded update of a filter, and its serialised measurements; late: after their batch."""
 
     update: FilterUpdate
     detections: list[bytes]
@@ -216,10 +213,7 @@ def differences(recorded: list[Any], found: list[Any]) -> list[str]:
 
 
 def replay(path: Path, out: Path | None, domain_id: int | None, interruption: Interruption) -> int:
-    """Replay a recording, print whether the found targets are equal, and return the exit code.
-
-    Logs and parameters of the nodes are written to a folder.
-    """
+    """Replay a recording, print whether the found targets are equal, and return the exit code."""
     recording = read_recording(path)
     folder = make_folder(out, '_replay')
     with Domain(domain_id) as domain, contextlib.ExitStack() as ends:

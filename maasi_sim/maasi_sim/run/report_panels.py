@@ -68,9 +68,8 @@ def draw_report(
 ) -> Figure:
     """Return the figure of a report.
 
-    The map shows an area, (d, 2) [m], from above, in 3D also from the south and the east, with the
-    ways of the robots. Beside it are the first plot, over time, with a heading; the shades of the
-    ways; the other plots; and rows of text, names and values, with the first events.
+    The map (d, 2) [m] from above, in 3D also from the south and the east, with the robots' ways;
+    beside it the first plot, over time, the shades of the ways, the other plots, and rows of text.
     """
     figure = Figure(figsize=_SIZE, layout='constrained')
     FigureCanvasAgg(figure)

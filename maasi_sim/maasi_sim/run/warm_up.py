@@ -36,11 +36,7 @@ def _simulate(*names: str) -> None:
 
 
 def prepare_nodes() -> None:
-    """Do once what nodes would do at their start, for nodes that are forked from here.
-
-    Kernels are those of robots and cameras, which several nodes use: filters and planners load
-    their own beside each other.
-    """
+    """Do once what nodes would do at their start, for nodes that are forked from here."""
     with compiling_said():
         _simulate('mambo_turtlebot')
     for name in (*(f'{name}_msgs.msg' for name in _MESSAGES), *_SERVICES):

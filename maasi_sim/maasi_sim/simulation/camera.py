@@ -1,10 +1,7 @@
-"""A simulated camera: images of the floor with its markers.
-
-The geometry is that of `maasi_drivers.vision.camera_model.Camera`, distortion included; light,
-noise, blur and distractors are set by `RenderSettings`. The image is linear in the light.
+"""A simulated camera: images of the floor with its markers, geometry as in `vision.camera_model`.
 
 Arrays by pixel are (h, w). The floor's coordinates under each pixel are in the map frame [m], NaN
-above the horizon.
+above the horizon. The image is linear in the light.
 """
 
 from __future__ import annotations
@@ -98,8 +95,7 @@ def _project(points, shot):  # type: ignore[no-untyped-def]
 def place(shapes, rims, floor_x, floor_y, shot, margin, boxes, drift):  # type: ignore[no-untyped-def]
     """Find the pixels that each shape may touch, and how far it moves during the exposure.
 
-    boxes (n, 4): left, top, right, bottom; empty where the shape is out of view. drift (n, 2): in
-    the floor's coordinates of mid exposure [m].
+    boxes (n, 4): left, top, right, bottom; empty out of view. drift (n, 2): on the floor [m].
     """
     centre, matrix = shot.centre, shot.matrix
     origin, exposure_time = shot.origin, shot.exposure_time
@@ -254,10 +250,7 @@ def floor_albedo(floor_x, floor_y, colour, texture, albedo):  # type: ignore[no-
 
 @njit(cache=True)
 def expose(albedo, floor_x, floor_y, exposure, noise, offsets, image):  # type: ignore[no-untyped-def]
-    """Turn albedo (3, h, w) into grey levels (h, w, 3): light, gains, noise, quantisation.
-
-    The light is a wave of parabolas, a cheap approximation of a sine.
-    """
+    """Turn albedo (3, h, w) into grey levels (h, w, 3); parabolas stand for the light's sine."""
     lens, light, gains = exposure.lens, exposure.light, exposure.gains
     read, shot = exposure.read_noise, exposure.shot_noise
     height, width = floor_x.shape

@@ -66,9 +66,8 @@ class OdometryReading:
 class OdometryModel:
     """A robot's odometry, which stands at zero at its start.
 
-    Height, roll and pitch are measured absolutely and have noise at most; x, y and heading are
-    integrated, and drift. The covariance describes the errors of `reported`, by default those of
-    `settings`.
+    Height, roll and pitch have noise only; x, y and heading drift. The covariance describes the
+    errors of `reported`, by default those of `settings`.
     """
 
     def __init__(

@@ -227,10 +227,7 @@ def publish_truth(node: Node, world: World, frame: str) -> None:
 
 
 class Connections:
-    """Tells whether expected nodes would receive what is published now.
-
-    `expected` are topics that each node subscribes to, by its full name.
-    """
+    """Tells whether nodes would receive what is published now, by the topics expected of each."""
 
     def __init__(self, node: Node, expected: Mapping[str, Sequence[str]]) -> None:
         self._node = node
@@ -270,10 +267,7 @@ class Connections:
 
 
 class ExternalRobot:
-    """A robot moved by another program: an autopilot's simulator, or a real vehicle.
-
-    Its state is what its driver publishes; simulated sensors measure from there.
-    """
+    """A robot moved by another program: sensors measure where its driver says that it is."""
 
     #: The simulation does not wait for it at shutdown.
     obeys = False

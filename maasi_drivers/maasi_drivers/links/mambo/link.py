@@ -1,11 +1,9 @@
 """Connection to a Parrot Mambo: pyparrot over WiFi or Bluetooth, in one thread. Without ROS.
 
-Over WiFi pyparrot keeps handing out its last packet after the link is cut, and the stamp in a
-position event is the time since the one before. So an event counts as new only when one of the
-acquisition stamps that come with it (of speed, altitude or orientation) has changed. Bluetooth
-delivers few of them, each notification once (pyparrot, docs/minidronecommands.rst: "more
-information via wifi than via BLE"): there each one counts, and so does the acknowledgement of a
-command, which is sent for that purpose when nothing else is received.
+Over WiFi pyparrot repeats its last packet after the link is cut: a position event is new only with
+a new stamp of speed, altitude or orientation. Over Bluetooth each notification comes once and
+counts, and so does the acknowledgement of a command, sent when nothing else is received (pyparrot,
+docs/minidronecommands.rst: "more information via wifi than via BLE").
 """
 
 from __future__ import annotations
@@ -60,12 +58,11 @@ class PositionEvent:
 
 
 class MamboLink:
-    """A connection to one Mambo.
+    """A connection to one Mambo, whose own thread talks to pyparrot: no call waits.
 
-    All calls return at once; a thread of its own talks to pyparrot, which sleeps in its commands. A
-    piloting command is sent once. That thread is a dead man's switch too: once the caller has not
-    called `keep_alive` for `CALLER_TIMEOUT`, the drone is commanded to hover, and to land after
-    `land_after` [s] more. `tilt` [rad] and `climb` [m/s] are set in the drone.
+    That thread is a dead man's switch, too: `CALLER_TIMEOUT` after the last `keep_alive` the drone
+    hovers, and `land_after` [s] later it lands. `tilt` [rad] and `climb` [m/s] are set in the
+    drone.
     """
 
     def __init__(

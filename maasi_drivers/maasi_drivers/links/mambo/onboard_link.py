@@ -1,7 +1,4 @@
-"""A Mambo with a program of its own as a driver's robot: poses by the feed, orders by UDP (001).
-
-The layout of the orders is in docs/measurement_feed.md; everything is little-endian.
-"""
+"""A Mambo with a program of its own as a driver's robot: the feed's poses, orders by UDP (001)."""
 
 from __future__ import annotations
 
@@ -45,11 +42,7 @@ class OrderKind(IntEnum):
 
 
 def encode(sequence: int, kind: OrderKind, position: FloatArray) -> bytes:
-    """Return an order as a datagram.
-
-    The position (3,) [m] is from where it took off, in the axes of its heading then: forward, left,
-    up; the heading stays.
-    """
+    """Return an order as a datagram; position (3,) [m] forward, left, up from the take-off."""
     if not np.isfinite(position).all():
         raise ValueError(f'order: got {position}, allowed are finite numbers [m]')
     data = _ORDER.pack(b'MSWO', 1, kind, 0, sequence % 2**32, *position, 0.0)

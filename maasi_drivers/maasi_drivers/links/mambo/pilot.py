@@ -47,11 +47,7 @@ class MamboPhase(Enum):
 
 
 class MamboPilot:
-    """Flies a Mambo from take-off to landing, and lands it on a fault.
-
-    `fence` is (3, 2) [m, map]; `problem` says why it takes no goals; times are of the monotonic
-    clock [s].
-    """
+    """Flies a Mambo from take-off to landing, in a fence (3, 2) [m, map]; lands it on a fault."""
 
     def __init__(
         self,

@@ -1,11 +1,8 @@
-"""Additions to pyparrot's connections to a Mambo, by Bluetooth and by UDP. Without ROS.
+"""What pyparrot 1.5.20 lacks for a Mambo by Bluetooth and by UDP. Without ROS.
 
-pyparrot 1.5.20 (`pyparrot/networking/bleConnection.py`) cannot send one piloting command, only
-repeat one and wait meanwhile; and its acknowledged commands wait half a second at least. The
-packets are those of its own methods, without the waiting.
-
-Its UDP socket (`pyparrot/networking/wifiConnection.py`) is bound to all interfaces, takes every
-datagram for one of the drone's, returns the last one again after a timeout, and its listener
+`bleConnection.py` cannot send one piloting command, only repeat one and wait meanwhile, and waits
+half a second for acknowledgements. The socket of `wifiConnection.py` is bound to all interfaces,
+takes every datagram for the drone's, returns the last one again after a timeout, and its listener
 dies on a truncated frame, or loops forever on one of size zero.
 """
 
@@ -102,11 +99,7 @@ class DroneSocket:
 
 
 def guard(connection: Any, drone: str, port: int) -> None:
-    """Make a connection of pyparrot receive through a `DroneSocket`.
-
-    The content of a frame may still be too short for pyparrot's parser: such a frame is dropped
-    instead of ending the listener.
-    """
+    """Make a connection receive by a `DroneSocket`, and drop frames that it cannot parse."""
     handle = connection.handle_data
 
     def open_sockets() -> None:

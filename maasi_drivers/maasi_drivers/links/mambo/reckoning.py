@@ -1,12 +1,9 @@
-"""Where a Mambo is between its position events, by a model of the commands. Without ROS.
+"""Where a Mambo is between its position events (two a second), by a model of the commands.
 
-Position events come twice a second. In between, a model flies the commands that were sent (dead
-reckoning), and each event corrects it where it was when the event was made.
-
-Roll and pitch of a command are shares of the largest tilt. A tilt accelerates by g tan(tilt), and
-drag opposes the speed, in proportion to it (R. Mahony, V. Kumar, P. Corke, "Multirotor
-aerial vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). So one measured number is
-enough: the steady speed at the largest tilt. A command acts after a delay.
+Each event corrects it where it was when the event was made. A tilt accelerates by g tan(tilt), and
+drag opposes the speed, in proportion to it (R. Mahony, V. Kumar, P. Corke, "Multirotor aerial
+vehicles", IEEE Robotics & Automation Magazine 19(3), 2012), so that one measured number is enough:
+the steady speed at the largest tilt. A command acts after a delay.
 """
 
 from __future__ import annotations
@@ -60,10 +57,7 @@ class TiltModel:
     def advance(
         self, course: Course, shares: FloatArray, h: float, push: FloatArray = _STILL_AIR
     ) -> Course:
-        """Return the course after `h` seconds under shares (4,): forward, left, up, turn.
-
-        `push` (2,) is a steady acceleration by what is not commanded [m/s^2, map].
-        """
+        """Return the course `h` s later under shares (4,) and another push (2,) [m/s^2, map]."""
         forward, left, up, turn = shares.tolist()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         rate = self.drag if forward or left else self.drag + _HOVER_RATE

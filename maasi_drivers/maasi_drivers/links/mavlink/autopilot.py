@@ -79,10 +79,7 @@ class Autopilot:
     # ---- what comes in -----------------------------------------------------------------------
 
     def take(self, message: Any, now: float) -> tuple[bool, int] | None:
-        """Take a message; after a heartbeat return whether it was armed before, and the mode then.
-
-        Of other systems only messages with the driver's own id count.
-        """
+        """Take a message; of a heartbeat return whether it was armed before, and the mode then."""
         kind, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         if self._shows_own_id(message):
             if self.failsafes is not None:
@@ -113,11 +110,7 @@ class Autopilot:
         return None
 
     def _shows_own_id(self, message: Any) -> bool:
-        """Return whether another program has the driver's system id.
-
-        The driver does not receive its own messages. Behind a router that keeps programs apart,
-        the answers to the other one's commands are all that comes.
-        """
+        """Return whether another program has the driver's id; a router passes answers only."""
         own = self.settings.own_system
         if message.get_srcSystem() == own:
             return True

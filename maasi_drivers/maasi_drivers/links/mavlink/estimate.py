@@ -55,11 +55,7 @@ _SAME_BOOT = 5.0
 
 
 class FlightOrigin:
-    """The place in the local frame that stands at the start in the map.
-
-    A local frame lasts as long as its autopilot is on: a file has the place for a driver that is
-    started again meanwhile, in the air or after a landing elsewhere.
-    """
+    """The place of the map's start in the local frame, in a file as long as the autopilot is on."""
 
     def __init__(
         self, settings: MavlinkSettings, start: list[float], path: Path | None, log: ReportLog
@@ -71,10 +67,7 @@ class FlightOrigin:
         self._log = log
 
     def find(self, position: FloatArray, booted: float, armed: bool) -> FloatArray | None:
-        """Return the place (3,), ENU [m], or None where it cannot be known.
-
-        `booted` is when the autopilot was switched on, on the steady clock [s].
-        """
+        """Return the place (3,), ENU [m], if known; `booted` [s, steady clock]: switched on."""
         kept = self._load(booted)
         if kept is not None:
             x, y, z = (position - kept).tolist()

@@ -138,8 +138,7 @@ _FOREIGN_AGE = 5.0
 class FailsafeCheck:
     """Whether a vehicle stops by itself when the driver is gone.
 
-    ArduPilot's ground station failsafe checks the system id of heartbeats alone
-    (`GCS::sysid_is_gcs`): any program with the driver's id keeps it from acting.
+    ArduPilot looks at the system id alone (`GCS::sysid_is_gcs`): any program with it prevents that.
     """
 
     def __init__(

@@ -25,11 +25,10 @@ class LinkError(RuntimeError):
 
 
 def make_sender(system: int) -> Any:
-    """Return what packs the messages of a driver, without a wire.
+    """Return what packs the messages of a driver, with another component id at each start.
 
-    Its component id is another one at each start: ArduPilot does not pass a heartbeat on to a link
-    on which it knows the same system and component (`MAVLink_routing::handle_heartbeat`), so a
-    program with both ids of the driver could not be heard.
+    ArduPilot passes no heartbeat to a link with the same system and component
+    (`MAVLink_routing::handle_heartbeat`): a program with both ids of the driver would not be heard.
     """
     return mavlink.MAVLink(None, system, random.choice(_COMPONENTS))
 
@@ -55,10 +54,7 @@ def open_connection(url: str, system: int, component: int, baud: int = 57600) ->
 
 
 class VehicleLink:
-    """A vehicle on a wire; `failure` says why the wire cannot be opened, which is retried.
-
-    Its thread holds `lock` while it works on `vehicle`, and so has everybody else, but for a flag.
-    """
+    """A vehicle on a wire, which is opened again after a `failure`; `lock` guards `vehicle`."""
 
     def __init__(self, settings: MavlinkSettings, start: list[float], memory: Path) -> None:
         self.settings = settings
@@ -77,10 +73,7 @@ class VehicleLink:
         self._thread.start()
 
     def finish(self, ending: Ending, patience: float) -> bool:
-        """Have it hold or land; return whether it confirms within `patience` seconds.
-
-        Where nothing flies there is nothing to wait for.
-        """
+        """Have it hold or land; return whether it confirms within `patience` [s], or is down."""
         with self.lock:
             self.vehicle.finish(ending)
         deadline = time.monotonic() + patience

@@ -198,10 +198,7 @@ class Vehicle(Autopilot):
         return ''
 
     def finish(self, ending: Ending, reason: str = '') -> None:
-        """Have it hold its position or land, and send it nowhere any more.
-
-        A vehicle that others fly is left alone; on the ground it is not armed any more.
-        """
+        """Have it hold or land, if it is the driver's to fly; neither arm nor move it any more."""
         self._permission.end()
         if self.phase is VehiclePhase.ENDING and self._ending == ending:
             return

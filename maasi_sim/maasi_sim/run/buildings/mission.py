@@ -23,15 +23,10 @@ Scheme = Literal['distributed', 'sequential', 'centralized']
 
 @dataclass
 class MissionRecord:
-    """What became of a mission.
+    """What became of a mission, by step: paths (n, 3) [m], cuboids visited, robots that search.
 
-    steps, complete: until all cuboids were visited, or it was given up; whether all were; paths: by
-    robot: positions at all steps, (steps + 1, 3) [m]; visited, active (steps + 1,): cuboids visited
-    by the team, and robots that search; snapshots: in order of time; collisions, outside: steps on
-    which a robot's way cut an object or obstacle, or it was outside the area; how: number of
-    decisions by how they were made; solve_times: wall time of each decision, of all robots together
-    if centralized [s]; recharges: batteries that failed; plans: predicted positions of all robots
-    at the steps that were asked for.
+    Snapshots in order of time; steps on which a way cut an object, or was outside the area; how
+    decisions were made, and their wall times [s]; batteries that failed; plans kept on request.
     """
 
     mission: CoveragePlan
@@ -68,13 +63,9 @@ def within_range(
 class CuboidMission:
     """Robots that search the faces of objects, step by step of dT [s].
 
-    `scheme`: distributed is each for itself, as in P2; sequential one after the other, each knowing
-    the new plans of those before it; centralized all together, P1.
-
-    Raises
-    ------
-    ValueError
-        If a robot cannot fly, an object is outside the area, or no cuboid can be reached.
+    Distributed is each for itself, as in P2; sequential one after the other, with the new plans of
+    those before; centralized all together, P1. ValueError: a robot cannot fly, an object is outside
+    the area, or no cuboid can be reached.
     """
 
     def __init__(
@@ -100,10 +91,7 @@ class CuboidMission:
         self.choices: dict[str, Plan] = {}
 
     def run(self, limit: int = 2000, keep: tuple[int, ...] = ()) -> MissionRecord:
-        """Run until the team has visited all cuboids, or for `limit` steps.
-
-        The end is that of the union of what the robots have visited, which none of them may know.
-        """
+        """Run until the team, which may not know it, has visited all cuboids, or to a limit."""
         paths: dict[str, list[FloatArray]] = {name: [] for name in self.agents}
         visited, active, times = [], [], []
         how: dict[str, int] = {}

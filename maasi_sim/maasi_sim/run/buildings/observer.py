@@ -26,10 +26,8 @@ class Moment(NamedTuple):
 class CuboidRecord(RunRecord):
     """The record of a search of buildings.
 
-    mission: searched objects; snapshots: as in the report, in the order of time and robots; of a
-    cuboid there can be several; choices: decisions by the way they were made; active (n, 2): time
-    [s] and robots that search; solve_times: of decisions [s]; most_heard: largest number of robots
-    received at once; completed: when the last cuboid was visited.
+    Snapshots of cuboids (several may be of one); decisions by how they were made; active (n, 2):
+    time [s] and robots that search; times of decisions [s]; most robots heard at once.
     """
 
     mission: CoveragePlan

@@ -16,10 +16,7 @@ _PATIENCE = 5.0
 
 
 class Control:
-    """Calls the services of planners and drivers; no command waits for another one.
-
-    The namespace is that of the team, without slashes at its ends.
-    """
+    """Calls the services of planners and drivers of a team; no command waits for another one."""
 
     def __init__(self, domain: int | None, namespace: str = '') -> None:
         self._namespace = namespace

@@ -263,10 +263,7 @@ class EventMaker:
         values: NDArray[Any],
         explored: float | None = None,
     ) -> None:
-        """Add e on a grid (nx, ny) or (nx, ny, nz), 1 is unseen, or its ninths as bytes.
-
-        The explored share follows from e where it is not given.
-        """
+        """Add e on a grid of two or three axes, or its ninths as bytes, and the explored share."""
         shape = [*values.shape, 1][:3]
         ninths = values if values.dtype == np.uint8 else np.clip(np.rint(9.0 * values), 0, 9)
         text = (ninths.astype(np.uint8) + ord('0')).tobytes().decode('ascii')

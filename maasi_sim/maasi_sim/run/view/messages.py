@@ -1,7 +1,6 @@
 """Makes events from the messages of a run: of a recording, of a run, or of any ROS graph.
 
-Topics are known by their types, and by the last part of their names where a type says too little,
-so that recordings of `ros2 bag record -a` and teams in a namespace are read as well.
+Topics are known by types, or the last part of their names: any bag and namespace is read.
 """
 
 from __future__ import annotations
@@ -78,9 +77,8 @@ def is_shown(topic: str, type_name: str) -> bool:
 class MessageEvents:
     """Take messages, of `rosbags` or of ROS, and hand their events to a maker.
 
-    The run begins at its first step where it `waits`, and what comes before is taken then; else
-    with the first state. `on_restart` is called when the time jumps back, as a bag that is played
-    again does: nothing is then kept.
+    The run begins at its first step where it `waits`, else with the first state. `on_restart` is
+    called when the time jumps back, as in a bag that is played again: nothing is then kept.
     """
 
     def __init__(
@@ -112,10 +110,7 @@ class MessageEvents:
             self.take(*self._early.pop(0))
 
     def _now(self, topic: str, message: Any) -> float:
-        """Return the time of a message with the time of the run; begin again if it jumps back.
-
-        Of each topic by itself, as messages of a bag that is played fast overtake each other.
-        """
+        """Return the run's time of a message; begin again if time jumps back on its topic."""
         now = seconds(message.stamp if hasattr(message, 'stamp') else message.header.stamp)
         if self._begin is None:
             self._begin = now
@@ -300,10 +295,7 @@ def _space(topic: str) -> str:
 
 
 def read_events(path: Path, progress: Callable[[float], None] | None = None) -> EventLog:
-    """Return the event log of a recording, or of the run whose folder holds one.
-
-    `progress` is called now and then with the share that is read.
-    """
+    """Return the event log of a recording or a run's folder; `progress` takes the share read."""
     with Bag(path) as bag:
         shown = {topic: kind for topic, kind in bag.types.items() if is_shown(topic, kind)}
         if not any(kind.startswith('maasi_msgs/') for kind in shown.values()):

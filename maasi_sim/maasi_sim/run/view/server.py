@@ -1,9 +1,8 @@
 """Serves the page of a live run, its events, and its controls where they are allowed.
 
 GET / is the page, GET /events a stream of Server-Sent Events, POST /control a command. Commands
-need a token, and so does all else unless the server listens on this machine only. Everything else
-is refused. A browser is served by a thread of its own, which alone waits for it: neither does the
-run wait for a browser, nor one browser for another.
+need a token, and so does all else unless the server listens on this machine only. A browser has a
+thread of its own: neither the run nor another browser waits for it.
 """
 
 from __future__ import annotations
@@ -49,10 +48,7 @@ _MOST_AT_ONCE = 2000
 
 
 class Hub:
-    """Keeps the events of a run; nothing that puts an event waits for a browser.
-
-    With more than `most` events those that change gradually are thinned, and browsers start over.
-    """
+    """Keeps the events of a run, about `most`; nothing that puts one waits for a browser."""
 
     def __init__(self, scene: Scene, most: int = MOST_EVENTS) -> None:
         self._scene = dict(scene)
@@ -89,10 +85,9 @@ class Hub:
     def next(
         self, generation: int, position: int, patience: float
     ) -> tuple[str, tuple[int, int], bool]:
-        """Return what follows a position, as Server-Sent Events.
+        """Return Server-Sent Events after a position, the next one, and whether nothing follows.
 
-        And generation and position of the next portion, and whether nothing follows. A browser
-        begins with generation -1; where another one has begun it gets the scene, and starts over.
+        A browser begins with generation -1; in another one than its own it gets the scene again.
         Nothing new within the patience [s] is a comment.
         """
         with self._changed:
@@ -128,15 +123,9 @@ class Hub:
 
 
 class ViewServer(ThreadingHTTPServer):
-    """Serve a hub to browsers until it is closed.
+    """Serve a hub to browsers until it is closed; without `commander` read only.
 
-    Where the port is in use, the next one that is free is taken; 0: any that is free. `commander`
-    carries out commands; None: read only.
-
-    Raises
-    ------
-    OSError
-        If the address cannot be listened on.
+    The next free port is taken (0: any); OSError if the address cannot be listened on.
     """
 
     daemon_threads = True
@@ -206,10 +195,7 @@ class ViewServer(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def keep(self, connection: Any, browsers: int = 0) -> bool:
-        """Do not close a connection for others: it has a command, or a stream.
-
-        Count so many browsers in; return whether there is room for them.
-        """
+        """Keep a command, or streams of so many browsers, open; return whether there is room."""
         with self._lock:
             self._idle.pop(connection, None)
             if self.browsers + browsers > MOST_BROWSERS:

@@ -79,10 +79,7 @@ _LIMITS = {(2, 8, 1): 'tilt', (2, 1, 0): 'climb', (2, 1, 1): 'turn'}
 
 
 def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) -> None:
-    """Execute a command on a firmware; `ValueError` where the content is no such command's.
-
-    Unknown ones are ignored.
-    """
+    """Execute a command on a firmware, ignore an unknown one; ValueError: its content is wrong."""
     try:
         if number == _PILOTING:
             flag, roll, pitch, yaw, climb, _ = struct.unpack('<BbbbbI', content)
@@ -148,9 +145,8 @@ def free_port() -> int:
 class FakeMambo:
     """A Mambo on this host, in real time, which a client such as pyparrot connects to.
 
-    For tests: `position_sent` is 'true', 'none' (no position events), 'stuck' (always the same) or
-    'nan'; `cut_up` and `cut_down` lose received, and sent, datagrams; `refused` counts what was
-    invalid, `heard` the commands by (project, class, id).
+    For tests: `position_sent` is 'true', 'none', 'stuck' or 'nan'; `cut_up` and `cut_down` lose
+    datagrams; `refused` counts invalid ones, `heard` commands by (project, class, id).
     """
 
     def __init__(

@@ -61,11 +61,7 @@ class FirmwareSettings:
 
 
 class TiltBody:
-    """A quadrotor under commanded tilts and drag [1/s], without a floor.
-
-    Position and velocity are in the map [m, m/s]; roll, pitch and yaw right-handed about forward,
-    left and up [rad].
-    """
+    """A quadrotor under commanded tilts and drag [1/s], without a floor [m, m/s, rad, map]."""
 
     def __init__(self, drag: float, pose: Pose) -> None:
         self.drag = drag
@@ -86,10 +82,9 @@ class TiltBody:
         return cosine * vx + sine * vy, cosine * vy - sine * vx
 
     def step(self, command: Sequence[float], most_tilt: float, h: float) -> None:
-        """Go on for `h` seconds, at most 0.05; hovering it tilts by `most_tilt` [rad] at most.
+        """Advance by `h` s: tilt forward and right [rad], climb, turn; without tilt it hovers.
 
-        The command is the tilt that accelerates it forward, and to the right [rad], the vertical
-        speed [m/s], and the rotation rate, anticlockwise [rad/s]; without tilt it hovers.
+        It brakes by `most_tilt` [rad] at most then; `h` is at most 0.05 s.
         """
         ahead, left = self.level_speed()
         pitch, roll, climb, turn_rate = command

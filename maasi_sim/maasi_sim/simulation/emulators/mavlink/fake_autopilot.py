@@ -53,9 +53,8 @@ _ACCEPTED, _FAILED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED
 class FakeAutopilot:
     """One vehicle with its autopilot, without a connection and a clock.
 
-    A setpoint that is not finite crashes it, as it did ArduPilot: `crashed` says why, and it is
-    silent. For tests: `gnss_lost_at` is when the first receiver loses its fix, `muted` has the
-    messages that do not come any more, `frozen` position and velocity that are sent instead of the
+    A setpoint that is not finite crashes it, as it did ArduPilot. For tests: when the first
+    receiver loses its fix, messages that do not come, position and velocity sent instead of the
     true ones.
     """
 

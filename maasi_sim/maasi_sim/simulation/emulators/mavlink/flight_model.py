@@ -15,10 +15,7 @@ _FALL, _BUOYANCY = -3.0, 0.1
 
 
 class FlightModel:
-    """A vehicle in its local frame, ENU, with the ground or the surface at height 0.
-
-    Units: speed (level), climb (up or down) [m/s]; acceleration [m/s^2].
-    """
+    """A vehicle in its local frame, ENU, above a surface at height 0 [m, m/s, m/s^2]."""
 
     def __init__(
         self,
