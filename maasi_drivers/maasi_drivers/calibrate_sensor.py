@@ -172,7 +172,3 @@ def main(arguments: list[str] | None = None) -> int:
             print(f'error: --json: {options.json}: {error.strerror}', file=sys.stderr)
             return 2
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -17,7 +17,6 @@ from maasi_filter.ros.run_node import run
 
 
 def _link(name: str, driver: RobotNode) -> RobotLink:
-    """Return the link of a class, `module:Class` in the folder of the links."""
     try:
         link: RobotLink = resolve_name(f'maasi_drivers.links.{name}')(driver)
     except ModuleNotFoundError as error:

@@ -132,7 +132,3 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
 def main(arguments: list[str] | None = None) -> int:
     """Run the guard."""
     return run(GuardNode, arguments)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

@@ -128,7 +128,6 @@ class MeasuringFlight:
         self.link.steer(0.0, 0.0, 0.0, 0.0)
 
     def _look(self) -> PositionEvent | None:
-        """Check the link; return a new position event, or None."""
         link, now = self.link, self.clock()
         link.keep_alive()
         event = link.position
@@ -243,7 +242,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Event) -> None:
-    """Fly, land, and print the result."""
     flight = MeasuringFlight(link, options.way, options.legs, time.monotonic)
     said = ''
     try:

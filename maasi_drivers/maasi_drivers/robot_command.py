@@ -63,8 +63,6 @@ def _metres(text: str) -> float:
 
 
 class _User:
-    """A node that waits for one robot."""
-
     def __init__(self, node: Node, options: argparse.Namespace) -> None:
         self._node = node
         self._options = options
@@ -77,7 +75,6 @@ class _User:
     def _wait(
         self, condition: Callable[[], object], timeout: float = math.inf, *, patient: bool = False
     ) -> bool:
-        """Return whether a condition came true before the timeout, and, if not patient, Ctrl-C."""
         end = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > end or (self._interrupted.is_set() and not patient):
@@ -86,7 +83,6 @@ class _User:
         return True
 
     def _require(self, condition: Callable[[], object], what: str) -> None:
-        """Wait for something; end the command where it does not come."""
         if self._wait(condition, self._options.timeout):
             return
         if self._interrupted.is_set():

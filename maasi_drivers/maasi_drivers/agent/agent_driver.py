@@ -84,8 +84,6 @@ class AgentDriver(RobotNode):
         # Outlives *cleanup* and *configure*, but not the process.
         self._stop_latched = False
 
-    # ---- life cycle --------------------------------------------------------------------------
-
     def prepare(self) -> None:
         """Make link, sensor and controller."""
         settings = self.settings
@@ -185,8 +183,6 @@ class AgentDriver(RobotNode):
             **self.link.status(),
         }
 
-    # ---- what link and sensor report ---------------------------------------------------------
-
     def take_pose(self, placed: StampedPose) -> None:
         """Take the robot's pose, and do the control step for it."""
         self.link.observe(placed)
@@ -236,10 +232,7 @@ class AgentDriver(RobotNode):
         if self.health.text and self.history.latest is None:
             self._state.publish_status(self.get_clock().now().nanoseconds)
 
-    # ---- the control step --------------------------------------------------------------------
-
     def _control(self, placed: StampedPose) -> None:
-        """Judge the goal, and publish state and command."""
         step = self.step_of(placed.stamp)
         robot = RobotState(placed.pose, placed.velocity, placed.angular_velocity)
         command, reached = self.link.steer(robot, step if self.settings.lockstep else None)
@@ -257,13 +250,10 @@ class AgentDriver(RobotNode):
         self.goals.publish_feedback(placed)
 
     def _on_robots(self, message: LockstepStep) -> None:
-        """Give the goal up when the robot leaves, in lockstep."""
         self.goals.away = self.robot not in message.robots
         if self.goals.away and self.active:
             self.end_goal(GoalStatus.ABORTED, 'left')
             self.follower.let_go()
-
-    # ---- the services stop and release -------------------------------------------------------
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._stop_latched = True

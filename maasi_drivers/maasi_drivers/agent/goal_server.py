@@ -101,10 +101,7 @@ class GoalServer:
             return f'tolerance: read {request.tolerance}, allowed are finite numbers from 0 [m]'
         return self._link.goal_problem(position)
 
-    # ---- the action --------------------------------------------------------------------------
-
     def _answer(self, handle: ServerGoalHandle) -> None:
-        """Take a goal, or abort it with the reason."""
         request = handle.request
         problem = self.problem(request)
         # After `problem`, which transforms the waypoint into the map.

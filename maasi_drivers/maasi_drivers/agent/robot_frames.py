@@ -103,7 +103,6 @@ class RobotFrames:
         self._connect()
 
     def _connect(self) -> None:
-        """Connect, and publish what does not change."""
         node, settings = self._node, self._settings
         self._type: Any = None
         try:
@@ -144,8 +143,6 @@ class RobotFrames:
         """Discard what moves, as after a jump of the clock."""
         self._buffer.clear()
         self._slot = self._taken = None
-
-    # ---- what is published -------------------------------------------------------------------
 
     def publish(self, placed: StampedPose, map_from_odom: Pose) -> None:
         """Publish where the robot is, `tf_rate` times a second of its stamps at most."""
@@ -189,8 +186,6 @@ class RobotFrames:
         # All of them each time: only the last message is latched.
         if self._static_publisher is not None and self._static:
             self._static_publisher.publish(self._type(transforms=[*self._static.values()]))
-
-    # ---- what others publish -----------------------------------------------------------------
 
     def _read(self, topic: str, message: Any) -> None:
         for item in message.transforms:

@@ -37,8 +37,6 @@ class RobotLink(ABC):
         #: Lowest and highest x, y, z of goals, (3, 2) [m, map], beside the driver's bounds.
         self.fence: FloatArray = np.tile([-math.inf, math.inf], (3, 1))
 
-    # ---- every link --------------------------------------------------------------------------
-
     @abstractmethod
     def connect(self) -> None:
         """Open the link, in *configure*; where this raises, the node stays unconfigured."""
@@ -73,8 +71,6 @@ class RobotLink(ABC):
     def status(self) -> dict[str, Any]:
         """Return values for the diagnostics."""
         return {}
-
-    # ---- life cycle and goals, where a robot needs them --------------------------------------
 
     def prepare(self) -> None:
         """Check the settings, before `connect`; `SettingsError` for what is not allowed."""
@@ -114,8 +110,6 @@ class RobotLink(ABC):
     def goal_cancelled(self) -> None:
         """Take note that a client cancelled the goal, after `hold`."""
 
-    # ---- control, where a robot differs ------------------------------------------------------
-
     def make_motion(self) -> MotionModel:
         """Return the controller."""
         settings = self.driver.settings
@@ -129,8 +123,6 @@ class RobotLink(ABC):
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
         """Return whether this command must change pose and images."""
         return bool(math.hypot(*command[:3]) > 0.02 or abs(command[3]) > 0.05)
-
-    # ---- lockstep ----------------------------------------------------------------------------
 
     def begin_step(self, stamp: int) -> None:
         """Take in what is older than the step at `stamp` [ns], before its control step."""

@@ -64,7 +64,6 @@ def scan_points(
 
 @njit(cache=True)
 def _is_free(x: float, y: float, heading: float, reach: float, circles: FloatArray) -> bool:
-    """Return whether a heading is free of circles for `reach` metres."""
     end_x = x + reach * math.cos(heading)
     end_y = y + reach * math.sin(heading)
     return is_clear((x, y, 0.0), (end_x, end_y, 0.0), circles, 0.0, False)

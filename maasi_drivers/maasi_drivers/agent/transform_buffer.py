@@ -79,7 +79,6 @@ class TransformBuffer:
             edge.add(stamp, pose)
 
     def _path(self, frame: str) -> list[str]:
-        """Return a frame and those above it, up to its root."""
         path = [frame]
         while (edge := self._edges.get(path[-1])) is not None:
             path.append(edge.parent)

@@ -172,6 +172,5 @@ class BagReader:
 
 
 def _words(error: Exception) -> str:
-    """Return an error on one line, of bounded length."""
     text = ' '.join(str(error).split()) or type(error).__name__
     return text if len(text) <= 300 else f'{text[:297]}...'

@@ -100,7 +100,6 @@ class TurtlebotLink(TopicLink):
         return command, reached
 
     def _without_progress(self, placed: StampedPose) -> float:
-        """Return for how long it has come no nearer to its waypoint [s]."""
         follower = self.driver.follower
         goal = follower.goal
         if goal is None or goal.status != GoalStatus.MOVING:
@@ -272,7 +271,6 @@ class Nav2Link(TurtlebotLink):
                 self.driver.end_goal(status, reason)
 
     def _stop_replaced(self) -> None:
-        """Cancel the goal before, where Nav2 has not taken another one instead."""
         handle, self._replaced = self._replaced, None
         if handle is not None:
             handle.cancel_goal_async()

@@ -110,8 +110,7 @@ class MountSettings(Settings):
     """Where the camera sits on the robot (REP-103); without rpy it looks forward, image top up."""
 
     position: Vector3 = Field(
-        default=[0.0, 0.0, 0.0],
-        description="Optical centre in the robot's frame [m]",
+        default=[0.0, 0.0, 0.0], description="Optical centre in the robot's frame [m]"
     )
     rpy: Vector3 = Field(
         default=[0.0, 1.5707963267948966, 0.0],

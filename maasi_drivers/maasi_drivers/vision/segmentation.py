@@ -55,7 +55,6 @@ def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
 
 @njit(cache=True, error_model='numpy')
 def _median(counts):  # type: ignore[no-untyped-def]
-    """Return the median of counted whole numbers, interpolated within its bin."""
     total = np.cumsum(counts)
     half = 0.5 * total[-1]
     value = np.searchsorted(total, half)
@@ -65,7 +64,6 @@ def _median(counts):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model='numpy')
 def _blueness(planes):  # type: ignore[no-untyped-def]
-    """Return (B - max(R, G)) over the mean of the channels (3, ...), -3 to 3, in their type."""
     red, green, blue = planes[0], planes[1], planes[2]
     return _THREE * (blue - np.maximum(red, green)) / (red + green + blue + _THREE * _DARK)
 

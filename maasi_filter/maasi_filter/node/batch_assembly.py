@@ -158,7 +158,6 @@ class BatchAssembly:
     def _problem(
         self, name: str, message: DetectionArray, expected: PendingBatch | None
     ) -> str | None:
-        """Return why a whole message is refused, or None."""
         if message.robot != name:
             return f'robot: read {message.robot!r}, allowed on this topic is {name!r}'
         if message.header.frame_id != self._node.settings.frame:

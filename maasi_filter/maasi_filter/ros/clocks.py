@@ -115,10 +115,7 @@ class ClockWatch:
     """
 
     def __init__(
-        self,
-        node: Node,
-        warn: Callable[[str, str], None],
-        on_restart: Callable[[float], None],
+        self, node: Node, warn: Callable[[str, str], None], on_restart: Callable[[float], None]
     ) -> None:
         self._node = node
         self._warn = warn

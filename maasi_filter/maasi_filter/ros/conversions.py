@@ -306,10 +306,7 @@ def sphere_marker(
 
 
 def filter_markers(
-    header: Header,
-    clusters: Iterable[Cluster],
-    found: Iterable[FoundTarget],
-    size: float,
+    header: Header, clusters: Iterable[Cluster], found: Iterable[FoundTarget], size: float
 ) -> MarkerArray:
     """Return markers of clusters (orange, scaled by their width) and found targets (green)."""
     markers = [

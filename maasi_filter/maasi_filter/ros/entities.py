@@ -56,7 +56,6 @@ class NodeEntities:
                 destroy(item)
 
     def _made(self) -> list[tuple[Any, Callable[[Any], object]]]:
-        """Return the entities of the node, each with what destroys it."""
         node = self._node
         # Of plugins; owners destroy their event handlers.
         waitables = [item for item in node.waitables if not isinstance(item, EventHandler)]

@@ -58,12 +58,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     settings: SettingsT
 
     def __init__(
-        self,
-        name: str,
-        settings: type[SettingsT],
-        *,
-        in_robot: bool = False,
-        **options: Any,
+        self, name: str, settings: type[SettingsT], *, in_robot: bool = False, **options: Any
     ) -> None:
         super().__init__(name, allow_undeclared_parameters=True, **options)
         self._always_in_robot = self._in_robot = in_robot
@@ -95,16 +90,12 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._entities_made.clear()
         super().destroy_node()
 
-    # ---- names -------------------------------------------------------------------------------
-
     def team_topic(self, name: str) -> str:
         """Return the full name of a topic of the team."""
         parts = [part for part in self.get_namespace().split('/') if part]
         if self._in_robot:
             parts = parts[:-1]
         return '/' + '/'.join([*parts, name])
-
-    # ---- life cycle --------------------------------------------------------------------------
 
     def prepare(self) -> None:
         """Create the objects that the settings describe, before `set_up`. In *configure*."""
@@ -224,8 +215,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         )
         service.callback = answer
 
-    # ---- readiness and lockstep --------------------------------------------------------------
-
     def expect(self, condition: Callable[[], bool]) -> None:
         """Add a condition for being ready."""
         self._peers.append(condition)
@@ -273,8 +262,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         if missing and (fault := loopback_fault()):
             self.get_logger().warning(fault)
 
-    # ---- time --------------------------------------------------------------------------------
-
     def reset(self) -> None:
         """Discard state with times after a backward jump of the clock."""
 
@@ -302,8 +289,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             return
         self.get_logger().warning(f'{text}: the search starts again')
         self.reset()
-
-    # ---- messages ----------------------------------------------------------------------------
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
         """Return a publisher without the event callbacks of rclpy; see `Endpoints`."""
@@ -354,8 +339,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             callback(message)
         else:
             self.drop('bad stamp', f'{topic}.{problem}')
-
-    # ---- diagnostics -------------------------------------------------------------------------
 
     def drop(self, reason: str, text: str, number: int = 1) -> None:
         """Count discarded data by a reason, and warn, throttled: what was read, what is allowed."""

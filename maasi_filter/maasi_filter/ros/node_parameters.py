@@ -96,7 +96,6 @@ class NodeParameters(Generic[SettingsT]):
         return [item for item in parameters if not item.name.startswith(self._foreign)]
 
     def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Return whether parameters may be set, and if not, why."""
         objections = self._objections(self._own(parameters))
         reason = '' if self._own_change else next(objections, '')
         return SetParametersResult(successful=not reason, reason=reason)
@@ -119,7 +118,6 @@ class NodeParameters(Generic[SettingsT]):
                 yield from (problems[name] for name in wrong if name in problems)
 
     def _note(self, parameters: list[Parameter]) -> None:
-        """Apply what was set."""
         if self._own_change:
             return
         own = self._own(parameters)
@@ -134,7 +132,6 @@ class NodeParameters(Generic[SettingsT]):
             setattr(target, last, getattr(source, last))
 
     def _with(self, own: Sequence[Parameter]) -> dict[str, Any]:
-        """Return the values that were set, and these."""
         values = self._given | {item.name: item.value for item in own}
         return {name: value for name, value in values.items() if value is not None}
 

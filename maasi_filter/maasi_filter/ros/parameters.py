@@ -61,10 +61,7 @@ class ParameterField:
 
 
 def parameter_fields(
-    model: type[BaseModel],
-    given: Mapping[str, Any],
-    prefix: str = '',
-    keys: tuple[str, ...] = (),
+    model: type[BaseModel], given: Mapping[str, Any], prefix: str = '', keys: tuple[str, ...] = ()
 ) -> Iterator[ParameterField]:
     """Yield the parameters of settings; the `given` ones determine which robots and parts exist."""
     for name, info in model.model_fields.items():
@@ -179,7 +176,6 @@ def _argument(annotation: Any, kind: type) -> Any:
 
 
 def _width(annotation: Any) -> int | None:
-    """Return the length of the lists in a list, if it is fixed."""
     element = _argument(annotation, list)
     if _argument(element, list) is None:
         return None

@@ -153,7 +153,6 @@ class SearchAgent:
         )
 
     def _photograph(self) -> None:
-        """Take a snapshot of each new cuboid that it is in."""
         for n in np.flatnonzero(self.mission.inside(self.position) & ~self.visited):
             self.visited[n] = True
             cell = self.mission.cells[n]
@@ -200,7 +199,6 @@ class SearchAgent:
         )
 
     def _aim(self, heard: Sequence[Broadcast]) -> FloatArray:
-        """Return x*: the cuboid nearest to its predicted position, or the assigned one (10)."""
         centres, unvisited = self.mission.centres, np.flatnonzero(~self.visited)
         if not heard and len(unvisited):
             offset = centres[unvisited] - self._predicted()

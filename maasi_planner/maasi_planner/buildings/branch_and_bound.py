@@ -63,7 +63,6 @@ class Instance(NamedTuple):
 
 @njit(cache=True)
 def _ahead(instance: Instance, tree: Tree, node: int) -> float:
-    """Return the most reward that can be added to a node."""
     if tree.closed[node]:
         return 0.0
     if tree.number[node] == 0:
@@ -234,7 +233,6 @@ def _visit(instance: Instance, tree: Tree, node: int, q: int) -> None:
 
 @njit(cache=True)
 def _can_add(instance: Instance, tree: Tree, node: int, q: int) -> bool:
-    """Return whether a visit is of a new cuboid, inside the bounds of its step."""
     for i in range(tree.number[node]):
         if instance.visit_cuboid[tree.visits[node, i]] == instance.visit_cuboid[q]:
             return False
@@ -248,7 +246,6 @@ def _can_add(instance: Instance, tree: Tree, node: int, q: int) -> bool:
 
 @njit(cache=True)
 def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
-    """Add the nodes with one more visit."""
     number = tree.number[node]
     last = tree.visits[node, number - 1] if number else -1
     for q in range(instance.visit_step.shape[0]):

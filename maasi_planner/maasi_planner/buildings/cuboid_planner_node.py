@@ -120,8 +120,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         # Snapshots of the agent that were published. A step may pass without a decision.
         self._published_shots = 0
 
-    # ---- life cycle --------------------------------------------------------------------------
-
     def set_up(self) -> None:
         """Compile and connect."""
         agent = self._make_agent()
@@ -181,7 +179,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         return self.modes.of[self.name] is Mode.SEARCHING
 
     def _take_command(self, word: str, _: list[str] | None) -> tuple[bool, str]:
-        """Execute a command; return whether it was accepted, and an answer as text."""
         if not self.active:
             return False, 'the planner is not active'
         if word == 'home':
@@ -210,8 +207,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             'solves without a plan': self.agent.failed,
             'last decision [ms]': f'{1e3 * self._solve_time:.2f}',
         }
-
-    # ---- input -------------------------------------------------------------------------------
 
     def _on_odometry(self, message: Odometry) -> None:
         if not self.active:
@@ -268,8 +263,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             self.warn_throttled('link', f'step {self._sent_step}: nothing on link/rx')
             self._decide([])
 
-    # ---- the step ----------------------------------------------------------------------------
-
     def _header(self, step: int) -> Header:
         stamp = stamp_to_ros(stamp_of_step(step, self.settings.step))
         return Header(frame_id=self.settings.frame, stamp=stamp)
@@ -318,7 +311,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         return heard
 
     def _decide(self, heard: list[Broadcast]) -> None:
-        """Decide, or let the robot stand if it does not search; publish what came out."""
         step = self._sent_step
         header = self._header(step)
         velocity = np.zeros(3)
@@ -371,7 +363,3 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
 def main(arguments: list[str] | None = None) -> int:
     """Run the planner node of one robot."""
     return run(CuboidPlannerNode, arguments)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

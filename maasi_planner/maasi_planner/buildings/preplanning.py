@@ -186,7 +186,6 @@ def _boxes(key: str, items: Sequence[BoxSettings], area: FloatArray) -> FloatArr
 def _face_cells(
     index: int, face: Face, box: FloatArray, distance: float, side: float, settings: CuboidSettings
 ) -> Iterator[Cell]:
-    """Yield the cells of a face, their cuboids not cut yet."""
     axis, upper = divmod(FACES.index(face), 2)
     others = [a for a in range(3) if a != axis]
     normal = np.zeros(3)
@@ -211,7 +210,6 @@ def _face_cells(
 def _usable(
     cell: Cell, area: FloatArray, solids: FloatArray, settings: CuboidSettings
 ) -> tuple[FloatArray, str]:
-    """Return the accessible part of a cuboid, or why there is none."""
     box = np.stack(
         [np.maximum(cell.box[:, 0], area[:, 0]), np.minimum(cell.box[:, 1], area[:, 1])], axis=1
     )

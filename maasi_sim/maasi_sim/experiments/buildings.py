@@ -50,7 +50,6 @@ def mission_settings(settings: dict[str, Any]) -> CuboidSettings:
 
 
 def _mission(settings: dict[str, Any], seed: int, scheme: Any) -> CuboidMission:
-    """Return the mission of a case; robots start at given places, or random ones."""
     search, area = mission_settings(settings), settings['area']
     rng = np.random.default_rng(seed)
     starts = settings.get('starts')

@@ -21,14 +21,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from maasi_sim.arguments import count
-from maasi_sim.experiments.experiment import (
-    Case,
-    Experiment,
-    Outcome,
-    Results,
-    Run,
-    WrongInput,
-)
+from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Results, Run, WrongInput
 from maasi_sim.experiments.runs import DamagedRun, NoRoom, load_run, run_of, to_text, write_file
 from maasi_sim.machine import code_digest, machine_difference, this_machine
 from maasi_sim.run.progress import ProgressDisplay
@@ -217,12 +210,7 @@ def maps_in(folder: Path) -> int:
 
 
 def plan(
-    experiment: Experiment,
-    out: Path,
-    runs: int,
-    seed: int = 1,
-    small: bool = False,
-    first: int = 0,
+    experiment: Experiment, out: Path, runs: int, seed: int = 1, small: bool = False, first: int = 0
 ) -> Campaign:
     """Compare the stored runs with the wanted ones: `runs` maps from number `first`."""
     cases = {case.name: case for case in experiment.cases(small)}

@@ -20,14 +20,7 @@ from maasi_sim.experiments.statistics import (
     paired_difference,
     student,
 )
-from maasi_sim.experiments.tables import (
-    interval,
-    markdown_table,
-    median,
-    number,
-    paired,
-    shown,
-)
+from maasi_sim.experiments.tables import interval, markdown_table, median, number, paired, shown
 
 HOLDS, NOT_SHOWN, NOT_HERE, DIFFERS = 'holds', 'not shown', 'not here', 'differs'
 ONE_RUN, NOT_RUN = 'no interval', 'not run'
@@ -96,7 +89,6 @@ def _finding(claim: Claim, paper: str, here: Sequence[str], gap: Interval, size:
 
 
 def _number(results: Results, claim: Claim, quantity: Quantity) -> Finding | None:
-    """Return the mean of a case beside the paper's number."""
     if not results.runs.get(claim.case):
         return None
     ours = interval(results, claim.case, quantity)
@@ -115,7 +107,6 @@ def _number(results: Results, claim: Claim, quantity: Quantity) -> Finding | Non
 
 
 def _pair(results: Results, claim: Claim, quantity: Quantity) -> Finding | None:
-    """Return the difference of two cases on the same maps."""
     names = claim.first, claim.second
     raw = results.pairs(*names, claim.quantity)
     both = paired(results, *names, quantity)
@@ -170,7 +161,6 @@ def _ratio(first: np.ndarray, second: np.ndarray) -> str:
 
 
 def _finished(quantity: Quantity, *values: np.ndarray) -> str:
-    """Return how many runs of each case got there, '' of what each run has."""
     if quantity.kind == 'mean':
         return ''
     parts = [f'{int((~np.isnan(one)).sum())} of {len(one)}' for one in values]

@@ -134,7 +134,6 @@ def compare(options: argparse.Namespace) -> int:
 
 
 def _unfinished(wanted: dict[str, Any]) -> Path | None:
-    """Return the newest folder of an interrupted comparison with the same request."""
     for folder in sorted(_RUNS.glob('compare_*'), reverse=True):
         try:
             read = json.loads((folder / 'request.json').read_text(encoding='utf-8'))
@@ -169,7 +168,6 @@ def _refuse_others(campaigns: Sequence[Campaign], out: Path) -> None:
 
 
 def _write(out: Path, tables: Sequence[SearchTable], seeds: Sequence[int]) -> None:
-    """Write tables, picture and JSON; NoRoom is raised if one cannot be written."""
     for table in tables:
         write_file(out / table.name / 'runs.csv', runs_text(table.results.every()))
     write_file(out / 'comparison.csv', compared_text(tables))

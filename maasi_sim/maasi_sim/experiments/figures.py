@@ -54,7 +54,6 @@ def as_png(draw: Callable[[Figure], None], dpi: int = 110) -> bytes:
 
 
 def _found_over(run: Run, grid: FloatArray, by: str) -> FloatArray:
-    """Return the true targets found at or before each point of a grid of another column."""
     if not len(run.columns[by]):
         return np.zeros(len(grid))
     index = np.searchsorted(run.columns[by], grid, side='right') - 1
@@ -204,11 +203,7 @@ def draw_paths(figure: Figure, results: Results, cases: Sequence[str] | None = N
 
 
 def draw_against(
-    figure: Figure,
-    results: Results,
-    setting: Sequence[str],
-    label: str,
-    quantities: Sequence[str],
+    figure: Figure, results: Results, setting: Sequence[str], label: str, quantities: Sequence[str]
 ) -> None:
     """Draw means, with 95 % confidence, against the number of the scenario at keys `setting`."""
     figure.set_size_inches(4.6 * len(quantities), 3.8)

@@ -79,7 +79,6 @@ def write_outputs(work: Campaign, seed: int) -> None:
 def _described(
     experiment: Experiment, cases: dict[str, dict[str, str]], pairs: list[list[str]]
 ) -> list[str]:
-    """Return tables, note and causes in Markdown."""
     parts = [*beside_paper(cases, pairs), experiment.note and f'{experiment.note}\n']
     if experiment.tested:
         parts.append(f'Causes of differences, tested: {experiment.tested}\n')
@@ -186,11 +185,7 @@ def wrapped(text: str) -> str:
         mark = line.split(' ', 1)[0]
         indent = ' ' * (len(mark) + 1) if mark == '-' or mark.rstrip('.').isdecimal() else ''
         lines += textwrap.wrap(
-            line,
-            _COLUMNS,
-            subsequent_indent=indent,
-            break_long_words=False,
-            break_on_hyphens=False,
+            line, _COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
         )
     return '\n'.join(lines)
 

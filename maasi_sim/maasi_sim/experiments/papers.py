@@ -121,7 +121,6 @@ def _axes(cases: Any) -> list[dict[str, dict[str, Any]]]:
 
 
 def _combined(cases: Any) -> dict[str, dict[str, Any]]:
-    """Return the values of each case by its name."""
     return {
         ', '.join(name for name, _ in items): merged(*(values for _, values in items))
         for items in product(*(axis.items() for axis in _axes(cases)))

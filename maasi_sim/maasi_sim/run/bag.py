@@ -116,11 +116,7 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
     """
 
     def __init__(
-        self,
-        path: Path,
-        types: Typestore,
-        images: ImageFormat = 'jpeg',
-        backlog: int = 8 * 2**20,
+        self, path: Path, types: Typestore, images: ImageFormat = 'jpeg', backlog: int = 8 * 2**20
     ) -> None:
         self.path = Path(path)
         self._types = types

@@ -70,7 +70,6 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         raise DomainError(f'no ROS domain from 1 to {DOMAINS[-1]} is free')
 
     def _take(self, number: int, team: str, shared: bool) -> str:
-        """Lock a domain and a namespace in it; return the name of a taken one, else empty."""
         wanted = {} if shared else {f'{number}': f'{number}'}
         wanted[f'{number} {team}'] = f'namespace /{team} in {number}'
         for name, words in wanted.items():
@@ -108,7 +107,6 @@ class Domain(contextlib.AbstractContextManager['Domain']):
 
 
 def _port_used(port: int) -> bool:
-    """Return whether some process on this host listens on a UDP port."""
     for table in ('/proc/net/udp', '/proc/net/udp6'):
         try:
             lines = Path(table).read_text().splitlines()[1:]

@@ -113,7 +113,6 @@ class Observer(ABC):
         return seconds(stamp) - (self.begin or 0.0)
 
     def _note_step(self, step: Any) -> None:
-        """Note the robots that take part."""
         if self.begin is None:
             self.begin = seconds(step.stamp)
         before, self.robots = self.robots, list(step.robots)

@@ -92,9 +92,7 @@ class Recorder:
     ) -> None:
         self.context = Context()
         rclpy.init(
-            context=self.context,
-            domain_id=domain,
-            signal_handler_options=SignalHandlerOptions.NO,
+            context=self.context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
         )
         self.node = Node(
             NAME,
@@ -159,7 +157,6 @@ class Recorder:
         return self.node.create_subscription(kind, full, lambda _: None, qos, raw=True)
 
     def _full(self, topic: str) -> str:
-        """Return the full name of a topic of the team."""
         return topic if topic in _SHARED else within(self._team, topic)
 
     def relative(self, topic: str) -> str | None:
@@ -335,7 +332,6 @@ class Recorder:
         return 0.0 if self._begun is None else (min(self.time, self._end) - self._begun) / 1e9
 
     def _is_own(self, topic: str, data: bytes) -> bool:
-        """Return whether a message on a topic shared by all teams is the team's own."""
         if self._team and topic == DIAGNOSTICS:
             names = [item.name for item in deserialize_message(data, DiagnosticArray).status]
             return any(name.startswith(f'/{self._team}/') for name in names)
@@ -389,7 +385,6 @@ class Recorder:
         return not _has_step(kind) or deserialize_message(data, kind).step <= self._last_step
 
     def _take(self, topics: Sequence[str]) -> list[tuple[str, bytes]]:
-        """Return the topics and messages that wait in subscriptions."""
         return [
             (topic, data)
             for topic in topics
@@ -462,13 +457,11 @@ class Recorder:
 
 @cache
 def _has_step(kind: Any) -> bool:
-    """Return whether messages of a type name the step that they belong to."""
     # In other packages it is something else: the length of an image's row.
     return kind.__module__.startswith('maasi_msgs.') and 'step' in kind.get_fields_and_field_types()
 
 
 def _queued(subscription: Subscription) -> list[bytes]:
-    """Return all serialised messages queued in a subscription."""
     taken: list[bytes] = []
     handle = subscription.handle
     while True:

@@ -134,9 +134,7 @@ class ReplayNode:
     ) -> None:
         self.context = Context()
         rclpy.init(
-            context=self.context,
-            domain_id=domain,
-            signal_handler_options=SignalHandlerOptions.NO,
+            context=self.context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
         )
         self.node = Node('replay', context=self.context, use_global_arguments=False)
         self.updates: list[FilterUpdate] = []
@@ -239,10 +237,7 @@ def replay(path: Path, out: Path | None, domain_id: int | None, interruption: In
 
 
 def _feed(
-    node: ReplayNode,
-    recording: Recording,
-    processes: list[NodeProcess],
-    interruption: Interruption,
+    node: ReplayNode, recording: Recording, processes: list[NodeProcess], interruption: Interruption
 ) -> int:
     first_difference = None
 

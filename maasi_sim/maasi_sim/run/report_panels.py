@@ -142,7 +142,6 @@ def _shades(colour: str) -> LinearSegmentedColormap:
 
 
 def _draw_way(view: MapView, path: FloatArray, colour: str, end: float, label: str) -> None:
-    """Draw a way of rows time [s], x, y, z [m], darker with time up to `end` [s]."""
     if len(path):
         places = view.points(path[:, 1:]).T
         lines = LineCollection(
@@ -178,7 +177,6 @@ def _draw_times(axes: Axes, colours: Mapping[str, str], end: float) -> None:
 
 
 def _add_legend(figure: Figure, views: Sequence[MapView]) -> None:
-    """Add a legend of all views with each label once."""
     unique: dict[str, Any] = {}
     for view in views:
         handles, labels = view.axes.get_legend_handles_labels()

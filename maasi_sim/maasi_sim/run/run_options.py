@@ -15,16 +15,7 @@ from maasi_sim.run.ending import EXIT_CODES
 
 LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 # Options that are arguments of a launch as well.
-_LAUNCH_OPTIONS = (
-    'out',
-    'seed',
-    'rate',
-    'planner',
-    'time_limit',
-    'namespace',
-    'log_level',
-    'port',
-)
+_LAUNCH_OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'namespace', 'log_level', 'port')
 _LAUNCH_FLAGS = ('lockstep', 'follow_clock', 'view')
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 

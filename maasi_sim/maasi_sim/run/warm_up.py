@@ -27,7 +27,6 @@ def warm_up() -> None:
 
 
 def _simulate(*names: str) -> None:
-    """Simulate one step of the robots of scenarios, and look for markers."""
     MarkerDetector(CameraSettings()).segment(np.zeros((120, 160, 3), np.uint8))
     for name in names:
         simulation = Simulation(load_scenario(name), 1)

@@ -151,22 +151,13 @@ class OdometryModel:
         )
 
     def _from_start(self, x: float, y: float, z: float) -> tuple[float, float, float]:
-        """Return a position of the map in the frame of the start."""
         (a, b, c), (d, e, f), (g, h, i) = self._rotation
         tx, ty, tz = self._shift
-        return (
-            tx + a * x + b * y + c * z,
-            ty + d * x + e * y + f * z,
-            tz + g * x + h * y + i * z,
-        )
+        return (tx + a * x + b * y + c * z, ty + d * x + e * y + f * z, tz + g * x + h * y + i * z)
 
     def _place(self, x: float, y: float) -> tuple[float, float]:
-        """Return the estimated position of a robot at x, y."""
         cosine, sine = math.cos(self._turn), math.sin(self._turn)
-        return (
-            self._offset[0] + cosine * x - sine * y,
-            self._offset[1] + sine * x + cosine * y,
-        )
+        return (self._offset[0] + cosine * x - sine * y, self._offset[1] + sine * x + cosine * y)
 
     def _grow(self, move_x: float, move_y: float, way: float) -> None:
         """Propagate the covariance of the drift over a move; an error of heading turns the move."""
@@ -198,7 +189,6 @@ class OdometryModel:
 
 
 def _product(first: list[float], second: list[float]) -> tuple[float, float, float, float]:
-    """Return the Hamilton product of two quaternions w, x, y, z."""
     w1, x1, y1, z1 = first
     w2, x2, y2, z2 = second
     return (

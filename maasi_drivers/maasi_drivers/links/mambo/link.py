@@ -109,8 +109,6 @@ class MamboLink:
         self._was_silent = False
         self._thread: threading.Thread | None = None
 
-    # ---- what the caller asks for ------------------------------------------------------------
-
     def connect(self) -> None:
         """Begin to connect."""
         make = self._make_drone()
@@ -201,8 +199,6 @@ class MamboLink:
                     ) from error
         return minidrone
 
-    # ---- the thread --------------------------------------------------------------------------
-
     def _make_drone(self) -> Any:
         minidrone = self.check()
         link = self
@@ -286,14 +282,12 @@ class MamboLink:
                 self._steering = [0, 0, 0, 0]
 
     def _ask_again(self) -> None:
-        """Ask for the drone's state when the link is back: it tells each change once."""
         silent = math.isfinite(self.heard_at) and time.monotonic() - self.heard_at > _OUTDATED
         if self._was_silent and not silent:
             self._drone.ask_for_state_update()
         self._was_silent = silent
 
     def _try_to_connect(self, drone: Any) -> str:
-        """Return why there is no connection, or nothing."""
         try:
             return '' if drone.connect(num_retries=3) else 'it refused the connection'
         except Exception as error:
@@ -326,8 +320,6 @@ class MamboLink:
             steering, self._steering = self._steering, None
         if steering is not None:
             self._drone.fly_direct(*steering)
-
-    # ---- what comes in -----------------------------------------------------------------------
 
     def _take(self, name: str, value: Any, sensors: Any) -> None:
         """Take one number of an event; called by pyparrot's thread."""

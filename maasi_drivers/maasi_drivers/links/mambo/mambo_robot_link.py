@@ -71,8 +71,6 @@ class MamboRobotLink(RobotLink):
         except MamboLinkError as error:
             raise SettingsError(f'parameter link: {error}') from error
 
-    # ---- link and life cycle -----------------------------------------------------------------
-
     def connect(self) -> None:
         """Connect; it takes off once the driver is active."""
         driver, link = self.driver, self._link
@@ -140,8 +138,6 @@ class MamboRobotLink(RobotLink):
             **{f'datagrams dropped: {key}': number for key, number in link.dropped.items()},
         }
 
-    # ---- what comes in -----------------------------------------------------------------------
-
     def _update(self) -> None:
         driver = self.driver
         now, pilot, link = time.monotonic(), self._pilot, self._link
@@ -169,7 +165,6 @@ class MamboRobotLink(RobotLink):
                 )
 
     def _judge(self, pilot: MamboPilot) -> None:
-        """Log the phase, and report the fault of the pilot."""
         phase, problem = pilot.phase, pilot.problem
         if phase is not self._phase:
             self._phase = phase
@@ -195,8 +190,6 @@ class MamboRobotLink(RobotLink):
         velocity = before + _SMOOTHING * (placed.velocity - before)
         covariance = self._mambo.pose_covariance()
         driver.take_pose(replace(placed, covariance=covariance, velocity=velocity))
-
-    # ---- goals and control -------------------------------------------------------------------
 
     def make_motion(self) -> MotionModel:
         """Return the controller, which the pilot uses as well."""

@@ -13,12 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import (
-    UNTIL_ARM,
-    ArmPermission,
-    make_fence,
-    outside_fence,
-)
+from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission, make_fence, outside_fence
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import FeedPeer, RobotNode
@@ -91,8 +86,6 @@ class OnboardLink(RobotLink):
         # Positions of the feed are relative to this.
         self._origin = Pose.from_yaw([*settings.start[:2], mambo.ground], settings.yaw)
 
-    # ---- link and life cycle -----------------------------------------------------------------
-
     def connect(self) -> None:
         """Send orders from now on: to be on the ground until it is active and may fly."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -113,7 +106,6 @@ class OnboardLink(RobotLink):
         self._lost_since: float | None = None
 
     def _arm(self) -> str:
-        """Let the drone take off; return why not, empty where it may."""
         problem = '' if self._mambo.arm else NOT_ALLOWED
         if not problem and self._feed_state is not FeedState.GROUND:
             problem = 'it is in the air, or not heard'
@@ -179,10 +171,7 @@ class OnboardLink(RobotLink):
             text = f'orders to {address}: {error.strerror or error}'
             self.driver.warn_throttled('orders', text)
 
-    # ---- the flight --------------------------------------------------------------------------
-
     def _take_feed_pose(self, stamp: int, pose: FeedPose) -> None:
-        """Take the drone's own pose at an image of the feed."""
         driver = self.driver
         if not driver.active or not driver.is_new_pose('feed', stamp):
             return

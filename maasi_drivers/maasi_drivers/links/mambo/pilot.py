@@ -85,8 +85,6 @@ class MamboPilot:
         self._ended = ''
         self._permission = ArmPermission(settings.arm_timeout)
 
-    # ---- where it is -------------------------------------------------------------------------
-
     @property
     def flying(self) -> bool:
         """Whether it follows commands."""
@@ -122,8 +120,6 @@ class MamboPilot:
             self._moved_at = now
         self._place, self._placed_at = place, now
 
-    # ---- control -----------------------------------------------------------------------------
-
     def fly(self, command: FloatArray) -> None:
         """Fly a velocity command (4,), once; without another one the drone hovers."""
         if not np.isfinite(command).all():
@@ -139,7 +135,6 @@ class MamboPilot:
             self._send(_STILL, _STILL)
 
     def _steer(self, command: FloatArray) -> None:
-        """Steer towards the commanded speed, limited to what can be stopped."""
         model, course = self.reckoning.model, self.reckoning.ahead()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         turned = np.array([[cosine, sine], [-sine, cosine]])
@@ -169,8 +164,6 @@ class MamboPilot:
         self._command = command
         self.reckoning.command(self._now, shares)
         self.link.steer(*shares.tolist())
-
-    # ---- what it is to do --------------------------------------------------------------------
 
     def permit(self, now: float) -> str:
         """Let it take off once; return why not, empty where it may."""
@@ -230,8 +223,6 @@ class MamboPilot:
         self.reckoning.command(self._now, _STILL)
         self.link.land()
 
-    # ---- the flight --------------------------------------------------------------------------
-
     def update(self, now: float) -> None:
         """Advance to `now`; at least ten times a second."""
         self._now = now
@@ -244,7 +235,6 @@ class MamboPilot:
         self.problem = self._advance(now)
 
     def _advance(self, now: float) -> str:
-        """Do what the phase needs; return why it takes no goals, or nothing."""
         link = self.link
         if self.phase is MamboPhase.CONNECTING:
             if not link.connected:
@@ -276,7 +266,6 @@ class MamboPilot:
         return self._ended
 
     def _stand(self, now: float) -> str:
-        """Take off if nothing prevents it."""
         state, low = self.link.flying_state, self._low_battery()
         if low or self._is_silent(now):
             self._permission.end()
@@ -307,7 +296,6 @@ class MamboPilot:
         return phase.value
 
     def _stay_up(self, now: float) -> str:
-        """Continue a flight, or land it."""
         if low := self._low_battery():
             return self.end(low)
         if self._lost_since is not None:
@@ -345,10 +333,7 @@ class MamboPilot:
             return 'landing: its goal was cancelled'
         return ''
 
-    # ---- faults ------------------------------------------------------------------------------
-
     def _low_battery(self) -> str:
-        """Return that the charge is too low, or nothing; an unknown one is negative."""
         charge, minimum = self.link.battery, self.settings.battery_minimum
         return f'battery at {charge:.2f}, below {minimum:.2f}' if 0.0 <= charge < minimum else ''
 

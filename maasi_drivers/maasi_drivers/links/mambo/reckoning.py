@@ -139,7 +139,6 @@ class DeadReckoning:
         return np.diag([position] * 3 + [tilt, tilt, attitude])
 
     def _acting(self) -> FloatArray:
-        """Return the shares that the drone flies now."""
         return next(shares for acts, shares in reversed(self._sent) if acts <= self._now)
 
     def command(self, now: float, shares: FloatArray) -> None:

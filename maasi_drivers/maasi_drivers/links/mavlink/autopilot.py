@@ -76,8 +76,6 @@ class Autopilot:
     def on_restart(self) -> None:
         """Take note that the autopilot was restarted."""
 
-    # ---- what comes in -----------------------------------------------------------------------
-
     def take(self, message: Any, now: float) -> tuple[bool, int] | None:
         """Take a message; of a heartbeat return whether it was armed before, and the mode then."""
         kind, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
@@ -145,8 +143,6 @@ class Autopilot:
             value = float(struct.unpack('<i', struct.pack('<f', value))[0])
         self.failsafes.take(message.param_id.rstrip('\0'), value)
 
-    # ---- what goes out -----------------------------------------------------------------------
-
     def send_heartbeat(self, now: float) -> None:
         """Send the driver's heartbeat if it is due."""
         if now - self._heartbeat_at >= _HEARTBEAT_PERIOD:
@@ -195,7 +191,6 @@ class Autopilot:
         self.commands.append(_Command(number, parameters))
 
     def _conclude(self, result: int | None) -> None:
-        """Take the result of the oldest command; None: it was not answered."""
         command = self.commands.popleft()
         if result == mavlink.MAV_RESULT_ACCEPTED:
             self.accepted.add(command.number)

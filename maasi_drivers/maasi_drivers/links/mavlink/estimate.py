@@ -183,7 +183,6 @@ class Estimate:
         return min(self.heard_at, self._status_at.get(_EKF, math.inf), fixes)
 
     def _silence(self, name: str) -> str:
-        """Return that a status does not come any more, or nothing."""
         silent = self._now - self._status_at.get(name, math.inf) > _STATUS_AGE
         return f'no {name} any more' if silent else ''
 

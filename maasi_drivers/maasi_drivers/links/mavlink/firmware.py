@@ -218,7 +218,6 @@ class FailsafeCheck:
         )
 
     def _station_problem(self) -> str:
-        """Return why the autopilot would not miss the driver alone, or nothing."""
         known = [(name, self.values.get(name)) for name in self._station]
         name, low = next((item for item in known if item[1] is not None), ('', None))
         if low is None:

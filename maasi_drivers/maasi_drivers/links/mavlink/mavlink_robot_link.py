@@ -63,8 +63,6 @@ class MavlinkRobotLink(RobotLink):
         self._ending = False
         self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], self._mavlink)
 
-    # ---- link and life cycle -----------------------------------------------------------------
-
     def prepare(self) -> None:
         """Make the link; it remembers the origin of a flight."""
         folder = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
@@ -85,7 +83,6 @@ class MavlinkRobotLink(RobotLink):
         self._link.close()
 
     def _arm(self) -> str:
-        """Let the vehicle take off; return why not, empty where it may."""
         driver, link = self.driver, self._link
         if self._localised and (driver.history.latest is None or ODOMETRY in driver.health):
             return f'no {driver.pose_name}'
@@ -163,8 +160,6 @@ class MavlinkRobotLink(RobotLink):
         with self._link.lock:
             self._link.vehicle.set_target(goal.position + self._local_origin, goal.yaw)
 
-    # ---- what comes in -----------------------------------------------------------------------
-
     def _update(self) -> None:
         driver, link = self.driver, self._link
         with link.lock:
@@ -196,7 +191,6 @@ class MavlinkRobotLink(RobotLink):
             self._take_telemetry(telemetry)
 
     def _log_reports(self) -> None:
-        """Log the reports of the vehicle."""
         with self._link.lock:
             reports = self._link.vehicle.log.take()
         logger = self.driver.get_logger()

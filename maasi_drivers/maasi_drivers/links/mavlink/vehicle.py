@@ -67,11 +67,7 @@ class Vehicle(Autopilot):
     """One vehicle, from the first heartbeat to the end; times are of the steady clock [s]."""
 
     def __init__(
-        self,
-        settings: MavlinkSettings,
-        start: list[float],
-        sender: Any,
-        memory: Path | None = None,
+        self, settings: MavlinkSettings, start: list[float], sender: Any, memory: Path | None = None
     ) -> None:
         super().__init__(settings, start, sender, memory)
         # Over its origin; a copter's is on the ground [m].
@@ -92,8 +88,6 @@ class Vehicle(Autopilot):
         self._reason = ''
         # Restarted after a flight: its local frame may be anywhere.
         self._displaced = False
-
-    # ---- state -------------------------------------------------------------------------------
 
     @property
     def flying(self) -> bool:
@@ -142,14 +136,11 @@ class Vehicle(Autopilot):
 
     @property
     def _top(self) -> float:
-        """Height to which it rises, in its local frame [m]."""
         return float(self.estimate.origin[2]) + self.height
 
     def _position(self) -> FloatArray:
         telemetry = self.estimate.telemetry
         return np.zeros(3) if telemetry is None else telemetry.position.copy()
-
-    # ---- what the driver wants ---------------------------------------------------------------
 
     def set_target(self, position: ArrayLike, yaw: float) -> None:
         """Have it go to a position (3,) [m], with a yaw [rad], and stay there."""
@@ -182,7 +173,6 @@ class Vehicle(Autopilot):
         self.forbid()
 
     def _objection(self, now: float) -> str:
-        """Return why it must not be armed, or taken over."""
         if self.phase in (VehiclePhase.RISING, VehiclePhase.FLYING):
             return 'it is in the air already'
         if self._displaced:
@@ -209,8 +199,6 @@ class Vehicle(Autopilot):
             what = 'it lands' if ending == 'land' else 'it holds its position'
             self._enter(VehiclePhase.ENDING, what + self._reason)
         self.forbid()
-
-    # ---- what comes in -----------------------------------------------------------------------
 
     def handle(self, message: Any, now: float) -> None:
         """Take a message."""
@@ -286,8 +274,6 @@ class Vehicle(Autopilot):
             self._displaced = True
             self._enter(VehiclePhase.STOPPED, f'{text}: start the driver again')
 
-    # ---- the phases --------------------------------------------------------------------------
-
     def tick(self, now: float) -> None:
         """Send what is due; at least 50 times a second."""
         self.send_heartbeat(now)
@@ -313,7 +299,6 @@ class Vehicle(Autopilot):
         return self._firmware.px4 and self.phase in (VehiclePhase.STARTING, VehiclePhase.ARMING)
 
     def _continue(self, now: float) -> None:
-        """Do what the present phase needs."""
         if self._phase_at == -math.inf:
             self._phase_at = now
         if self._permission.expired(now):

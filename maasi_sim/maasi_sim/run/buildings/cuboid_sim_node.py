@@ -107,7 +107,3 @@ class CuboidSimNode(SimNode):
 def main(arguments: list[str] | None = None) -> int:
     """Run the simulation node of a search of buildings."""
     return run(CuboidSimNode, arguments)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

@@ -146,7 +146,6 @@ class CuboidMission:
         )
 
     def _decide(self, broadcasts: dict[str, Broadcast]) -> list[float]:
-        """Let all robots decide, and return how long each took, or all together [s]."""
         if self.scheme == 'centralized':
             return [self._decide_jointly()]
         places = {name: message.position for name, message in broadcasts.items()}

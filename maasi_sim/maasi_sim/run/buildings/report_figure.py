@@ -35,7 +35,6 @@ def plot_cuboid_report(record: CuboidRecord) -> Figure:
 
 
 def _area(record: CuboidRecord) -> FloatArray:
-    """Return the part of the area with everything in it, (3, 2) [m]."""
     mission = record.mission
     boxes = [*mission.objects, *mission.obstacles, *mission.boxes]
     corners = [np.asarray(box, dtype=float).T for box in boxes]

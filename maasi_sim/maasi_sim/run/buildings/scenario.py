@@ -95,7 +95,6 @@ def load_cuboid_scenario(
 
 
 def _problems(scenario: CuboidScenario) -> Problems:
-    """Yield what is wrong between the keys."""
     if scenario.dimension != 3:
         yield (
             f'environment.bounds: read {scenario.dimension} axes, allowed are three: buildings are '

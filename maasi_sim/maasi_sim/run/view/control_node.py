@@ -24,9 +24,7 @@ class Control:
         self._running = 0
         self._context = Context()
         rclpy.init(
-            context=self._context,
-            domain_id=domain,
-            signal_handler_options=SignalHandlerOptions.NO,
+            context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
         )
 
     def __call__(self, command: str, robot: str | None) -> tuple[bool, str]:

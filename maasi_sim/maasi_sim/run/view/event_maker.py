@@ -42,7 +42,6 @@ def significant(value: float) -> float:
 
 
 def _upper(covariance: ArrayLike) -> list[float]:
-    """Return the upper triangle of a covariance with three axes: xx, xy, xz, yy, yz, zz."""
     return [significant(value) for value in padded(covariance)[np.triu_indices(3)]]
 
 

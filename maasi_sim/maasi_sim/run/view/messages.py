@@ -290,7 +290,6 @@ class MessageEvents:
 
 
 def _space(topic: str) -> str:
-    """Return the namespace of a topic, without slashes at its ends."""
     return topic.rpartition('/')[0].strip('/')
 
 

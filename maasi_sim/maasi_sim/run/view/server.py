@@ -208,14 +208,12 @@ class ViewServer(ThreadingHTTPServer):
 
 
 def _number(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """Return the address that a host is given by, None where it is given by a name."""
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host)
     return None
 
 
 def _own_address() -> str:
-    """Return an address by which other machines reach this one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             # Of a documentation network: only the route to it is looked up, nothing is sent.
@@ -268,7 +266,6 @@ class _Handler(BaseHTTPRequestHandler):
                 self._report(HTTPStatus.OK, *commander(*command))
 
     def _read_command(self) -> tuple[str, str | None] | None:
-        """Return command and robot; None: it was refused."""
         length, body = self.headers.get('Content-Length', ''), None
         if not (length.isascii() and length.isdecimal()):
             self._refuse(HTTPStatus.LENGTH_REQUIRED, 'Content-Length: allowed is a number')
@@ -309,7 +306,6 @@ class _Handler(BaseHTTPRequestHandler):
         return allowed
 
     def _stream(self) -> None:
-        """Send events until the run or the browser ends."""
         self.close_connection = True
         if not self.server.keep(self.connection, 1):
             self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_BROWSERS} browsers are here')

@@ -144,7 +144,6 @@ def _write_gif(path: Path, pictures: Iterator[ImageArray]) -> None:
 
 
 def _pictures(log: EventLog, speed: float, rate: int, progress: Progress) -> Iterator[ImageArray]:
-    """Yield pictures of the run, (height, width, 3)."""
     now = Moments(log)
     places = [event[3][:2] for event in log.events if event[1] == 'robot'] or [[0, 0], [1, 1]]
     extent = [np.min(places, axis=0) - 1.0, np.max(places, axis=0) + 1.0]
@@ -266,7 +265,6 @@ class Sheet:
             self._line(centre[:2] + (radius + kept) * _CIRCLE, '--', color=_SOLID, lw=1.0)
 
     def _draw_boxes(self, now: Moments) -> None:
-        """Draw buildings and cuboids."""
         for key, colour, alpha in (('objects', OBJECT, 0.35), ('blocks', OBSTACLE, 0.6)):
             for box in now.scene.get(key, []):
                 self._box(box, colour, alpha)
@@ -278,7 +276,6 @@ class Sheet:
         self._next(f'{box} {alpha}', lambda: draw_box(self._axes, sides, colour, alpha, ''))
 
     def _draw_known(self, now: Moments) -> None:
-        """Draw fences, and true and found targets."""
         for name, colour in self._colours.items():
             fence = self._robots.get(name, {}).get('fence')
             if fence and self.size == 3:
@@ -294,7 +291,6 @@ class Sheet:
                 self._text([x, y, z], f'  {number}', fontsize=8, weight='normal')
 
     def _draw_expected(self, now: Moments) -> None:
-        """Draw potential targets, detections, and lines to robots that one hears."""
         for event in now.last['filter'].values():
             for x, y, z, mass, *covariance in event[4]:
                 style: Any = {'color': POTENTIAL, 'alpha': min(0.3 + mass, 1.0)}
@@ -352,13 +348,11 @@ class Sheet:
 
 
 def _turn(yaw: float) -> FloatArray:
-    """Return what turns rows x, y by a yaw [rad]."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return np.array([[cos, sin], [-sin, cos]])
 
 
 def _view(view: dict[str, Any], place: list[float], yaw: float) -> FloatArray:
-    """Return the outline of a field of view from above, (n, 2) [m]."""
     if view['kind'] != 'box':
         return np.asarray(_CIRCLE * view['size'][:2] + place[:2])
     corners = _outline(*np.array([view['lower'][:2], view['upper'][:2]]))
@@ -366,6 +360,5 @@ def _view(view: dict[str, Any], place: list[float], yaw: float) -> FloatArray:
 
 
 def _outline(lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return the outline of a rectangle from its corners, (5, 2) [m]."""
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
     return np.asarray(lower + corners * (upper - lower))

@@ -47,7 +47,6 @@ class ViewNode(Node):
         self._discover()
 
     def _discover(self) -> None:
-        """Subscribe to the topics that have appeared."""
         for topic, types in self.get_topic_names_and_types():
             # Raw images would load the network of real robots.
             unknown = topic not in self._known and types[0] != IMAGE_TYPE
@@ -113,7 +112,3 @@ def main(arguments: list[str] | None = None) -> int:
         page.close()
         rclpy.try_shutdown()
     return DONE
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

@@ -244,8 +244,6 @@ class FakeMambo:
                     del self._unacked[sequence]
                 self._transmit(frame)
 
-    # ---- sending -----------------------------------------------------------------------------
-
     def _transmit(self, frame: Frame) -> None:
         if self._controller is not None and not self.cut_down:
             with contextlib.suppress(OSError):
@@ -295,8 +293,6 @@ class FakeMambo:
         psi = round(math.degrees(-estimate.yaw))
         # Its stamp is the time since the one before, unlike that of the others.
         self._event((2, 18, 0), struct.pack('<ffhhh', x, y, round(z), psi, round(1000.0 * elapsed)))
-
-    # ---- receiving ---------------------------------------------------------------------------
 
     def _answer_door(self) -> None:
         visitor, (host, _) = self._door.accept()
@@ -409,7 +405,3 @@ def main(arguments: list[str] | None = None) -> int:
             print(f'{flying.name.lower()} at {place} m, battery {charge:.0%}', flush=True)
     fake.close()
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -202,8 +202,6 @@ class MamboFirmware:
         self._readings += 1
         return self._odometry.step(self.state, self._readings).pose
 
-    # ---- commands ----------------------------------------------------------------------------
-
     def hear(self) -> None:
         """Note the time of a message from the controller."""
         self._heard_at = self.time
@@ -232,8 +230,6 @@ class MamboFirmware:
         """Set what 100 per cent are, of a name in `LIMITS` and in its unit, cut to its range."""
         (low, high), unit = LIMITS[name]
         self.limits[name] = min(max(value, low), high) * unit
-
-    # ---- time --------------------------------------------------------------------------------
 
     def advance(self, dt: float) -> None:
         """Advance by `dt` seconds."""
@@ -279,7 +275,6 @@ class MamboFirmware:
         return piloting if acts else Piloting()
 
     def _command(self) -> tuple[float, float, float, float]:
-        """Return the command of the body."""
         if self.flying_state == FlyingState.TAKING_OFF:
             return 0.0, 0.0, _TAKE_OFF_SPEED, 0.0
         if self.flying_state == FlyingState.LANDING:

@@ -59,11 +59,7 @@ class FakeAutopilot:
     """
 
     def __init__(
-        self,
-        settings: AutopilotSettings,
-        sender: Any,
-        yaw: float,
-        generator: np.random.Generator,
+        self, settings: AutopilotSettings, sender: Any, yaw: float, generator: np.random.Generator
     ) -> None:
         self.settings = settings
         self.firmware = FIRMWARES[settings.firmware]
@@ -145,8 +141,6 @@ class FakeAutopilot:
         self._rising_to: float | None = None
         # Place and yaw of the last set-point.
         self._setpoint: tuple[FloatArray, float | None] | None = (self.body.position.copy(), None)
-
-    # ---- the clock ---------------------------------------------------------------------------
 
     def advance(self, dt: float) -> None:
         """Advance by `dt` seconds: move, check failsafes, send due messages."""
@@ -235,8 +229,6 @@ class FakeAutopilot:
         self.say(3, f'{kind} Failsafe')
         return True
 
-    # ---- sending -----------------------------------------------------------------------------
-
     def say(self, severity: int, text: str) -> None:
         """Send a text."""
         self._sender.statustext_send(severity, text.encode()[:50])
@@ -307,8 +299,6 @@ class FakeAutopilot:
             self._sender.gps2_raw_send(
                 self._milliseconds * 1000, fix, 0, 0, 0, 100, 100, 0, 0xFFFF, 12, 0, 0
             )
-
-    # ---- receiving ---------------------------------------------------------------------------
 
     def handle(self, message: Any, link: int = 0) -> None:
         """Take a message from one of its links, 0 is the driver's."""

@@ -151,7 +151,3 @@ def main(arguments: list[str] | None = None) -> int:
         print(f'the autopilot crashed: {autopilot.crashed}', file=sys.stderr)
         return 3
     return 0
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())
