@@ -21,8 +21,7 @@ from maasi_drivers.settings.camera import load_calibration
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.parameters import parameter_fields, unflatten
 
-# Mean errors above this multiple of their standard deviation are significant.
-_CLEAR = 4.0
+_CLEAR = 4.0  # mean errors above this multiple of their standard deviation are significant
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -23,17 +23,14 @@ from maasi_drivers.links.mambo.reckoning import Course, TiltModel
 from maasi_drivers.settings.vehicles import LEAST_TILT, MOST_TILT
 from maasi_filter.arrays import FloatArray
 
-# Rest before each leg: the first part for the firmware to stop it [s].
-_REST, _STOPPING = 3.0, 1.8
-# Above this multiple of the planned distance it has not followed the command.
-_EXCESS = 1.5
+_REST, _STOPPING = 3.0, 1.8  # rest before each leg: the first part for the firmware to stop it [s]
+_EXCESS = 1.5  # above this multiple of the planned distance it has not followed the command
 # Longest silence, and longest waits for take-off and connection [s].
 _SILENCE, _PATIENCE = 1.5, 15.0
 _LEAST_BATTERY = 0.2
 # Largest residual of a fit [m], and relative uncertainty of the speed [1].
 _MOST_MISFIT, _MOST_DOUBT = 0.05, 0.35
-# Drag [1/s] and delay [s] that are searched.
-_LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)
+_LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)  # drag [1/s] and delay [s] that are searched
 
 
 class MeasurementError(RuntimeError):
@@ -211,8 +208,7 @@ _ALLOWED = {
     'port': (1024, 65535),
 }
 _PERIOD = 0.05
-# Longest wait for it to land [s].
-_LANDING = 15.0
+_LANDING = 15.0  # longest wait for it to land [s]
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -30,8 +30,7 @@ _STATUS = {
     AgentState.ABORTED: 'goal given up',
     AgentState.UNAVAILABLE: 'cannot go on',
 }
-# Longest wait for the answer to a cancelled goal [s].
-_CANCEL_TIME = 5.0
+_CANCEL_TIME = 5.0  # longest wait for the answer to a cancelled goal [s]
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -6,8 +6,7 @@ from argparse import ArgumentParser, ArgumentTypeError
 from difflib import get_close_matches
 from typing import Any
 
-# Largest parameter of a ROS node.
-LARGEST = 2**63 - 1
+LARGEST = 2**63 - 1  # largest parameter of a ROS node
 
 
 class Parser(ArgumentParser):

@@ -24,12 +24,9 @@ from maasi_sim.scenario.schema import Scenario
 class SearchState(FoundCount):
     """State of a search after a measurement batch."""
 
-    #: Of the true targets among those found [m]; nan without any.
-    rmse: float
-    #: Robots that measured.
-    members: tuple[str, ...]
-    #: Of all robots, (3,) [m].
-    positions: dict[str, FloatArray]
+    rmse: float  #: of the true targets among those found [m]; nan without any
+    members: tuple[str, ...]  #: robots that measured
+    positions: dict[str, FloatArray]  #: of all robots, (3,) [m]
 
 
 @dataclass

@@ -79,10 +79,8 @@ class AgentDriver(RobotNode):
         super().__init__(**options)
         self._links = links
         self._make_sensor = make_sensor
-        # What has to be closed.
-        self._opened: list[RobotLink | SensorInput] = []
-        # Outlives *cleanup* and *configure*, but not the process.
-        self._stop_latched = False
+        self._opened: list[RobotLink | SensorInput] = []  # what has to be closed
+        self._stop_latched = False  # outlives *cleanup* and *configure*, but not the process
 
     def prepare(self) -> None:
         """Make link, sensor and controller."""

@@ -46,8 +46,7 @@ class MeasurementQueue:
         self._frames: deque[tuple[int, Any]] = deque(maxlen=frames)
         self._requests: list[MeasurementRequest] = []
         self._capacity = requests
-        #: Stamp of the last image [ns].
-        self.latest: int | None = None
+        self.latest: int | None = None  #: stamp of the last image [ns]
 
     def __len__(self) -> int:
         return len(self._requests)
@@ -95,8 +94,7 @@ class MeasurementQueue:
         self._requests.remove(request)
 
 
-# How far stamps of images or batches may be ahead of the odometry [ns].
-_AHEAD = 2_000_000_000
+_AHEAD = 2_000_000_000  # how far stamps of images or batches may be ahead of the odometry [ns]
 
 
 class MeasurementResponder:

@@ -17,14 +17,10 @@ from maasi_planner.motion.dynamic_window import window_command
 from maasi_planner.obstacles import Obstacles, is_clear, next_point
 from maasi_planner.settings import MotionSettings
 
-# Size of the cells in which points count as one [m].
-_CELL = 0.03
-# Number of headings that are tried where the straight way is blocked.
-_HEADINGS = 72
-# Cost of a change of the last heading, relative to that of a detour [1/rad].
-_STEADINESS = 0.3
-# Below this distance the robot touches the point, and may still leave it [m].
-_SKIN = 1e-3
+_CELL = 0.03  # size of the cells in which points count as one [m]
+_HEADINGS = 72  # number of headings that are tried where the straight way is blocked
+_STEADINESS = 0.3  # cost of a change of the last heading, relative to that of a detour [1/rad]
+_SKIN = 1e-3  # below this distance the robot touches the point, and may still leave it [m]
 
 
 def scan_points(

@@ -13,8 +13,7 @@ from maasi_filter.ros.clocks import StampGate
 # Upper bound on frames, against floods.
 _MOST_FRAMES = 2000
 _LONGEST_NAME = 200
-# A stamp that is farther from the one before is one of another time [ns].
-_JUMP = 10_000_000_000
+_JUMP = 10_000_000_000  # a stamp that is farther from the one before is one of another time [ns]
 
 
 class TransformError(LookupError):

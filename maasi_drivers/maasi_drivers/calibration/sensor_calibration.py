@@ -12,8 +12,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 
-# Least number of observations for a covariance.
-LEAST_OBSERVATIONS = 10
+LEAST_OBSERVATIONS = 10  # least number of observations for a covariance
 # Detections farther from the target than this multiple of the median are of something else.
 _FAR = 8.0
 # Below this all detections agree to rounding [m].

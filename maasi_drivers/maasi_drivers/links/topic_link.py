@@ -79,8 +79,7 @@ class CommandPublisher:
 _ZERO = (0.0, 0.0, 0.0, 0.0)
 # At the end: commands, and longest wait until the last one has arrived [s].
 _STOP_COMMANDS, _STOP_TIME = 3, Duration(seconds=0.3)
-# Polls from one look for the guard to the next.
-_GUARD_POLLS = 5
+_GUARD_POLLS = 5  # polls from one look for the guard to the next
 
 
 class TopicLink(RobotLink):

@@ -24,10 +24,8 @@ from maasi_filter.ros.qos import sensor_reader
 from maasi_planner.motion import MotionModel, RobotState
 from maasi_planner.obstacles import Obstacles
 
-# Kind of fault.
-_SCAN = 'scan'
-# A distance to the waypoint that is smaller by this is progress [m].
-_PROGRESS = 0.02
+_SCAN = 'scan'  # kind of fault
+_PROGRESS = 0.02  # a distance to the waypoint that is smaller by this is progress [m]
 
 
 class TurtlebotLink(TopicLink):
@@ -44,8 +42,7 @@ class TurtlebotLink(TopicLink):
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
-        # Its controller, where it uses the scan.
-        self._motion: ScanUnicycle | None = None
+        self._motion: ScanUnicycle | None = None  # its controller, where it uses the scan
         self.reset()
 
     def make_motion(self) -> MotionModel:

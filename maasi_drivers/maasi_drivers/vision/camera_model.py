@@ -17,8 +17,7 @@ _OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]
 
 # End of the iteration that undoes a distortion: number of steps, error [px].
 _UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-13)
-# Farther than this from its pixel an undistorted point is none [px].
-_MISSED = 1e-6
+_MISSED = 1e-6  # farther than this from its pixel an undistorted point is none [px]
 
 
 @dataclass(frozen=True)

@@ -114,10 +114,8 @@ class VideoSource:
             )
         self.source = source
         self.live = '://' in source or source.startswith('/dev/') or source.isdigit()
-        #: What is wrong; empty while frames come.
-        self.error = ''
-        #: Whether a file has come to its end.
-        self.ended = False
+        self.error = ''  #: what is wrong; empty while frames come
+        self.ended = False  #: whether a file has come to its end
         # The newest one, until it is taken.
         self._frames: deque[VideoFrame] = deque(maxlen=1)
         self._count = 0

@@ -18,8 +18,7 @@ from maasi_filter.arrays import BoolArray, ImageArray, IntArray
 
 # Added to the mean of the channels before dividing by it: noise in the dark is not blue.
 _DARK = 6.0
-# In the type of images: products with it stay so.
-_THREE = np.float32(3.0)
+_THREE = np.float32(3.0)  # in the type of images: products with it stay so
 
 
 def paper_mask(image: ImageArray, threshold: float = 35.0) -> BoolArray:

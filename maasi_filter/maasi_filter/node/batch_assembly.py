@@ -16,8 +16,7 @@ from maasi_msgs.msg import BatchMember, DetectionArray, MeasurementBatch
 
 # Largest lead of the stamp of a measurement over that of its batch [ns].
 _STAMP_AHEAD = 60_000_000_000
-# Capacity of the buffer of detections that arrive before their batch.
-_MOST_EARLY = 64
+_MOST_EARLY = 64  # capacity of the buffer of detections that arrive before their batch
 
 
 @dataclass

@@ -12,11 +12,9 @@ from rclpy.node import Node
 
 _NANOSECONDS = 1_000_000_000
 
-#: Smallest difference of consecutive stamps that counts as a jump [ns].
-JUMP = _NANOSECONDS
+JUMP = _NANOSECONDS  #: smallest difference of consecutive stamps that counts as a jump [ns]
 
-#: Largest valid stamp [s].
-LAST_STAMP = 2**31 - 1
+LAST_STAMP = 2**31 - 1  #: largest valid stamp [s]
 
 # Limit of the first batch id, and of the lead of later ids over the last one.
 _FIRST_IDS = 2**62

@@ -27,13 +27,10 @@ from maasi_msgs.msg import FoundTarget as FoundTargetMessage
 #: of a search sees so many targets at once.
 MOST_DETECTIONS = 200
 
-#: Largest accepted coordinate [m]: the circumference of the Earth.
-FARTHEST = 4e7
-#: Largest accepted speed [m/s, rad/s].
-FASTEST = 1e5
+FARTHEST = 4e7  #: largest accepted coordinate [m]: the circumference of the Earth
+FASTEST = 1e5  #: largest accepted speed [m/s, rad/s]
 
-#: Most characters of a class or identity.
-LONGEST_NAME = 100
+LONGEST_NAME = 100  #: most characters of a class or identity
 
 
 def stamp_to_ros(nanoseconds: int) -> Time:

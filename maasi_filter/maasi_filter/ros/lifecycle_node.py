@@ -34,8 +34,7 @@ __all__ = ['LockstepLifecycleNode', 'SettingsError']
 _PEERS_PERIOD = 0.02
 _DIAGNOSTICS_PERIOD = 1.0
 _WARNING_PERIOD = 2.0
-# From activation until a node says what it waits for [s].
-_NOTICE_DELAY = 3.0
+_NOTICE_DELAY = 3.0  # from activation until a node says what it waits for [s]
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -54,8 +53,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         Whether its namespace is that of a robot: topics of the team are one level up.
     """
 
-    #: Read in *configure*, and valid until the next one.
-    settings: SettingsT
+    settings: SettingsT  #: read in *configure*, and valid until the next one
 
     def __init__(
         self, name: str, settings: type[SettingsT], *, in_robot: bool = False, **options: Any

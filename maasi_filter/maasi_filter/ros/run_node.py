@@ -48,10 +48,8 @@ def executor_of(node: Node, context: Context | None = None) -> Executor:
     return executor
 
 
-# Period of the check for signals [s].
-_SIGNAL_PERIOD = 0.1
-# From the last message to the end of the context [s].
-_FAREWELL = 0.05
+_SIGNAL_PERIOD = 0.1  # period of the check for signals [s]
+_FAREWELL = 0.05  # from the last message to the end of the context [s]
 
 
 def run(

@@ -18,8 +18,7 @@ from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
 from maasi_planner.buildings.sharing import Broadcast, assigned, rewards
 from maasi_planner.buildings.way_finder import WayFinder
 
-# Tolerances of arrival at the station [m, m/s].
-_ARRIVED, _ARRIVED_SPEED = 2.0, 2.0
+_ARRIVED, _ARRIVED_SPEED = 2.0, 2.0  # tolerances of arrival at the station [m, m/s]
 # Largest deviation from the last plan for which that plan may be continued [m, m/s].
 _SAME_STATE = 0.5
 

@@ -18,12 +18,9 @@ from numba import njit
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.buildings.dynamics import Dynamics
 
-# The objective is scaled so that its rows are of the size of one.
-SCALE = 1e4
-# A row is met when it is this close to its bounds [m, m/s, N].
-TOLERANCE = 1e-7
-# A row is a combination of active ones when this share of its length is left.
-DEPENDENT = 1e-10
+SCALE = 1e4  # the objective is scaled so that its rows are of the size of one
+TOLERANCE = 1e-7  # a row is met when it is this close to its bounds [m, m/s, N]
+DEPENDENT = 1e-10  # a row is a combination of active ones when this share of its length is left
 
 
 class AxisRoom(NamedTuple):

@@ -17,12 +17,9 @@ from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.buildings.axis_problem import solve_axis
 from maasi_planner.buildings.search_tree import Tree, copy_node, free, pop, push
 
-# A plan must be better than the best by this much, scaled objective.
-GAP = 1e-3
-# A position beyond a face by no less than minus this is beyond it [m].
-FACE_TOLERANCE = 1e-6
-# The same for the first two positions, which are given [m].
-GIVEN_TOLERANCE = 1e-3
+GAP = 1e-3  # a plan must be better than the best by this much, scaled objective
+FACE_TOLERANCE = 1e-6  # a position beyond a face by no less than minus this is beyond it [m]
+GIVEN_TOLERANCE = 1e-3  # the same for the first two positions, which are given [m]
 
 FOUND, EXHAUSTED, UNFINISHED, FULL = 0, 1, 2, 3
 

@@ -14,8 +14,7 @@ from dataclasses import replace
 
 from maasi_planner.buildings.problem import Plan, PlanSolver, Problem
 
-# Tolerance of equal objectives [1].
-_GAP = 1e-7
+_GAP = 1e-7  # tolerance of equal objectives [1]
 
 
 def solve_jointly(solver: PlanSolver, problems: Sequence[Problem]) -> list[Plan] | None:

@@ -47,8 +47,7 @@ from maasi_planner.conversions import path_to_ros
 from maasi_planner.node.search_action import offer_services
 from maasi_planner.node.search_modes import Mode, SearchModes
 
-# Largest difference of the stamps of odometry and step [ns].
-_STAMP_TOLERANCE = 1_000_000
+_STAMP_TOLERANCE = 1_000_000  # largest difference of the stamps of odometry and step [ns]
 # Longest wait until the last command has arrived [s].
 _STOP_TIME = Duration(seconds=0.3)
 _REASONS = {
@@ -96,8 +95,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         except ValueError as error:
             raise SettingsError(f'parameter {error}') from error
         self.modes = SearchModes([self.name])
-        # Odometry may skip steps.
-        self._gate = StampGate(max(JUMP, round(3e9 * settings.step)))
+        self._gate = StampGate(max(JUMP, round(3e9 * settings.step)))  # odometry may skip steps
         self._begin_anew()
 
     def _make_agent(self) -> SearchAgent:

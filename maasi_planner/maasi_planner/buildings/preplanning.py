@@ -19,8 +19,7 @@ from maasi_planner.buildings.settings import (
     SearchCameraSettings,
 )
 
-# Least thickness of a cuboid [m].
-_THINNEST = 1.0
+_THINNEST = 1.0  # least thickness of a cuboid [m]
 
 
 def detection_probability(distance: float, camera: SearchCameraSettings) -> float:
@@ -83,8 +82,7 @@ class CoveragePlan:
     coverage: float
     boxes: FloatArray = field(init=False)
     centres: FloatArray = field(init=False)
-    # Objects and obstacles.
-    solids: FloatArray = field(init=False)
+    solids: FloatArray = field(init=False)  # objects and obstacles
 
     def __post_init__(self) -> None:
         boxes = np.array([cell.box for cell in self.cells]).reshape(-1, 3, 2)

@@ -17,12 +17,9 @@ from maasi_planner.buildings.settings import CuboidMethodSettings
 
 How = Literal['optimal', 'best_so_far', 'shifted', 'brake']
 
-# Relaxation of bounds if rounding leaves the state outside of them [m, m/s].
-GIVE = 1e-4
-# Tolerance of the present position in a cuboid: plans touch faces, up to rounding [m].
-TOUCH = 1e-6
-# Nodes between two checks of the time limit, and capacity of open nodes.
-_SLICE, _ROOM = 500, 16384
+GIVE = 1e-4  # relaxation of bounds if rounding leaves the state outside of them [m, m/s]
+TOUCH = 1e-6  # tolerance of the present position in a cuboid: plans touch faces, up to rounding [m]
+_SLICE, _ROOM = 500, 16384  # nodes between two checks of the time limit, and capacity of open nodes
 # Share of the smoothness weight of a robot that flies home, so that its forces are unique.
 _HOMING_SMOOTHNESS = 1e-2
 

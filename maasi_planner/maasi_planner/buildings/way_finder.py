@@ -9,8 +9,7 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings.preplanning import segment_cuts
 
-# Distance of intermediate targets from the corners of obstacles [m].
-_BERTH = 3.0
+_BERTH = 3.0  # distance of intermediate targets from the corners of obstacles [m]
 
 
 class WayFinder:

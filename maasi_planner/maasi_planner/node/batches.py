@@ -16,8 +16,7 @@ from maasi_planner.coordinator import Coordinator, Member
 from maasi_planner.node.filter_guard import FilterGuard
 from maasi_planner.node_settings import PlannerNodeSettings
 
-# Measurements that are remembered, to recognise duplicate updates.
-_MEASUREMENTS_KEPT = 1000
+_MEASUREMENTS_KEPT = 1000  # measurements that are remembered, to recognise duplicate updates
 
 
 class Batches:
@@ -45,8 +44,7 @@ class Batches:
         self.published_at = time.monotonic()
         self.update = FilterUpdate()
         self._message = MeasurementBatch()
-        # Last batch of an earlier planner process.
-        self._before = 0
+        self._before = 0  # last batch of an earlier planner process
         # Robot and index of the last measurements whose update was used.
         self._processed: deque[tuple[str, int]] = deque(maxlen=_MEASUREMENTS_KEPT)
 

@@ -56,8 +56,7 @@ class FilterWatch:
 
 # A longer gap between two checks means that the planner itself was suspended [s].
 _LONGEST_GAP = 1.0
-# Period of updates of the names of filters [s].
-_NAMES_PERIOD = 1.0
+_NAMES_PERIOD = 1.0  # period of updates of the names of filters [s]
 
 
 class FilterGuard:

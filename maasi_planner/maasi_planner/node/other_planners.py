@@ -41,8 +41,7 @@ class OtherPlanners:
             name: {-1: np.array(others[name].start)} for name in sorted(others)
         }
         self._silence: dict[str, Silence] = {}
-        #: In lockstep, who took part in the step before.
-        self.before: set[str] = set()
+        self.before: set[str] = set()  #: in lockstep, who took part in the step before
 
     def set_up(self) -> None:
         """Create publishers and subscriptions, where there are others."""

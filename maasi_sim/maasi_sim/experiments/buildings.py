@@ -20,10 +20,8 @@ from maasi_sim.run.buildings.picture import draw_mission, legend
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Largest number of steps of a mission.
-_LIMIT = 1000
-# Without a limit on wall time a decision does not depend on the machine [s].
-_FOR_EVER = 1e9
+_LIMIT = 1000  # largest number of steps of a mission
+_FOR_EVER = 1e9  # without a limit on wall time a decision does not depend on the machine [s]
 
 STEPS = Quantity('steps', 'time until all cuboids are visited', 's', 'restricted')
 QUANTITIES = (

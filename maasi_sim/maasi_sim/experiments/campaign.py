@@ -34,13 +34,11 @@ EXIT_CODES = (
     'Exit codes: 0 all runs are there, 1 some failed, 2 wrong input, 3 stopped: no room on the '
     'disk, or the workers are gone, 130 interrupted.'
 )
-# Longest wait for the scheduler of a cluster and for its first worker [s].
-PATIENCE = 20.0
+PATIENCE = 20.0  # longest wait for the scheduler of a cluster and for its first worker [s]
 # One thread for each worker; the number of workers sets the load.
 _ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS')
 _MIXED = '--mixed-workers allows it'
-# Wall time between two lines of progress without a terminal [s].
-_QUIET_PERIOD = 10.0
+_QUIET_PERIOD = 10.0  # wall time between two lines of progress without a terminal [s]
 
 
 class WorkersLost(RuntimeError):

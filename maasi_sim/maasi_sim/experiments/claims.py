@@ -24,8 +24,7 @@ from maasi_sim.experiments.tables import interval, markdown_table, median, numbe
 
 HOLDS, NOT_SHOWN, NOT_HERE, DIFFERS = 'holds', 'not shown', 'not here', 'differs'
 ONE_RUN, NOT_RUN = 'no interval', 'not run'
-# What is within this share of the other is alike.
-ALIKE = 0.2
+ALIKE = 0.2  # what is within this share of the other is alike
 # The summary in README.md stands between these lines.
 BEGIN, END = '<!-- claims: begin -->\n', '<!-- claims: end -->\n'
 _WORDS = {'less': 'less', 'greater': 'more', 'alike': 'alike', 'number': ''}

@@ -25,10 +25,8 @@ from maasi_sim.experiments.statistics import (
 )
 from maasi_sim.machine import code_digest, this_machine
 
-# Version of comparison.json.
-VERSION = 1
-# Bootstrap intervals of fewer pairs are too narrow.
-FEWEST = 10
+VERSION = 1  # version of comparison.json
+FEWEST = 10  # bootstrap intervals of fewer pairs are too narrow
 
 
 def capped(values: FloatArray, limit: float) -> FloatArray:
@@ -220,8 +218,7 @@ QUANTITIES = (
     Quantity('filter_time', 'filter step', 's'),
     Quantity('processor_time', 'computation of a search', 's'),
 )
-# Shown in milliseconds in Markdown.
-_SHORT = ('planning_time', 'filter_time')
+_SHORT = ('planning_time', 'filter_time')  # shown in milliseconds in Markdown
 
 
 @dataclass(frozen=True)

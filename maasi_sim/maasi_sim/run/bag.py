@@ -33,8 +33,7 @@ __all__ = ['Bag', 'BagError', 'BagWriteError', 'BagWriter', 'load_types', 'topic
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 SCENARIO_TOPIC = '/scenario'
-# Reason in one word, then a line in words.
-ENDING_TOPIC = '/ending'
+ENDING_TOPIC = '/ending'  # reason in one word, then a line in words
 
 ImageFormat = Literal['jpeg', 'png', 'raw']
 

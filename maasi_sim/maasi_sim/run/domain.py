@@ -15,10 +15,8 @@ from pathlib import Path
 
 from maasi_filter.ros.loopback import loopback_fault
 
-# Domains whose ports lie below the ephemeral ports of Linux (from 32768).
-DOMAINS = range(0, 102)
-# Environment variable of the profiles of Fast DDS.
-_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+DOMAINS = range(0, 102)  # domains whose ports lie below the ephemeral ports of Linux (from 32768)
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'  # environment variable of the profiles of Fast DDS
 # A port or a segment, its locks, and the semaphore under which a port is opened (Fast DDS 2.14).
 _NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
 # Ports of the RTPS specification: this many for each domain, from this one.

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from maasi_sim.run.node_plan import NodePlan
     from maasi_sim.run.run_options import Options
 
-# Goal status of `AgentState`.
-UNAVAILABLE = 5
+UNAVAILABLE = 5  # goal status of `AgentState`
 
 
 @dataclass(frozen=True)
@@ -56,20 +55,14 @@ class Observer(ABC):
     update_topics: Sequence[str] = ()
     #: Targets or cuboids there are, and found so far; measurements so far, of all robots.
     total = found = measurements = 0
-    #: Share of the environment explored.
-    explored = 0.0
-    #: Whether something was found since the caller last reset it.
-    news = False
-    #: Time and step at which all was found, where the scenario stops then.
-    completed: Any = None
-    #: The reason, once all planners report that nothing is left to gain.
-    settled: str | None = None
-    #: Step at which the search ended by itself.
-    end_step: int | None = None
+    explored = 0.0  #: share of the environment explored
+    news = False  #: whether something was found since the caller last reset it
+    completed: Any = None  #: time and step at which all was found, where the scenario stops then
+    settled: str | None = None  #: the reason, once all planners report that nothing is left to gain
+    end_step: int | None = None  #: step at which the search ended by itself
     #: Time of the first step [s]: a clock that the run follows may start at any time.
     begin: float | None = None
-    #: That take part, as the simulation says.
-    robots: list[str] | None = None
+    robots: list[str] | None = None  #: that take part, as the simulation says
 
     def __init__(
         self, name: str, scenario: Any, seed: int, types: Typestore, topics: Sequence[str]
@@ -164,8 +157,7 @@ class Mission(Protocol[Record]):
     #: Name of the scenario, and the scenario with all layers.
     name: str
     scenario: Any
-    #: Word for a success in the progress line.
-    found_word: str
+    found_word: str  #: word for a success in the progress line
 
     def prepare(self) -> None:
         """Assign addresses on this host to simulated robots."""

@@ -18,8 +18,7 @@ from maasi_sim.run.topics import within
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import to_yaml
 
-# Time of the simulation.
-SIMULATED = {'use_sim_time': True}
+SIMULATED = {'use_sim_time': True}  # time of the simulation
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,7 @@ class NodePlan:
     remaps: Mapping[str, str] = field(default_factory=dict)
     #: Parameters on the command line, as the file must not start a search on real robots.
     given: Mapping[str, Any] = field(default_factory=dict)
-    #: Before those of ROS.
-    arguments: tuple[str, ...] = ()
+    arguments: tuple[str, ...] = ()  #: before those of ROS
 
     @property
     def full_name(self) -> str:

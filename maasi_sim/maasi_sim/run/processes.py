@@ -42,8 +42,7 @@ _ENVIRONMENT = {
 }
 # Addresses of Unix sockets have at most 107 bytes; multiprocessing adds 32 to the folder.
 _LONGEST_FOLDER = 75
-# A heartbeat this soon after a restart is from the previous process [s].
-_LEAST_START = 0.5
+_LEAST_START = 0.5  # a heartbeat this soon after a restart is from the previous process [s]
 # Signals of a shutdown, and the timeout of each [s].
 ENDING = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5.0))
 

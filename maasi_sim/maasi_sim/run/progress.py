@@ -8,8 +8,7 @@ import sys
 import time
 from typing import TextIO
 
-# ECMA-48: back to the begin of the line, which is erased.
-_ERASE = '\r\x1b[K'
+_ERASE = '\r\x1b[K'  # ECMA-48: back to the begin of the line, which is erased
 
 
 class ProgressDisplay:
@@ -21,8 +20,7 @@ class ProgressDisplay:
         self._period = 0.1 if self._terminal else period
         self._last = -1e9
         self._found = -1
-        # On a terminal: the line that changes.
-        self._line = ''
+        self._line = ''  # on a terminal: the line that changes
 
     @property
     def due(self) -> bool:

@@ -27,8 +27,7 @@ from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, planner_settings
 
-# Where a robot was, and what it saw there.
-Measured = tuple[StampedPose, AgentMeasurement]
+Measured = tuple[StampedPose, AgentMeasurement]  # where a robot was, and what it saw there
 
 
 def search_recording(scenario: str, bag: Path, out: Path | None, seed: int | None) -> int:

@@ -37,23 +37,17 @@ from maasi_sim.run.view.messages import is_shown
 NAME = 'recorder'
 READY, DONE = '/lockstep/ready', '/lockstep/done'
 DIAGNOSTICS, ROSOUT = '/diagnostics', '/rosout'
-# Topics shared by all teams of a domain.
-_SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)
-# Not recorded: of no use to readers of the recording.
-_SKIPPED = ('/parameter_events', READY)
-# A copy of the found targets for a restarted filter.
-_KEPT = '/found_targets/kept'
+_SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)  # topics shared by all teams of a domain
+_SKIPPED = ('/parameter_events', READY)  # not recorded: of no use to readers of the recording
+_KEPT = '/found_targets/kept'  # a copy of the found targets for a restarted filter
 # Topics still recorded during shutdown.
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
 # The clock may come after messages of its time: by so much [s], in lockstep by so many steps. A
 # larger lead is of another clock.
 _LARGEST_LEAD, _MOST_STEPS = 1.0, 50
-# Between two calls to take off [s].
-_ARMING_PERIOD = 2.0
-# Longest wait for the acknowledgement of stop commands [s].
-_STOP_PATIENCE = 1.0
-# Until they are sent again.
-_ACKNOWLEDGED = Duration(seconds=0.1)
+_ARMING_PERIOD = 2.0  # between two calls to take off [s]
+_STOP_PATIENCE = 1.0  # longest wait for the acknowledgement of stop commands [s]
+_ACKNOWLEDGED = Duration(seconds=0.1)  # until they are sent again
 
 
 class Recorder:
@@ -117,10 +111,8 @@ class Recorder:
         #: Robots at the first step, and time of the first message of each recorded topic [ns].
         self.robots: list[str] = []
         self.first: dict[str, int] = {}
-        #: Share of the environment explored, published by planners each second.
-        self.explored = 0.0
-        # Planners whose present error is among the complaints.
-        self._faulty: set[str] = set()
+        self.explored = 0.0  #: share of the environment explored, published by planners each second
+        self._faulty: set[str] = set()  # planners whose present error is among the complaints
         #: Time of the last diagnostics of each node [s of wall time].
         self.heartbeats: dict[str, float] = {}
         self._arming: dict[str, Client] = {}

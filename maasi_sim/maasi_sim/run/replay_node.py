@@ -67,8 +67,7 @@ class Batch:
 class Recording:
     """Contents of a recording for a replay."""
 
-    #: Scenario, seed and parameters of each node.
-    facts: dict[str, Any]
+    facts: dict[str, Any]  #: scenario, seed and parameters of each node
     #: Of several filters in the order of steps and names.
     batches: list[Batch] = field(default_factory=list)
     #: By namespace of the filter: found targets at the end.

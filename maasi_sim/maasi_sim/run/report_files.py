@@ -15,8 +15,7 @@ from maasi_sim.machine import this_machine
 from maasi_sim.run.mission import Mission, RunRecord
 from maasi_sim.run.run_folder import ResultsError, remove, write_text, write_whole
 
-# Of the format of `report.json`, see `report.schema.json`.
-REPORT_VERSION = 1
+REPORT_VERSION = 1  # of the format of `report.json`, see `report.schema.json`
 
 END_REASONS = {
     'all_found': 'all targets found',

@@ -22,12 +22,10 @@ from maasi_filter.arrays import FloatArray
 from maasi_sim.run.mission import RunRecord
 
 PALE, GRID, UNSEEN = '#9A9A9A', '#E6E6E6', '#CFCFCF'
-# Of axes to the right of the last value, or a step at the end cannot be seen.
-MARGIN = 1.015
+MARGIN = 1.015  # of axes to the right of the last value, or a step at the end cannot be seen
 # Size [inch], and the parts of it that a legend takes beside a text, and for a letter.
 _SIZE, _HANDLE, _LETTER = (13.0, 8.0), 0.75, 0.068
-# A side view is at least this share of the size of the view from above.
-_THINNEST = 0.22
+_THINNEST = 0.22  # a side view is at least this share of the size of the view from above
 
 
 @dataclass(frozen=True)

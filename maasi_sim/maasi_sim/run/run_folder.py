@@ -12,8 +12,7 @@ from typing import Any
 
 from maasi_sim.scenario.layering import ScenarioError
 
-# Disk full, quota exceeded, or file too large.
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk full, quota exceeded, or file too large
 
 
 class ResultsError(RuntimeError):

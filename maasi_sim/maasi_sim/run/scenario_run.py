@@ -40,12 +40,10 @@ from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning, to_
 
 # Between two checks of processes and topics; while the nodes start, and while they run [s].
 _START_POLL, _POLL = 0.02, 0.05
-# Between two checks for runs that follow the clock [s].
-_FOLLOWERS_PERIOD = 0.5
+_FOLLOWERS_PERIOD = 0.5  # between two checks for runs that follow the clock [s]
 # Longest wait for a publisher of others, which may not fit the recorder [s].
 _CONNECTION_PATIENCE = 5.0
-# Wall time between two messages about missing nodes [s].
-_START_PATIENCE = 10.0
+_START_PATIENCE = 10.0  # wall time between two messages about missing nodes [s]
 
 
 class ScenarioRun:
@@ -75,8 +73,7 @@ class ScenarioRun:
         self._follows = options.follow_clock or self.mission.scenario.external_clock
         self._bag: BagWriter | None = None
         self._page: RunPage | None = None
-        #: Errors of writing.
-        self.unwritten: list[str] = []
+        self.unwritten: list[str] = []  #: errors of writing
         # Wall time when all nodes were ready, and of the first step.
         self._complete: float | None = None
         self._begun: float | None = None

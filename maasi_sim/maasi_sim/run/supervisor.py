@@ -19,17 +19,14 @@ from maasi_sim.run.topics import within
 
 # Wall time between two checks of the processes, where steps come in quick succession [s].
 _CHECK_PERIOD = 0.05
-# A longer gap between two checks means that the run itself was suspended [s].
-_LONGEST_GAP = 1.0
-# For the last messages of drivers to arrive [s].
-_LAST_MESSAGES = 0.02
+_LONGEST_GAP = 1.0  # a longer gap between two checks means that the run itself was suspended [s]
+_LAST_MESSAGES = 0.02  # for the last messages of drivers to arrive [s]
 
 
 class Supervisor:
     """Watches the nodes of a run: one that dies or hangs is restarted, or ends the run."""
 
-    #: What the nodes say; it may be made while they start.
-    recorder: Recorder
+    recorder: Recorder  #: what the nodes say; it may be made while they start
 
     def __init__(
         self, mission: Mission[Any], options: Options, folder: Path, display: ProgressDisplay
@@ -40,8 +37,7 @@ class Supervisor:
         self.processes = {
             name: plan.process(folder, team, level) for name, plan in self.plans.items()
         }
-        #: Nodes that died, hung or were restarted.
-        self.events: list[dict[str, Any]] = []
+        self.events: list[dict[str, Any]] = []  #: nodes that died, hung or were restarted
         #: Whether all nodes were ready once; until then they may take long.
         self.running = False
         self._scenario = mission.scenario

@@ -14,8 +14,7 @@ from maasi_filter.settings import Settings
 from maasi_planner.motion import RobotState
 from maasi_sim.simulation.world import noise_stream
 
-# Reported variances stay positive: consumers invert them.
-_LEAST_VARIANCE = 1e-12
+_LEAST_VARIANCE = 1e-12  # reported variances stay positive: consumers invert them
 
 
 class OdometrySettings(Settings):
@@ -91,8 +90,7 @@ class OdometryModel:
         self._offset = (0.0, 0.0)
         self._turn = 0.0
         axes = 3 if start.position[2] > 0.0 else 2
-        # The constant error of the position [m].
-        self._constant = np.zeros(3)
+        self._constant = np.zeros(3)  # the constant error of the position [m]
         if settings.position_offset > 0.0:
             drawn = noise_stream(seed, robot, 0, 'offset').standard_normal(axes)
             self._constant[:axes] = drawn * (settings.position_offset / math.hypot(*drawn))

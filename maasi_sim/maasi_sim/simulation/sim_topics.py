@@ -78,8 +78,7 @@ class RobotTopics:
         unit = getattr(robot, 'battery_unit', 'fraction')
         self._full = 100.0 if unit == 'percent' else 1.0
         self._battery.header.frame_id = f'{name}/base_link'
-        #: Full names of the topics that its driver needs.
-        self.needed: list[str] = []
+        self.needed: list[str] = []  #: full names of the topics that its driver needs
         if self._odometry_publisher is not None:
             self.needed.append(self._odometry_publisher.topic_name)
         if self.robot.camera is not None:
@@ -269,12 +268,10 @@ class Connections:
 class ExternalRobot:
     """A robot moved by another program: sensors measure where its driver says that it is."""
 
-    #: The simulation does not wait for it at shutdown.
-    obeys = False
+    obeys = False  #: the simulation does not wait for it at shutdown
 
     def __init__(self, start: Pose) -> None:
-        #: In the map.
-        self.state = RobotState(start)
+        self.state = RobotState(start)  #: in the map
 
     def take(self, message: AgentState) -> None:
         """Store the newest state."""

@@ -27,21 +27,16 @@ HANDSHAKE_PORT = 44444
 AIRBORNE = ('takingoff', 'hovering', 'flying', 'landing')
 
 _STAMPS = ('DroneSpeed_ts', 'DroneAltitude_ts', 'DroneQuaternion_ts')
-# Period of the thread's loop [s]; requests wake it.
-_ROUND = 0.05
-# Silence of its caller after which the drone is commanded to hover [s].
-CALLER_TIMEOUT = 0.5
-# From one take-off or landing command to the next while the drone does not obey [s].
-_REPEAT = 0.7
-# Age of what was heard last after which a reported landing does not count [s].
-_OUTDATED = 1.0
+_ROUND = 0.05  # period of the thread's loop [s]; requests wake it
+CALLER_TIMEOUT = 0.5  # silence of its caller after which the drone is commanded to hover [s]
+_REPEAT = 0.7  # from one take-off or landing command to the next while the drone does not obey [s]
+_OUTDATED = 1.0  # age of what was heard last after which a reported landing does not count [s]
 # Over Bluetooth: silence after which a command is sent that the drone has to acknowledge [s].
 _PROBE_PERIOD = 0.3
 # From one try to connect to the next [s].
 _RECONNECT = 1.0
 _BLUETOOTH = re.compile(r'([0-9a-fA-F]{2}:){5}[0-9a-fA-F]{2}')
-# Farthest that a position can be from the take-off point [m].
-_FARTHEST = 1000.0
+_FARTHEST = 1000.0  # farthest that a position can be from the take-off point [m]
 
 
 class MamboLinkError(RuntimeError):
@@ -80,18 +75,14 @@ class MamboLink:
         self.tilt = tilt
         self.climb = climb
         self.land_after = land_after
-        #: Fault of the link; while it is not connected it keeps trying.
-        self.error = ''
-        #: Whether the drone has answered.
-        self.connected = False
+        self.error = ''  #: fault of the link; while it is not connected it keeps trying
+        self.connected = False  #: whether the drone has answered
         #: Of the drone, as pyparrot calls it: landed, takingoff, hovering, flying, ...
         self.flying_state = ''
-        #: Charge, 0 to 1; negative: not received yet.
-        self.battery = -1.0
+        self.battery = -1.0  #: charge, 0 to 1; negative: not received yet
         #: Time of the last new data or acknowledgement, monotonic clock [s].
         self.heard_at = -math.inf
-        #: The last position event.
-        self.position: PositionEvent | None = None
+        self.position: PositionEvent | None = None  #: the last position event
         #: Position events that could not be used.
         self.bad_events = 0
         self._drone: Any = None

@@ -23,8 +23,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_planner.motion import MotionModel, RobotState
 
-# Longest time between two updates of the pilot [s].
-POLL_PERIOD = 0.05
+POLL_PERIOD = 0.05  # longest time between two updates of the pilot [s]
 # At the end: longest wait until the drone reports that it lands, and between two checks [s].
 _LANDING_TIME, _LANDING_PERIOD = 1.0, 0.02
 # Share of a new difference of positions in the velocity.

@@ -24,8 +24,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.lifecycle_node import SettingsError
 
-# Magic and version, kind, nothing, sequence, position and yaw.
-_ORDER = struct.Struct('<4sBBHI4f')
+_ORDER = struct.Struct('<4sBBHI4f')  # magic and version, kind, nothing, sequence, position and yaw
 
 
 class OrderKind(IntEnum):
@@ -44,10 +43,8 @@ def encode(sequence: int, kind: OrderKind, position: FloatArray) -> bytes:
     return data + struct.pack('<I', zlib.crc32(data))
 
 
-# Between two orders [s]; without them the program on board hovers, then lands.
-_PERIOD = 0.1
-# At the end: orders to land, and the time between them [s].
-_LAST_ORDERS, _LAST_PERIOD = 5, 0.05
+_PERIOD = 0.1  # between two orders [s]; without them the program on board hovers, then lands
+_LAST_ORDERS, _LAST_PERIOD = 5, 0.05  # at the end: orders to land, and the time between them [s]
 
 
 class OnboardLink(RobotLink):

@@ -15,20 +15,16 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import MotionModel, RobotState
 
-# Acceleration per speed error [1/s].
-_SPEED_GAIN = 2.5
-# Acceleration of the desired speed: little tilt, as images are taken meanwhile [m/s^2].
-_RAMP = 0.4
-# A desired velocity older than this is discarded [s].
-_DESIRED_AGE = 0.5
+_SPEED_GAIN = 2.5  # acceleration per speed error [1/s]
+_RAMP = 0.4  # acceleration of the desired speed: little tilt, as images are taken meanwhile [m/s^2]
+_DESIRED_AGE = 0.5  # a desired velocity older than this is discarded [s]
 # Share of the largest acceleration that stops it before the geofence: the rest is for wind.
 _BRAKE_SHARE = 0.5
 # Largest speed per metre to the geofence, well below the bandwidth of the speed [1/s].
 _NEAR_RATE = 1.0
 # Placeholder until the speed at the largest tilt is measured; never used in flight [m/s].
 _UNKNOWN_SPEED = 1.0
-# How far from its altitude a Mambo counts as there after take-off [m].
-ALTITUDE_TOLERANCE = 0.1
+ALTITUDE_TOLERANCE = 0.1  # how far from its altitude a Mambo counts as there after take-off [m]
 # Under a command faster than this, an event equal to the bit is no new position [m/s].
 _LEAST_SPEED = 0.05
 _STILL = np.zeros(4)

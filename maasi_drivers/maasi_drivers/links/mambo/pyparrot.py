@@ -14,8 +14,7 @@ import struct
 from collections import Counter
 from typing import Any
 
-# Project, class and command of the largest tilt.
-_MAX_TILT = (2, 8, 1)
+_MAX_TILT = (2, 8, 1)  # project, class and command of the largest tilt
 
 
 def mend(connection: Any) -> None:
@@ -48,8 +47,7 @@ def _write(
 # Type, buffer, sequence, total size.
 _HEADER = struct.Struct('<BBBI')
 _TYPES = range(1, 5)
-# Longest wait for a datagram: then the listener checks whether it has to end [s].
-_TIMEOUT = 0.3
+_TIMEOUT = 0.3  # longest wait for a datagram: then the listener checks whether it has to end [s]
 
 
 def has_whole_frames(data: bytes) -> bool:

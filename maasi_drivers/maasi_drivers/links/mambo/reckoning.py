@@ -83,8 +83,7 @@ class TiltModel:
 # Share of the difference to an event by which position and velocity are corrected.
 _POSITION_GAIN, _VELOCITY_GAIN = 0.8, 0.25
 _EVENT_PERIOD = 0.5
-# Above this difference an event replaces the estimate [m].
-_JUMP = 0.5
+_JUMP = 0.5  # above this difference an event replaces the estimate [m]
 # Longest time of one prediction [s].
 _LONGEST = 1.0
 _HISTORY = 64
@@ -107,8 +106,7 @@ class DeadReckoning:
         #: Time of flight since the last correction [s].
         self.age = 0.0
         self._turn = origin.rotation()
-        # By the last event [m].
-        self._measured = origin.position
+        self._measured = origin.position  # by the last event [m]
         # Recent commands, and the time at which each takes effect.
         self._sent: deque[tuple[float, FloatArray]] = deque([(-math.inf, np.zeros(4))])
         self._now = -math.inf

@@ -59,14 +59,12 @@ class Autopilot:
         self.mode = -1
         self.lost = False
         self.estimate = Estimate(settings, self.place, self.on_restart)
-        #: Commands that were not answered yet.
-        self.commands: deque[_Command] = deque()
+        self.commands: deque[_Command] = deque()  #: commands that were not answered yet
         #: Numbers of those that were accepted in this phase of the flight.
         self.accepted: set[int] = set()
         self._sender = sender
         self._received_at = self._heartbeat_at = self._setpoint_at = -math.inf
-        # Of the last request for messages.
-        self._requested_at = -math.inf
+        self._requested_at = -math.inf  # of the last request for messages
 
     @property
     def in_external_mode(self) -> bool:

@@ -119,10 +119,8 @@ def _host_boot() -> str:
     return Path('/proc/sys/kernel/random/boot_id').read_text().strip()
 
 
-# A time since boot that is smaller by more than this means a restart [ms].
-_RESTART = 1000
-# Of GPS_RAW_INT: the least fix with a height.
-_FIX_3D = 3
+_RESTART = 1000  # a time since boot that is smaller by more than this means a restart [ms]
+_FIX_3D = 3  # of GPS_RAW_INT: the least fix with a height
 # Of EKF_STATUS_REPORT: a level or absolute position, and none that is only assumed.
 _EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
 # A status counts for this time; it is asked for twice a second [s].

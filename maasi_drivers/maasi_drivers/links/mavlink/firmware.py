@@ -131,8 +131,7 @@ def identify(autopilot: int, vehicle_type: int) -> Firmware:
 _STATION, _HIGHEST = ('SYSID_MYGCS', 'MAV_GCS_SYSID'), 'MAV_GCS_SYSID_HI'
 # Period and number of requests for a parameter that is not answered [s, 1].
 _ANSWER_TIMEOUT, _TRIES = 0.5, 5
-# A message with our system id counts for this time [s].
-_FOREIGN_AGE = 5.0
+_FOREIGN_AGE = 5.0  # a message with our system id counts for this time [s]
 
 
 class FailsafeCheck:

@@ -12,10 +12,8 @@ from maasi_drivers.links.mavlink.protocol import mavlink, mavutil
 from maasi_drivers.links.mavlink.vehicle import Vehicle
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 
-# Longest time until the next check of what is due [s].
-_PERIOD = 0.02
-# Between two tries to open a device that is not there [s].
-_RETRY = 1.0
+_PERIOD = 0.02  # longest time until the next check of what is due [s]
+_RETRY = 1.0  # between two tries to open a device that is not there [s]
 # Component ids that MAVLink leaves to private networks: no ground station has one of them.
 _COMPONENTS = range(mavlink.MAV_COMP_ID_USER1, mavlink.MAV_COMP_ID_USER43 + 1)
 

@@ -23,14 +23,11 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 
 POLL_PERIOD = 0.02
-# Kinds of faults.
-_VEHICLE, _GEOFENCE = 'vehicle', 'geofence'
-# At the end: longest wait until the autopilot confirms that it holds or lands [s].
-_STOP_TIME = 1.0
+_VEHICLE, _GEOFENCE = 'vehicle', 'geofence'  # kinds of faults
+_STOP_TIME = 1.0  # at the end: longest wait until the autopilot confirms that it holds or lands [s]
 # Between a localiser's pose and the autopilot's for the same instant, at most [ns].
 _LONGEST_LAG = 300_000_000
-# Closer than this to its target, the vehicle keeps its heading [m].
-_TURNING = 0.3
+_TURNING = 0.3  # closer than this to its target, the vehicle keeps its heading [m]
 
 
 class MavlinkRobotLink(RobotLink):

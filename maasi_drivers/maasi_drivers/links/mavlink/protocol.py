@@ -10,10 +10,8 @@ mavlink = mavutil.mavlink
 
 __all__ = ['mavlink', 'mavutil']
 
-# Of MAV_SEVERITY.
-ERROR, WARNING, INFO, DEBUG = 3, 4, 6, 7
-# Texts of the autopilot that are younger explain a refusal [s].
-_TEXT_AGE = 6.0
+ERROR, WARNING, INFO, DEBUG = 3, 4, 6, 7  # of MAV_SEVERITY
+_TEXT_AGE = 6.0  # texts of the autopilot that are younger explain a refusal [s]
 
 
 class ReportLog:

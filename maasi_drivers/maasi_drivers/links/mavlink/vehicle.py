@@ -46,12 +46,9 @@ COMMANDED = (
 
 
 _MODE, _TAKE_OFF = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_NAV_TAKEOFF
-# Period of requests for the final mode [s].
-_ENDING_PERIOD = 0.3
-# Period of attempts to arm; the autopilot reports refusals [s].
-_ARMING_PERIOD = 2.0
-# Time for which set-points are sent before a mode that needs them [s].
-_STREAM_AHEAD = 1.2
+_ENDING_PERIOD = 0.3  # period of requests for the final mode [s]
+_ARMING_PERIOD = 2.0  # period of attempts to arm; the autopilot reports refusals [s]
+_STREAM_AHEAD = 1.2  # time for which set-points are sent before a mode that needs them [s]
 # The height is reached within this; a smaller change is no progress [m].
 _REACHED, _PROGRESS = 0.2, 0.1
 # Phases in which the service `arm` is refused with the fault.
@@ -84,10 +81,8 @@ class Vehicle(Autopilot):
         self._phase_at = self._tried_at = -math.inf
         self._fix_needed = False
         self._ending: Ending | None = None
-        # Why it lands by itself.
-        self._reason = ''
-        # Restarted after a flight: its local frame may be anywhere.
-        self._displaced = False
+        self._reason = ''  # why it lands by itself
+        self._displaced = False  # restarted after a flight: its local frame may be anywhere
 
     @property
     def flying(self) -> bool:

@@ -17,8 +17,7 @@ from maasi_sim.run.buildings.scenario import load_cuboid_scenario
 from maasi_sim.run.buildings.simulation import CuboidSimulation
 from maasi_sim.simulation.sim_node import SimNode
 
-# Share of a step after which the link delivers, even if some robots sent nothing.
-_PATIENCE = 0.1
+_PATIENCE = 0.1  # share of a step after which the link delivers, even if some robots sent nothing
 
 
 class CuboidSimNode(SimNode):

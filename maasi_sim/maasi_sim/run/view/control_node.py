@@ -11,8 +11,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from maasi_planner.search_command import call_all
 
-# Longest wait for the answers of all services [s].
-_PATIENCE = 5.0
+_PATIENCE = 5.0  # longest wait for the answers of all services [s]
 
 
 class Control:

@@ -47,8 +47,7 @@ Event = list[Any]
 Scene = dict[str, Any]
 Listener = Callable[[Event], None]
 
-# Largest packed log: with the page around it a replay stays below 5 MB.
-LARGEST = 4_500_000
+LARGEST = 4_500_000  # largest packed log: with the page around it a replay stays below 5 MB
 # Shortest time between states of a robot, and between other events that may be thinned [s].
 STATE_PERIOD = 0.1
 _THINNED = ('robot', 'seen', 'filter', 'map', 'way', 'score', 'cuboid', 'picture')

@@ -16,16 +16,12 @@ from maasi_sim.run.targets.scoring import score
 from maasi_sim.run.topics import point
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning
 
-# Objectives below this stand for candidates that are not allowed.
-_NOT_ALLOWED = -1e29
+_NOT_ALLOWED = -1e29  # objectives below this stand for candidates that are not allowed
 # Status of a robot: of AgentState, and what only those who watch know.
 MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
-# Of a `CuboidDecision`.
-_ACTIVITIES = ('searching', 'returning', 'recharging')
-# A robot is silent when others say where they are for so long without it [s].
-_SILENCE = 3.0
-# Points of a planned way that are shown.
-_MOST_POINTS = 40
+_ACTIVITIES = ('searching', 'returning', 'recharging')  # of a `CuboidDecision`
+_SILENCE = 3.0  # a robot is silent when others say where they are for so long without it [s]
+_MOST_POINTS = 40  # points of a planned way that are shown
 
 
 def padded(values: ArrayLike) -> FloatArray:
@@ -79,8 +75,7 @@ class EventMaker:
         self._modes: dict[str, str] = {}
         self._planned: dict[str, list[int]] = {}
         self._measured: set[tuple[str, str, int]] = set()
-        #: Latest time of an event [s].
-        self.latest = 0.0
+        self.latest = 0.0  #: latest time of an event [s]
 
     def _put(self, time: float, kind: str, owner: str, *content: Any) -> None:
         key = kind, owner

@@ -30,16 +30,13 @@ from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.server import Commander, Hub, ViewServer
 from maasi_sim.scenario.schema import Scenario
 
-# For browsers to take the last events [s].
-_FAREWELL = 2.0
-# Between exploration functions of a search [s].
-_MAP_PERIOD = 1.0
+_FAREWELL = 2.0  # for browsers to take the last events [s]
+_MAP_PERIOD = 1.0  # between exploration functions of a search [s]
 # Calls that wait at most, and wait for more before they are made, so that the run has the
 # processor [s].
 MOST_WAITING = 50_000
 _PERIOD = 0.05
-# Patience at the end for calls that wait [s].
-_PATIENCE = 5.0
+_PATIENCE = 5.0  # patience at the end for calls that wait [s]
 
 
 class LiveView:

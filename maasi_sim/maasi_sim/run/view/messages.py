@@ -27,8 +27,7 @@ from maasi_sim.run.view.scene import empty_scene, scene_of_facts
 
 STEP = 'maasi_msgs/msg/LockstepStep'
 MARKERS = 'visualization_msgs/msg/MarkerArray'
-# Messages between two words on the progress.
-_PROGRESS = 1000
+_PROGRESS = 1000  # messages between two words on the progress
 # Fields of a `RobotDecision`, and of the message of a candidate.
 _SAME = ('control_cost', 'target_refinement', 'exploration', 'objective', 'measurements')
 _COLUMNS = {**dict(zip(_SAME, _SAME)), 'lengths': 'length'}
@@ -96,8 +95,7 @@ class MessageEvents:
         # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
-        #: Images that wait for their detections.
-        self.pictures = Pictures()
+        self.pictures = Pictures()  #: images that wait for their detections
 
     def take(self, topic: str, type_name: str, message: Any) -> None:
         """Take a message of a topic for which `is_shown` is true."""

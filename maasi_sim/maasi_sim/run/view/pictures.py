@@ -17,8 +17,7 @@ from maasi_sim.run.bag import COMPRESSED_TYPE, IMAGE_TYPE
 IMAGES = {IMAGE_TYPE: 'camera/image_raw', COMPRESSED_TYPE: 'camera/image_raw/compressed'}
 # Largest width [px], quality as JPEG, and time from one of a robot to the next [s].
 _WIDTH, _QUALITY, _PERIOD = 240, 60, 0.5
-# Images of a camera that are kept until the detections in them come.
-_KEPT = 16
+_KEPT = 16  # images of a camera that are kept until the detections in them come
 
 
 class Pictures:

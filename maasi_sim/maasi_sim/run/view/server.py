@@ -26,15 +26,12 @@ from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Scene, line, thin
 from maasi_sim.run.view.page_file import empty_page
 
 PORT = 8420
-# Further ports that are tried where one is in use.
-_MORE_PORTS = 20
+_MORE_PORTS = 20  # further ports that are tried where one is in use
 # Takes a command and a robot (None: all); returns whether it was followed, and an answer.
 Commander = Callable[[str, 'str | None'], 'tuple[bool, str]']
 COMMANDS = ('start', 'pause', 'resume', 'home', 'stop', 'release')
-# Browsers at once; further ones are refused.
-MOST_BROWSERS = 32
-# Other connections at once; beyond them the oldest is closed.
-MOST_IDLE = 64
+MOST_BROWSERS = 32  # browsers at once; further ones are refused
+MOST_IDLE = 64  # other connections at once; beyond them the oldest is closed
 # Longest body of a request [bytes], and longest wait for a browser that reads or writes [s].
 LARGEST_BODY = 4096
 PATIENCE = 10.0
@@ -158,8 +155,7 @@ class ViewServer(ThreadingHTTPServer):
             except OSError as error:
                 if error.errno != errno.EADDRINUSE or wanted == last:
                     raise
-        # That it listens on.
-        self.port = int(self.server_address[1])
+        self.port = int(self.server_address[1])  # that it listens on
         threading.Thread(target=self.serve_forever, name='view server', daemon=True).start()
 
     @property

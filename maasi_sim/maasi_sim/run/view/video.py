@@ -27,15 +27,12 @@ from maasi_sim.run.run_folder import write_whole
 from maasi_sim.run.view.event_log import Event, EventLog, Scene
 from maasi_sim.run.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
-# Called with the share that is done.
-Progress = Callable[[float], object]
+Progress = Callable[[float], object]  # called with the share that is done
 # Pictures per second; GIFs would be large. Size [in] at a resolution [px/in].
 RATE, GIF_RATE = 30, 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80
-# The last picture is shown for so long [s].
-_HOLD = 2.0
-# Detections are shown for so long [s].
-_FADE = 1.0
+_HOLD = 2.0  # the last picture is shown for so long [s]
+_FADE = 1.0  # detections are shown for so long [s]
 # Points of a way that are drawn, and those of a circle.
 _MOST_POINTS = 600
 _CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 40)) for f in (np.cos, np.sin)], axis=1)

@@ -25,8 +25,7 @@ from maasi_sim.run.view.scene import empty_scene, scene_of
 from maasi_sim.scenario.layering import ScenarioError
 
 DONE, WRONG_INPUT = 0, 2
-# Period of looks for new topics [s].
-_DISCOVERY = 0.5
+_DISCOVERY = 0.5  # period of looks for new topics [s]
 
 
 class ViewNode(Node):

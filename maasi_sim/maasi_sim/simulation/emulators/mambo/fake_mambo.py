@@ -74,8 +74,7 @@ def frames(data: bytes) -> Iterator[Frame]:
 
 ALL_STATES = (0, 4, 0)
 _TAKE_OFF, _PILOTING, _LAND, _EMERGENCY = (2, 0, 1), (2, 0, 2), (2, 0, 3), (2, 0, 4)
-# Commands that set a limit.
-_LIMITS = {(2, 8, 1): 'tilt', (2, 1, 0): 'climb', (2, 1, 1): 'turn'}
+_LIMITS = {(2, 8, 1): 'tilt', (2, 1, 0): 'climb', (2, 1, 1): 'turn'}  # commands that set a limit
 
 
 def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) -> None:
@@ -103,10 +102,8 @@ def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) 
         raise ValueError(f'command {number}: {error}') from error
 
 
-#: Port of the handshake, fixed in pyparrot.
-HANDSHAKE_PORT = 44444
-#: Port of commands, announced in the handshake.
-COMMAND_PORT = 6000
+HANDSHAKE_PORT = 44444  #: port of the handshake, fixed in pyparrot
+COMMAND_PORT = 6000  #: port of commands, announced in the handshake
 
 COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS = 10, 11, 12
 EVENTS, ACKED_EVENTS = 126, 127

@@ -41,8 +41,7 @@ from maasi_sim.simulation.odometry import OdometryModel, OdometrySettings
 from maasi_sim.simulation.robots import Battery
 
 _GRAVITY = 9.81
-# Deceleration for each m/s while it hovers [1/s].
-_HOVER_GAIN = 2.0
+_HOVER_GAIN = 2.0  # deceleration for each m/s while it hovers [1/s]
 # Time constants of tilt, vertical speed and rotation rate [s].
 _TILT_TIME, _CLIMB_TIME, _TURN_TIME = 0.1, 0.2, 0.1
 

@@ -37,14 +37,12 @@ from maasi_sim.simulation.emulators.mavlink.autopilot_settings import (
 )
 from maasi_sim.simulation.emulators.mavlink.flight_model import FlightModel
 
-# ArduCopter disarms on the ground after so long [s].
-_DISARM_DELAY = 10.0
+_DISARM_DELAY = 10.0  # ArduCopter disarms on the ground after so long [s]
 # PX4 wants setpoints for so long, and not so long ago, before OFFBOARD [s].
 _OFFBOARD_STREAM, _OFFBOARD_AGE = 1.0, 0.5
 _LANDING, _SURFACING = 0.5, 0.3
 _POSITION_IGNORED, _YAW_IGNORED = 0b111, 1 << 10
-# Of EKF_STATUS_REPORT.
-_EKF_GOOD, _EKF_START = 1 | 2 | 4 | 8 | 16 | 32, 1 | 128
+_EKF_GOOD, _EKF_START = 1 | 2 | 4 | 8 | 16 | 32, 1 | 128  # of EKF_STATUS_REPORT
 # From the loss of GNSS to that of the position estimate [s].
 _DEAD_RECKONING = 8.0
 _ACCEPTED, _FAILED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED
@@ -86,8 +84,7 @@ class FakeAutopilot:
         self.origin = np.zeros(3)
         self._sender = sender
         self._generator = generator
-        # True height at arming [m].
-        self._home = 0.0
+        self._home = 0.0  # true height at arming [m]
         # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
         # System, component and link of what was heard; the driver is on link 0.

@@ -22,8 +22,7 @@ from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotS
 from maasi_sim.simulation.emulators.mavlink.fake_autopilot import FakeAutopilot
 
 _PERIOD = 0.02
-# Longest time simulated at once after a delay [s].
-_LONGEST = 0.5
+_LONGEST = 0.5  # longest time simulated at once after a delay [s]
 
 
 class FakeVehicle:

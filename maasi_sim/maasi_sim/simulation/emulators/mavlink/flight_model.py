@@ -10,8 +10,7 @@ from maasi_filter.arrays import FloatArray
 
 # Speed for each metre of way left, of the position controller [1/s]; largest yaw rate [rad/s].
 _GAIN, _YAW_RATE = 1.0, 1.0
-# Speed without power: a submarine rises [m/s].
-_FALL, _BUOYANCY = -3.0, 0.1
+_FALL, _BUOYANCY = -3.0, 0.1  # speed without power: a submarine rises [m/s]
 
 
 class FlightModel:
