@@ -30,22 +30,17 @@ class Observation:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """A sensor's R and bias of range [m] and angles [rad], and what they rest on.
+    """A sensor's noise, and the observations that it rests on."""
 
-    Target as given, or where it was seen on average [m, map]; smallest and largest range;
-    observations used, too near for a bearing, of something else, with the target in view, and of
-    those missed.
-    """
-
-    covariance: FloatArray
-    bias: FloatArray
-    target: FloatArray
-    ranges: tuple[float, float]
-    used: int
-    near: int
-    others: int
-    inside: int
-    missed: int
+    covariance: FloatArray  # R, (d, d): of the errors of range [m] and angles [rad]
+    bias: FloatArray  # (d,): their mean
+    target: FloatArray  # (d,): as given, or the mean of where it was seen [m, map]
+    ranges: tuple[float, float]  # smallest and largest of those used [m]
+    used: int  # observations from which R is estimated
+    near: int  # left out because the target was too near for a bearing
+    others: int  # detections of something else
+    inside: int  # observations with the target in the field of view
+    missed: int  # of those, the ones that did not show it
 
     @property
     def deviations(self) -> FloatArray:

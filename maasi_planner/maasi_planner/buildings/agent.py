@@ -33,20 +33,15 @@ class Activity(Enum):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Snapshot of a cell.
-
-    robot: name of the robot; step: time step; cuboid: index of the cuboid of the cell; position
-    (3,): of the robot [m]; direction (3,): optical axis, opposite to the normal of the face;
-    distance: from the face [m]; detection_probability: p_d at that distance.
-    """
+    """Snapshot of a cell, by a robot at a step."""
 
     robot: str
     step: int
-    cuboid: int
-    position: FloatArray
-    direction: FloatArray
-    distance: float
-    detection_probability: float
+    cuboid: int  # index of that of the cell
+    position: FloatArray  # (3,) of the robot [m]
+    direction: FloatArray  # (3,) optical axis, opposite to the normal of the face
+    distance: float  # from the face [m]
+    detection_probability: float  # p_d at that distance
 
 
 def decision_stream(seed: int, robot: str, step: int) -> np.random.Generator:

@@ -34,20 +34,12 @@ class AxisRoom(NamedTuple):
 
 @dataclass(frozen=True)
 class AxisRows:
-    """What is linear in the forces u_0 to u_{T-1} of an axis.
-
-    Rows: positions P_2 to P_T, velocities v_1 to v_T, forces, and P_T plus the ways that are left
-    after each step of braking, as if air resistance were all. P_1 is given by the state.
-
-    matrix (m, T): rows; gram (m, m): matrix H^-1 matrix', H the Hessian of the objective; inverse
-    (T, T): H^-1; pull (T + 1,): weight of the squared distance from the target at P_0 to P_T,
-    scaled [1/m^2].
-    """
+    """What is linear in the forces u_0 to u_{T-1} of an axis, m rows; P_1 is given by the state."""
 
     matrix: FloatArray
-    gram: FloatArray
-    inverse: FloatArray
-    pull: FloatArray
+    gram: FloatArray  # (m, m): matrix H^-1 matrix', H the Hessian of the objective
+    inverse: FloatArray  # (T, T): H^-1
+    pull: FloatArray  # (T + 1,): weight of the squared distance from the target, scaled [1/m^2]
 
 
 def axis_rows(

@@ -25,37 +25,27 @@ FOUND, EXHAUSTED, UNFINISHED, FULL = 0, 1, 2, 3
 
 
 class Instance(NamedTuple):
-    """One problem for the compiled search; objectives scaled.
+    """One problem for the compiled search, Q visits to choose from; objectives scaled."""
 
-    gram (m, m): of each axis; free, lower, upper (3, m): values of the rows at the free minimum,
-    and their bounds; rise, sink (3, J): what the ways to brake are longer by than their rows, going
-    up and down [m]; given (2, 3): P_0 and P_1 [m]; area (3, 2): [m]; horizon: T; visit_step,
-    visit_cuboid (Q,): visits to choose from, in order of their steps; visit_reward (Q,): their
-    rewards; visit_lower, visit_upper (Q, 3): their cuboids [m]; most: most reward of all visits;
-    ahead (Q,): most reward that can follow a visit; follows (Q, Q): whether a visit (column) may
-    follow another (row); obstacles (O, 3, 2): corners, clearance included [m]; between: whether
-    segments, and not only positions, keep away from obstacles.
-    """
-
-    gram: FloatArray
-    free: FloatArray
+    gram: FloatArray  # (m, m) of each axis
+    free: FloatArray  # (3, m): values of the rows at the free minimum, and their bounds
     lower: FloatArray
     upper: FloatArray
-    rise: FloatArray
-    sink: FloatArray
-    given: FloatArray
-    area: FloatArray
+    rise: FloatArray  # (3, J): what ways to brake are longer by than their rows, going up, and
+    sink: FloatArray  # going down [m]
+    given: FloatArray  # (2, 3): P_0 and P_1 [m]
+    area: FloatArray  # (3, 2) [m]
     horizon: int
-    visit_step: IntArray
+    visit_step: IntArray  # (Q,), in this order
     visit_cuboid: IntArray
-    visit_reward: FloatArray
-    visit_lower: FloatArray
+    visit_reward: FloatArray  # (Q,)
+    visit_lower: FloatArray  # (Q, 3): corners of their cuboids [m]
     visit_upper: FloatArray
-    most: float
-    ahead: FloatArray
-    follows: BoolArray
-    obstacles: FloatArray
-    between: bool
+    most: float  # most reward of all visits
+    ahead: FloatArray  # (Q,): most reward that can follow a visit
+    follows: BoolArray  # (Q, Q): whether a visit (column) may follow another (row)
+    obstacles: FloatArray  # (O, 3, 2): corners, clearance included [m]
+    between: bool  # whether segments, and not only positions, keep away from obstacles
 
 
 @njit(cache=True)

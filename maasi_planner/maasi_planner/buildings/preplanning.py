@@ -37,19 +37,14 @@ def footprint(distance: float, camera: SearchCameraSettings) -> float:
 
 @dataclass(frozen=True)
 class Cell:
-    """A part of a face and the cuboid that it is searched from.
+    """A part of a face and the cuboid that it is searched from."""
 
-    target: index of the object; face: west, east, south, north, bottom or top; centre, normal (3,):
-    of the cell [m], and outward; size (2,): sides of the cell [m]; box (3, 2): lower and upper
-    corner of the cuboid [m].
-    """
-
-    target: int
-    face: str
-    centre: FloatArray
-    normal: FloatArray
-    size: FloatArray
-    box: FloatArray
+    target: int  # index of the object
+    face: str  # west, east, south, north, bottom or top
+    centre: FloatArray  # (3,) of the cell [m]
+    normal: FloatArray  # (3,) outward
+    size: FloatArray  # (2,): sides of the cell [m]
+    box: FloatArray  # (3, 2): lower and upper corner of the cuboid [m]
 
     def sides(self) -> FloatArray:
         """Return lower and upper corner of the cell, (3, 2) [m]: flat along its normal."""
@@ -64,22 +59,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class CoveragePlan:
-    """Cells of the faces to search and their cuboids, planned before take-off.
-
-    cells: searchable cells; lost: other cells, and why they are lost; area (3, 2): admissible
-    positions [m]; objects, obstacles (n, 3, 2): true size, without clearance [m]; distance,
-    footprint: d and r [m]; coverage: share of the searchable faces that the snapshots cover, 0 to
-    1.
-    """
+    """Cells of the faces to search and their cuboids, planned before take-off."""
 
     cells: list[Cell]
-    lost: list[tuple[Cell, str]]
-    area: FloatArray
-    objects: FloatArray
+    lost: list[tuple[Cell, str]]  # other cells, and why they are lost
+    area: FloatArray  # (3, 2): admissible positions [m]
+    objects: FloatArray  # (n, 3, 2): true size, without clearance [m]
     obstacles: FloatArray
-    distance: float
-    footprint: float
-    coverage: float
+    distance: float  # d [m]
+    footprint: float  # r [m]
+    coverage: float  # share of the searchable faces that the snapshots cover, 0 to 1
     boxes: FloatArray = field(init=False)
     centres: FloatArray = field(init=False)
     solids: FloatArray = field(init=False)  # objects and obstacles

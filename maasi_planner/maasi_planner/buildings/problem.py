@@ -26,46 +26,31 @@ _HOMING_SMOOTHNESS = 1e-2
 
 @dataclass
 class Problem:
-    """State and knowledge of a robot when it plans.
+    """State and knowledge of a robot when it plans."""
 
-    position, velocity (3,): its state [m, m/s]; target (3,): x*, guidance target [m]; cuboids (N,
-    3, 2): lower and upper corners [m]; wanted (N,): which are unvisited and have a reward of 1;
-    obstacles (O, 3, 2): objects and obstacles, clearance included [m]; area (3, 2): admissible
-    positions [m]; homing: whether it only flies to its target, without search (8); hint: visits
-    (step, cuboid) of the previous plan, shifted to now; put_off: consecutive postponements of the
-    first visit; without effect if rewards are not discounted.
-    """
-
-    position: FloatArray
-    velocity: FloatArray
-    target: FloatArray
-    cuboids: FloatArray
-    wanted: BoolArray
-    obstacles: FloatArray
-    area: FloatArray
-    homing: bool = False
-    hint: list[tuple[int, int]] = field(default_factory=list)
-    put_off: int = 0
+    position: FloatArray  # (3,) [m]
+    velocity: FloatArray  # (3,) [m/s]
+    target: FloatArray  # (3,): x*, guidance target [m]
+    cuboids: FloatArray  # (N, 3, 2): lower and upper corners [m]
+    wanted: BoolArray  # (N,): which are unvisited and have a reward of 1
+    obstacles: FloatArray  # (O, 3, 2): objects and obstacles, clearance included [m]
+    area: FloatArray  # (3, 2): admissible positions [m]
+    homing: bool = False  # whether it only flies to its target, without search (8)
+    hint: list[tuple[int, int]] = field(default_factory=list)  # of the plan before, as of now
+    put_off: int = 0  # consecutive postponements of the first visit, if rewards are discounted
 
 
 @dataclass
 class Plan:
-    """A plan, starting at P_0.
+    """A plan, starting at P_0."""
 
-    positions, velocities (T + 1, 3): from now on [m, m/s]; controls (T, 3): forces [N]; visits:
-    step, from 1, and cuboid; each cuboid once, in order of the steps; how: optimal; best_so_far: a
-    limit ended the solve; shifted: no solution, the previous plan is continued; brake: no valid
-    previous plan either; objective: value of (9), without cuboids visited earlier; nodes: number of
-    solved relaxations.
-    """
-
-    positions: FloatArray
-    velocities: FloatArray
-    controls: FloatArray
-    visits: list[tuple[int, int]]
-    how: How
-    objective: float = float('nan')
-    nodes: int = 0
+    positions: FloatArray  # (T + 1, 3), from now on [m]
+    velocities: FloatArray  # (T + 1, 3) [m/s]
+    controls: FloatArray  # (T, 3): forces [N]
+    visits: list[tuple[int, int]]  # step, from 1, and cuboid, each once, in order
+    how: How  # best_so_far: a limit ended the solve; shifted, brake: there was no solution
+    objective: float = float('nan')  # value of (9), without cuboids visited earlier
+    nodes: int = 0  # number of solved relaxations
 
 
 class PlanSolver:

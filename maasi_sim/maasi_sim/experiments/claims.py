@@ -32,21 +32,16 @@ _WORDS = {'less': 'less', 'greater': 'more', 'alike': 'alike', 'number': ''}
 
 @dataclass(frozen=True)
 class Finding:
-    """What our runs say about a claim, stored beside the figure of its experiment.
-
-    `gap` is first minus second, or ours minus the paper's number, with half of its 95 % interval
-    (None of one run) and Student's `degrees`; `size` is the second, or the paper's number. `paper`
-    and `here` are the cells of the table.
-    """
+    """What our runs say about a claim, stored beside the figure of its experiment."""
 
     says: str
     expects: str
-    paper: str
-    here: str
-    gap: float
-    half_width: float | None
-    degrees: float
-    size: float
+    paper: str  # cell of the table
+    here: str  # cell of the table
+    gap: float  # first minus second, or ours minus the paper's number
+    half_width: float | None  # of the 95 % interval; None of one run
+    degrees: float  # of Student's distribution
+    size: float  # the second, or the paper's number
     earlier: bool = False
 
     def verdict(self, level: float = LEVEL) -> str:

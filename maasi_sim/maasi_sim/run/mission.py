@@ -26,11 +26,11 @@ UNAVAILABLE = 5  # goal status of `AgentState`
 
 @dataclass(frozen=True)
 class RunEnd:
-    """How a run ended: a key of `END_REASONS`, simulated and wall time [s], events of nodes."""
+    """How a run ended."""
 
-    reason: str
-    time: float
-    wall_time: float
+    reason: str  # a key of `END_REASONS`
+    time: float  # simulated [s]
+    wall_time: float  # from the first step [s]
     events: list[dict[str, Any]] = field(default_factory=list)
 
 

@@ -24,36 +24,27 @@ DISC, RECTANGLE = 0, 1
 
 
 class Shot(NamedTuple):
-    """A camera in the map, and the motion of its robot during the exposure.
+    """A camera in the map, and the motion of its robot during the exposure."""
 
-    Centre (3,) [m], turn (3, 3) from camera to map, and the camera's model; origin of the robot
-    (3,) [m], its velocities in the map (3,) [m/s, rad/s], and the exposure's time [s].
-    """
-
-    centre: FloatArray
-    turn: FloatArray
+    centre: FloatArray  # (3,) [m]
+    turn: FloatArray  # (3, 3) from camera to map
     matrix: FloatArray
     distortion: FloatArray
     largest_radius: float
-    origin: FloatArray
-    velocity: FloatArray
-    rotation_rate: FloatArray
-    exposure_time: float
+    origin: FloatArray  # (3,) of the robot [m]
+    velocity: FloatArray  # (3,) in the map [m/s]
+    rotation_rate: FloatArray  # (3,) in the map [rad/s]
+    exposure_time: float  # [s]
 
 
 class Exposure(NamedTuple):
-    """How light becomes grey levels.
+    """How light becomes grey levels."""
 
-    Share of the light that passes the lens, (h, w); amplitude, wave vector [turns/m] and phase
-    [turns] of the light, (4,); gains of R, G, B; deviation in the dark, and variance for each grey
-    level of signal.
-    """
-
-    lens: FloatArray
-    light: FloatArray
-    gains: FloatArray
-    read_noise: float
-    shot_noise: float
+    lens: FloatArray  # share of the light that passes, (h, w)
+    light: FloatArray  # amplitude, wave vector [turns/m] and phase [turns], (4,)
+    gains: FloatArray  # of R, G, B
+    read_noise: float  # deviation in the dark
+    shot_noise: float  # variance for each grey level of signal
 
 
 @njit(cache=True, error_model='numpy')

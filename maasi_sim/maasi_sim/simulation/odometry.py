@@ -50,16 +50,12 @@ class OdometrySettings(Settings):
 
 @dataclass(frozen=True)
 class OdometryReading:
-    """Odometry of one step, as in ``nav_msgs/Odometry``.
+    """Odometry of one step, as in ``nav_msgs/Odometry``."""
 
-    The pose is in the frame of the robot at the start, with its covariance (6, 6) [m, rad]; the
-    velocities are in the robot's frame [m/s, rad/s].
-    """
-
-    pose: Pose
-    covariance: FloatArray
-    velocity: FloatArray
-    angular_velocity: FloatArray
+    pose: Pose  # in the frame of the robot at the start
+    covariance: FloatArray  # (6, 6) of the pose [m, rad]
+    velocity: FloatArray  # in the robot's frame [m/s]
+    angular_velocity: FloatArray  # in the robot's frame [rad/s]
 
 
 class OdometryModel:

@@ -23,25 +23,21 @@ Scheme = Literal['distributed', 'sequential', 'centralized']
 
 @dataclass
 class MissionRecord:
-    """What became of a mission, by step: paths (n, 3) [m], cuboids visited, robots that search.
-
-    Snapshots in order of time; steps on which a way cut an object, or was outside the area; how
-    decisions were made, and their wall times [s]; batteries that failed; plans kept on request.
-    """
+    """What became of a mission."""
 
     mission: CoveragePlan
     steps: int
-    complete: bool
-    paths: dict[str, FloatArray]
-    visited: NDArray[np.int64]
-    active: NDArray[np.int64]
+    complete: bool  # whether all cuboids were visited after these steps
+    paths: dict[str, FloatArray]  # positions at all steps, (steps + 1, 3) [m]
+    visited: NDArray[np.int64]  # (steps + 1,): cuboids visited by the team
+    active: NDArray[np.int64]  # (steps + 1,): robots that search
     snapshots: list[Snapshot]
-    collisions: int
-    outside: int
-    how: dict[str, int]
-    solve_times: FloatArray
-    recharges: int
-    plans: dict[int, dict[str, FloatArray]]
+    collisions: int  # steps on which a way cut an object or obstacle
+    outside: int  # steps on which a robot was outside the area
+    how: dict[str, int]  # decisions by how they were made
+    solve_times: FloatArray  # of each decision, of all robots together if centralized [s]
+    recharges: int  # batteries that failed
+    plans: dict[int, dict[str, FloatArray]]  # predicted positions at the steps asked for
 
 
 def within_range(

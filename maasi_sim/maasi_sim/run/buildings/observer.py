@@ -24,18 +24,15 @@ class Moment(NamedTuple):
 
 @dataclass
 class CuboidRecord(RunRecord):
-    """The record of a search of buildings.
-
-    Snapshots of cuboids (several may be of one); decisions by how they were made; active (n, 2):
-    time [s] and robots that search; times of decisions [s]; most robots heard at once.
-    """
+    """The record of a search of buildings."""
 
     mission: CoveragePlan
-    snapshots: list[dict[str, Any]] = field(default_factory=list)
-    choices: dict[str, int] = field(default_factory=dict)
+    snapshots: list[dict[str, Any]] = field(default_factory=list)  # several may be of one cuboid
+    choices: dict[str, int] = field(default_factory=dict)  # decisions by how they were made
+    # Time [s] and robots that search.
     active: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    solve_times: FloatArray = field(default_factory=lambda: np.zeros(0))
-    most_heard: int = 0
+    solve_times: FloatArray = field(default_factory=lambda: np.zeros(0))  # of decisions [s]
+    most_heard: int = 0  # largest number of robots received at once
     completed: Moment | None = None
 
 
