@@ -1,7 +1,5 @@
 """The command that gives a sensor's noise R from a recording of one target."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

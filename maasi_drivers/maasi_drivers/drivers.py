@@ -1,7 +1,5 @@
 """The drivers of the suite by executable; MAVLink, an extra, is imported where it is used."""
 
-from __future__ import annotations
-
 from functools import partial
 from pkgutil import resolve_name
 from typing import Any

@@ -1,7 +1,5 @@
 """The guard of a robot: a small process that stops the robot when its driver dies or hangs."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

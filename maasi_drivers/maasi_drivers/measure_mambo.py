@@ -4,8 +4,6 @@ Each leg is the largest tilt one way and then the other for the same time T, fro
 g tan(tilt) T^2 long, a bound for any drone. Then it hovers, and flies back.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import signal

@@ -1,7 +1,5 @@
 """Show the state of a robot, or send it to a waypoint: for manual tests."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import signal

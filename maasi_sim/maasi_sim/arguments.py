@@ -1,7 +1,5 @@
 """Command lines: what was read and what is allowed, when an option or a number is wrong."""
 
-from __future__ import annotations
-
 from argparse import ArgumentParser, ArgumentTypeError
 from difflib import get_close_matches
 from typing import Any

@@ -1,7 +1,5 @@
 """A word on stderr while kernels are compiled: once on a machine, for a minute or two."""
 
-from __future__ import annotations
-
 import sys
 from time import perf_counter
 from typing import Any

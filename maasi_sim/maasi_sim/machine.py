@@ -1,7 +1,5 @@
 """On what a run was made, as far as it changes the last bits (docs/repeatability.md)."""
 
-from __future__ import annotations
-
 import hashlib
 import platform
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The result of a search in one process."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The driver of a robot: a node that joins a link, a sensor, goals, and answers to batches."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any

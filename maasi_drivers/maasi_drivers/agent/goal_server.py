@@ -1,7 +1,5 @@
 """The action `go_to` of a robot: which goals it takes, and how they end."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A robot's answers to measurement batches: batch, image and pose to detections."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Odometry placed in the map, velocities from poses, and poses at a stamp. Without ROS."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from dataclasses import dataclass, field

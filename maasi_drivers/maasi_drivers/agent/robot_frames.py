@@ -1,7 +1,5 @@
 """A robot's frames on /tf and /tf_static, its description, and poses of other nodes there."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial

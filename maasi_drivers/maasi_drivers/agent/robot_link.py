@@ -3,8 +3,6 @@
 # Optional hooks do nothing.
 # ruff: noqa: B027
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The node of one robot, as its link, its sensor and the parts of its driver see it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a robot says on topics: poses by odometry or a localiser, and the charge."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """A ground robot's laser scan: placed in the map, and avoided by a dynamic window. Without ROS."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A robot's sensor as its driver uses it, and a sensor of range, bearing and elevation."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from typing import Generic, TypeVar

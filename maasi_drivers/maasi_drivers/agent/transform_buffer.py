@@ -1,7 +1,5 @@
 """Transforms on /tf, at any stamp, without ROS: the wheels of ROS 2 have no tf2_ros."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The topic `state` of a robot, and the faults that its driver finds by itself."""
 
-from __future__ import annotations
-
 import time
 
 from maasi_drivers.agent.odometry import StampedPose

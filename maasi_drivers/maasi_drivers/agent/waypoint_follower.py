@@ -1,7 +1,5 @@
 """What a robot does about its goal: go there, hold, stop. Without ROS."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntEnum

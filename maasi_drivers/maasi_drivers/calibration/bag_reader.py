@@ -1,7 +1,5 @@
 """Read recordings (rosbag2), also MCAP files whose end is missing."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """A robot in a recording: where it was, and its images or detections."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A sensor's noise R from observations at one target, as in 000, section 5.2."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

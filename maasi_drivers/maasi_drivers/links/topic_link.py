@@ -1,7 +1,5 @@
 """A robot with ROS topics for odometry, battery and velocity commands."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Ground robots with topics: by the driver's own commands, with a laser scan, or by Nav2."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

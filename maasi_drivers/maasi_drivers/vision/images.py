@@ -1,7 +1,5 @@
 """Images as arrays: from messages, and from streams, devices and files. Without ROS."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """Markers in RGB images (h, w, 3): the papers' rule, one for any light, and fiducials."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

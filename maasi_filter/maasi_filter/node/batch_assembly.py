@@ -1,7 +1,5 @@
 """Puts the measurements of each batch together, in the order of the batches."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Time of a node: stamps of messages, silence of sources, jumps of a simulated clock."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

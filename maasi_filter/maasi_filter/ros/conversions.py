@@ -1,7 +1,5 @@
 """Conversions between messages and records of the library, in pairs."""
 
-from __future__ import annotations
-
 import array
 import math
 from collections.abc import Callable, Iterable, Sequence

@@ -1,7 +1,5 @@
 """Entities of a node: what they wait for, how long they live, and bad requests to them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection, Hashable
 from functools import partial

@@ -1,7 +1,5 @@
 """Base of all nodes of a search: parameters, life cycle, readiness, lockstep, diagnostics."""
 
-from __future__ import annotations
-
 import math
 import time
 import traceback

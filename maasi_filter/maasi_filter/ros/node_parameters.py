@@ -1,7 +1,5 @@
 """The ROS parameters of a node: declared from its settings, read in *configure*."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches

@@ -1,7 +1,5 @@
 """Settings that nodes share, and those of the filter node."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field

@@ -7,8 +7,6 @@ the former.
 Settings by name, `robots`, become the list `robots` and `robot.<name>.<key>`.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import textwrap

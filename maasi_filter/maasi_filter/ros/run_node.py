@@ -1,7 +1,5 @@
 """Runs a node as a process: command line, executor, signals, clean end."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

@@ -1,7 +1,5 @@
 """One robot of the distributed search of 004: knowledge, messages, decisions and snapshots."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum

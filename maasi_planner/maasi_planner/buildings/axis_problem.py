@@ -6,8 +6,6 @@ their bounds. Only bounds and free motion change from step to step: the method w
 Gram matrix alone.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

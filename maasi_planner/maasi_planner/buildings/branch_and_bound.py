@@ -5,8 +5,6 @@ its relaxation is a quadratic problem for each axis. An *open* node stands for e
 visits and perhaps later ones, a *closed* one for those with no other.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Without (5j) it decomposes into one P2 per robot; best-first search forbids a cu
 plan to visit to one or the other, and the first node without one is the optimum.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections import Counter

@@ -1,7 +1,5 @@
 """Between messages and the records of the search of buildings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

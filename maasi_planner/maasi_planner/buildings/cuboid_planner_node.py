@@ -1,7 +1,5 @@
 """The planner node of one robot that searches buildings beside others (004)."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

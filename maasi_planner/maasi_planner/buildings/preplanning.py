@@ -1,7 +1,5 @@
 """Pre-planning: from objects to cuboids, 004, IV."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace

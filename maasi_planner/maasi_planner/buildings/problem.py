@@ -1,7 +1,5 @@
 """The problem of one robot at one step, 004, P2, and its exact solution."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from typing import Literal

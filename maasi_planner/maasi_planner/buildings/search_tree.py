@@ -1,7 +1,5 @@
 """Nodes of the branch and bound search, best bound first, in arrays of fixed size."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What robots tell each other, and how they share the cuboids: 004, (10) to (14)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Paths around obstacles."""
 
-from __future__ import annotations
-
 import heapq
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measurement batches of the planner node, and the filter's updates of them."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Supervision of the filter by the planner node, and found targets kept for it."""
 
-from __future__ import annotations
-
 import math
 import time
 

@@ -1,7 +1,5 @@
 """Goals of the robots: those of decisions, the way home, and those of other clients."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Destinations that planners of single robots tell each other (002, section 4)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 

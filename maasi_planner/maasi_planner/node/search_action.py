@@ -1,7 +1,5 @@
 """The action and the services that start, pause and end a search."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial

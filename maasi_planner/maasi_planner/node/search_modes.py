@@ -1,7 +1,5 @@
 """The mode of each robot of a team in a search, and its commands. Without ROS."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from enum import Enum
 

@@ -4,8 +4,6 @@ Seeds do not depend on the worker. Other processors or versions may change the l
 runs of different machines are mixed only on request (docs/repeatability.md).
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import multiprocessing

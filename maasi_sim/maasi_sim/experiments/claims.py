@@ -1,7 +1,5 @@
 """The papers' claims: what our runs say about each, and a verdict by one rule."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

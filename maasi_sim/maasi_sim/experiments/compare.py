@@ -1,7 +1,5 @@
 """Compare planners and filters: searches of scenarios in one process each, on the same seeds."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -4,8 +4,6 @@ A case's settings are the layers of the experiment, of its preset and of the cas
 own values on top. A list of mappings of cases means all combinations of them.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Mapping
 from functools import cache, partial

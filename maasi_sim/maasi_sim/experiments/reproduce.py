@@ -1,7 +1,5 @@
 """Run the papers' experiments and compare the results with the papers'."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Searches in one process as experiments: cases, runs and measured quantities."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import pkgutil

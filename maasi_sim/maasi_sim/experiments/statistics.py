@@ -1,7 +1,5 @@
 """Means with confidence intervals: of numbers, and of paired differences."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Tables: of our results beside the papers', and of comparisons of searches."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Write recordings (rosbag2, MCAP) of serialised messages without ROS, by time; read runs'."""
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import threading

@@ -1,7 +1,5 @@
 """ROS domains of runs, and the shared memory that processes with Fast DDS leave in them."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import hashlib

@@ -1,7 +1,5 @@
 """Which nodes a scenario needs, with their parameters."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field

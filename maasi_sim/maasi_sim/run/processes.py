@@ -3,8 +3,6 @@
 The fork server of `multiprocessing` has loaded what nodes share: they start in a tenth of the time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

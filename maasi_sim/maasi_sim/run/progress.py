@@ -1,7 +1,5 @@
 """Progress of a run: one updated line on a terminal, else plain lines."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import sys

@@ -3,8 +3,6 @@
 Sensors, start and filter are the scenario's; each robot measures once in each sensor period.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

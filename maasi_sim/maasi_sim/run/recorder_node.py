@@ -1,7 +1,5 @@
 """The recorder: subscribes to all topics of a run, records them, and takes part in lockstep."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import struct

@@ -1,7 +1,5 @@
 """Replay the measurements of a recording to the filter node, and compare the found targets."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

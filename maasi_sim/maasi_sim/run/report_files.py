@@ -1,7 +1,5 @@
 """The files of a report, and the common part of all reports."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -1,7 +1,5 @@
 """The frame of the figures of reports: the map from above and the sides, ways, plots and text."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The folder of a run, and files that are written whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import itertools

@@ -1,7 +1,5 @@
 """One run of a scenario: its nodes are started, monitored and stopped, and reported on."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

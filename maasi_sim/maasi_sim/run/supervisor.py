@@ -1,7 +1,5 @@
 """The nodes of a run: planned, watched, restarted and stopped."""
 
-from __future__ import annotations
-
 import signal
 import time
 from pathlib import Path

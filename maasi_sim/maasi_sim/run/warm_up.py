@@ -1,7 +1,5 @@
 """What nodes need at their start, done once in the process that they are forked from."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 

@@ -4,8 +4,6 @@ Arrays by pixel are (h, w). The floor's coordinates under each pixel are in the 
 above the horizon. The image is linear in the light.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Simulated odometry: starts at zero, with noise, and drift that grows with the distance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What the simulation node publishes: topics of robots, the truth; and who receives it."""
 
-from __future__ import annotations
-
 import array
 import contextlib
 import math

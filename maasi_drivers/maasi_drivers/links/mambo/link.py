@@ -6,8 +6,6 @@ counts, and so does the acknowledgement of a command, sent when nothing else is 
 docs/minidronecommands.rst: "more information via wifi than via BLE").
 """
 
-from __future__ import annotations
-
 import errno
 import importlib
 import math

@@ -1,7 +1,5 @@
 """A Parrot Mambo on WiFi or Bluetooth as a driver's robot."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A Mambo with a program of its own as a driver's robot: the feed's poses, orders by UDP (001)."""
 
-from __future__ import annotations
-
 import socket
 import struct
 import time

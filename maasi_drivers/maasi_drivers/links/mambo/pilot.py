@@ -1,7 +1,5 @@
 """A Mambo's flight: its commands from take-off to landing. Without ROS."""
 
-from __future__ import annotations
-
 import math
 from enum import Enum
 

@@ -6,8 +6,6 @@ takes every datagram for the drone's, returns the last one again after a timeout
 dies on a truncated frame, or loops forever on one of size zero.
 """
 
-from __future__ import annotations
-
 import math
 import socket
 import struct

@@ -6,8 +6,6 @@ vehicles", IEEE Robotics & Automation Magazine 19(3), 2012), so that one measure
 the steady speed at the largest tilt. A command acts after a delay.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The messages of an autopilot: its type, mode and parameters, and requests to it."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections import deque

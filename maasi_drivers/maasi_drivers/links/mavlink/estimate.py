@@ -1,7 +1,5 @@
 """The state of a vehicle by its autopilot: pose, batteries, fix, landed or not."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

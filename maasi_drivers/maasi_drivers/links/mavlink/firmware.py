@@ -1,7 +1,5 @@
 """What sets the autopilots apart: their modes, how they start, and the check of their failsafes."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Connection to a vehicle, which one thread alone reads and writes."""
 
-from __future__ import annotations
-
 import random
 import threading
 import time

@@ -1,7 +1,5 @@
 """A vehicle that speaks MAVLink as a driver's robot."""
 
-from __future__ import annotations
-
 import math
 import os
 import time

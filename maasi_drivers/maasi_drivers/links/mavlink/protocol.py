@@ -1,7 +1,5 @@
 """MAVLink 2 by pymavlink, and reports for the log."""
 
-from __future__ import annotations
-
 from collections import deque
 
 from pymavlink import mavutil

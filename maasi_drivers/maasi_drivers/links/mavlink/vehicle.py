@@ -1,7 +1,5 @@
 """One vehicle from its first heartbeat to the end: phases of a flight. No wire, no thread."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from enum import Enum

@@ -1,7 +1,5 @@
 """The simulation node of searches of buildings: robots, time, and the link between the robots."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A search of buildings (004) in one process: robots, batteries, and a link of limited range."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass

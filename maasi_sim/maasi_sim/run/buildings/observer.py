@@ -1,7 +1,5 @@
 """Gathers the data of the report of a search of buildings from its messages."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 

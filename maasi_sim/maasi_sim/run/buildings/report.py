@@ -1,7 +1,5 @@
 """The report of a search of buildings as plain values, and in words."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The figure of a search of buildings: from above and the sides, and its course."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba

@@ -1,7 +1,5 @@
 """Scenario files of searches of buildings (004): `planner: {name: cuboid_mpc}`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal

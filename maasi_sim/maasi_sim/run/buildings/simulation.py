@@ -1,7 +1,5 @@
 """Robots that search buildings, on one clock, and their link of limited range (004)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

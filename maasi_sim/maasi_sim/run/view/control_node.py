@@ -1,7 +1,5 @@
 """Calls the services that pause, resume, send home and stop, for a page."""
 
-from __future__ import annotations
-
 import argparse
 import threading
 

@@ -33,8 +33,6 @@ Covariances are their upper triangle: xx, xy, xz, yy, yz, zz. Lengths are in met
 radians, in the frame of the map.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json

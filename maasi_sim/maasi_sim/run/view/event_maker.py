@@ -1,7 +1,5 @@
 """Makes the events of a run from what its filter, planner and robots say, as their records."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The page of a running run, of its messages, and of a search in this process."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

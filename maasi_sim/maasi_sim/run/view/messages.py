@@ -3,8 +3,6 @@
 Topics are known by types, or the last part of their names: any bag and namespace is read.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The page that shows a run, as one HTML file: alone for a live run, or with a run inside."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Small pictures of what cameras saw as their robots measured, and where detections are in them."""
 
-from __future__ import annotations
-
 import base64
 from collections import defaultdict, deque
 from collections.abc import Callable

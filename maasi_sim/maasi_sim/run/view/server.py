@@ -5,8 +5,6 @@ need a token, and so does all else unless the server listens on this machine onl
 thread of its own: neither the run nor another browser waits for it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import hmac

@@ -1,7 +1,5 @@
 """Renders the events of a run as a video, without a browser."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """A node that shows any search: beside real robots, or beside a bag that is played."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable

@@ -5,8 +5,6 @@ The protocol is that of pyparrot 1.5.20: a handshake in JSON over TCP, then fram
 as in Parrot's minidrone.xml.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

@@ -23,8 +23,6 @@ reference" (minidrone.xml, PilotingModeChanged, mode easy).
 Frames: the position is relative to the take-off point and heading, x forward, y left, z up.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

@@ -11,8 +11,6 @@ on to others, heartbeats only where their system and component are not known
 (`MAVLink_routing::check_and_forward`, `handle_heartbeat`).
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A simulated MAVLink vehicle on a real link, in real time."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import signal

@@ -1,7 +1,5 @@
 """How a vehicle moves under the position controller of its autopilot."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
