@@ -184,8 +184,7 @@ class AgentDriver(RobotNode):
         self.link.observe(placed)
         self.silence.end()
         if self.health.end(ODOMETRY, f'{self.pose_name}: received again'):
-            # It may have been silent with the odometry.
-            self._watchdog.sensed_at = None
+            self._watchdog.sensed_at = None  # it may have been silent with the odometry
         if self.settings.lockstep:
             self.link.begin_step(placed.stamp)
         else:
@@ -233,8 +232,7 @@ class AgentDriver(RobotNode):
         robot = RobotState(placed.pose, placed.velocity, placed.angular_velocity)
         command, reached = self.link.steer(robot, step if self.settings.lockstep else None)
         if FROZEN_POSE in self.health:
-            # Such a pose cannot be controlled with.
-            command = np.zeros(4)
+            command = np.zeros(4)  # such a pose cannot be controlled with
         self._watchdog.moving = self.link.is_moving(placed, command)
         if reached is not None:
             self.goals.finish(reached)

@@ -125,8 +125,7 @@ class GoalServer:
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         goal = self._driver.follower.current
         if goal is None or goal.handle is not handle:
-            # It has ended or was replaced.
-            return CancelResponse.REJECT
+            return CancelResponse.REJECT  # it has ended or was replaced
         self._driver.end_goal(GoalStatus.CANCELED, 'cancelled')
         if not self._driver.settings.lockstep:
             self._link.hold()

@@ -218,8 +218,7 @@ class RobotFrames:
                 return
             pose = self._buffer.pose(settings.frame, self._base, stamp)
         except TransformError:
-            # The driver reports the missing pose.
-            return
+            return  # the driver reports the missing pose
         self._taken = stamp
         age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)
         if age > settings.odometry_timeout:

@@ -244,8 +244,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         if problem:
             self.health.begin(kind, problem)
         elif self.health.end(kind, recovered):
-            # The position that it held is outdated.
-            self.follower.stay()
+            self.follower.stay()  # the position that it held is outdated
 
     def offer_arm(self, arm: Callable[[], str], in_air: Callable[[], bool] = lambda: False) -> None:
         """Offer the service `arm` of a robot that takes off, or is taken over `in_air`."""

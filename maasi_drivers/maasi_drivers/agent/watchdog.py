@@ -95,8 +95,7 @@ class Watchdog:
         self._checked_at = now
         self._stalled = now - before > 2.0 * PERIOD and not self._stalled
         if self._stalled:
-            # This process was suspended: odometry may be waiting in the queue.
-            return
+            return  # this process was suspended: odometry may be waiting in the queue
         self._link.poll()
         if driver.settings.battery_minimum and now - self._charged_at > _CHARGE_PATIENCE:
             driver.warn_throttled(

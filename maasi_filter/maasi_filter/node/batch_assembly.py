@@ -59,8 +59,7 @@ class BatchAssembly:
         known = {key: item.stamp for key, item in self.pending.items()}
         known[last] = self._progress.stamp
         if known.get(number) == stamp:
-            # Duplicate batch: the planner republishes batches that may have been missed.
-            return
+            return  # duplicate batch: the planner republishes batches that may have been missed
         if number <= last or (number in self.pending and not node.settings.lockstep):
             node.drop('old batch', f'measurement_batch.id: read {number}, allowed is a new one')
             return
@@ -108,8 +107,7 @@ class BatchAssembly:
             return None
         key = (number, int(message.measurement), stamp_from_ros(message.header.stamp))
         if self._progress.heard.get(name) == key:
-            # Duplicate: drivers also republish.
-            return None
+            return None  # duplicate: drivers also republish
         self._progress.heard[name] = key
         if expected is not None:
             self._take(expected, message)
@@ -170,8 +168,7 @@ class BatchAssembly:
             # After one stamp from the future, later messages with valid stamps are not late.
             earliest, latest = min(last, expected.stamp), expected.stamp + _STAMP_AHEAD
         elif message.batch_id > self._progress.batch:
-            # Its batch may still arrive.
-            return None
+            return None  # its batch may still arrive
         else:
             # The first one, where no planner sends batches, may have any stamp up to now.
             now = self._node.get_clock().now().nanoseconds

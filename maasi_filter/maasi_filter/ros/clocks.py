@@ -63,8 +63,7 @@ class StampGate:
                 self._suspect = stamp
                 return False
         elif last is not None and stamp < last:
-            # A late message, not a jump: the reference stays at the last stamp.
-            return True
+            return True  # a late message, not a jump: the reference stays at the last stamp
         self._last = stamp
         return True
 

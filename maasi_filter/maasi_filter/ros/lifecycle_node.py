@@ -193,8 +193,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             try:
                 self.tear_down()
             except Exception:
-                # Continue with the rest.
-                self.get_logger().error(traceback.format_exc())
+                self.get_logger().error(traceback.format_exc())  # continue with the rest
         self.configured = False
         self._peers.clear()
         self._entities_made.clear()

@@ -108,8 +108,7 @@ def run(
             if rclpy.ok() and node.configured:
                 node.halt()
             node.destroy_node()
-            # A context takes with it what nobody has received yet.
-            time.sleep(_FAREWELL)
+            time.sleep(_FAREWELL)  # a context takes with it what nobody has received yet
         rclpy.try_shutdown()
         # Explicit: a forked process ends with `os._exit`, without clean-up by the interpreter.
         get_default_context(shutting_down=True).destroy()

@@ -209,8 +209,7 @@ def _visit(instance: Instance, tree: Tree, node: int, q: int) -> None:
         tree.high[node, a, k] = min(tree.high[node, a, k], high)
         place = tree.values[node, a, k - 2]
         if place < low or place > high:
-            # Where it lies inside already, nothing changes.
-            tree.dirty[node] |= 1 << a
+            tree.dirty[node] |= 1 << a  # where it lies inside already, nothing changes
     tree.visits[node, tree.number[node]] = q
     tree.number[node] += 1
     tree.reward[node] += instance.visit_reward[q]
@@ -265,8 +264,7 @@ def search(instance: Instance, tree: Tree, most: int) -> int:
             return UNFINISHED
         node = pop(tree)
         if tree.bound[node] >= tree.best[0] - GAP:
-            # No other node is better.
-            break
+            break  # no other node is better
         if tree.dirty[node]:
             solved += 1
             tree.counts[2] += 1

@@ -94,8 +94,7 @@ class Batches:
         self._guard.watch.answered(number)
         measured = [(member.robot, int(member.measurement)) for member in message.members]
         if measured and all(item in self._processed for item in measured):
-            # Duplicate, from a restarted filter.
-            return
+            return  # duplicate, from a restarted filter
         self._processed.extend(measured)
         coordinator.absorb(poses, clusters)
         self.used = max(self.used, number)

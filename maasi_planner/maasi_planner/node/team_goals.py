@@ -182,8 +182,7 @@ class TeamGoals:
                 sent.handle = handle
                 handle.get_result_async().add_done_callback(partial(self._ended, name, sent))
             else:
-                # The goal was cancelled before it was answered.
-                handle.cancel_goal_async()
+                handle.cancel_goal_async()  # the goal was cancelled before it was answered
         self._on_answer(name, sent.number, accepted)
 
     def _ended(self, name: str, sent: _Sent, future: Any) -> None:

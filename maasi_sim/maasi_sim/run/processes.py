@@ -256,8 +256,7 @@ def stop(processes: Sequence[NodeProcess]) -> list[str]:
         deadline = time.monotonic() + patience
         while any(process.is_alive() for process in rest) and time.monotonic() < deadline:
             time.sleep(0.005)
-    # The last signal is SIGKILL.
-    return [process.name for process in rest]
+    return [process.name for process in rest]  # the last signal is SIGKILL
 
 
 if _STARTED_BY in os.environ:

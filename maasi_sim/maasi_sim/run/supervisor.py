@@ -86,8 +86,7 @@ class Supervisor:
             text = f'{name} not ready {limits.start:g} s after the start'
             return Ending('not_ready', NODE_FAILED, text, [name])
         elif self._options.lockstep:
-            # A step may take long: `limits.silence` applies to awaited nodes.
-            return None
+            return None  # a step may take long: `limits.silence` applies to awaited nodes
         elif process.hangs(now, limits.heartbeat):
             text = f'{name} hangs: no heartbeat for {now - process.beaten:.1f} s'
         else:

@@ -38,8 +38,7 @@ def prepare_nodes() -> None:
         _simulate('mambo_turtlebot')
     for name in (*(f'{name}_msgs.msg' for name in _MESSAGES), *_SERVICES):
         importlib.import_module(name)
-    # Messages import it at their first use.
-    importlib.import_module('rosidl_generator_py')
+    importlib.import_module('rosidl_generator_py')  # messages import it at their first use
     # Searches of all installed packages and of all modules, which a node needs for its parameters
     # and for its first log message.
     PLANNERS.names()

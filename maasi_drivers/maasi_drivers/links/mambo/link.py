@@ -256,8 +256,7 @@ class MamboLink:
                 drone.disconnect()
             else:
                 connection.is_listening = False
-                # Its listener closes the sockets itself.
-                connection.listener_thread.join(2.0)
+                connection.listener_thread.join(2.0)  # its listener closes the sockets itself
 
     def _watch_caller(self) -> None:
         """Have the drone hover, and then land, where the caller hangs."""

@@ -145,12 +145,10 @@ class MamboRobotLink(RobotLink):
         pilot.update(now)
         self._judge(pilot)
         if link.battery >= 0.0:
-            # The drone reports only changes.
-            driver.take_charge(link.battery)
+            driver.take_charge(link.battery)  # the drone reports only changes
         state, stamp = pilot.state, driver.arrivals.stamp(now)
         if stamp is None:
-            # A simulated time has not begun: nothing is late.
-            driver.silence.end()
+            driver.silence.end()  # a simulated time has not begun: nothing is late
         elif self._mambo.pose == 'events' and pilot.has_pose and state is not None:
             driver.restart_if_back('the clock', stamp)
             latest, covariance = driver.history.latest, pilot.reckoning.covariance()

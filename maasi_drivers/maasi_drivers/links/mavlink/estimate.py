@@ -253,8 +253,7 @@ class Estimate:
         self._note_time(message.time_boot_ms, now)
         before = self._position
         if before is not None and message.time_boot_ms <= before[0]:
-            # A duplicate.
-            return
+            return  # a duplicate
         self._position = (message.time_boot_ms, values)
         if before is not None and before[1] == values and armed:
             # An estimate that moves at all never repeats to the bit: it is frozen.

@@ -115,8 +115,7 @@ def _problems(scenario: CuboidScenario) -> Problems:
         try:
             SearchAgent(name, scenario.planner, mission, robot, scenario.step)
         except ValueError as error:
-            # It begins with `name: key: `.
-            yield f'robots.{str(error).replace(": ", ".", 1)}'
+            yield f'robots.{str(error).replace(": ", ".", 1)}'  # it begins with `name: key: `
 
 
 def mission_of(scenario: CuboidScenario) -> CuboidMission:

@@ -313,8 +313,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(text.encode())
                 time.sleep(0.0 if closed else _PORTION_PERIOD)
         except OSError:
-            # The client has disconnected, or does not read.
-            pass
+            pass  # the client has disconnected, or does not read
         finally:
             self.server.keep(self.connection, -1)
 

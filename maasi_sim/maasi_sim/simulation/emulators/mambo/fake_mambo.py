@@ -82,8 +82,7 @@ def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) 
             flag, roll, pitch, yaw, climb, _ = struct.unpack('<BbbbbI', content)
             values = [max(-100, min(value, 100)) for value in (roll, pitch, yaw, climb)]
             if not flag:
-                # Without the flag the drone keeps itself level.
-                values[:2] = [0, 0]
+                values[:2] = [0, 0]  # without the flag the drone keeps itself level
             firmware.pilot(Piloting(*values))
         elif number == _TAKE_OFF:
             firmware.take_off()
@@ -326,8 +325,7 @@ class FakeMambo:
         if frame.kind == DATA_WITH_ACK:
             self._send(ACK, frame.buffer + 128, bytes([frame.sequence]))
             if self._done.get(frame.buffer) == frame.sequence:
-                # Retransmission after a lost acknowledgement.
-                return
+                return  # retransmission after a lost acknowledgement
             self._done[frame.buffer] = frame.sequence
         if frame.buffer not in (COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS):
             return

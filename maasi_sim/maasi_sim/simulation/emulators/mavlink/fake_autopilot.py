@@ -132,8 +132,7 @@ class FakeAutopilot:
         if isinstance(mode, str):
             mode = next(key for key, name in self.firmware.modes.items() if name == mode)
         self.mode = mode
-        # Height of a take-off [m].
-        self._rising_to: float | None = None
+        self._rising_to: float | None = None  # height of a take-off [m]
         # Place and yaw of the last set-point.
         self._setpoint: tuple[FloatArray, float | None] | None = (self.body.position.copy(), None)
 
@@ -147,8 +146,7 @@ class FakeAutopilot:
             self._reported_ready = True
             self.origin = self.body.position.copy()
             if self.body.submarine:
-                # Depths are from the surface.
-                self.origin[2] = 0.0
+                self.origin[2] = 0.0  # depths are from the surface
             self.say(6, 'EKF3 IMU0 is using GPS')
         self._move(dt)
         self._look_after_failsafes(dt)
