@@ -274,7 +274,14 @@ def run(
 ) -> int:
     """Run the driver of a robot until it is asked to end; return the exit code.
 
-    Link and sensor are made as by `AgentDriver`; one link may stand for a dict of them.
+    Parameters
+    ----------
+    link : callable or dict
+        What makes the link, or one for each allowed value of the parameter `link`.
+    sensor : callable
+        What makes the sensor, as `CameraInput`.
+    arguments : list of str, optional
+        Of the command line.
     """
     links = link if isinstance(link, Mapping) else {'topics': link}
     return run_node(lambda: AgentDriver(links, sensor), arguments, AgentDriver)

@@ -195,10 +195,7 @@ class CameraSettings(Settings):
         d: list[float],
         distortion_model: str = 'plumb_bob',
     ) -> CameraSettings:
-        """Return these settings with the intrinsics of a ``sensor_msgs/CameraInfo``.
-
-        Units: width, height [px]; k [px].
-        """
+        """Return these settings with the intrinsics [px] of a ``sensor_msgs/CameraInfo``."""
         if distortion_model not in ('plumb_bob', ''):
             raise ValueError(f"distortion_model: got '{distortion_model}', allowed 'plumb_bob'")
         if len(k) != 9:
