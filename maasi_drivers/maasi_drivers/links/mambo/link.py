@@ -50,29 +50,22 @@ class PositionEvent:
     received: float  # monotonic clock [s]
 
 
+@dataclass(eq=False)
 class MamboLink:
     """A connection to one Mambo, whose own thread talks to pyparrot: no call waits.
 
     That thread is a dead man's switch, too: `CALLER_TIMEOUT` after the last `keep_alive` the drone
-    hovers, and `land_after` [s] later it lands. `tilt` [rad] and `climb` [m/s] are set in the
-    drone.
+    hovers, and `land_after` later it lands.
     """
 
-    def __init__(
-        self,
-        kind: Literal['wifi', 'ble'] = 'wifi',
-        address: str = '192.168.99.3',
-        port: int = 43210,
-        tilt: float = math.radians(10.0),
-        climb: float = 0.5,
-        land_after: float = 3.0,
-    ) -> None:
-        self.kind = kind
-        self.address = address
-        self.port = port
-        self.tilt = tilt
-        self.climb = climb
-        self.land_after = land_after
+    kind: Literal['wifi', 'ble'] = 'wifi'
+    address: str = '192.168.99.3'
+    port: int = 43210
+    tilt: float = math.radians(10.0)  # set in the drone [rad]
+    climb: float = 0.5  # set in the drone [m/s]
+    land_after: float = 3.0  # [s]
+
+    def __post_init__(self) -> None:
         self.error = ''  #: fault of the link; while it is not connected it keeps trying
         self.connected = False  #: whether the drone has answered
         #: Of the drone, as pyparrot calls it: landed, takingoff, hovering, flying, ...

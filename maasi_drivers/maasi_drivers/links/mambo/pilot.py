@@ -1,6 +1,7 @@
 """A Mambo's flight: its commands from take-off to landing. Without ROS."""
 
 import math
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -40,22 +41,18 @@ class MamboPhase(Enum):
     LANDING = 'landing'
 
 
+@dataclass(eq=False)
 class MamboPilot:
     """Flies a Mambo from take-off to landing, in a fence (3, 2) [m, map]; lands it on a fault."""
 
-    def __init__(
-        self,
-        link: MamboLink,
-        motion: MotionModel,
-        settings: MamboSettings,
-        home: Pose,
-        fence: FloatArray,
-    ) -> None:
-        self.link = link
-        self.motion = motion
-        self.settings = settings
-        self.home = home
-        self.fence = fence
+    link: MamboLink
+    motion: MotionModel
+    settings: MamboSettings
+    home: Pose
+    fence: FloatArray
+
+    def __post_init__(self) -> None:
+        link, settings, home = self.link, self.settings, self.home
         self.phase = MamboPhase.CONNECTING
         self.problem = 'connecting to the Mambo'
         speed = settings.full_speed or _UNKNOWN_SPEED

@@ -16,10 +16,6 @@ _RETRY = 1.0  # between two tries to open a device that is not there [s]
 _COMPONENTS = range(mavlink.MAV_COMP_ID_USER1, mavlink.MAV_COMP_ID_USER43 + 1)
 
 
-class LinkError(RuntimeError):
-    """A connection that cannot be opened."""
-
-
 def make_sender(system: int) -> Any:
     """Return what packs the messages of a driver, with another component id at each start.
 
@@ -32,7 +28,7 @@ def make_sender(system: int) -> Any:
 def open_connection(url: str, system: int, component: int, baud: int = 57600) -> Any:
     """Return pymavlink's connection, which speaks MAVLink 2."""
     if mavlink.WIRE_PROTOCOL_VERSION != '2.0':
-        raise LinkError(
+        raise ValueError(
             'pymavlink was imported before maasi_drivers.links.mavlink and speaks MAVLink 1: set '
             'MAVLINK20=1'
         )
@@ -46,7 +42,7 @@ def open_connection(url: str, system: int, component: int, baud: int = 57600) ->
             robust_parsing=True,
         )
     except (OSError, ValueError, IndexError) as error:
-        raise LinkError(f'mavlink.url: read {url!r}: {error}') from error
+        raise ValueError(f'mavlink.url: read {url!r}: {error}') from error
 
 
 class VehicleLink:
@@ -93,7 +89,7 @@ class VehicleLink:
             connection = open_connection(
                 settings.url, settings.own_system, component, settings.baud
             )
-        except LinkError as error:
+        except ValueError as error:
             self.failure = str(error)
             return
         self._connection = self._sender.file = connection

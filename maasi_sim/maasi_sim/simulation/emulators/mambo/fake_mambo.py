@@ -139,7 +139,7 @@ def free_port() -> int:
 class FakeMambo:
     """A Mambo on this host, in real time, which a client such as pyparrot connects to.
 
-    For tests: `position_sent` is 'true', 'none', 'stuck' or 'nan'; `cut_up` and `cut_down` lose
+    For tests: `position_sent` is 'true', 'none' or 'nan'; `cut_up` and `cut_down` lose
     datagrams; `refused` counts invalid ones, `heard` commands by (project, class, id).
     """
 
@@ -160,7 +160,6 @@ class FakeMambo:
         self._unacked: dict[int, tuple[Frame, int, float]] = {}
         self._done: dict[int, int] = {}
         self._sensors_at = 0.0
-        self._stuck: Pose | None = None
         self._said: tuple[int, int] | None = None
         self._door = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._air = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -277,10 +276,6 @@ class FakeMambo:
         self._event((2, 18, 4), struct.pack('<ffffH', *turn.orientation, stamp))
         if self.position_sent == 'none':
             return
-        if self.position_sent == 'stuck':
-            self._stuck = estimate = self._stuck or estimate
-        else:
-            self._stuck = None
         x, y, z = (100.0 * estimate.position).tolist()
         if self.position_sent == 'nan':
             x = math.nan
@@ -398,3 +393,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(f'{flying.name.lower()} at {place} m, battery {charge:.0%}', flush=True)
     fake.close()
     return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -6,9 +6,7 @@ is refused in the air (`Mode::do_user_takeoff_U_m`) and ends within a tenth of i
 (`_AutoTakeoff::run`), EXTENDED_SYS_STATE tells take-off from flight
 (`GCS_MAVLINK_Copter::landed_state`), and the ground station failsafe looks at the system id of
 heartbeats alone (`GCS::sysid_is_gcs`). Positions that it reports are from the EKF's origin, which
-is where the vehicle is when the EKF starts, also after a restart. What comes on one link is passed
-on to others, heartbeats only where their system and component are not known
-(`MAVLink_routing::check_and_forward`, `handle_heartbeat`).
+is where the vehicle is when the EKF starts, also after a restart.
 """
 
 import math
@@ -85,8 +83,6 @@ class FakeAutopilot:
         self._home = 0.0  # true height at arming [m]
         # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
-        # System, component and link of what was heard; the driver is on link 0.
-        self._routes: set[tuple[int, int, int]] = set()
         self._armed_at = -math.inf
         self._station_at = math.inf
         self._failed: set[str] = set()
@@ -123,7 +119,6 @@ class FakeAutopilot:
         self.armed = self._reported_ready = False
         # The barometer is calibrated again.
         self.now = self.height_error = 0.0
-        self._routes.clear()
         self.take_mode(self._first_mode)
         self._reset_messages()
 
@@ -293,28 +288,14 @@ class FakeAutopilot:
                 self._milliseconds * 1000, fix, 0, 0, 0, 100, 100, 0, 0xFFFF, 12, 0, 0
             )
 
-    def handle(self, message: Any, link: int = 0) -> None:
-        """Take a message from one of its links, 0 is the driver's."""
+    def handle(self, message: Any) -> None:
+        """Take a message."""
         if self.crashed:
             return
-        self._route(message, link)
         target = getattr(message, 'target_system', self.settings.system)
         handler = _HANDLERS.get(message.get_type())
         if handler is not None and target in (0, self.settings.system):
             handler(self, message)
-
-    def _route(self, message: Any, link: int) -> None:
-        """Pass a message for all on to the driver, as ArduPilot does."""
-        ids = message.get_srcSystem(), message.get_srcComponent()
-        self._routes.add((*ids, link))
-        if link == 0 or getattr(message, 'target_system', 0) != 0:
-            return
-        if message.get_type() == 'HEARTBEAT':
-            passes = (*ids, 0) not in self._routes
-        else:
-            passes = any(route[2] == 0 for route in self._routes)
-        if passes:
-            self._sender.file.write(bytes(message.get_msgbuf()))
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.get_srcSystem() == self.parameters.get('SYSID_MYGCS'):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from maasi_drivers.links.mavlink.firmware import FIRMWARES
-from maasi_drivers.links.mavlink.link import LinkError, open_connection
+from maasi_drivers.links.mavlink.link import open_connection
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
@@ -130,7 +130,7 @@ def main(arguments: list[str] | None = None) -> int:
         vehicle = FakeVehicle(
             settings, options.url, Pose.from_yaw(np.zeros(3), 0.0), np.random.default_rng(1)
         )
-    except (ValueError, LinkError) as error:
+    except ValueError as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
     ended = threading.Event()
@@ -148,3 +148,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f'the autopilot crashed: {autopilot.crashed}', file=sys.stderr)
         return 3
     return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
