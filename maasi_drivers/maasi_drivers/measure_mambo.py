@@ -188,7 +188,6 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
 
 
 def _way(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> float:
-    """Return the way forward at a time of a leg, by tilts that act at once [m]."""
     course = Course(np.zeros(3), np.zeros(3), 0.0)
     ends = [begin for begin, _ in tilts[1:]] + [math.inf]
     for (begin, share), end in zip(tilts, ends, strict=True):

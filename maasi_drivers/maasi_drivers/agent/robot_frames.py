@@ -210,7 +210,6 @@ class RobotFrames:
             self._take_pose()
 
     def _take_pose(self) -> None:
-        """Take the robot's pose if tf has a newer one that is not stale."""
         settings = self._settings
         try:
             stamp = self._buffer.latest(settings.frame, self._base)

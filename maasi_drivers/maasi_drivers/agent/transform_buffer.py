@@ -82,7 +82,6 @@ class TransformBuffer:
         return path
 
     def _between(self, target: str, source: str) -> tuple[list[_Edge], list[_Edge]]:
-        """Return the edges from target and from source up to the frame above both."""
         if target == source:
             return [], []
         known = {edge.parent for edge in self._edges.values()} | self._edges.keys()

@@ -102,7 +102,6 @@ class BagReader:
             raise BagError(f'{self.path}: cannot be read: {_words(error)}') from error
 
     def _readable(self, path: Path) -> list[Path]:
-        """Return what the reader is to open: the recording, or copies of its files with an end."""
         files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
         files = [file for file in files if file.suffix == '.mcap']
         cut = [file for file in files if not has_end(file)]

@@ -188,7 +188,6 @@ def _stamp(message: Any) -> int:
 
 
 def _pose(message: Any) -> Pose | None:
-    """Return a recorded pose; None where it is none."""
     point, turn = message.position, message.orientation
     try:
         return Pose(

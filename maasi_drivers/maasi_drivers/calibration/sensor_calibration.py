@@ -116,7 +116,6 @@ def sensor_noise(
 
 
 def _nearest(seen: Sequence[FloatArray], place: FloatArray) -> list[int | None]:
-    """Return for each observation which of its detections is the target's; none: none is."""
     distances = [np.linalg.norm(spots - place, axis=1) for spots in seen]
     least = [float(item.min()) for item in distances if len(item)]
     limit = max(_FAR * float(np.median(least)), _ROUNDING) if least else 0.0

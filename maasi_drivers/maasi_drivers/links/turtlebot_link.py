@@ -111,7 +111,6 @@ class TurtlebotLink(TopicLink):
             self._place_scan()
 
     def _place_scan(self) -> None:
-        """Place the scan in the map once the odometry covers its stamp."""
         driver, message, settings = self.driver, self._scan, self.driver.settings.scan
         latest = driver.history.latest
         if message is None or latest is None or settings is None or self._motion is None:

@@ -202,7 +202,6 @@ class BatchAssembly:
             member.pose = message.pose.pose
 
     def _late(self, name: str, message: DetectionArray) -> PendingBatch | None:
-        """Return a late measurement, or one that was not asked for, as a batch of its own."""
         measurement = self._measurement(message)
         if measurement is None:
             return None

@@ -26,8 +26,6 @@ from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, Sett
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import LockstepDone
 
-__all__ = ['LockstepLifecycleNode', 'SettingsError']
-
 # Period of the check for peers [s].
 _PEERS_PERIOD = 0.02
 _DIAGNOSTICS_PERIOD = 1.0
@@ -317,7 +315,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def _check_size(
         self, topic: str, msg_type: Any, callback: Callable[[Any], None], data: bytes
     ) -> None:
-        """Call back with a serialised message unless it is too large."""
         limit = self.settings.largest_message
         if len(data) <= limit:
             callback(deserialize_message(data, msg_type))

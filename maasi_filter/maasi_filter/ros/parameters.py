@@ -168,7 +168,6 @@ def choices(annotation: Any) -> list[Any]:
 
 
 def _argument(annotation: Any, kind: type) -> Any:
-    """Return the type of the elements of a list, or of the values of a dictionary, or None."""
     found = [get_args(item)[-1] for item in choices(annotation) if get_origin(item) is kind]
     return found[0] if found else None
 

@@ -251,7 +251,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._try_step()
 
     def _check_link(self) -> None:
-        """Decide without other robots if the link is silent for too long."""
         if not self.active or self._sent_step != self._wanted_step:
             return
         patience = self.settings.link_patience * self.settings.step

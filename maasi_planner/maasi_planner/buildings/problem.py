@@ -165,7 +165,6 @@ class PlanSolver:
         return instance, base - float(rewards[1]) * len(due), due
 
     def _bounds(self, problem: Problem, give: float) -> tuple[FloatArray, FloatArray]:
-        """Return the bounds of the rows: positions, velocities, forces, and ways to brake."""
         horizon, dynamics = self.settings.horizon, self.dynamics
         area = np.asarray(problem.area, dtype=float)
         parts = horizon - 1, horizon, horizon
@@ -207,7 +206,6 @@ class PlanSolver:
 
 
 def _due(problem: Problem, place: FloatArray) -> tuple[list[int], BoolArray]:
-    """Return the cuboids that are visited at P_1, which is given, and the other wanted ones."""
     wanted = np.asarray(problem.wanted, dtype=bool).copy()
     if problem.homing:
         return [], np.zeros_like(wanted)

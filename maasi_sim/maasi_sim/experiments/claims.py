@@ -142,7 +142,6 @@ def _difference(gap: Interval) -> str:
 
 
 def _ratio(first: np.ndarray, second: np.ndarray) -> str:
-    """Return the mean ratio on the same maps with its bootstrap interval, '' if there is none."""
     known = ~np.isnan(first) & ~np.isnan(second)
     first, second = first[known], second[known]
     if (first <= 0.0).any() or (second <= 0.0).any() or (first == second).all():

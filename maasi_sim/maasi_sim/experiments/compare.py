@@ -152,7 +152,6 @@ def _new_folder() -> Path:
 
 
 def _refuse_others(campaigns: Sequence[Campaign], out: Path) -> None:
-    """Refuse a folder with whole searches of the same names and seeds but other settings."""
     other = sum(
         file.exists() and file not in work.complaints
         for work in campaigns

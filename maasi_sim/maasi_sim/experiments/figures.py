@@ -114,7 +114,6 @@ def _frame(axes: Axes) -> None:
 
 
 def _mark_published(axes: Axes, results: Results, styles: Mapping[str, str]) -> None:
-    """Mark on the top line when the paper's methods have found all, with its confidence."""
     label: str | None = "all found, the paper's"
     published = {
         item.case: item
@@ -138,7 +137,6 @@ def _mark_published(axes: Axes, results: Results, styles: Mapping[str, str]) -> 
 
 
 def _draw_path(figure: Figure, place: tuple[int, int, int], results: Results, run: Run) -> None:
-    """Draw where the robots measured, the true targets, and those found, in 2D or 3D."""
     scenario = results.case(run.case).settings['scenario']
     bounds = np.array(scenario['environment']['bounds'], dtype=float)
     dimension = len(bounds)

@@ -26,8 +26,6 @@ from rosbags.typesys.store import Typestore
 
 from maasi_drivers.calibration.bag_reader import BagError, BagReader
 
-__all__ = ['Bag', 'BagError', 'BagWriteError', 'BagWriter', 'load_types', 'topic_qos']
-
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 SCENARIO_TOPIC = '/scenario'

@@ -137,7 +137,6 @@ def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> l
 
 
 def _may_go(path: Path, domain: int | None) -> bool:
-    """Return whether no process can be about to open an unused port or segment again."""
     number = path.name.removeprefix('fastrtps_port')
     if number == path.name:
         return True

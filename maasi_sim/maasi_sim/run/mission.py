@@ -123,7 +123,6 @@ class Observer(ABC):
                 yield item
 
     def _complete(self, record: RunRecord, end: RunEnd) -> None:
-        """Add how the run ended, ways and events to a record; the time of its end is set."""
         record.end_reason, record.wall_time = end.reason, end.wall_time
         # Several steps after the end may have been taken.
         own = [event for event in self._events if event['time'] <= record.end_time]

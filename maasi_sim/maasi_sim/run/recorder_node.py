@@ -303,7 +303,6 @@ class Recorder:
         return max(stamp, before) if known else self.time
 
     def _note_planner(self, status: DiagnosticStatus) -> None:
-        """Note what a planner says between its decisions: its error, and the exploration."""
         if not status.name.endswith('/planner_node'):
             return
         if status.level != DiagnosticStatus.ERROR:
@@ -364,7 +363,6 @@ class Recorder:
             self._last_step = self.step
 
     def _belongs(self, topic: str, data: bytes) -> bool:
-        """Return whether a message is not of a step after the last one."""
         if self._last_step < 0:
             return True
         kind = self._subscriptions[topic].msg_type

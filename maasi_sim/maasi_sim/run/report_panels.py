@@ -130,7 +130,6 @@ def _map_views(figure: Figure, place: SubplotSpec, area: FloatArray) -> list[Map
 
 
 def _shades(colour: str) -> LinearSegmentedColormap:
-    """Return the shades of a robot's colour, from light at the beginning to dark at the end."""
     middle = np.array(to_rgb(colour))
     return LinearSegmentedColormap.from_list(
         colour, [0.4 * middle + 0.6, middle, 0.6 * middle], N=64
@@ -156,7 +155,6 @@ def _draw_way(view: MapView, path: FloatArray, colour: str, end: float, label: s
 
 
 def _draw_times(axes: Axes, colours: Mapping[str, str], end: float) -> None:
-    """Draw a band for each robot: which shade of its way is which time [s]."""
     for row, colour in enumerate(colours.values()):
         axes.imshow(
             np.linspace(0.0, 1.0, 256)[None, :],
@@ -191,7 +189,6 @@ def _add_legend(figure: Figure, views: Sequence[MapView]) -> None:
 
 
 def _write_rows(axes: Axes, rows: Sequence[tuple[str, str]]) -> None:
-    """Write names and values below each other, with space for at least ten."""
     axes.set_axis_off()
     for index, (key, value) in enumerate(rows):
         height = 1.0 - (index + 0.5) / max(len(rows), 10)

@@ -280,7 +280,6 @@ class ScenarioRun:
         return ending
 
     def _turn(self) -> Ending | None:
-        """Take what nodes have sent; return an ending if the run is over, or a node has failed."""
         recorder, observer, limit = self.recorder, self.observer, self._limits.time
         time.sleep(_POLL if self.supervisor.running else _START_POLL)
         recorder.drain(round(limit * 1e9))

@@ -118,7 +118,6 @@ class Supervisor:
         self.events.append({'time': time_, 'node': name, 'event': event, **details})
 
     def _standstill(self, now: float) -> Ending:
-        """Return the ending of a run whose time has stopped."""
         silence = f'for {self._scenario.limits.silence:g} s'
         if self._options.follow_clock:
             text = f'/clock, which this run follows, stands still {silence}'

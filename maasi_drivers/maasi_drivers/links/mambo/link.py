@@ -252,7 +252,6 @@ class MamboLink:
                 connection.listener_thread.join(2.0)  # its listener closes the sockets itself
 
     def _watch_caller(self) -> None:
-        """Have the drone hover, and then land, where the caller hangs."""
         late = time.monotonic() - self._called_at - CALLER_TIMEOUT
         if late <= 0.0 or not self.airborne:
             return
@@ -303,7 +302,6 @@ class MamboLink:
             self._drone.fly_direct(*steering)
 
     def _take(self, name: str, value: Any, sensors: Any) -> None:
-        """Take one number of an event; called by pyparrot's thread."""
         if self.kind == 'ble':
             self._fresh = True
             self.heard_at = time.monotonic()

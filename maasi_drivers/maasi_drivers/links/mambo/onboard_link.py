@@ -180,7 +180,6 @@ class OnboardLink(RobotLink):
         driver.take_pose(replace(placed, covariance=self._mambo.pose_covariance()))
 
     def _next_order(self, pose: FeedPose, place: Pose) -> str:
-        """Order what the flight needs next; return why no goals are taken, or nothing."""
         mambo, now = self._mambo, time.monotonic()
         self._feed_state = pose.state
         if self._landed_for:

@@ -173,7 +173,6 @@ class MamboPilot:
         return self.link.error or self._unfit() or self._low_battery() or unheard or silent
 
     def _unfit(self) -> str:
-        """Return which parameter keeps it on the ground, or nothing."""
         if not self.settings.arm:
             return NOT_ALLOWED
         if self.settings.full_speed is None:
@@ -329,7 +328,6 @@ class MamboPilot:
         return f'battery at {charge:.2f}, below {minimum:.2f}' if 0.0 <= charge < minimum else ''
 
     def _missing(self, now: float) -> str:
-        """Return what has been missing for longer than the timeout, or nothing."""
         for text, since in (
             ('link lost: nothing from the Mambo', self.link.heard_at),
             ('no position', self._placed_at),

@@ -203,7 +203,6 @@ class DeadReckoning:
             self.push = np.clip(self.push + change[:2], -_MOST_PUSH, _MOST_PUSH)
 
     def _at(self, time: float) -> tuple[FloatArray, float]:
-        """Return position and heading at a time, from the sample before it."""
         if not self._past:
             return self.course.position, self.course.yaw
         earlier = (item for item in reversed(self._past) if item[0] <= time)

@@ -100,7 +100,6 @@ class FlightOrigin:
             self._log.add(WARNING, f'the origin of the flight cannot be kept: {error}')
 
     def _load(self, booted: float) -> FloatArray | None:
-        """Return what was kept of this autopilot since it is on, for this place in the map."""
         try:
             item = json.loads(self._path.read_text()) if self._path is not None else {}
             host, before = item['boot']

@@ -236,7 +236,6 @@ class MavlinkRobotLink(RobotLink):
             self.driver.follower.stay()
 
     def _align(self, placed: StampedPose) -> None:
-        """Compute where the autopilot's frame is in the map, from its pose at the same time."""
         local = self._local_poses.at(placed.stamp) or self._local_poses.latest
         if local is None or abs(local.stamp - placed.stamp) > _LONGEST_LAG:
             return

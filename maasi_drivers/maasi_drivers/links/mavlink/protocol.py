@@ -6,8 +6,6 @@ from pymavlink import mavutil
 
 mavlink = mavutil.mavlink
 
-__all__ = ['mavlink', 'mavutil']
-
 ERROR, WARNING, INFO, DEBUG = 3, 4, 6, 7  # of MAV_SEVERITY
 _TEXT_AGE = 6.0  # texts of the autopilot that are younger explain a refusal [s]
 

@@ -233,7 +233,6 @@ class Vehicle(Autopilot):
                 self._detail = f'mode {name}'
 
     def _own_modes(self, before: int) -> set[int]:
-        """Return the allowed modes: any other one is the pilot's or a failsafe's."""
         external = self._firmware.external
         if self.phase in (VehiclePhase.ARMING, VehiclePhase.RISING, VehiclePhase.FLYING):
             return {external}
@@ -313,7 +312,6 @@ class Vehicle(Autopilot):
             work(now)
 
     def _is_due(self, now: float, period: float) -> bool:
-        """Return whether a request may be sent again, and note that it is."""
         if now - self._tried_at < period or self.commands:
             return False
         self._tried_at = now

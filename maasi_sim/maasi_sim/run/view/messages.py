@@ -118,7 +118,6 @@ class MessageEvents:
         return max(now - self._begin, 0.0)
 
     def _time(self, message: Any) -> float:
-        """Return the time of any other message: a latched one may be old [s]."""
         if self._begin is None:
             return 0.0
         return max(seconds(message.header.stamp) - self._begin, 0.0)
@@ -245,7 +244,6 @@ class MessageEvents:
         self.maker.truth(self.maker.latest, np.array(points).reshape(-1, 3)[:, :size])
 
     def _take_markers(self, topic: str, message: Any) -> None:
-        """Take obstacles and buildings of a run without scenario."""
         parts: dict[str, list[Any]] = {}
         for item in message.markers:
             part = _PARTS.get((topic.rpartition('/')[2], item.ns.rpartition('/')[2]), '')

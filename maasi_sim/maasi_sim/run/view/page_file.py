@@ -32,7 +32,6 @@ def write_replay(log: EventLog, path: Path, largest: int = LARGEST) -> None:
 
 @cache
 def _page() -> str:
-    """Return the page with style and modules: browsers load no modules beside a local file."""
     names = ('index.html', 'page.css', *(f'{name}.js' for name in _MODULES.split()))
     text, style, *modules = ((FOLDER / name).read_text(encoding='utf-8') for name in names)
     # In one scope nothing is imported.

@@ -107,7 +107,6 @@ class Hub:
         return text or ': \n\n', (generation, position), closed
 
     def _thin(self) -> None:
-        """Halve what changes gradually, until a tenth of the room is free."""
         while len(self._events) > 0.9 * self._most and self._period < 1e5:
             self._period *= 2.0
             self._events = thin(self._events, self._period)

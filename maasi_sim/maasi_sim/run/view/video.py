@@ -213,7 +213,6 @@ class Sheet:
         self._used.clear()
 
     def _next(self, kind: str, make: Callable[[], Any]) -> Any:
-        """Have an artist of a kind drawn, and return it; it is made where none is free."""
         pool, number = self._pool[kind], self._used[kind]
         if number == len(pool):
             pool.append(make())
@@ -222,7 +221,6 @@ class Sheet:
         return pool[number]
 
     def _line(self, places: ArrayLike, style: str, **options: Any) -> None:
-        """Draw places (n, 2 or 3) [m]; in the plane without their height."""
         points = np.asarray(places, dtype=float)
         points = points.reshape(-1, points.shape[-1] if points.ndim > 1 else 3)[:, : self.size].T
         line = self._next(style, lambda: self._axes.plot(*points, style)[0])
@@ -235,7 +233,6 @@ class Sheet:
         label.set(text=text, **options)
 
     def _mark(self, row: list[float], deviations: float, **style: Any) -> None:
-        """Draw a place [m]; in the plane with the ellipse of its covariance."""
         x, y, z, xx, xy, _, yy, *_ = row
         self._line([x, y, z], 'o', ms=4, **style)
         if self.size == 2:

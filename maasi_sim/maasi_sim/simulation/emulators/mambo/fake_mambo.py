@@ -222,7 +222,6 @@ class FakeMambo:
                     last = now
 
     def _advance(self, dt: float) -> None:
-        """Advance by `dt` seconds, and send due messages."""
         firmware = self.firmware
         firmware.advance(dt)
         self._tell_state()

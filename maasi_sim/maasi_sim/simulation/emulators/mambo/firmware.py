@@ -250,7 +250,6 @@ class MamboFirmware:
         return self.charge.charge <= self.settings.critical_charge
 
     def _look_after(self) -> None:
-        """Land, or change the flying state, without a command."""
         state, settings = self.flying_state, self.settings
         if state in (FlyingState.LANDED, FlyingState.LANDING, FlyingState.EMERGENCY):
             return

@@ -90,7 +90,6 @@ class FakeAutopilot:
         self._reset_messages()
 
     def _reset_messages(self) -> None:
-        """Send the messages that are sent by default, at their periods [s]."""
         self._sent_at: dict[str, float] = {}
         self.periods = dict.fromkeys(
             ('HEARTBEAT', 'BATTERY_STATUS', 'EXTENDED_SYS_STATE', 'GPS_RAW_INT'), 1.0
@@ -210,7 +209,6 @@ class FakeAutopilot:
             self.take_mode(firmware.land)
 
     def _acts(self, kind: str, *names: str) -> bool:
-        """Return whether a failsafe acts now, for the first time since arming."""
         if kind in self._failed or not any(self.parameters.get(name, 0) for name in names):
             return False
         self._failed.add(kind)
