@@ -98,10 +98,7 @@ class RobotFrames:
         self._taken: int | None = None
         self._publisher: Publisher | None = None
         self._static_publisher: Publisher | None = None
-        self._connect()
-
-    def _connect(self) -> None:
-        node, settings = self._node, self._settings
+        settings = node.settings
         self._type: Any = None
         try:
             from tf2_msgs.msg import TFMessage

@@ -218,10 +218,10 @@ def draw_decision_times(figure: Figure, results: Results) -> None:
     for offset, quantity in ((-0.2, 'centralized'), (0.2, 'distributed')):
         ours = [float(np.mean(results.values(name, quantity))) for name in names]
         axes.bar(places + offset, ours, 0.35, label=f'{quantity}, ours')
-        theirs = {p.case: p.value for p in results.experiment.published if p.quantity == quantity}
+        theirs = results.experiment.published_of(quantity)
         axes.plot(
             places + offset,
-            [theirs.get(name, np.nan) for name in names],
+            [theirs[name].value if name in theirs else np.nan for name in names],
             '_',
             ms=22,
             color=_PAPER_COLOUR,

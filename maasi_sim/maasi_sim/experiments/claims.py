@@ -121,10 +121,8 @@ def _pair(results: Results, claim: Claim, quantity: Quantity) -> Finding | None:
 
 
 def _published(experiment: Experiment, case: str, quantity: str) -> Interval | None:
-    for item in experiment.published:
-        if (item.case, item.quantity) == (case, quantity):
-            return from_published(item.value, item.half_width, item.runs)
-    return None
+    item = experiment.published_of(quantity).get(case)
+    return from_published(item.value, item.half_width, item.runs) if item else None
 
 
 def _printed(item: Interval, quantity: Quantity) -> str:

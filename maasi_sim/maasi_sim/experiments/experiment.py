@@ -177,6 +177,10 @@ class Experiment:
         """Return a quantity by its name."""
         return next(item for item in self.quantities if item.name == name)
 
+    def published_of(self, quantity: str) -> dict[str, Published]:
+        """Return the paper's numbers for a quantity by case."""
+        return {item.case: item for item in self.published if item.quantity == quantity}
+
 
 @dataclass
 class Results:

@@ -115,11 +115,7 @@ def _frame(axes: Axes) -> None:
 
 def _mark_published(axes: Axes, results: Results, styles: Mapping[str, str]) -> None:
     label: str | None = "all found, the paper's"
-    published = {
-        item.case: item
-        for item in results.experiment.published
-        if item.quantity == 'measurements_to_find_all'
-    }
+    published = results.experiment.published_of('measurements_to_find_all')
     for name, key in styles.items():
         if name in published:
             axes.errorbar(
@@ -227,9 +223,7 @@ def draw_table(
     figure.set_size_inches(1.3 + 1.45 * len(columns), 0.8 + 0.62 * len(rows))
     plot = figure.add_subplot()
     plot.axis('off')
-    published = {
-        item.case: item for item in results.experiment.published if item.quantity == quantity
-    }
+    published = results.experiment.published_of(quantity)
     cells, means = [], np.full((len(rows), len(columns)), np.nan)
     for i, row in enumerate(rows):
         line = []

@@ -104,7 +104,6 @@ class Row:
 def rows(results: Results) -> Iterator[Row]:
     """Yield the table of an experiment: every quantity of every case."""
     experiment = results.experiment
-    published = {(item.case, item.quantity): item for item in experiment.published}
     for name in results.names():
         preset = results.case(name).preset
         for quantity in experiment.quantities:
@@ -114,7 +113,7 @@ def rows(results: Results) -> Iterator[Row]:
                 continue
             ours = interval(results, name, quantity)
             middle = median(values, quantity) if finished else math.nan
-            theirs = published.get((name, quantity.name))
+            theirs = experiment.published_of(quantity.name).get(name)
             paper = gap = None
             if theirs is not None:
                 paper = from_published(theirs.value, theirs.half_width, theirs.runs)

@@ -143,10 +143,11 @@ class MavlinkRobotLink(RobotLink):
         """Return the state of the vehicle."""
         with self._link.lock:
             vehicle = self._link.vehicle
+            read = {} if vehicle.failsafes is None else vehicle.failsafes.values
             return {
                 'vehicle': vehicle.phase.name,
                 'in the air': vehicle.in_air,
-                **{f'parameter {key}': item for key, item in vehicle.parameters.items()},
+                **{f'parameter {key}': item for key, item in read.items()},
                 **{f'ignored: {key}': number for key, number in vehicle.estimate.dropped.items()},
             }
 

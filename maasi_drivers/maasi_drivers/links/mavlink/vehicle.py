@@ -1,7 +1,6 @@
 """One vehicle from its first heartbeat to the end: phases of a flight. No wire, no thread."""
 
 import math
-from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -92,12 +91,6 @@ class Vehicle(Autopilot):
         """Whether it is armed, and not on the ground."""
         landed = self.estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND
         return self.armed and not landed
-
-    @property
-    def parameters(self) -> Mapping[str, float | None]:
-        """Of the failsafes, as read; None where the autopilot does not have it."""
-        failsafes = self.failsafes
-        return {} if failsafes is None else failsafes.values
 
     @property
     def at_rest(self) -> bool:
