@@ -47,6 +47,6 @@ setup(
             'robot_command = maasi_entry:robot_command',
             'measure_mambo = maasi_entry:measure_mambo',
             'guard_node = maasi_entry:guard_node',
-        ],
+        ]
     },
 )

@@ -51,6 +51,6 @@ setup(
             'view_node = maasi_entry:view_node',
             'compare = maasi_entry:compare',
             'run_scenario = maasi_entry:run_scenario',
-        ],
+        ]
     },
 )

@@ -1,7 +1,5 @@
 """The command that gives a sensor's noise R from a recording of one target."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
@@ -21,8 +19,7 @@ from maasi_drivers.settings.camera import load_calibration
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.parameters import parameter_fields, unflatten
 
-# Mean errors above this multiple of their standard deviation are significant.
-_CLEAR = 4.0
+_CLEAR = 4.0  # mean errors above this multiple of their standard deviation are significant
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -172,7 +169,3 @@ def main(arguments: list[str] | None = None) -> int:
             print(f'error: --json: {options.json}: {error.strerror}', file=sys.stderr)
             return 2
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,9 +1,4 @@
-"""The drivers of the suite, each a link to its robot and a sensor; executables by their names.
-
-A link to vehicles is imported by the driver that uses it: MAVLink needs an extra of the package.
-"""
-
-from __future__ import annotations
+"""The drivers of the suite by executable; MAVLink, an extra, is imported where it is used."""
 
 from functools import partial
 from pkgutil import resolve_name
@@ -20,7 +15,6 @@ from maasi_filter.ros.run_node import run
 
 
 def _link(name: str, driver: RobotNode) -> RobotLink:
-    """Return the link of a class, `module:Class` in the folder of the links."""
     try:
         link: RobotLink = resolve_name(f'maasi_drivers.links.{name}')(driver)
     except ModuleNotFoundError as error:

@@ -1,7 +1,5 @@
 """The guard of a robot: a small process that stops the robot when its driver dies or hangs."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -96,8 +94,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
 
     def _on_liveliness(self, lease: float, event: Any) -> None:
         if lease != self._lease:
-            # Of an earlier configuration.
-            return
+            return  # of an earlier configuration
         self._lost = event.alive_count == 0
         if not self._lost:
             self._heard = True
@@ -117,8 +114,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         self._publisher.refresh()
         # Repeated: Nav2 may have been about to accept the driver's last goal.
         if self._stop_timer is not None and self._nav2.service_is_ready():
-            # Without an id: all its goals.
-            self._nav2.call_async(CancelGoal.Request())
+            self._nav2.call_async(CancelGoal.Request())  # without an id: all its goals
 
     def _command_zeros(self) -> None:
         if self._stop_timer is None:
@@ -132,7 +128,3 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
 def main(arguments: list[str] | None = None) -> int:
     """Run the guard."""
     return run(GuardNode, arguments)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

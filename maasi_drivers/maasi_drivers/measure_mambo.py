@@ -1,11 +1,8 @@
 """A command that measures how fast a Mambo flies at its largest tilt: `mambo.full_speed`.
 
-Each leg is the largest tilt one way and then the other for the same time T, from rest. Without
-drag a leg is g tan(tilt) T^2 long and ends at rest; with drag it is shorter, so that its length is
-bounded in advance for any drone. Then it hovers, and flies back.
+Each leg is the largest tilt one way and then the other for the same time T, from rest: without drag
+g tan(tilt) T^2 long, a bound for any drone. Then it hovers, and flies back.
 """
-
-from __future__ import annotations
 
 import argparse
 import math
@@ -24,17 +21,14 @@ from maasi_drivers.links.mambo.reckoning import Course, TiltModel
 from maasi_drivers.settings.vehicles import LEAST_TILT, MOST_TILT
 from maasi_filter.arrays import FloatArray
 
-# Rest before each leg: the first part for the firmware to stop it [s].
-_REST, _STOPPING = 3.0, 1.8
-# Above this multiple of the planned distance it has not followed the command.
-_EXCESS = 1.5
+_REST, _STOPPING = 3.0, 1.8  # rest before each leg: the first part for the firmware to stop it [s]
+_EXCESS = 1.5  # above this multiple of the planned distance it has not followed the command
 # Longest silence, and longest waits for take-off and connection [s].
 _SILENCE, _PATIENCE = 1.5, 15.0
 _LEAST_BATTERY = 0.2
 # Largest residual of a fit [m], and relative uncertainty of the speed [1].
 _MOST_MISFIT, _MOST_DOUBT = 0.05, 0.35
-# Drag [1/s] and delay [s] that are searched.
-_LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)
+_LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)  # drag [1/s] and delay [s] that are searched
 
 
 class MeasurementError(RuntimeError):
@@ -52,11 +46,7 @@ class MeasuredSpeed:
 
 @dataclass
 class Leg:
-    """One leg: from rest, one way and back.
-
-    `tilts` are time since `begin` [s] and share of the largest tilt forward, `events` time since
-    `begin` and place forward of the take-off point [m].
-    """
+    """A leg from rest; tilts (share of the largest) and places forward [m] by time from begin."""
 
     begin: float  # monotonic clock [s]
     origin: float  # where it rested, forward of the take-off point [m]
@@ -133,7 +123,6 @@ class MeasuringFlight:
         self.link.steer(0.0, 0.0, 0.0, 0.0)
 
     def _look(self) -> PositionEvent | None:
-        """Check the link; return a new position event, or None."""
         link, now = self.link, self.clock()
         link.keep_alive()
         event = link.position
@@ -199,7 +188,6 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
 
 
 def _way(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> float:
-    """Return the way forward at a time of a leg, by tilts that act at once [m]."""
     course = Course(np.zeros(3), np.zeros(3), 0.0)
     ends = [begin for begin, _ in tilts[1:]] + [math.inf]
     for (begin, share), end in zip(tilts, ends, strict=True):
@@ -217,8 +205,7 @@ _ALLOWED = {
     'port': (1024, 65535),
 }
 _PERIOD = 0.05
-# Longest wait for it to land [s].
-_LANDING = 15.0
+_LANDING = 15.0  # longest wait for it to land [s]
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -248,7 +235,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Event) -> None:
-    """Fly, land, and print the result."""
     flight = MeasuringFlight(link, options.way, options.legs, time.monotonic)
     said = ''
     try:

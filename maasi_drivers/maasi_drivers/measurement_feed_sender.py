@@ -1,7 +1,5 @@
 """Segments images and sends what it sees as a measurement feed: what runs on board of a robot."""
 
-from __future__ import annotations
-
 import argparse
 import signal
 import socket

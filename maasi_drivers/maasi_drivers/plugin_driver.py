@@ -1,7 +1,5 @@
 """Runs a driver of a user's own: `plugin_driver module:Class`, or the name of an installed one."""
 
-from __future__ import annotations
-
 import sys
 
 from maasi_drivers.settings.driver import DRIVERS

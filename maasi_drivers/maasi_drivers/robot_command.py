@@ -1,7 +1,5 @@
 """Show the state of a robot, or send it to a waypoint: for manual tests."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import signal
@@ -30,8 +28,7 @@ _STATUS = {
     AgentState.ABORTED: 'goal given up',
     AgentState.UNAVAILABLE: 'cannot go on',
 }
-# Longest wait for the answer to a cancelled goal [s].
-_CANCEL_TIME = 5.0
+_CANCEL_TIME = 5.0  # longest wait for the answer to a cancelled goal [s]
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -63,8 +60,6 @@ def _metres(text: str) -> float:
 
 
 class _User:
-    """A node that waits for one robot."""
-
     def __init__(self, node: Node, options: argparse.Namespace) -> None:
         self._node = node
         self._options = options
@@ -77,7 +72,6 @@ class _User:
     def _wait(
         self, condition: Callable[[], object], timeout: float = math.inf, *, patient: bool = False
     ) -> bool:
-        """Return whether a condition came true before the timeout, and, if not patient, Ctrl-C."""
         end = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > end or (self._interrupted.is_set() and not patient):
@@ -86,7 +80,6 @@ class _User:
         return True
 
     def _require(self, condition: Callable[[], object], what: str) -> None:
-        """Wait for something; end the command where it does not come."""
         if self._wait(condition, self._options.timeout):
             return
         if self._interrupted.is_set():

@@ -3,8 +3,6 @@
 A package of its own, because importing a module of the others loads NumPy and rclpy first.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 from functools import partial

@@ -1,7 +1,5 @@
 """One colour for one thing: on the page (`colours.js` has the same), in pictures and in RViz."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 FOUND, POTENTIAL, SEEN, AWAY = '#009E73', '#E69F00', '#CC79A7', '#8B929B'

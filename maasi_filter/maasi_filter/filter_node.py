@@ -415,7 +415,3 @@ def _is_due(rate: float, now: float, last: float) -> bool:
 def main(arguments: list[str] | None = None) -> int:
     """Run the filter node."""
     return run(FilterNode, arguments)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

@@ -1,7 +1,5 @@
 """Found targets of a filter, its own and those of other filters (002, section 4)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -11,8 +9,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
 from maasi_filter.vector_math import squared_distance
 
-# Gate on the squared normalised distance of two estimates of the same target.
-SAME_TARGET = 16.0
+SAME_TARGET = 16.0  # gate on the squared normalised distance of two estimates of the same target
 
 
 def distance(position: FloatArray, covariance: FloatArray, target: FoundTarget) -> float:
@@ -48,8 +45,7 @@ class FoundTargets:
             f = known.index(True) if any(known) else nearest(target, estimates)
             old = self.targets[f] if f >= 0 else None
             if old is not None and not any(known) and (old.time, old.robot) <= (target.time, robot):
-                # Another one found it first.
-                continue
+                continue  # another one found it first
             number = self.next_id() if old is None else old.id
             new = replace(target, id=number, robot=robot, origin=target.id)
             if old is None:

@@ -1,7 +1,5 @@
 """Metrics of the estimate of a set of targets."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

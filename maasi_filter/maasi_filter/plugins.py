@@ -1,7 +1,5 @@
 """Plugins: classes found by entry point, or by `module:Class`. See `docs/plugins.md`."""
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 import importlib

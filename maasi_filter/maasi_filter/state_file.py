@@ -5,8 +5,6 @@ as JSON with one array for all numbers of a type. What has the right version and
 written by this module, so that its content is not checked.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -3,8 +3,6 @@
 Multiplications and additions may be fused, so that the last bit depends on the processor.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -19,8 +17,7 @@ MAGIC = 6755399441055744.0
 LOG2_E = 1.4426950408889634
 LOG_2_HIGH = 6.93147180369123816490e-01
 LOG_2_LOW = 1.90821492927058770002e-10
-# Below this exp(x) is taken as 0.
-LEAST_EXPONENT = -708.0
+LEAST_EXPONENT = -708.0  # below this exp(x) is taken as 0
 
 
 def _generate_wide_vectors(context: Any) -> Any:

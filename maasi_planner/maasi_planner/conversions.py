@@ -3,8 +3,6 @@
 The checks raise `ValueError` naming the field, what was read, and what is allowed.
 """
 
-from __future__ import annotations
-
 import array
 import math
 from collections.abc import Collection
@@ -36,8 +34,7 @@ from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.team import Decision, RobotDecision
 
-# J of an inadmissible candidate; messages contain finite numbers only.
-NOT_ALLOWED = -1e30
+NOT_ALLOWED = -1e30  # J of an inadmissible candidate; messages contain finite numbers only
 
 
 def _robot_to_ros(name: str, index: int, decision: RobotDecision) -> RobotDecisionMessage:

@@ -1,7 +1,5 @@
 """Measurement trigger: periodic, or by expected information (000, (24), (33))."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

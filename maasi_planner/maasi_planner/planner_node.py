@@ -491,7 +491,3 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 def main(arguments: list[str] | None = None) -> int:
     """Run the planner node."""
     return run(PlannerNode, arguments)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

@@ -1,7 +1,5 @@
 """Start, pause, resume, send home or stop a search, the team's or one robot's; arm vehicles."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import time
@@ -19,8 +17,7 @@ DONE, REFUSED, ABSENT, INTERRUPTED = 0, 1, 2, 130
 # Commands that only drivers have.
 _OF_DRIVERS = ('release', 'arm')
 _TRIGGER = 'std_srvs/srv/Trigger'
-# Discovery ends this long after the last new service [s].
-_SETTLED = 1.0
+_SETTLED = 1.0  # discovery ends this long after the last new service [s]
 
 
 def build_parser() -> argparse.ArgumentParser:

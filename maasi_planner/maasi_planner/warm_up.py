@@ -1,7 +1,5 @@
 """Compile, or load from the cache, every kernel that a decision uses."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maasi_filter.area import Area

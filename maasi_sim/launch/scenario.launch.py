@@ -1,7 +1,6 @@
 """Launch a run of a scenario: ros2 launch maasi_sim scenario.launch.py scenario:=FILE.
 
-It starts `run_scenario`, which starts the nodes, records and writes the report. The launch ends
-with it. Exit status: 0 if `run_scenario` exited with 0, else 1, after an error with its exit code.
+It ends with `run_scenario`; exit status: 0 if that exited with 0, else 1, and its code in an error.
 """
 
 from launch import LaunchContext, LaunchDescription

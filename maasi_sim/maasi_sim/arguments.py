@@ -1,13 +1,10 @@
 """Command lines: what was read and what is allowed, when an option or a number is wrong."""
 
-from __future__ import annotations
-
 from argparse import ArgumentParser, ArgumentTypeError
 from difflib import get_close_matches
 from typing import Any
 
-# Largest parameter of a ROS node.
-LARGEST = 2**63 - 1
+LARGEST = 2**63 - 1  # largest parameter of a ROS node
 
 
 class Parser(ArgumentParser):

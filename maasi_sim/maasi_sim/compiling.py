@@ -1,7 +1,5 @@
 """A word on stderr while kernels are compiled: once on a machine, for a minute or two."""
 
-from __future__ import annotations
-
 import sys
 from time import perf_counter
 from typing import Any
@@ -10,8 +8,7 @@ from numba.core.event import Listener, install_listener
 
 # Of compiling: before it is said, which a function or two do not reach, and between two words [s].
 PATIENCE, PERIOD = 1.0, 10.0
-# Of the suite, in a first search, about.
-KERNELS = 80
+KERNELS = 80  # of the suite, in a first search, about
 
 
 class _Compiling(Listener):

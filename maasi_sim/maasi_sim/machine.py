@@ -1,9 +1,4 @@
-"""On what a run was made: processor and versions, as far as they change the last bits of numbers.
-
-See docs/repeatability.md.
-"""
-
-from __future__ import annotations
+"""On what a run was made, as far as it changes the last bits (docs/repeatability.md)."""
 
 import hashlib
 import platform

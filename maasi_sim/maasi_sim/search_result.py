@@ -1,7 +1,5 @@
 """The result of a search in one process."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -24,12 +22,9 @@ from maasi_sim.scenario.schema import Scenario
 class SearchState(FoundCount):
     """State of a search after a measurement batch."""
 
-    #: Of the true targets among those found [m]; nan without any.
-    rmse: float
-    #: Robots that measured.
-    members: tuple[str, ...]
-    #: Of all robots, (3,) [m].
-    positions: dict[str, FloatArray]
+    rmse: float  #: of the true targets among those found [m]; nan without any
+    members: tuple[str, ...]  #: robots that measured
+    positions: dict[str, FloatArray]  #: of all robots, (3,) [m]
 
 
 @dataclass

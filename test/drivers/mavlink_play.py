@@ -38,6 +38,32 @@ class Wire:
         return messages
 
 
+class RoutingAutopilot(FakeAutopilot):
+    """One with two links: what comes on link 1 for all is passed on to the driver, as by ArduPilot.
+
+    Heartbeats only where their system and component are not known there
+    (`MAVLink_routing::check_and_forward`, `handle_heartbeat`).
+    """
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.heard = set()
+
+    def handle(self, message, link=0):
+        ids = message.get_srcSystem(), message.get_srcComponent()
+        if link == 0:
+            self.heard.add(ids)
+        elif getattr(message, 'target_system', 0) == 0 and not self.crashed:
+            heartbeat = message.get_type() == 'HEARTBEAT'
+            if ids not in self.heard if heartbeat else self.heard:
+                self._sender.file.write(bytes(message.get_msgbuf()))
+        super().handle(message)
+
+    def restart(self):
+        super().restart()
+        self.heard.clear()
+
+
 class Play:
     """Both sides, and what went over the wire; `stranger` is called as what others do meanwhile."""
 
@@ -49,7 +75,7 @@ class Play:
         self.height, self._memory = HEIGHTS[firmware], memory
         self.to_driver, self.to_autopilot = Wire(), Wire()
         self.stranger = lambda: None
-        self.autopilot = FakeAutopilot(
+        self.autopilot = RoutingAutopilot(
             AutopilotSettings.model_validate({'firmware': firmware} | (autopilot or {})),
             mavlink.MAVLink(self.to_driver, 1, 1),
             0.3,

@@ -1,7 +1,5 @@
 """The driver of a robot: a node that joins a link, a sensor, goals, and answers to batches."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -81,12 +79,8 @@ class AgentDriver(RobotNode):
         super().__init__(**options)
         self._links = links
         self._make_sensor = make_sensor
-        # What has to be closed.
-        self._opened: list[RobotLink | SensorInput] = []
-        # Outlives *cleanup* and *configure*, but not the process.
-        self._stop_latched = False
-
-    # ---- life cycle --------------------------------------------------------------------------
+        self._opened: list[RobotLink | SensorInput] = []  # what has to be closed
+        self._stop_latched = False  # outlives *cleanup* and *configure*, but not the process
 
     def prepare(self) -> None:
         """Make link, sensor and controller."""
@@ -188,15 +182,12 @@ class AgentDriver(RobotNode):
             **self.link.status(),
         }
 
-    # ---- what link and sensor report ---------------------------------------------------------
-
     def take_pose(self, placed: StampedPose) -> None:
         """Take the robot's pose, and do the control step for it."""
         self.link.observe(placed)
         self.silence.end()
         if self.health.end(ODOMETRY, f'{self.pose_name}: received again'):
-            # It may have been silent with the odometry.
-            self._watchdog.sensed_at = None
+            self._watchdog.sensed_at = None  # it may have been silent with the odometry
         if self.settings.lockstep:
             self.link.begin_step(placed.stamp)
         else:
@@ -250,16 +241,12 @@ class AgentDriver(RobotNode):
         if self.health.text and self.history.latest is None:
             self._state.publish_status(self.get_clock().now().nanoseconds)
 
-    # ---- the control step --------------------------------------------------------------------
-
     def _control(self, placed: StampedPose) -> None:
-        """Judge the goal, and publish state and command."""
         step = self.step_of(placed.stamp)
         robot = RobotState(placed.pose, placed.velocity, placed.angular_velocity)
         command, reached = self.link.steer(robot, step if self.settings.lockstep else None)
         if FROZEN_POSE in self.health:
-            # Such a pose cannot be controlled with.
-            command = np.zeros(4)
+            command = np.zeros(4)  # such a pose cannot be controlled with
         self._watchdog.moving = self.link.is_moving(placed, command)
         if reached is not None:
             self.goals.finish(reached)
@@ -271,13 +258,10 @@ class AgentDriver(RobotNode):
         self.goals.publish_feedback(placed)
 
     def _on_robots(self, message: LockstepStep) -> None:
-        """Give the goal up when the robot leaves, in lockstep."""
         self.goals.away = self.robot not in message.robots
         if self.goals.away and self.active:
             self.end_goal(GoalStatus.ABORTED, 'left')
             self.follower.let_go()
-
-    # ---- the services stop and release -------------------------------------------------------
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._stop_latched = True

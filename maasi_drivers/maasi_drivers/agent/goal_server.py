@@ -1,7 +1,5 @@
 """The action `go_to` of a robot: which goals it takes, and how they end."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np
@@ -19,12 +17,7 @@ _SETTLE_TIME, _LAST_TASKS = 0.3, 5
 
 
 class GoalServer:
-    """Takes goals of `go_to` (maasi_msgs/GoToWaypoint).
-
-    The newest goal replaces the one before, and the robot turns to it without a stop. One that
-    cannot be taken is aborted at once, with the reason in its result: the protocol has no reason
-    in a rejection.
-    """
+    """Takes goals of `go_to`, each in place of the one before; a bad one is aborted, with why."""
 
     def __init__(self, driver: RobotNode, link: RobotLink) -> None:
         self._driver = driver
@@ -109,10 +102,7 @@ class GoalServer:
             return f'tolerance: read {request.tolerance}, allowed are finite numbers from 0 [m]'
         return self._link.goal_problem(position)
 
-    # ---- the action --------------------------------------------------------------------------
-
     def _answer(self, handle: ServerGoalHandle) -> None:
-        """Take a goal, or abort it with the reason."""
         request = handle.request
         problem = self.problem(request)
         # After `problem`, which transforms the waypoint into the map.
@@ -138,8 +128,7 @@ class GoalServer:
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         goal = self._driver.follower.current
         if goal is None or goal.handle is not handle:
-            # It has ended or was replaced.
-            return CancelResponse.REJECT
+            return CancelResponse.REJECT  # it has ended or was replaced
         self._driver.end_goal(GoalStatus.CANCELED, 'cancelled')
         if not self._driver.settings.lockstep:
             self._link.hold()

@@ -1,7 +1,5 @@
 """A robot's answers to measurement batches: batch, image and pose to detections."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any
@@ -35,12 +33,7 @@ class MeasurementRequest:
 
 
 class MeasurementQueue:
-    """Matches requests, images (or sweeps) and poses, in any order of arrival.
-
-    An image answers one request at most: it is one measurement.
-
-    Units: offset [ns].
-    """
+    """Matches requests with images (or sweeps), one for each, and poses, in any order."""
 
     def __init__(
         self, history: PoseHistory, offset: int = 0, frames: int = 8, requests: int = 16
@@ -51,8 +44,7 @@ class MeasurementQueue:
         self._frames: deque[tuple[int, Any]] = deque(maxlen=frames)
         self._requests: list[MeasurementRequest] = []
         self._capacity = requests
-        #: Stamp of the last image [ns].
-        self.latest: int | None = None
+        self.latest: int | None = None  #: stamp of the last image [ns]
 
     def __len__(self) -> int:
         return len(self._requests)
@@ -77,8 +69,7 @@ class MeasurementQueue:
     def next(self) -> tuple[MeasurementRequest, int, Any, StampedPose] | None:
         """Return the next request that can be answered, stamp and image for it, and the pose then.
 
-        The image is taken; the request stays until `answered`, so that another image can take the
-        place of one that turns out bad. None while something is awaited.
+        The image is taken; the request stays until `answered`: another image may have to answer it.
         """
         latest = self.history.latest
         if not self._requests or latest is None:
@@ -101,8 +92,7 @@ class MeasurementQueue:
         self._requests.remove(request)
 
 
-# How far stamps of images or batches may be ahead of the odometry [ns].
-_AHEAD = 2_000_000_000
+_AHEAD = 2_000_000_000  # how far stamps of images or batches may be ahead of the odometry [ns]
 
 
 class MeasurementResponder:
@@ -189,10 +179,7 @@ class MeasurementResponder:
                 return
 
     def _is_ahead(self, reason: str, what: str, stamp: int) -> bool:
-        """Return whether a stamp [ns] is far ahead of the odometry, and drop it then.
-
-        In lockstep the step decides, and nothing is ahead of it.
-        """
+        """Return whether a stamp [ns] is far ahead of the odometry, and drop it then."""
         latest = self._driver.history.latest
         if self._driver.settings.lockstep or latest is None or stamp <= latest.stamp + _AHEAD:
             return False

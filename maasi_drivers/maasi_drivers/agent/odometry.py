@@ -1,7 +1,5 @@
 """Odometry placed in the map, velocities from poses, and poses at a stamp. Without ROS."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from dataclasses import dataclass, field
@@ -155,11 +153,7 @@ class PoseHistory:
         self._poses.clear()
 
     def at(self, stamp: int) -> StampedPose | None:
-        """Return the pose at a stamp [ns], interpolated between its neighbours.
-
-        None where the stamp is before the first pose kept or after the last one: nothing is
-        extrapolated, the caller waits for the next odometry.
-        """
+        """Return the pose at a stamp [ns], interpolated; None outside of those kept."""
         poses = self._poses
         if not poses or not poses[0].stamp <= stamp <= poses[-1].stamp:
             return None
@@ -174,10 +168,7 @@ class PoseSpeed:
         self._before: tuple[int, Pose] | None = None
 
     def place(self, stamp: int, pose: Pose) -> StampedPose:
-        """Return a pose with velocities by the difference from the one before; zero at first.
-
-        Units: stamp [ns].
-        """
+        """Return a pose at a stamp [ns], with velocities by the difference from the one before."""
         velocity, turning = np.zeros(3), np.zeros(3)
         before, self._before = self._before, (stamp, pose)
         if before is not None and 0 < stamp - before[0] < 1_000_000_000:

@@ -1,7 +1,5 @@
 """A robot's frames on /tf and /tf_static, its description, and poses of other nodes there."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -59,10 +57,7 @@ def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
 
 
 def robot_description(robot: str, settings: DriverSettings) -> str:
-    """Return the URDF of a robot: a cylinder of its radius, and the frames of its sensors.
-
-    Links have the names of the frames. The height is not known: it is drawn as the radius.
-    """
+    """Return the URDF of a robot: a cylinder as high as its radius, and its sensors' frames."""
     root = ElementTree.Element('robot', name=robot)
     link = ElementTree.SubElement(root, 'link', name=base_frame(robot, settings))
     for part in ('visual', 'collision'):
@@ -81,10 +76,7 @@ def robot_description(robot: str, settings: DriverSettings) -> str:
 
 
 class RobotFrames:
-    """The frames of one robot, on the team's `tf` and `tf_static`.
-
-    In lockstep these are not read: only the robot's own frames are known.
-    """
+    """The frames of one robot, on the team's `tf` and `tf_static`, unread in lockstep."""
 
     def __init__(
         self,
@@ -106,11 +98,7 @@ class RobotFrames:
         self._taken: int | None = None
         self._publisher: Publisher | None = None
         self._static_publisher: Publisher | None = None
-        self._connect()
-
-    def _connect(self) -> None:
-        """Connect, and publish what does not change."""
-        node, settings = self._node, self._settings
+        settings = node.settings
         self._type: Any = None
         try:
             from tf2_msgs.msg import TFMessage
@@ -150,8 +138,6 @@ class RobotFrames:
         """Discard what moves, as after a jump of the clock."""
         self._buffer.clear()
         self._slot = self._taken = None
-
-    # ---- what is published -------------------------------------------------------------------
 
     def publish(self, placed: StampedPose, map_from_odom: Pose) -> None:
         """Publish where the robot is, `tf_rate` times a second of its stamps at most."""
@@ -196,8 +182,6 @@ class RobotFrames:
         if self._static_publisher is not None and self._static:
             self._static_publisher.publish(self._type(transforms=[*self._static.values()]))
 
-    # ---- what others publish -----------------------------------------------------------------
-
     def _read(self, topic: str, message: Any) -> None:
         for item in message.transforms:
             try:
@@ -223,7 +207,6 @@ class RobotFrames:
             self._take_pose()
 
     def _take_pose(self) -> None:
-        """Take the robot's pose if tf has a newer one that is not stale."""
         settings = self._settings
         try:
             stamp = self._buffer.latest(settings.frame, self._base)
@@ -231,8 +214,7 @@ class RobotFrames:
                 return
             pose = self._buffer.pose(settings.frame, self._base, stamp)
         except TransformError:
-            # The driver reports the missing pose.
-            return
+            return  # the driver reports the missing pose
         self._taken = stamp
         age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)
         if age > settings.odometry_timeout:
@@ -253,12 +235,7 @@ class RobotFrames:
             raise ValueError(f'header.frame_id: read {frame[:40]!r}, {allowed}') from error
 
     def to_map(self, waypoint: PoseStamped, now: int) -> str | None:
-        """Bring a waypoint into the map; return what is wrong where that is not possible.
-
-        A waypoint without a stamp is one in its frame as it is now.
-
-        Units: now [ns].
-        """
+        """Bring a waypoint into the map at a time [ns]; return what is wrong where it cannot be."""
         header, settings = waypoint.header, self._settings
         frame = header.frame_id.strip('/')
         if header.frame_id == settings.frame:

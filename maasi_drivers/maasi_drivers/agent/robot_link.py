@@ -3,8 +3,6 @@
 # Optional hooks do nothing.
 # ruff: noqa: B027
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -35,8 +33,6 @@ class RobotLink(ABC):
         self.driver = driver
         #: Lowest and highest x, y, z of goals, (3, 2) [m, map], beside the driver's bounds.
         self.fence: FloatArray = np.tile([-math.inf, math.inf], (3, 1))
-
-    # ---- every link --------------------------------------------------------------------------
 
     @abstractmethod
     def connect(self) -> None:
@@ -72,8 +68,6 @@ class RobotLink(ABC):
     def status(self) -> dict[str, Any]:
         """Return values for the diagnostics."""
         return {}
-
-    # ---- life cycle and goals, where a robot needs them --------------------------------------
 
     def prepare(self) -> None:
         """Check the settings, before `connect`; `SettingsError` for what is not allowed."""
@@ -113,8 +107,6 @@ class RobotLink(ABC):
     def goal_cancelled(self) -> None:
         """Take note that a client cancelled the goal, after `hold`."""
 
-    # ---- control, where a robot differs ------------------------------------------------------
-
     def make_motion(self) -> MotionModel:
         """Return the controller."""
         settings = self.driver.settings
@@ -127,8 +119,6 @@ class RobotLink(ABC):
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
         """Return whether this command must change pose and images."""
         return bool(math.hypot(*command[:3]) > 0.02 or abs(command[3]) > 0.05)
-
-    # ---- lockstep ----------------------------------------------------------------------------
 
     def begin_step(self, stamp: int) -> None:
         """Take in what is older than the step at `stamp` [ns], before its control step."""

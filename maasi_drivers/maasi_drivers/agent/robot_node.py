@@ -1,7 +1,5 @@
 """The node of one robot, as its link, its sensor and the parts of its driver see it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -22,11 +20,7 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 
 
 class ArrivalClock:
-    """The node's time at any instant of the steady clock.
-
-    Simulated time arrives in steps and late, so that its largest recent lead over the steady clock
-    is the true one. With system time the result is exact.
-    """
+    """The node's time at any instant of the steady clock, by its largest recent lead over that."""
 
     def __init__(self) -> None:
         # Instants of the last 2 s [s] and leads of the node's time [ns], with falling leads.
@@ -99,10 +93,7 @@ class Health:
 
 @dataclass(frozen=True)
 class FeedPeer:
-    """The only sender of a measurement feed that is used: its address, and what takes its poses.
-
-    `on_pose` takes the stamp [ns] and the `FeedPose` of each image.
-    """
+    """The only sender of a measurement feed that is used: its address, and what takes its poses."""
 
     address: str
     on_pose: Callable[[int, Any], None]
@@ -259,15 +250,10 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         if problem:
             self.health.begin(kind, problem)
         elif self.health.end(kind, recovered):
-            # The position that it held is outdated.
-            self.follower.stay()
+            self.follower.stay()  # the position that it held is outdated
 
     def offer_arm(self, arm: Callable[[], str], in_air: Callable[[], bool] = lambda: False) -> None:
-        """Offer the service `arm` (std_srvs/Trigger) of a robot that takes off.
-
-        `arm` gives the permission, or returns why it is refused; `in_air` tells whether the robot
-        flies already, and is taken over.
-        """
+        """Offer the service `arm` of a robot that takes off, or is taken over `in_air`."""
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             problem = '' if self.active else 'the driver is not active'

@@ -1,7 +1,5 @@
 """What a robot says on topics: poses by odometry or a localiser, and the charge."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -137,11 +135,7 @@ class BatteryTopic:
         self._driver.take_charge(charge)
 
     def take_before(self, stamp: int) -> None:
-        """In lockstep: take the readings of the steps before the one at `stamp` [ns].
-
-        Whether a reading arrives before the odometry of its own step depends on the scheduler; by
-        the next step it has arrived in any case.
-        """
+        """In lockstep: take the readings before a stamp [ns], which have arrived in any case."""
         handle = self._subscription.handle
         while (taken := handle.take_message(BatteryState, False)) is not None:
             self._on_battery(taken[0])

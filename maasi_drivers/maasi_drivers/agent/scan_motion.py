@@ -1,7 +1,5 @@
 """A ground robot's laser scan: placed in the map, and avoided by a dynamic window. Without ROS."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -18,14 +16,10 @@ from maasi_planner.motion.dynamic_window import window_command
 from maasi_planner.obstacles import is_clear, next_point
 from maasi_planner.settings import MotionSettings
 
-# Size of the cells in which points count as one [m].
-_CELL = 0.03
-# Number of headings that are tried where the straight way is blocked.
-_HEADINGS = 72
-# Cost of a change of the last heading, relative to that of a detour [1/rad].
-_STEADINESS = 0.3
-# Below this distance the robot touches the point, and may still leave it [m].
-_SKIN = 1e-3
+_CELL = 0.03  # size of the cells in which points count as one [m]
+_HEADINGS = 72  # number of headings that are tried where the straight way is blocked
+_STEADINESS = 0.3  # cost of a change of the last heading, relative to that of a detour [1/rad]
+_SKIN = 1e-3  # below this distance the robot touches the point, and may still leave it [m]
 
 
 def scan_points(
@@ -36,10 +30,7 @@ def scan_points(
     placed: StampedPose,
     mount: ArrayLike,
 ) -> FloatArray:
-    """Return where the beams of a scan ended, (n, 2) in the map [m].
-
-    Shapes and units: angles [rad]; seconds_per_beam [s]; mount (3,) [m, rad].
-    """
+    """Return where the beams of a scan ended, (n, 2) in the map [m]."""
     distances = np.asarray(ranges, dtype=float)
     names = ('angle_min', 'angle_increment', 'range_min', 'range_max', 'time_increment')
     for name, value in zip(names, (*angles, *limits, seconds_per_beam), strict=True):
@@ -68,7 +59,6 @@ def scan_points(
 
 @njit(cache=True)
 def _is_free(x: float, y: float, heading: float, reach: float, circles: FloatArray) -> bool:
-    """Return whether a heading is free of circles for `reach` metres."""
     end_x = x + reach * math.cos(heading)
     end_y = y + reach * math.sin(heading)
     return is_clear((x, y, 0.0), (end_x, end_y, 0.0), circles, 0.0, False)
@@ -84,11 +74,10 @@ def way_around(
     reach: float,
     before: float,
 ) -> tuple[float, float, float]:
-    """
-    Return a point to head for that is free for `reach` metres or up to the target, and its heading.
+    """Return a free point towards the target, at most `reach` away [m], and the heading to it.
 
-    The target itself where the straight way is free, else the free heading that is nearest to it
-    and to the one chosen before (not a number: none was); the target where no heading is free.
+    Free headings near the straight way and the one chosen before are preferred; the target itself
+    where the straight way is free, or none is.
     """
     dx = target_x - x
     dy = target_y - y
@@ -120,13 +109,7 @@ def way_around(
 
 
 class ScanUnicycle(Unicycle):
-    """A ground robot that keeps clear of known obstacles and of what its scanner sees.
-
-    Ways around known obstacles are planned; what is seen beside them is avoided locally, so that
-    the robot can get stuck in a pocket: the driver gives up a waypoint that gets no nearer.
-
-    Units: radius [m].
-    """
+    """A ground robot that plans around known obstacles and avoids what its scanner sees locally."""
 
     def __init__(
         self, settings: MotionSettings, area: Area, radius: float, scan: ScanSettings

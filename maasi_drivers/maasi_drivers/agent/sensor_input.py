@@ -1,7 +1,5 @@
 """A robot's sensor as its driver uses it, and a sensor of range, bearing and elevation."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from typing import Generic, TypeVar
@@ -68,11 +66,7 @@ class SensorInput(ABC, Generic[DataT]):
 
 
 class RangingMount:
-    """Turns sweeps of a mounted sensor into measurements from the robot's position.
-
-    R of the sensor is that of range, bearing and elevation in its own frame; in a planar search the
-    elevation has the noise of the bearing.
-    """
+    """Turns sweeps of a mounted sensor, by its R, into measurements from the robot's position."""
 
     def __init__(self, settings: RangingSettings, sensor: Sensor) -> None:
         self._model = sensor.measurement
@@ -87,11 +81,7 @@ class RangingMount:
     def measurements(
         self, sweep: FloatArray, pose: StampedPose
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what the robot measured.
-
-        Shapes and units: sweep (m, 3) [rad]; returned: values (m, d) [m, rad], covariances (m, d,
-        d), positions (m, d) [m, map].
-        """
+        """Return values (m, d), covariances and positions in the map of a sweep (m, 3) [m, rad]."""
         d = self._model.dimension
         if not len(sweep):
             return np.zeros((0, d)), np.zeros((0, d, d)), np.zeros((0, d))

@@ -28,12 +28,9 @@ _ANY_ANGLE = np.pi**2 / 3.0
 def measured(
     model: MeasurementModel, positions: FloatArray, covariances: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray]:
-    """Return range and angles of targets, and their covariances, to first order.
+    """Return range and angles of targets (n, d) [m, map], and their covariances, to first order.
 
     Right over a target the bearing says nothing: its variance is that of a uniform angle at most.
-
-    Shapes and units: positions (n, d) [m, map], covariances (n, d, d) [m^2]; returned the same [m,
-    rad].
     """
     # Straight above there is no derivative: that of a nanometre beside.
     beside = np.array(positions)

@@ -1,9 +1,4 @@
-"""A buffer of the transforms on /tf: where a frame was in another one at a stamp. Without ROS.
-
-Of its own, as the wheels of ROS 2 have no tf2_ros.
-"""
-
-from __future__ import annotations
+"""Transforms on /tf, at any stamp, without ROS: the wheels of ROS 2 have no tf2_ros."""
 
 from dataclasses import dataclass, field
 
@@ -16,8 +11,7 @@ from maasi_filter.ros.clocks import StampGate
 # Upper bound on frames, against floods.
 _MOST_FRAMES = 2000
 _LONGEST_NAME = 200
-# A stamp that is farther from the one before is one of another time [ns].
-_JUMP = 10_000_000_000
+_JUMP = 10_000_000_000  # a stamp that is farther from the one before is one of another time [ns]
 
 
 class TransformError(LookupError):
@@ -61,12 +55,7 @@ class TransformBuffer:
     def add(
         self, parent: str, child: str, pose: Pose, stamp: int = 0, *, static: bool = False
     ) -> None:
-        """Add a transform; a frame that has another parent from now on loses what was known of it.
-
-        Stamps of a transform have to grow.
-
-        Units: stamp [ns].
-        """
+        """Add a transform, later than before [ns]; a frame with a new parent loses its old ones."""
         for name in (parent, child):
             if not 0 < len(name) <= _LONGEST_NAME:
                 raise ValueError(
@@ -87,14 +76,12 @@ class TransformBuffer:
             edge.add(stamp, pose)
 
     def _path(self, frame: str) -> list[str]:
-        """Return a frame and those above it, up to its root."""
         path = [frame]
         while (edge := self._edges.get(path[-1])) is not None:
             path.append(edge.parent)
         return path
 
     def _between(self, target: str, source: str) -> tuple[list[_Edge], list[_Edge]]:
-        """Return the edges from target and from source up to the frame above both."""
         if target == source:
             return [], []
         known = {edge.parent for edge in self._edges.values()} | self._edges.keys()
@@ -113,18 +100,12 @@ class TransformBuffer:
         return ups, downs
 
     def latest(self, target: str, source: str) -> int | None:
-        """Return the latest stamp [ns] at which all transforms between two frames are known.
-
-        None where all of them are static.
-        """
+        """Return the latest stamp [ns] known of all between two frames; None: all are static."""
         ups, downs = self._between(target, source)
         return min((edge.last for edge in [*ups, *downs] if edge.last is not None), default=None)
 
     def pose(self, target: str, source: str, stamp: int | None = None) -> Pose:
-        """Return the pose of frame `source` in frame `target`; by default at `latest`.
-
-        Units: stamp [ns].
-        """
+        """Return the pose of `source` in `target` at a stamp [ns], by default at `latest`."""
         stamp = self.latest(target, source) if stamp is None else stamp
         sides = []
         for edges in self._between(target, source):

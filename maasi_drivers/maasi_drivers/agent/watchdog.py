@@ -1,7 +1,5 @@
 """The topic `state` of a robot, and the faults that its driver finds by itself."""
 
-from __future__ import annotations
-
 import time
 
 from maasi_drivers.agent.odometry import StampedPose
@@ -97,8 +95,7 @@ class Watchdog:
         self._checked_at = now
         self._stalled = now - before > 2.0 * PERIOD and not self._stalled
         if self._stalled:
-            # This process was suspended: odometry may be waiting in the queue.
-            return
+            return  # this process was suspended: odometry may be waiting in the queue
         self._link.poll()
         if driver.settings.battery_minimum and now - self._charged_at > _CHARGE_PATIENCE:
             driver.warn_throttled(

@@ -1,7 +1,5 @@
 """What a robot does about its goal: go there, hold, stop. Without ROS."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntEnum
@@ -26,11 +24,9 @@ class GoalStatus(IntEnum):
 
 @dataclass(eq=False)
 class Goal:
-    """A waypoint (3,) of a robot [m, map].
+    """A waypoint (3,) of a robot [m, map] by the id of its decision, in effect after `step`.
 
-    `id` is the index of its decision plus one; it takes effect from the step after `step` on.
-    Within `tolerance` it counts as reached; 0: the robot's own [m]. `handle` is that of its client;
-    `reason` says why it ended without success.
+    Reached within `tolerance` [m], 0: the robot's own. `reason` says why it ended without success.
     """
 
     id: int
@@ -43,10 +39,7 @@ class Goal:
 
 
 class WaypointFollower:
-    """Steers a robot to its waypoints and holds it there; `goal` is the last that took effect.
-
-    Without a goal a ground robot stands still; the controller of a flying one holds its position.
-    """
+    """Steers a robot to its waypoints and holds it there; `goal` is the last that took effect."""
 
     def __init__(self, motion: MotionModel) -> None:
         self.motion = motion
@@ -91,11 +84,7 @@ class WaypointFollower:
         return math.hypot(*offset[:2]) if self.on_ground else math.hypot(*offset)
 
     def update(self, state: RobotState, step: int | None = None) -> tuple[FloatArray, Goal | None]:
-        """Return the command (4,) of a control step, and the goal that is reached in it.
-
-        vx, vy, vz [m/s, body], yaw rate [rad/s]. With a step a goal acts from the one after its
-        own, else at once.
-        """
+        """Return vx, vy, vz [m/s, body] and yaw rate of a step, and the goal reached in it."""
         position = state.pose.position
         if self._next is not None and (step is None or step > self._next.step):
             self.goal, self._next = self._next, None

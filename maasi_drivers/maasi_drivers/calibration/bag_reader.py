@@ -1,7 +1,5 @@
 """Read recordings (rosbag2), also MCAP files whose end is missing."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import tempfile
@@ -104,7 +102,6 @@ class BagReader:
             raise BagError(f'{self.path}: cannot be read: {_words(error)}') from error
 
     def _readable(self, path: Path) -> list[Path]:
-        """Return what the reader is to open: the recording, or copies of its files with an end."""
         files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
         files = [file for file in files if file.suffix == '.mcap']
         cut = [file for file in files if not has_end(file)]
@@ -172,6 +169,5 @@ class BagReader:
 
 
 def _words(error: Exception) -> str:
-    """Return an error on one line, of bounded length."""
     text = ' '.join(str(error).split()) or type(error).__name__
     return text if len(text) <= 300 else f'{text[:297]}...'

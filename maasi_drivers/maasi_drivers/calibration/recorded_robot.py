@@ -1,7 +1,5 @@
 """A robot in a recording: where it was, and its images or detections."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -190,7 +188,6 @@ def _stamp(message: Any) -> int:
 
 
 def _pose(message: Any) -> Pose | None:
-    """Return a recorded pose; None where it is none."""
     point, turn = message.position, message.orientation
     try:
         return Pose(

@@ -1,7 +1,5 @@
 """A sensor's noise R from observations at one target, as in 000, section 5.2."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,8 +10,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 
-# Least number of observations for a covariance.
-LEAST_OBSERVATIONS = 10
+LEAST_OBSERVATIONS = 10  # least number of observations for a covariance
 # Detections farther from the target than this multiple of the median are of something else.
 _FAR = 8.0
 # Below this all detections agree to rounding [m].
@@ -31,39 +28,17 @@ class Observation:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """A sensor's noise.
+    """A sensor's noise, and the observations that it rests on."""
 
-    Attributes
-    ----------
-    covariance : ndarray, shape (d, d)
-        R: of the errors of range [m], bearing and, in 3D, elevation [rad].
-    bias : ndarray, shape (d,)
-        Their mean.
-    target : ndarray, shape (d,)
-        Where the target is [m, map]: as given, or the mean of where it was seen.
-    ranges : tuple of float
-        Smallest and largest range of the observations that were used [m].
-    used : int
-        Observations from which R is estimated.
-    near : int
-        Observations left out because the target was too near for a bearing.
-    others : int
-        Detections of something else.
-    inside : int
-        Observations with the target in the field of view.
-    missed : int
-        Of those, the ones that did not show it.
-    """
-
-    covariance: FloatArray
-    bias: FloatArray
-    target: FloatArray
-    ranges: tuple[float, float]
-    used: int
-    near: int
-    others: int
-    inside: int
-    missed: int
+    covariance: FloatArray  # R, (d, d): of the errors of range [m] and angles [rad]
+    bias: FloatArray  # (d,): their mean
+    target: FloatArray  # (d,): as given, or the mean of where it was seen [m, map]
+    ranges: tuple[float, float]  # smallest and largest of those used [m]
+    used: int  # observations from which R is estimated
+    near: int  # left out because the target was too near for a bearing
+    others: int  # detections of something else
+    inside: int  # observations with the target in the field of view
+    missed: int  # of those, the ones that did not show it
 
     @property
     def deviations(self) -> FloatArray:
@@ -82,12 +57,9 @@ def sensor_noise(
     target: ArrayLike | None = None,
     least_range: float = 0.05,
 ) -> SensorNoise:
-    """Return a sensor's noise.
+    """Return a sensor's noise by observations of a target (d,) [m, map].
 
-    In each observation the detection nearest to the target counts, unless it is eight times as far
-    as the median.
-
-    Shapes and units: target (d,) [m, map]; least_range [m].
+    The nearest detection counts, unless it is eight times as far from the target as the median.
     """
     model = sensor.measurement
     seen = [model.inverse(observation.values, observation.pose) for observation in observations]
@@ -144,7 +116,6 @@ def sensor_noise(
 
 
 def _nearest(seen: Sequence[FloatArray], place: FloatArray) -> list[int | None]:
-    """Return for each observation which of its detections is the target's; none: none is."""
     distances = [np.linalg.norm(spots - place, axis=1) for spots in seen]
     least = [float(item.min()) for item in distances if len(item)]
     limit = max(_FAR * float(np.median(least)), _ROUNDING) if least else 0.0

@@ -1,7 +1,5 @@
 """A robot with ROS topics for odometry, battery and velocity commands."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -27,10 +25,7 @@ _TYPES: dict[str, type] = {
 
 
 class CommandPublisher:
-    """Publishes commands as TwistStamped, as Twist, or as what is subscribed.
-
-    TurtleBot3s of Jazzy listen to TwistStamped, those of Humble to Twist, on the same topic.
-    """
+    """Publishes TwistStamped (TurtleBot3 of Jazzy), Twist (of Humble) or what is subscribed."""
 
     def __init__(self, node: Node, topic: str, kind: CommandType, lockstep: bool = False) -> None:
         self._node = node
@@ -82,8 +77,7 @@ class CommandPublisher:
 _ZERO = (0.0, 0.0, 0.0, 0.0)
 # At the end: commands, and longest wait until the last one has arrived [s].
 _STOP_COMMANDS, _STOP_TIME = 3, Duration(seconds=0.3)
-# Polls from one look for the guard to the next.
-_GUARD_POLLS = 5
+_GUARD_POLLS = 5  # polls from one look for the guard to the next
 
 
 class TopicLink(RobotLink):

@@ -1,7 +1,5 @@
 """Ground robots with topics: by the driver's own commands, with a laser scan, or by Nav2."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,10 +21,8 @@ from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.qos import sensor_reader
 from maasi_planner.motion import MotionModel, RobotState
 
-# Kind of fault.
-_SCAN = 'scan'
-# A distance to the waypoint that is smaller by this is progress [m].
-_PROGRESS = 0.02
+_SCAN = 'scan'  # kind of fault
+_PROGRESS = 0.02  # a distance to the waypoint that is smaller by this is progress [m]
 
 
 class TurtlebotLink(TopicLink):
@@ -43,8 +39,7 @@ class TurtlebotLink(TopicLink):
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
-        # Its controller, where it uses the scan.
-        self._motion: ScanUnicycle | None = None
+        self._motion: ScanUnicycle | None = None  # its controller, where it uses the scan
         self.reset()
 
     def make_motion(self) -> MotionModel:
@@ -99,7 +94,6 @@ class TurtlebotLink(TopicLink):
         return command, reached
 
     def _without_progress(self, placed: StampedPose) -> float:
-        """Return for how long it has come no nearer to its waypoint [s]."""
         follower = self.driver.follower
         goal = follower.goal
         if goal is None or goal.status != GoalStatus.MOVING:
@@ -116,7 +110,6 @@ class TurtlebotLink(TopicLink):
             self._place_scan()
 
     def _place_scan(self) -> None:
-        """Place the scan in the map once the odometry covers its stamp."""
         driver, message, settings = self.driver, self._scan, self.driver.settings.scan
         latest = driver.history.latest
         if message is None or latest is None or settings is None or self._motion is None:
@@ -271,7 +264,6 @@ class Nav2Link(TurtlebotLink):
                 self.driver.end_goal(status, reason)
 
     def _stop_replaced(self) -> None:
-        """Cancel the goal before, where Nav2 has not taken another one instead."""
         handle, self._replaced = self._replaced, None
         if handle is not None:
             handle.cancel_goal_async()

@@ -107,15 +107,10 @@ class SegmentationSettings(Settings):
 
 
 class MountSettings(Settings):
-    """Where the camera sits on the robot (frames as in REP-103: x forward, y left, z up).
-
-    With ``rpy`` zero the camera looks along the robot's x axis, image top up. A pitch of pi/2 looks
-    straight down, the image's top towards the robot's front.
-    """
+    """Where the camera sits on the robot (REP-103); without rpy it looks forward, image top up."""
 
     position: Vector3 = Field(
-        default=[0.0, 0.0, 0.0],
-        description="Optical centre in the robot's frame [m]",
+        default=[0.0, 0.0, 0.0], description="Optical centre in the robot's frame [m]"
     )
     rpy: Vector3 = Field(
         default=[0.0, 1.5707963267948966, 0.0],
@@ -229,10 +224,7 @@ class CameraSettings(Settings):
         d: list[float],
         distortion_model: str = 'plumb_bob',
     ) -> CameraSettings:
-        """Return these settings with the intrinsics of a ``sensor_msgs/CameraInfo``.
-
-        Units: width, height [px]; k [px].
-        """
+        """Return these settings with the intrinsics [px] of a ``sensor_msgs/CameraInfo``."""
         if distortion_model not in ('plumb_bob', ''):
             raise ValueError(f"distortion_model: got '{distortion_model}', allowed 'plumb_bob'")
         if len(k) != 9:

@@ -64,8 +64,7 @@ class ScanSettings(Settings):
     """How a ground robot keeps clear of what its laser scanner sees."""
 
     position: Vector2 = Field(
-        default=[0.0, 0.0],
-        description="Of the scanner in the robot's frame, x and y [m]",
+        default=[0.0, 0.0], description="Of the scanner in the robot's frame, x and y [m]"
     )
     yaw: Finite = Field(default=0.0, description="Of the scanner in the robot's frame [rad]")
     reach: float = Field(
@@ -112,8 +111,7 @@ class DriverSettings(NodeSettings):
         default=None, description='With link mavlink: how, and what it may be made to do'
     )
     start: Vector3 = Field(
-        default=[0.0, 0.0, 0.0],
-        description='Position in the map where its odometry is zero [m]',
+        default=[0.0, 0.0, 0.0], description='Position in the map where its odometry is zero [m]'
     )
     yaw: Finite = Field(default=0.0, description='Heading there, from the x axis of the map [rad]')
     radius: float = Field(default=0.1, gt=0.0, description='Of the robot [m]')

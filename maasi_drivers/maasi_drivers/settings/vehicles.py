@@ -42,8 +42,7 @@ class FlightSettings(Settings):
         'it is to be called again [s]',
     )
     ground: Finite = Field(
-        default=0.0,
-        description='Height in the map of the ground, or the surface, at its start [m]',
+        default=0.0, description='Height in the map of the ground, or the surface, at its start [m]'
     )
     latency: float = Field(
         default=0.0, ge=0.0, le=1.0, description='Age of a position when it arrives [s]'

@@ -17,8 +17,7 @@ _OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]
 
 # End of the iteration that undoes a distortion: number of steps, error [px].
 _UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-13)
-# Farther than this from its pixel an undistorted point is none [px].
-_MISSED = 1e-6
+_MISSED = 1e-6  # farther than this from its pixel an undistorted point is none [px]
 
 
 @dataclass(frozen=True)
@@ -93,10 +92,7 @@ class Camera:
         return np.reshape(pixels, (-1, 2)), np.reshape(slopes[:, 3:5], (-1, 2, 2))
 
     def undistort(self, pixels: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the ideal rays (n, 2) of pixels, and their derivatives (n, 2, 2) [1/px].
-
-        In normalised coordinates; not a number where the distortion has no inverse.
-        """
+        """Return rays (n, 2) of pixels, nan: no inverse; their derivatives (n, 2, 2) [1/px]."""
         given = np.reshape(np.asarray(pixels, float), (-1, 2))
         points = np.empty((0, 2))
         if len(given):

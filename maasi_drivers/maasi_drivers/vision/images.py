@@ -1,7 +1,5 @@
 """Images as arrays: from messages, and from streams, devices and files. Without ROS."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -104,10 +102,7 @@ class VideoFrame:
 
 
 class VideoSource:
-    """Reads a source in a thread of its own, and keeps the newest frame.
-
-    A stream or device that breaks off is opened again. A file is played at its own rate, once.
-    """
+    """Keeps the newest frame; what breaks off is opened again, a file is played once."""
 
     def __init__(self, source: str) -> None:
         if not source:
@@ -117,10 +112,8 @@ class VideoSource:
             )
         self.source = source
         self.live = '://' in source or source.startswith('/dev/') or source.isdigit()
-        #: What is wrong; empty while frames come.
-        self.error = ''
-        #: Whether a file has come to its end.
-        self.ended = False
+        self.error = ''  #: what is wrong; empty while frames come
+        self.ended = False  #: whether a file has come to its end
         # The newest one, until it is taken.
         self._frames: deque[VideoFrame] = deque(maxlen=1)
         self._count = 0

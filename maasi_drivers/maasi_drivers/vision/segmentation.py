@@ -1,9 +1,4 @@
-"""Markers in an image: the papers' rule, one that adapts to the light, and fiducial markers.
-
-All rules take an RGB image (h, w, 3) and return `Blobs`; `segment` chooses by name.
-"""
-
-from __future__ import annotations
+"""Markers in RGB images (h, w, 3): the papers' rule, one for any light, and fiducials."""
 
 import math
 from collections.abc import Callable
@@ -21,15 +16,11 @@ from maasi_filter.arrays import BoolArray, ImageArray, IntArray
 
 # Added to the mean of the channels before dividing by it: noise in the dark is not blue.
 _DARK = 6.0
-# In the type of images: products with it stay so.
-_THREE = np.float32(3.0)
+_THREE = np.float32(3.0)  # in the type of images: products with it stay so
 
 
 def paper_mask(image: ImageArray, threshold: float = 35.0) -> BoolArray:
-    """Return where B - R/2 - G/2 > threshold (001, eq. (16)).
-
-    Computed in whole numbers of half grey levels, so nothing is rounded or clipped.
-    """
+    """Return where B - R/2 - G/2 > threshold (001, eq. (16)), by whole half grey levels."""
     # Plane by plane, which is faster.
     red, green, blue = (plane.astype(np.int16) for plane in cv2.split(image))
     return np.asarray(2 * blue - red - green > int(np.floor(2.0 * threshold)))
@@ -38,8 +29,7 @@ def paper_mask(image: ImageArray, threshold: float = 35.0) -> BoolArray:
 def _components(mask: BoolArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
     """Return the 8-connected components of a mask (h, w), in the order of rows.
 
-    Labels (h, w), component plus one, 0: background; boxes (n, 4): left, top, width, height; and
-    the components as blobs with the plain centroids of their pixels.
+    Labels (h, w), component plus one; boxes (n, 4): left, top, width, height; plain centroids.
     """
     # Labelled pixel by pixel: other algorithms number them in the order of blocks of pixels.
     _, labels, stats, centroids = cv2.connectedComponentsWithStatsWithAlgorithm(
@@ -62,7 +52,6 @@ def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
 
 @njit(cache=True, error_model='numpy')
 def _median(counts):  # type: ignore[no-untyped-def]
-    """Return the median of counted whole numbers, interpolated within its bin."""
     total = np.cumsum(counts)
     half = 0.5 * total[-1]
     value = np.searchsorted(total, half)
@@ -72,7 +61,6 @@ def _median(counts):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model='numpy')
 def _blueness(planes):  # type: ignore[no-untyped-def]
-    """Return (B - max(R, G)) over the mean of the channels (3, ...), -3 to 3, in their type."""
     red, green, blue = planes[0], planes[1], planes[2]
     return _THREE * (blue - np.maximum(red, green)) / (red + green + blue + _THREE * _DARK)
 
@@ -152,12 +140,10 @@ def _measure(planes, gains, labels, boxes, reached, aspect, solidity):  # type: 
 def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     """Find compact blobs that are bluer than the floor, in any light.
 
-    White balance from the median of the image (the floor); blueness (B - max(R, G)) over the mean
-    of the channels, which neither gradients nor exposure change, and which tells purple and pale
-    blue from blue; a threshold on it, raised where the floor is noisy (median absolute deviation),
-    and a higher one that each blob has to reach (hysteresis); gates on aspect and solidity;
-    centroids weighted by how much of each pixel is marker. Sizes are gated where the geometry is
-    known, in `maasi_drivers.vision.marker_detector`.
+    White balance by the image's median; blueness (B - max(R, G)) over the mean, on which neither
+    gradients nor exposure act; hysteresis, with a threshold raised by noise (median absolute
+    deviation); gates on aspect and solidity; centroids weighted by the share of marker in each
+    pixel.
     """
     planes = np.array(cv2.split(image))
     # About 4096 pixels.
@@ -182,11 +168,7 @@ _SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=np.fl
 
 
 def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blobs:
-    """Find ArUco markers; their ids are the identities of the targets.
-
-    The detector finds whole markers only, so none is cut by the border. The centre is where the
-    diagonals intersect, which perspective does not shift.
-    """
+    """Find whole ArUco markers by id; diagonals cross at the centre, from any perspective."""
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     found, ids, _ = _detector(settings.dictionary).detectMarkers(grey)
     corners = np.reshape(np.array(found, dtype=np.float32), (-1, 4, 2))

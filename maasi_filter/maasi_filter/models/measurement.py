@@ -4,8 +4,6 @@ Range, bearing and, in 3D, elevation (000, eq. (6) to (9)). Bearings are in the 
 relative to the robot's heading. In 2D the range is horizontal.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -24,8 +22,7 @@ def wrap(angle: float) -> float:
     if -math.pi <= angle < math.pi:
         return angle
     wrapped = angle - TWO_PI * math.floor((angle + math.pi) / TWO_PI)
-    # Rounding may land on pi itself.
-    return wrapped if wrapped < math.pi else wrapped - TWO_PI
+    return wrapped if wrapped < math.pi else wrapped - TWO_PI  # rounding may land on pi itself
 
 
 def wrap_angle(angle: ArrayLike) -> FloatArray:

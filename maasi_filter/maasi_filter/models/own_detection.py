@@ -1,7 +1,5 @@
 """Detection models of a user's own: pi as a compiled function, or as one of NumPy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NoReturn
@@ -15,10 +13,8 @@ from maasi_filter.models.detection import CUSTOM, NUMBER, REACH, DetectionModel,
 from maasi_filter.plugins import PluginError
 from maasi_filter.unexplored_map import interpolate_at
 
-# Cells from the robot to the reach, on each axis, by dimension.
-_CELLS = {2: 256, 3: 48}
-# Places at which a compiled function is tried.
-_TRIALS = 64
+_CELLS = {2: 256, 3: 48}  # cells from the robot to the reach, on each axis, by dimension
+_TRIALS = 64  # places at which a compiled function is tried
 
 
 class OwnDetection(DetectionModel):

@@ -1,7 +1,5 @@
 """Puts the measurements of each batch together, in the order of the batches."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -16,8 +14,7 @@ from maasi_msgs.msg import BatchMember, DetectionArray, MeasurementBatch
 
 # Largest lead of the stamp of a measurement over that of its batch [ns].
 _STAMP_AHEAD = 60_000_000_000
-# Capacity of the buffer of detections that arrive before their batch.
-_MOST_EARLY = 64
+_MOST_EARLY = 64  # capacity of the buffer of detections that arrive before their batch
 
 
 @dataclass
@@ -62,8 +59,7 @@ class BatchAssembly:
         known = {key: item.stamp for key, item in self.pending.items()}
         known[last] = self._progress.stamp
         if known.get(number) == stamp:
-            # Duplicate batch: the planner republishes batches that may have been missed.
-            return
+            return  # duplicate batch: the planner republishes batches that may have been missed
         if number <= last or (number in self.pending and not node.settings.lockstep):
             node.drop('old batch', f'measurement_batch.id: read {number}, allowed is a new one')
             return
@@ -111,8 +107,7 @@ class BatchAssembly:
             return None
         key = (number, int(message.measurement), stamp_from_ros(message.header.stamp))
         if self._progress.heard.get(name) == key:
-            # Duplicate: drivers also republish.
-            return None
+            return None  # duplicate: drivers also republish
         self._progress.heard[name] = key
         if expected is not None:
             self._take(expected, message)
@@ -158,7 +153,6 @@ class BatchAssembly:
     def _problem(
         self, name: str, message: DetectionArray, expected: PendingBatch | None
     ) -> str | None:
-        """Return why a whole message is refused, or None."""
         if message.robot != name:
             return f'robot: read {message.robot!r}, allowed on this topic is {name!r}'
         if message.header.frame_id != self._node.settings.frame:
@@ -174,8 +168,7 @@ class BatchAssembly:
             # After one stamp from the future, later messages with valid stamps are not late.
             earliest, latest = min(last, expected.stamp), expected.stamp + _STAMP_AHEAD
         elif message.batch_id > self._progress.batch:
-            # Its batch may still arrive.
-            return None
+            return None  # its batch may still arrive
         else:
             # The first one, where no planner sends batches, may have any stamp up to now.
             now = self._node.get_clock().now().nanoseconds
@@ -209,7 +202,6 @@ class BatchAssembly:
             member.pose = message.pose.pose
 
     def _late(self, name: str, message: DetectionArray) -> PendingBatch | None:
-        """Return a late measurement, or one that was not asked for, as a batch of its own."""
         measurement = self._measurement(message)
         if measurement is None:
             return None

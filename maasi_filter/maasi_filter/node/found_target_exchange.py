@@ -1,7 +1,5 @@
 """Found targets of the filters of other robots (002, section 4)."""
 
-from __future__ import annotations
-
 from collections import deque
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Time of a node: stamps of messages, silence of sources, jumps of a simulated clock."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any
@@ -12,11 +10,9 @@ from rclpy.node import Node
 
 _NANOSECONDS = 1_000_000_000
 
-#: Smallest difference of consecutive stamps that counts as a jump [ns].
-JUMP = _NANOSECONDS
+JUMP = _NANOSECONDS  #: smallest difference of consecutive stamps that counts as a jump [ns]
 
-#: Largest valid stamp [s].
-LAST_STAMP = 2**31 - 1
+LAST_STAMP = 2**31 - 1  #: largest valid stamp [s]
 
 # Limit of the first batch id, and of the lead of later ids over the last one.
 _FIRST_IDS = 2**62
@@ -28,10 +24,7 @@ _LEAST_BACKWARD, _LEAST_FORWARD = 1_000_000, 200_000_000
 
 
 def stamp_problem(message: Any) -> str | None:
-    """Return the error of the stamp of a message: field, what was read, what is allowed.
-
-    A message with neither `header.stamp` nor `stamp` has none.
-    """
+    """Return the error of the stamp of a message: field, what was read, what is allowed."""
     name, owner = 'header.stamp', getattr(message, 'header', None)
     if owner is None:
         name, owner = 'stamp', message
@@ -46,20 +39,14 @@ def stamp_problem(message: Any) -> str | None:
 
 
 def batch_id_limit(last: int) -> int:
-    """Return the highest batch id that is accepted after `last`.
-
-    Ids increase, and uint64 is bounded: a node that accepted an id near the bound could not
-    continue from it. Ids below the limit are accepted, so that filter and planner agree again.
-    """
+    """Return the highest batch id after `last`: none could follow near the bound of uint64."""
     return max(last, _FIRST_IDS) + _IDS_AHEAD
 
 
 class StampGate:
     """Distinguishes a jump of a stream of stamps from a single wrong stamp.
 
-    A stamp that jumps is refused; if the next one follows it, the stream has really jumped (its
-    source was restarted, messages were lost), and is accepted from there.
-    `jump` is the largest difference of two stamps that is none, in their unit.
+    A stamp that jumps (by more than `jump`) is refused, and accepted where the next one follows it.
     """
 
     def __init__(self, jump: int = JUMP) -> None:
@@ -76,18 +63,13 @@ class StampGate:
                 self._suspect = stamp
                 return False
         elif last is not None and stamp < last:
-            # A late message, not a jump: the reference stays at the last stamp.
-            return True
+            return True  # a late message, not a jump: the reference stays at the last stamp
         self._last = stamp
         return True
 
 
 class Silence:
-    """Time since the last message of a source: simulated if the node uses simulated time.
-
-    On a busy machine simulated time slows down with everything else, while timeouts of wall time
-    would expire without a fault. Otherwise the clock is the steady one.
-    """
+    """Time since the last message of a source, simulated where the node's time is."""
 
     def __init__(self, node: Node) -> None:
         self._clock = node.get_clock()
@@ -123,18 +105,12 @@ class Silence:
 class ClockWatch:
     """Informs a node that its time starts again.
 
-    A looped recording or a restarted simulation has one publisher of `/clock`: a backward jump
-    counts at once. With several publishers the time may alternate between theirs: then a jump
-    counts only after the time has stayed back.
-    `warn` is called with a key and a text; `on_restart`, from the executor, with the size of the
-    jump [s].
+    With one publisher of `/clock` a backward jump counts at once, with several only after the time
+    has stayed back. `warn` takes a key and a text; `on_restart` takes the size of the jump [s].
     """
 
     def __init__(
-        self,
-        node: Node,
-        warn: Callable[[str, str], None],
-        on_restart: Callable[[float], None],
+        self, node: Node, warn: Callable[[str, str], None], on_restart: Callable[[float], None]
     ) -> None:
         self._node = node
         self._warn = warn

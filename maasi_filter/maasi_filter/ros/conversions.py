@@ -1,7 +1,5 @@
 """Conversions between messages and records of the library, in pairs."""
 
-from __future__ import annotations
-
 import array
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -28,13 +26,10 @@ from maasi_msgs.msg import FoundTarget as FoundTargetMessage
 #: of a search sees so many targets at once.
 MOST_DETECTIONS = 200
 
-#: Largest accepted coordinate [m]: the circumference of the Earth.
-FARTHEST = 4e7
-#: Largest accepted speed [m/s, rad/s].
-FASTEST = 1e5
+FARTHEST = 4e7  #: largest accepted coordinate [m]: the circumference of the Earth
+FASTEST = 1e5  #: largest accepted speed [m/s, rad/s]
 
-#: Most characters of a class or identity.
-LONGEST_NAME = 100
+LONGEST_NAME = 100  #: most characters of a class or identity
 
 
 def stamp_to_ros(nanoseconds: int) -> Time:
@@ -237,11 +232,7 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
 def measurement_from_ros(
     message: DetectionArray, sensor: Sensor, drop: Callable[[str, str, int], None]
 ) -> AgentMeasurement:
-    """Return the measurement of a robot.
-
-    Invalid detections, equal ones, and those beyond `MOST_DETECTIONS` are left out: `drop` is
-    called with reason, text and number.
-    """
+    """Return a robot's measurement; invalid, equal and surplus detections go to `drop`."""
     pose = pose_from_ros(message.pose.pose)
     errors = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
     if not np.isfinite(errors).all():
@@ -332,10 +323,7 @@ def sphere_marker(
 
 
 def filter_markers(
-    header: Header,
-    clusters: Iterable[Cluster],
-    found: Iterable[FoundTarget],
-    size: float,
+    header: Header, clusters: Iterable[Cluster], found: Iterable[FoundTarget], size: float
 ) -> MarkerArray:
     """Return markers of clusters (orange, scaled by their width) and found targets (green)."""
     markers = [
@@ -355,12 +343,7 @@ def filter_markers(
 
 
 class MarkerBoard:
-    """Makes each array of markers replace the previous one.
-
-    The first array deletes all markers that a viewer still shows of an earlier process; later
-    arrays delete those that are no longer present. Other nodes on the same topic also lose their
-    markers with the first array, until they publish again.
-    """
+    """Makes each array of markers replace the previous one, the first all that are shown."""
 
     def __init__(self) -> None:
         self._shown: dict[tuple[str, int], Marker] | None = None

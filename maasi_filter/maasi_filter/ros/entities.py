@@ -1,7 +1,5 @@
 """Entities of a node: what they wait for, how long they live, and bad requests to them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection, Hashable
 from functools import partial
@@ -25,9 +23,8 @@ _ERRORS: dict[str, tuple[type[Exception], ...]] = {
 class NodeEntities:
     """Publishers, subscriptions, services, clients, timers and actions made since `mark`.
 
-    Action clients, action servers and subscriptions with event callbacks are permanent: rclpy's
-    events executor crashes (SIGSEGV) if one is destroyed while an event of it is queued, as it
-    then calls Python without the interpreter's lock.
+    Actions and subscriptions with event callbacks are permanent: rclpy's events executor crashes
+    (SIGSEGV) if one is destroyed while an event of it is queued.
     """
 
     def __init__(self, node: Node) -> None:
@@ -57,7 +54,6 @@ class NodeEntities:
                 destroy(item)
 
     def _made(self) -> list[tuple[Any, Callable[[Any], object]]]:
-        """Return the entities of the node, each with what destroys it."""
         node = self._node
         # Of plugins; owners destroy their event handlers.
         waitables = [item for item in node.waitables if not isinstance(item, EventHandler)]
@@ -73,11 +69,7 @@ class NodeEntities:
 
 
 def survive_bad_requests(node: Node, drop: Callable[[str, str], None]) -> None:
-    """Answer requests on which rclpy raises with an empty response, instead of ending the node.
-
-    rclpy raises on the type of an undeclared parameter, on values of an unknown type, and on a
-    transition that is not defined in the present state. `drop` counts and logs: reason, text.
-    """
+    """Answer bad types and undefined transitions, on which rclpy raises, with an empty response."""
 
     def answer(name: str, errors: Any, callback: Any, request: Any, response: Any) -> Any:
         try:
@@ -101,8 +93,7 @@ _EVERYWHERE = ('/parameter_events', '/diagnostics')
 class Endpoints:
     """Endpoints of a node's topics: to whom a message would get, and what never connects.
 
-    In place of the event callbacks of rclpy, which publishers and subscriptions that are destroyed
-    while their node spins must not have (`NodeEntities`).
+    Event callbacks of rclpy must not be destroyed while their node spins (`NodeEntities`).
     """
 
     def __init__(self, node: Node) -> None:
@@ -112,10 +103,7 @@ class Endpoints:
         self._lasting: set[str] = set()
 
     def look(self) -> list[str]:
-        """Return a warning for each topic with an endpoint that is known but never connects.
-
-        It is logged once. Call about once per second.
-        """
+        """Return a warning, once, for each topic with a known endpoint that never connects."""
         node, now = self._node, time.monotonic()
         unconnected = {
             f'{item.topic_name}: a publisher does not connect'
@@ -138,10 +126,7 @@ class Endpoints:
         return warnings
 
     def reach(self, publisher: Publisher, number: int, names: Collection[str]) -> bool:
-        """Return whether a message would reach all expected subscribers.
-
-        Arguments as of `LockstepLifecycleNode.expect_subscribers`.
-        """
+        """Return whether a message would reach so many subscribers, and nodes of all names."""
         topic = publisher.topic_name
         known = [info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)]
         peers = [name for name in known if name not in _OBSERVERS and not name.startswith('_')]

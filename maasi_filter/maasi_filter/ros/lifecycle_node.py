@@ -1,7 +1,5 @@
 """Base of all nodes of a search: parameters, life cycle, readiness, lockstep, diagnostics."""
 
-from __future__ import annotations
-
 import math
 import time
 import traceback
@@ -28,14 +26,11 @@ from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, Sett
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import LockstepDone
 
-__all__ = ['LockstepLifecycleNode', 'SettingsError']
-
 # Period of the check for peers [s].
 _PEERS_PERIOD = 0.02
 _DIAGNOSTICS_PERIOD = 1.0
 _WARNING_PERIOD = 2.0
-# From activation until a node says what it waits for [s].
-_NOTICE_DELAY = 3.0
+_NOTICE_DELAY = 3.0  # from activation until a node says what it waits for [s]
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -54,16 +49,10 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         Whether its namespace is that of a robot: topics of the team are one level up.
     """
 
-    #: Read in *configure*, and valid until the next one.
-    settings: SettingsT
+    settings: SettingsT  #: read in *configure*, and valid until the next one
 
     def __init__(
-        self,
-        name: str,
-        settings: type[SettingsT],
-        *,
-        in_robot: bool = False,
-        **options: Any,
+        self, name: str, settings: type[SettingsT], *, in_robot: bool = False, **options: Any
     ) -> None:
         super().__init__(name, allow_undeclared_parameters=True, **options)
         self._always_in_robot = self._in_robot = in_robot
@@ -95,16 +84,12 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._entities_made.clear()
         super().destroy_node()
 
-    # ---- names -------------------------------------------------------------------------------
-
     def team_topic(self, name: str) -> str:
         """Return the full name of a topic of the team."""
         parts = [part for part in self.get_namespace().split('/') if part]
         if self._in_robot:
             parts = parts[:-1]
         return '/' + '/'.join([*parts, name])
-
-    # ---- life cycle --------------------------------------------------------------------------
 
     def prepare(self) -> None:
         """Create the objects that the settings describe, before `set_up`. In *configure*."""
@@ -119,10 +104,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         """Stop all motion, in *deactivate* and at shutdown. May be called more than once."""
 
     def tear_down(self) -> None:
-        """Undo `prepare` and `set_up`, in *cleanup*; the base class destroys ROS entities.
-
-        Also called after a failed *configure*.
-        """
+        """Undo `prepare` and `set_up`, in *cleanup* and after a failed *configure*."""
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the parameters, compile, warm up and connect."""
@@ -209,8 +191,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             try:
                 self.tear_down()
             except Exception:
-                # Continue with the rest.
-                self.get_logger().error(traceback.format_exc())
+                self.get_logger().error(traceback.format_exc())  # continue with the rest
         self.configured = False
         self._peers.clear()
         self._entities_made.clear()
@@ -226,8 +207,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             self.resolve_service_name(name), lambda: self.create_service(Trigger, name, answer)
         )
         service.callback = answer
-
-    # ---- readiness and lockstep --------------------------------------------------------------
 
     def expect(self, condition: Callable[[], bool]) -> None:
         """Add a condition for being ready."""
@@ -276,18 +255,13 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         if missing and (fault := loopback_fault()):
             self.get_logger().warning(fault)
 
-    # ---- time --------------------------------------------------------------------------------
-
     def reset(self) -> None:
         """Discard state with times after a backward jump of the clock."""
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], None], *others: Any, **options: Any
     ) -> Any:
-        """Return a timer that is never called after its destruction.
-
-        The executor may already have queued it.
-        """
+        """Return a timer that is never called after its destruction, as a queued call would be."""
 
         def call() -> None:
             if any(item is made for item in self.timers):
@@ -309,8 +283,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.get_logger().warning(f'{text}: the search starts again')
         self.reset()
 
-    # ---- messages ----------------------------------------------------------------------------
-
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
         """Return a publisher without the event callbacks of rclpy; see `Endpoints`."""
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
@@ -321,11 +293,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
-        """Return a subscription that drops messages with an invalid stamp, and far too large ones.
-
-        It is never called after its destruction; the executor may already have queued a message.
-        It has no event callbacks of rclpy; see `Endpoints`.
-        """
+        """Return a subscription that drops invalid stamps and sizes; silent once destroyed."""
         options.setdefault(
             'event_callbacks', SubscriptionEventCallbacks(use_default_callbacks=False)
         )
@@ -347,7 +315,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def _check_size(
         self, topic: str, msg_type: Any, callback: Callable[[Any], None], data: bytes
     ) -> None:
-        """Call back with a serialised message unless it is too large."""
         limit = self.settings.largest_message
         if len(data) <= limit:
             callback(deserialize_message(data, msg_type))
@@ -365,13 +332,8 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         else:
             self.drop('bad stamp', f'{topic}.{problem}')
 
-    # ---- diagnostics -------------------------------------------------------------------------
-
     def drop(self, reason: str, text: str, number: int = 1) -> None:
-        """Count discarded data by a short reason, and warn, throttled.
-
-        `text`: topic and field, what was read, what is allowed.
-        """
+        """Count discarded data by a reason, and warn, throttled: what was read, what is allowed."""
         self.dropped[reason] += number
         self.warn_throttled(reason, f'dropped: {text}')
 

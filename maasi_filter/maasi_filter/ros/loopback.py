@@ -1,7 +1,5 @@
 """The loopback interface, through which nodes on one host discover each other."""
 
-from __future__ import annotations
-
 import socket
 
 _ANY_PORT = 7400

@@ -1,7 +1,5 @@
 """The ROS parameters of a node: declared from its settings, read in *configure*."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
@@ -38,10 +36,8 @@ class SettingsError(Exception):
 class NodeParameters(Generic[SettingsT]):
     """Declares the parameters of a node, and reads its settings from them.
 
-    Parameters that were not set have the defaults of the settings: once the node is configured,
-    the resolved ones (of a preset, for example), which depend on the parameters that were set.
-    The node has to allow undeclared parameters: optional ones are declared only if they have a
-    value, as a file of `ros2 param dump` cannot represent None.
+    Those that were not set have the settings' defaults, once configured those of a preset, too.
+    Optional ones are declared with a value only: a file of `ros2 param dump` cannot represent None.
     """
 
     def __init__(self, node: Node, model: type[SettingsT]) -> None:
@@ -98,7 +94,6 @@ class NodeParameters(Generic[SettingsT]):
         return [item for item in parameters if not item.name.startswith(self._foreign)]
 
     def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Return whether parameters may be set, and if not, why."""
         objections = self._objections(self._own(parameters))
         reason = '' if self._own_change else next(objections, '')
         return SetParametersResult(successful=not reason, reason=reason)
@@ -121,7 +116,6 @@ class NodeParameters(Generic[SettingsT]):
                 yield from (problems[name] for name in wrong if name in problems)
 
     def _note(self, parameters: list[Parameter]) -> None:
-        """Apply what was set."""
         if self._own_change:
             return
         own = self._own(parameters)
@@ -136,7 +130,6 @@ class NodeParameters(Generic[SettingsT]):
             setattr(target, last, getattr(source, last))
 
     def _with(self, own: Sequence[Parameter]) -> dict[str, Any]:
-        """Return the values that were set, and these."""
         values = self._given | {item.name: item.value for item in own}
         return {name: value for name, value in values.items() if value is not None}
 

@@ -1,7 +1,5 @@
 """Settings that nodes share, and those of the filter node."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field
@@ -18,8 +16,7 @@ LIVELINESS_LEASE = 0.5
 class NodeSettings(Settings):
     """Settings common to all nodes of a search."""
 
-    #: Parameters that can be set while the node runs.
-    live: ClassVar[frozenset[str]] = frozenset()
+    live: ClassVar[frozenset[str]] = frozenset()  #: parameters that can be set while the node runs
 
     # First: what names a class of a plugin is checked after it.
     plugin_path: Annotated[list[str], AfterValidator(add_folders)] = Field(

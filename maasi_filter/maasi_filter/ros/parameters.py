@@ -7,8 +7,6 @@ the former.
 Settings by name, `robots`, become the list `robots` and `robot.<name>.<key>`.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import textwrap
@@ -61,10 +59,7 @@ class ParameterField:
 
 
 def parameter_fields(
-    model: type[BaseModel],
-    given: Mapping[str, Any],
-    prefix: str = '',
-    keys: tuple[str, ...] = (),
+    model: type[BaseModel], given: Mapping[str, Any], prefix: str = '', keys: tuple[str, ...] = ()
 ) -> Iterator[ParameterField]:
     """Yield the parameters of settings; the `given` ones determine which robots and parts exist."""
     for name, info in model.model_fields.items():
@@ -103,10 +98,7 @@ def flatten(settings: BaseModel, prefix: str = '') -> dict[str, Any]:
 
 
 def unflatten(model: type[BaseModel], flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Return flat parameters as nested values for `model.model_validate`.
-
-    ValueError, if a list has no rows of numbers, names the parameter.
-    """
+    """Return flat parameters as nested values; a ValueError names the parameter without rows."""
     nested: dict[str, Any] = {}
     for item in parameter_fields(model, flat):
         # Parts without a value are made too, so that errors name what is missing in them.
@@ -171,13 +163,11 @@ def choices(annotation: Any) -> list[Any]:
 
 
 def _argument(annotation: Any, kind: type) -> Any:
-    """Return the type of the elements of a list, or of the values of a dictionary, or None."""
     found = [get_args(item)[-1] for item in choices(annotation) if get_origin(item) is kind]
     return found[0] if found else None
 
 
 def _width(annotation: Any) -> int | None:
-    """Return the length of the lists in a list, if it is fixed."""
     element = _argument(annotation, list)
     if _argument(element, list) is None:
         return None
@@ -199,10 +189,7 @@ def _by_name(annotation: Any) -> type[BaseModel] | None:
 
 
 def parameters_of(node: type) -> Iterator[ParameterField]:
-    """Yield the parameters of a class of nodes; those of each robot as of one named NAME.
-
-    Its settings are the type argument of one of its bases.
-    """
+    """Yield the parameters of a class of nodes, its type argument; each robot's as of NAME."""
     model = next(
         argument
         for kind in node.__mro__
@@ -215,10 +202,7 @@ def parameters_of(node: type) -> Iterator[ParameterField]:
 
 
 def node_help(node: type, name: str, base: type) -> str:
-    """Return the help of a class of nodes, whose executable has this name.
-
-    Topics are from the docstrings, up to that of `base`.
-    """
+    """Return the help of a class of nodes; topics are from docstrings, up to that of `base`."""
     text = [
         f'usage: {name} [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r __ns:=/TEAM] ...]'
     ]

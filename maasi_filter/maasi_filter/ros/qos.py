@@ -1,7 +1,5 @@
 """Quality of service by purpose of a topic."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -30,10 +28,8 @@ def _reliable(depth: int | None, latched: bool = False, **options: Any) -> QoSPr
 
 # Lossless topics: batches, detections, updates, states, decisions, lockstep.
 RELIABLE = _reliable(None)
-# Found targets, the truth, the last update.
-LATCHED = _reliable(1, latched=True)
-# As LATCHED, for a reader of several publishers.
-LATCHED_ALL = _reliable(None, latched=True)
+LATCHED = _reliable(1, latched=True)  # found targets, the truth, the last update
+LATCHED_ALL = _reliable(None, latched=True)  # as LATCHED, for a reader of several publishers
 # Updates of the filter: a restarted planner receives the last ones.
 UPDATES = _reliable(100, latched=True)
 # States of robots. Liveliness is asserted by the executor thread: a process whose executor hangs
@@ -43,12 +39,10 @@ LIVELY = _reliable(
     liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
     liveliness_lease_duration=Duration(seconds=LIVELINESS_LEASE),
 )
-# Period of assertion [s].
-LIVELINESS_PERIOD = 0.1
+LIVELINESS_PERIOD = 0.1  # period of assertion [s]
 # Commands to a robot: a short queue, as old commands are useless after a link failure.
 COMMANDS = _reliable(3)
-# Transforms, as in tf2.
-TRANSFORMS = _reliable(100)
+TRANSFORMS = _reliable(100)  # transforms, as in tf2
 # Sensor data: each message replaces the previous one.
 SENSOR = _reliable(10)
 SENSOR_READER = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)

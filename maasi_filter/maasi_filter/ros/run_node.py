@@ -1,7 +1,5 @@
 """Runs a node as a process: command line, executor, signals, clean end."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal
@@ -25,22 +23,16 @@ from maasi_filter.ros.parameters import node_help
 
 
 class _NoNode:
-    """Stands beside the node of an events executor.
-
-    rclpy 7.1 crashes (SIGSEGV) where a task raises and its events executor has exactly one node
-    (ros2/rclpy, pull request 1718); with two the exception ends the spin.
-    """
+    """Beside the node of an events executor, which crashes with one (rclpy 7.1, pull 1718)."""
 
     executor: Any = None
     subscriptions = timers = clients = services = waitables = guards = ()
 
 
 def executor_of(node: Node, context: Context | None = None) -> Executor:
-    """Return an executor that runs one node.
+    """Return an executor for one node: rclpy's events executor if it is there, which is fast.
 
-    rclpy's events executor if this version has it: the single-threaded one rebuilds its wait set
-    for each callback, which takes two to four times the CPU time. In both, an exception in a
-    callback ends the spin, and neither may spin after its `shutdown`.
+    In both, an exception in a callback ends the spin, and neither may spin after its `shutdown`.
     """
     try:
         from rclpy.experimental.events_executor import EventsExecutor
@@ -54,10 +46,8 @@ def executor_of(node: Node, context: Context | None = None) -> Executor:
     return executor
 
 
-# Period of the check for signals [s].
-_SIGNAL_PERIOD = 0.1
-# From the last message to the end of the context [s].
-_FAREWELL = 0.05
+_SIGNAL_PERIOD = 0.1  # period of the check for signals [s]
+_FAREWELL = 0.05  # from the last message to the end of the context [s]
 
 
 def run(
@@ -65,10 +55,7 @@ def run(
     arguments: list[str] | None = None,
     kind: type[LockstepLifecycleNode[Any]] | None = None,
 ) -> int:
-    """Run a node until it is asked to end; return the exit code.
-
-    SIGINT and SIGTERM stop all motion before the node is destroyed.
-    """
+    """Run a node until it is asked to end and has stopped all motion; return the exit code."""
     if {'-h', '--help'} & set(sys.argv[1:] if arguments is None else arguments):
         explained = kind or (make_node if isinstance(make_node, type) else LockstepLifecycleNode)
         try:
@@ -121,8 +108,7 @@ def run(
             if rclpy.ok() and node.configured:
                 node.halt()
             node.destroy_node()
-            # A context takes with it what nobody has received yet.
-            time.sleep(_FAREWELL)
+            time.sleep(_FAREWELL)  # a context takes with it what nobody has received yet
         rclpy.try_shutdown()
         # Explicit: a forked process ends with `os._exit`, without clean-up by the interpreter.
         get_default_context(shutting_down=True).destroy()

@@ -1,7 +1,5 @@
 """One robot of the distributed search of 004: knowledge, messages, decisions and snapshots."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -18,8 +16,7 @@ from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
 from maasi_planner.buildings.sharing import Broadcast, assigned, rewards
 from maasi_planner.buildings.way_finder import WayFinder
 
-# Tolerances of arrival at the station [m, m/s].
-_ARRIVED, _ARRIVED_SPEED = 2.0, 2.0
+_ARRIVED, _ARRIVED_SPEED = 2.0, 2.0  # tolerances of arrival at the station [m, m/s]
 # Largest deviation from the last plan for which that plan may be continued [m, m/s].
 _SAME_STATE = 0.5
 
@@ -34,20 +31,15 @@ class Activity(Enum):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Snapshot of a cell.
-
-    robot: name of the robot; step: time step; cuboid: index of the cuboid of the cell; position
-    (3,): of the robot [m]; direction (3,): optical axis, opposite to the normal of the face;
-    distance: from the face [m]; detection_probability: p_d at that distance.
-    """
+    """Snapshot of a cell, by a robot at a step."""
 
     robot: str
     step: int
-    cuboid: int
-    position: FloatArray
-    direction: FloatArray
-    distance: float
-    detection_probability: float
+    cuboid: int  # index of that of the cell
+    position: FloatArray  # (3,) of the robot [m]
+    direction: FloatArray  # (3,) optical axis, opposite to the normal of the face
+    distance: float  # from the face [m]
+    detection_probability: float  # p_d at that distance
 
 
 def decision_stream(seed: int, robot: str, step: int) -> np.random.Generator:
@@ -62,11 +54,7 @@ def inflated(boxes: FloatArray, clearance: float) -> FloatArray:
 
 
 class SearchAgent:
-    """A robot with its own planner.
-
-    At each step: `observe` its state, send the returned message, and `decide` with the messages
-    received. `mission` is the same for all robots; steps take `step` seconds.
-    """
+    """A robot with its own planner: at each step it observes, sends, and decides."""
 
     def __init__(
         self,
@@ -157,7 +145,6 @@ class SearchAgent:
         )
 
     def _photograph(self) -> None:
-        """Take a snapshot of each new cuboid that it is in."""
         for n in np.flatnonzero(self.mission.inside(self.position) & ~self.visited):
             self.visited[n] = True
             cell = self.mission.cells[n]
@@ -204,7 +191,6 @@ class SearchAgent:
         )
 
     def _aim(self, heard: Sequence[Broadcast]) -> FloatArray:
-        """Return x*: the cuboid nearest to its predicted position, or the assigned one (10)."""
         centres, unvisited = self.mission.centres, np.flatnonzero(~self.visited)
         if not heard and len(unvisited):
             offset = centres[unvisited] - self._predicted()

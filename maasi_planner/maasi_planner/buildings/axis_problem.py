@@ -1,13 +1,10 @@
 """The quadratic problem of one axis: rows, costs, and a dual active-set method.
 
-Once it is fixed which cuboids are visited at which step and which faces of obstacles are kept
-away from, P2 of 004 decomposes into one problem for each axis: choose T forces u such that
-positions, velocities, forces and the way to brake afterwards, all linear in u, stay in their
-bounds. The matrices are the same at every step of a mission; only bounds and the free motion
-change, so that the method works on the rows' Gram matrix alone.
+Once visits and faces of obstacles are fixed, P2 of 004 decomposes into one problem for each axis: T
+forces u such that positions, velocities, forces and the way to brake, all linear in u, stay in
+their bounds. Only bounds and free motion change from step to step: the method works on the rows'
+Gram matrix alone.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass
@@ -19,12 +16,9 @@ from numba import njit
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.buildings.dynamics import Dynamics
 
-# The objective is scaled so that its rows are of the size of one.
-SCALE = 1e4
-# A row is met when it is this close to its bounds [m, m/s, N].
-TOLERANCE = 1e-7
-# A row is a combination of active ones when this share of its length is left.
-DEPENDENT = 1e-10
+SCALE = 1e4  # the objective is scaled so that its rows are of the size of one
+TOLERANCE = 1e-7  # a row is met when it is this close to its bounds [m, m/s, N]
+DEPENDENT = 1e-10  # a row is a combination of active ones when this share of its length is left
 
 
 class AxisRoom(NamedTuple):
@@ -38,29 +32,18 @@ class AxisRoom(NamedTuple):
 
 @dataclass(frozen=True)
 class AxisRows:
-    """What is linear in the forces u_0 to u_{T-1} of an axis.
-
-    Rows: positions P_2 to P_T, velocities v_1 to v_T, forces, and P_T plus the ways that are left
-    after each step of braking, as if air resistance were all. P_1 is given by the state.
-
-    matrix (m, T): rows; gram (m, m): matrix H^-1 matrix', H the Hessian of the objective; inverse
-    (T, T): H^-1; pull (T + 1,): weight of the squared distance from the target at P_0 to P_T,
-    scaled [1/m^2].
-    """
+    """What is linear in the forces u_0 to u_{T-1} of an axis, m rows; P_1 is given by the state."""
 
     matrix: FloatArray
-    gram: FloatArray
-    inverse: FloatArray
-    pull: FloatArray
+    gram: FloatArray  # (m, m): matrix H^-1 matrix', H the Hessian of the objective
+    inverse: FloatArray  # (T, T): H^-1
+    pull: FloatArray  # (T + 1,): weight of the squared distance from the target, scaled [1/m^2]
 
 
 def axis_rows(
     dynamics: Dynamics, horizon: int, pull: FloatArray, smoothness: float, rolling: FloatArray
 ) -> AxisRows:
-    """Return the rows of an axis; `pull` (T + 1,) and `smoothness` not scaled yet.
-
-    rolling (J,): ways to brake from a speed of 1, by air resistance alone [m]; none: no such rows.
-    """
+    """Return the rows of an axis for unscaled weights and ways to roll to a halt (J,) [m]."""
     forces = np.eye(horizon)
     gamma = dynamics.step / dynamics.mass
     velocities = np.zeros((horizon + 1, horizon))
@@ -91,11 +74,9 @@ def solve_axis(
     y: FloatArray,
     room: AxisRoom,
 ) -> float:
-    """Minimise over the rows' values y within their bounds: dual active-set method.
+    """Minimise over the rows' values y = free + gram lambda in their bounds (Goldfarb, Idnani).
 
-    The method of Goldfarb and Idnani, written in the values y = free + gram lambda. Returns the
-    objective above that of the free minimum; inf where there is no solution, or where the
-    objective is certain to exceed `cutoff`.
+    Returns the objective above that of the free minimum; inf: no solution, or above `cutoff`.
     """
     active, multipliers, factor, work = room
     m = free.shape[0]

@@ -1,12 +1,9 @@
 """Exact branch and bound over visits and obstacle faces: 004, P2 for one robot.
 
-A node fixes visits in the order of their steps, and which faces of obstacles some segments of the
-trajectory stay beyond. Its relaxation is one quadratic problem for each axis. An *open* node
-stands for every plan that makes these visits and perhaps later ones, a *closed* one for those
-that make no other. Faces are branched on only where a trajectory crosses an obstacle.
+A node fixes visits in the order of their steps, and which faces of obstacles segments stay beyond;
+its relaxation is a quadratic problem for each axis. An *open* node stands for every plan with these
+visits and perhaps later ones, a *closed* one for those with no other.
 """
-
-from __future__ import annotations
 
 import math
 from typing import NamedTuple
@@ -18,53 +15,39 @@ from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.buildings.axis_problem import solve_axis
 from maasi_planner.buildings.search_tree import Tree, copy_node, free, pop, push
 
-# A plan must be better than the best by this much, scaled objective.
-GAP = 1e-3
-# A position beyond a face by no less than minus this is beyond it [m].
-FACE_TOLERANCE = 1e-6
-# The same for the first two positions, which are given [m].
-GIVEN_TOLERANCE = 1e-3
+GAP = 1e-3  # a plan must be better than the best by this much, scaled objective
+FACE_TOLERANCE = 1e-6  # a position beyond a face by no less than minus this is beyond it [m]
+GIVEN_TOLERANCE = 1e-3  # the same for the first two positions, which are given [m]
 
 FOUND, EXHAUSTED, UNFINISHED, FULL = 0, 1, 2, 3
 
 
 class Instance(NamedTuple):
-    """One problem for the compiled search; objectives scaled.
+    """One problem for the compiled search, Q visits to choose from; objectives scaled."""
 
-    gram (m, m): of each axis; free, lower, upper (3, m): values of the rows at the free minimum,
-    and their bounds; rise, sink (3, J): what the ways to brake are longer by than their rows, going
-    up and down [m]; given (2, 3): P_0 and P_1 [m]; area (3, 2): [m]; horizon: T; visit_step,
-    visit_cuboid (Q,): visits to choose from, in order of their steps; visit_reward (Q,): their
-    rewards; visit_lower, visit_upper (Q, 3): their cuboids [m]; most: most reward of all visits;
-    ahead (Q,): most reward that can follow a visit; follows (Q, Q): whether a visit (column) may
-    follow another (row); obstacles (O, 3, 2): corners, clearance included [m]; between: whether
-    segments, and not only positions, keep away from obstacles.
-    """
-
-    gram: FloatArray
-    free: FloatArray
+    gram: FloatArray  # (m, m) of each axis
+    free: FloatArray  # (3, m): values of the rows at the free minimum, and their bounds
     lower: FloatArray
     upper: FloatArray
-    rise: FloatArray
-    sink: FloatArray
-    given: FloatArray
-    area: FloatArray
+    rise: FloatArray  # (3, J): what ways to brake are longer by than their rows, going up, and
+    sink: FloatArray  # going down [m]
+    given: FloatArray  # (2, 3): P_0 and P_1 [m]
+    area: FloatArray  # (3, 2) [m]
     horizon: int
-    visit_step: IntArray
+    visit_step: IntArray  # (Q,), in this order
     visit_cuboid: IntArray
-    visit_reward: FloatArray
-    visit_lower: FloatArray
+    visit_reward: FloatArray  # (Q,)
+    visit_lower: FloatArray  # (Q, 3): corners of their cuboids [m]
     visit_upper: FloatArray
-    most: float
-    ahead: FloatArray
-    follows: BoolArray
-    obstacles: FloatArray
-    between: bool
+    most: float  # most reward of all visits
+    ahead: FloatArray  # (Q,): most reward that can follow a visit
+    follows: BoolArray  # (Q, Q): whether a visit (column) may follow another (row)
+    obstacles: FloatArray  # (O, 3, 2): corners, clearance included [m]
+    between: bool  # whether segments, and not only positions, keep away from obstacles
 
 
 @njit(cache=True)
 def _ahead(instance: Instance, tree: Tree, node: int) -> float:
-    """Return the most reward that can be added to a node."""
     if tree.closed[node]:
         return 0.0
     if tree.number[node] == 0:
@@ -123,10 +106,7 @@ def _position(instance: Instance, tree: Tree, node: int, a: int, k: int) -> floa
 
 @njit(cache=True)
 def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int) -> tuple[int, int]:
-    """Return the first segment from `begin` to `end`, and the obstacle in its way; (-1, -1): none.
-
-    Segment k joins P_{k-1} and P_k; segment T + 1 is the way to brake.
-    """
+    """Return the first segment from begin to end through an obstacle, and that; or (-1, -1)."""
     horizon = instance.horizon
     steps = instance.rise.shape[1]
     first = 3 * horizon - 1
@@ -229,8 +209,7 @@ def _visit(instance: Instance, tree: Tree, node: int, q: int) -> None:
         tree.high[node, a, k] = min(tree.high[node, a, k], high)
         place = tree.values[node, a, k - 2]
         if place < low or place > high:
-            # Where it lies inside already, nothing changes.
-            tree.dirty[node] |= 1 << a
+            tree.dirty[node] |= 1 << a  # where it lies inside already, nothing changes
     tree.visits[node, tree.number[node]] = q
     tree.number[node] += 1
     tree.reward[node] += instance.visit_reward[q]
@@ -238,7 +217,6 @@ def _visit(instance: Instance, tree: Tree, node: int, q: int) -> None:
 
 @njit(cache=True)
 def _can_add(instance: Instance, tree: Tree, node: int, q: int) -> bool:
-    """Return whether a visit is of a new cuboid, inside the bounds of its step."""
     for i in range(tree.number[node]):
         if instance.visit_cuboid[tree.visits[node, i]] == instance.visit_cuboid[q]:
             return False
@@ -252,7 +230,6 @@ def _can_add(instance: Instance, tree: Tree, node: int, q: int) -> bool:
 
 @njit(cache=True)
 def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
-    """Add the nodes with one more visit."""
     number = tree.number[node]
     last = tree.visits[node, number - 1] if number else -1
     for q in range(instance.visit_step.shape[0]):
@@ -273,10 +250,9 @@ def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
 
 @njit(cache=True)
 def search(instance: Instance, tree: Tree, most: int) -> int:
-    """Continue a search by at most `most` nodes.
+    """Continue a search by at most `most` nodes; return whether the best is the optimum (FOUND).
 
-    Returns FOUND: the best node is the optimum; EXHAUSTED: there is no plan; UNFINISHED: nodes are
-    left; FULL: there was no room for more, the best node may not be the optimum.
+    EXHAUSTED: there is no plan; UNFINISHED: nodes are left; FULL: there was no room for more.
     """
     horizon = instance.horizon
     end = horizon + 1
@@ -288,8 +264,7 @@ def search(instance: Instance, tree: Tree, most: int) -> int:
             return UNFINISHED
         node = pop(tree)
         if tree.bound[node] >= tree.best[0] - GAP:
-            # No other node is better.
-            break
+            break  # no other node is better
         if tree.dirty[node]:
             solved += 1
             tree.counts[2] += 1

@@ -1,11 +1,8 @@
 """Exact joint planning of all robots: 004, P1.
 
-Without (5j) the problem decomposes into one problem P2 per robot. A cuboid that two robots plan to
-visit counts once: best-first search branches by forbidding it to one or to the other robot. The
-first node without such a conflict is the optimum.
+Without (5j) it decomposes into one P2 per robot; best-first search forbids a cuboid that two robots
+plan to visit to one or the other, and the first node without one is the optimum.
 """
-
-from __future__ import annotations
 
 import heapq
 import math
@@ -15,8 +12,7 @@ from dataclasses import replace
 
 from maasi_planner.buildings.problem import Plan, PlanSolver, Problem
 
-# Tolerance of equal objectives [1].
-_GAP = 1e-7
+_GAP = 1e-7  # tolerance of equal objectives [1]
 
 
 def solve_jointly(solver: PlanSolver, problems: Sequence[Problem]) -> list[Plan] | None:

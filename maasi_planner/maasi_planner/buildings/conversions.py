@@ -1,7 +1,5 @@
 """Between messages and the records of the search of buildings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,8 +26,7 @@ from maasi_planner.buildings.problem import Plan
 from maasi_planner.buildings.settings import HazardSettings
 from maasi_planner.buildings.sharing import Broadcast
 
-# Upper bound of the parameters of a battery.
-_LARGEST_HAZARD = 1e9
+_LARGEST_HAZARD = 1e9  # upper bound of the parameters of a battery
 
 
 def vector_to_ros(values: FloatArray) -> Vector3:

@@ -1,7 +1,5 @@
 """The planner node of one robot that searches buildings beside others (004)."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 
@@ -47,8 +45,7 @@ from maasi_planner.conversions import path_to_ros
 from maasi_planner.node.search_action import offer_services
 from maasi_planner.node.search_modes import Mode, SearchModes
 
-# Largest difference of the stamps of odometry and step [ns].
-_STAMP_TOLERANCE = 1_000_000
+_STAMP_TOLERANCE = 1_000_000  # largest difference of the stamps of odometry and step [ns]
 # Longest wait until the last command has arrived [s].
 _STOP_TIME = Duration(seconds=0.3)
 _REASONS = {
@@ -96,8 +93,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         except ValueError as error:
             raise SettingsError(f'parameter {error}') from error
         self.modes = SearchModes([self.name])
-        # Odometry may skip steps.
-        self._gate = StampGate(max(JUMP, round(3e9 * settings.step)))
+        self._gate = StampGate(max(JUMP, round(3e9 * settings.step)))  # odometry may skip steps
         self._begin_anew()
 
     def _make_agent(self) -> SearchAgent:
@@ -119,8 +115,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._solve_time = 0.0
         # Snapshots of the agent that were published. A step may pass without a decision.
         self._published_shots = 0
-
-    # ---- life cycle --------------------------------------------------------------------------
 
     def set_up(self) -> None:
         """Compile and connect."""
@@ -181,7 +175,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         return self.modes.of[self.name] is Mode.SEARCHING
 
     def _take_command(self, word: str, _: list[str] | None) -> tuple[bool, str]:
-        """Execute a command; return whether it was accepted, and an answer as text."""
         if not self.active:
             return False, 'the planner is not active'
         if word == 'home':
@@ -210,8 +203,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             'solves without a plan': self.agent.failed,
             'last decision [ms]': f'{1e3 * self._solve_time:.2f}',
         }
-
-    # ---- input -------------------------------------------------------------------------------
 
     def _on_odometry(self, message: Odometry) -> None:
         if not self.active:
@@ -260,15 +251,12 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._try_step()
 
     def _check_link(self) -> None:
-        """Decide without other robots if the link is silent for too long."""
         if not self.active or self._sent_step != self._wanted_step:
             return
         patience = self.settings.link_patience * self.settings.step
         if self._decided_step < self._sent_step and time.monotonic() - self._sent_at > patience:
             self.warn_throttled('link', f'step {self._sent_step}: nothing on link/rx')
             self._decide([])
-
-    # ---- the step ----------------------------------------------------------------------------
 
     def _header(self, step: int) -> Header:
         stamp = stamp_to_ros(stamp_of_step(step, self.settings.step))
@@ -318,7 +306,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         return heard
 
     def _decide(self, heard: list[Broadcast]) -> None:
-        """Decide, or let the robot stand if it does not search; publish what came out."""
         step = self._sent_step
         header = self._header(step)
         velocity = np.zeros(3)
@@ -371,7 +358,3 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
 def main(arguments: list[str] | None = None) -> int:
     """Run the planner node of one robot."""
     return run(CuboidPlannerNode, arguments)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

@@ -1,7 +1,5 @@
 """Pre-planning: from objects to cuboids, 004, IV."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,8 +17,7 @@ from maasi_planner.buildings.settings import (
     SearchCameraSettings,
 )
 
-# Least thickness of a cuboid [m].
-_THINNEST = 1.0
+_THINNEST = 1.0  # least thickness of a cuboid [m]
 
 
 def detection_probability(distance: float, camera: SearchCameraSettings) -> float:
@@ -38,19 +35,14 @@ def footprint(distance: float, camera: SearchCameraSettings) -> float:
 
 @dataclass(frozen=True)
 class Cell:
-    """A part of a face and the cuboid that it is searched from.
+    """A part of a face and the cuboid that it is searched from."""
 
-    target: index of the object; face: west, east, south, north, bottom or top; centre, normal (3,):
-    of the cell [m], and outward; size (2,): sides of the cell [m]; box (3, 2): lower and upper
-    corner of the cuboid [m].
-    """
-
-    target: int
-    face: str
-    centre: FloatArray
-    normal: FloatArray
-    size: FloatArray
-    box: FloatArray
+    target: int  # index of the object
+    face: str  # west, east, south, north, bottom or top
+    centre: FloatArray  # (3,) of the cell [m]
+    normal: FloatArray  # (3,) outward
+    size: FloatArray  # (2,): sides of the cell [m]
+    box: FloatArray  # (3, 2): lower and upper corner of the cuboid [m]
 
     def sides(self) -> FloatArray:
         """Return lower and upper corner of the cell, (3, 2) [m]: flat along its normal."""
@@ -65,26 +57,19 @@ class Cell:
 
 @dataclass(frozen=True)
 class CoveragePlan:
-    """Cells of the faces to search and their cuboids, planned before take-off.
-
-    cells: searchable cells; lost: other cells, and why they are lost; area (3, 2): admissible
-    positions [m]; objects, obstacles (n, 3, 2): true size, without clearance [m]; distance,
-    footprint: d and r [m]; coverage: share of the searchable faces that the snapshots cover, 0 to
-    1.
-    """
+    """Cells of the faces to search and their cuboids, planned before take-off."""
 
     cells: list[Cell]
-    lost: list[tuple[Cell, str]]
-    area: FloatArray
-    objects: FloatArray
+    lost: list[tuple[Cell, str]]  # other cells, and why they are lost
+    area: FloatArray  # (3, 2): admissible positions [m]
+    objects: FloatArray  # (n, 3, 2): true size, without clearance [m]
     obstacles: FloatArray
-    distance: float
-    footprint: float
-    coverage: float
+    distance: float  # d [m]
+    footprint: float  # r [m]
+    coverage: float  # share of the searchable faces that the snapshots cover, 0 to 1
     boxes: FloatArray = field(init=False)
     centres: FloatArray = field(init=False)
-    # Objects and obstacles.
-    solids: FloatArray = field(init=False)
+    solids: FloatArray = field(init=False)  # objects and obstacles
 
     def __post_init__(self) -> None:
         boxes = np.array([cell.box for cell in self.cells]).reshape(-1, 3, 2)
@@ -186,7 +171,6 @@ def _boxes(key: str, items: Sequence[BoxSettings], area: FloatArray) -> FloatArr
 def _face_cells(
     index: int, face: Face, box: FloatArray, distance: float, side: float, settings: CuboidSettings
 ) -> Iterator[Cell]:
-    """Yield the cells of a face, their cuboids not cut yet."""
     axis, upper = divmod(FACES.index(face), 2)
     others = [a for a in range(3) if a != axis]
     normal = np.zeros(3)
@@ -211,7 +195,6 @@ def _face_cells(
 def _usable(
     cell: Cell, area: FloatArray, solids: FloatArray, settings: CuboidSettings
 ) -> tuple[FloatArray, str]:
-    """Return the accessible part of a cuboid, or why there is none."""
     box = np.stack(
         [np.maximum(cell.box[:, 0], area[:, 0]), np.minimum(cell.box[:, 1], area[:, 1])], axis=1
     )

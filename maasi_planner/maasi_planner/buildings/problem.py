@@ -1,7 +1,5 @@
 """The problem of one robot at one step, 004, P2, and its exact solution."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from typing import Literal
@@ -17,65 +15,44 @@ from maasi_planner.buildings.settings import CuboidMethodSettings
 
 How = Literal['optimal', 'best_so_far', 'shifted', 'brake']
 
-# Relaxation of bounds if rounding leaves the state outside of them [m, m/s].
-GIVE = 1e-4
-# Tolerance of the present position in a cuboid: plans touch faces, up to rounding [m].
-TOUCH = 1e-6
-# Nodes between two checks of the time limit, and capacity of open nodes.
-_SLICE, _ROOM = 500, 16384
+GIVE = 1e-4  # relaxation of bounds if rounding leaves the state outside of them [m, m/s]
+TOUCH = 1e-6  # tolerance of the present position in a cuboid: plans touch faces, up to rounding [m]
+_SLICE, _ROOM = 500, 16384  # nodes between two checks of the time limit, and capacity of open nodes
 # Share of the smoothness weight of a robot that flies home, so that its forces are unique.
 _HOMING_SMOOTHNESS = 1e-2
 
 
 @dataclass
 class Problem:
-    """State and knowledge of a robot when it plans.
+    """State and knowledge of a robot when it plans."""
 
-    position, velocity (3,): its state [m, m/s]; target (3,): x*, guidance target [m]; cuboids (N,
-    3, 2): lower and upper corners [m]; wanted (N,): which are unvisited and have a reward of 1;
-    obstacles (O, 3, 2): objects and obstacles, clearance included [m]; area (3, 2): admissible
-    positions [m]; homing: whether it only flies to its target, without search (8); hint: visits
-    (step, cuboid) of the previous plan, shifted to now; put_off: consecutive postponements of the
-    first visit; without effect if rewards are not discounted.
-    """
-
-    position: FloatArray
-    velocity: FloatArray
-    target: FloatArray
-    cuboids: FloatArray
-    wanted: BoolArray
-    obstacles: FloatArray
-    area: FloatArray
-    homing: bool = False
-    hint: list[tuple[int, int]] = field(default_factory=list)
-    put_off: int = 0
+    position: FloatArray  # (3,) [m]
+    velocity: FloatArray  # (3,) [m/s]
+    target: FloatArray  # (3,): x*, guidance target [m]
+    cuboids: FloatArray  # (N, 3, 2): lower and upper corners [m]
+    wanted: BoolArray  # (N,): which are unvisited and have a reward of 1
+    obstacles: FloatArray  # (O, 3, 2): objects and obstacles, clearance included [m]
+    area: FloatArray  # (3, 2): admissible positions [m]
+    homing: bool = False  # whether it only flies to its target, without search (8)
+    hint: list[tuple[int, int]] = field(default_factory=list)  # of the plan before, as of now
+    put_off: int = 0  # consecutive postponements of the first visit, if rewards are discounted
 
 
 @dataclass
 class Plan:
-    """A plan, starting at P_0.
+    """A plan, starting at P_0."""
 
-    positions, velocities (T + 1, 3): from now on [m, m/s]; controls (T, 3): forces [N]; visits:
-    step, from 1, and cuboid; each cuboid once, in order of the steps; how: optimal; best_so_far: a
-    limit ended the solve; shifted: no solution, the previous plan is continued; brake: no valid
-    previous plan either; objective: value of (9), without cuboids visited earlier; nodes: number of
-    solved relaxations.
-    """
-
-    positions: FloatArray
-    velocities: FloatArray
-    controls: FloatArray
-    visits: list[tuple[int, int]]
-    how: How
-    objective: float = float('nan')
-    nodes: int = 0
+    positions: FloatArray  # (T + 1, 3), from now on [m]
+    velocities: FloatArray  # (T + 1, 3) [m/s]
+    controls: FloatArray  # (T, 3): forces [N]
+    visits: list[tuple[int, int]]  # step, from 1, and cuboid, each once, in order
+    how: How  # best_so_far: a limit ended the solve; shifted, brake: there was no solution
+    objective: float = float('nan')  # value of (9), without cuboids visited earlier
+    nodes: int = 0  # number of solved relaxations
 
 
 class PlanSolver:
-    """Solves the problems of one kind of robot; reuses its matrices and workspace.
-
-    After `node_limit` relaxations or `time_limit` [s of wall time] it returns the best plan so far.
-    """
+    """Solves the problems of one kind of robot, with at most so many nodes or seconds."""
 
     def __init__(self, dynamics: Dynamics, settings: CuboidMethodSettings) -> None:
         self.dynamics = dynamics
@@ -96,10 +73,7 @@ class PlanSolver:
         self._tree = make_tree(_ROOM, horizon, len(self._search.matrix))
 
     def solve(self, problem: Problem) -> Plan | None:
-        """Return the best plan; None if there is none.
-
-        Bounds are relaxed by `GIVE` if rounding has left the state outside.
-        """
+        """Return the best plan, or None; bounds give by `GIVE` if rounding left a state outside."""
         plan = self._solve(problem, 0.0)
         return plan if plan is not None else self._solve(problem, GIVE)
 
@@ -191,7 +165,6 @@ class PlanSolver:
         return instance, base - float(rewards[1]) * len(due), due
 
     def _bounds(self, problem: Problem, give: float) -> tuple[FloatArray, FloatArray]:
-        """Return the bounds of the rows: positions, velocities, forces, and ways to brake."""
         horizon, dynamics = self.settings.horizon, self.dynamics
         area = np.asarray(problem.area, dtype=float)
         parts = horizon - 1, horizon, horizon
@@ -207,11 +180,9 @@ class PlanSolver:
     def _visits(
         self, problem: Problem, first: FloatArray, wanted: BoolArray
     ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return possible visits from P_1, and extreme motion.
+        """Return possible visits from P_1: step, cuboid, and corners of its part that is in reach.
 
-        A visit is possible only if its cuboid intersects the set reachable by extreme forces: step,
-        cuboid and lower and upper corner of the intersection. Extreme motion is the sum of the
-        lowest and highest velocities before each step, (3, T + 1) [m].
+        And the sums of the lowest and highest velocities before each step, (3, T + 1) [m].
         """
         dynamics, sums = self.dynamics, np.zeros((2, 3, self.settings.horizon + 1))
         for side, sign in enumerate((-1.0, 1.0)):
@@ -235,7 +206,6 @@ class PlanSolver:
 
 
 def _due(problem: Problem, place: FloatArray) -> tuple[list[int], BoolArray]:
-    """Return the cuboids that are visited at P_1, which is given, and the other wanted ones."""
     wanted = np.asarray(problem.wanted, dtype=bool).copy()
     if problem.homing:
         return [], np.zeros_like(wanted)

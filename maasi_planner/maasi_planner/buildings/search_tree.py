@@ -1,7 +1,5 @@
 """Nodes of the branch and bound search, best bound first, in arrays of fixed size."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -12,33 +10,23 @@ from maasi_planner.buildings.axis_problem import AxisRoom
 
 
 class Tree(NamedTuple):
-    """Nodes of the search, best bound first, in arrays that are reused.
+    """n nodes of the search, best bound first, in arrays that are reused."""
 
-    bound, reward (n,): lower bound of the objective, and the reward of the visits made; cost (n,
-    3): of each axis; dirty (n,): bit mask of the axes that have to be solved again; closed (n,):
-    whether no further visits are made; visits, number (n, V): the visits made; low, high (n, 3, T +
-    2): bounds of the positions P_0 to P_T and, last, of the way to brake [m]; values (n, 3, m): of
-    the rows; heap, spare (n,): nodes by bound, and nodes that are free; counts (5,): sizes of
-    `heap` and `spare`, nodes solved, best node (-1: none), out of nodes; best (1,): objective of
-    the best node; scratch (3, m): bounds of an axis while it is solved; room: scratch
-    of `solve_axis`.
-    """
-
-    bound: FloatArray
-    reward: FloatArray
-    cost: FloatArray
-    dirty: IntArray
-    closed: BoolArray
-    visits: IntArray
-    number: IntArray
-    low: FloatArray
+    bound: FloatArray  # (n,): lower bound of the objective
+    reward: FloatArray  # (n,) of the visits made
+    cost: FloatArray  # (n, 3): of each axis
+    dirty: IntArray  # (n,): bit mask of the axes that have to be solved again
+    closed: BoolArray  # (n,): whether no further visits are made
+    visits: IntArray  # (n, V): the visits made
+    number: IntArray  # (n,) of them
+    low: FloatArray  # (n, 3, T + 2): bounds of P_0 to P_T and, last, of the way to brake [m]
     high: FloatArray
-    values: FloatArray
-    heap: IntArray
-    spare: IntArray
-    counts: IntArray
-    best: FloatArray
-    scratch: FloatArray
+    values: FloatArray  # (n, 3, m): of the rows
+    heap: IntArray  # (n,): nodes by bound
+    spare: IntArray  # (n,): nodes that are free
+    counts: IntArray  # sizes of heap and spare, nodes solved, best node (or -1), out of nodes
+    best: FloatArray  # (1,): objective of the best node
+    scratch: FloatArray  # (3, m): bounds of an axis while it is solved
     room: AxisRoom
 
 

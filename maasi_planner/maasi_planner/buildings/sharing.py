@@ -1,7 +1,5 @@
 """What robots tell each other, and how they share the cuboids: 004, (10) to (14)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,32 +12,22 @@ from maasi_planner.buildings.settings import CuboidMethodSettings, HazardSetting
 
 @dataclass(frozen=True)
 class Broadcast:
-    """Message of a robot to those in range at a step (V-B).
-
-    robot: its name; step: t; position, velocity (3,): [m, m/s]; searching: whether it takes part; a
-    robot on its way home still shares its search map; visited (N,): V, its search map;
-    flight_steps: t_Fl, since its last recharge; plan: steps from now until the visit, by cuboid, of
-    its previous plan; hazard: of its battery; predicted (3,): position at t + tau* + 1 in its
-    previous plan [m].
-    """
+    """Message of a robot to those in range at a step (V-B)."""
 
     robot: str
-    step: int
-    position: FloatArray
-    velocity: FloatArray
-    searching: bool
-    visited: BoolArray
-    flight_steps: int
-    plan: Mapping[int, int]
-    hazard: HazardSettings
-    predicted: FloatArray
+    step: int  # t
+    position: FloatArray  # (3,) [m]
+    velocity: FloatArray  # (3,) [m/s]
+    searching: bool  # whether it takes part; on its way home it still shares its search map
+    visited: BoolArray  # (N,): V, its search map
+    flight_steps: int  # t_Fl, since its last recharge
+    plan: Mapping[int, int]  # steps from now until the visit, by cuboid, of the plan before
+    hazard: HazardSettings  # of its battery
+    predicted: FloatArray  # (3,): position at t + tau* + 1 in the plan before [m]
 
 
 def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntArray) -> int | None:
-    """Return the cuboid assigned to robot `own` among robots at positions (m, 3): (10).
-
-    None if fewer cuboids than robots are left and this robot gets none.
-    """
+    """Return the cuboid assigned to robot `own` of robots at places (m, 3): (10); None: too few."""
     if not len(unvisited):
         return None
     # Deferred: SciPy takes long to import, and searches for targets do not need it.

@@ -1,7 +1,5 @@
 """Paths around obstacles."""
 
-from __future__ import annotations
-
 import heapq
 
 import numpy as np
@@ -9,8 +7,7 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings.preplanning import segment_cuts
 
-# Distance of intermediate targets from the corners of obstacles [m].
-_BERTH = 3.0
+_BERTH = 3.0  # distance of intermediate targets from the corners of obstacles [m]
 
 
 class WayFinder:
@@ -27,10 +24,7 @@ class WayFinder:
         self._down = speed
 
     def first_corner(self, place: FloatArray, target: FloatArray) -> FloatArray:
-        """Return the next intermediate target on the path from a position (3,) to a target (3,).
-
-        The target itself if it is visible, or if there is no path.
-        """
+        """Return the next corner (3,) of the path to a target; without any, the target."""
         if not segment_cuts(place, target, self.solids).any():
             return target
         points = np.vstack([place, target, self._corners(place, target)])

@@ -1,7 +1,5 @@
 """Measurement batches of the planner node, and the filter's updates of them."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -16,16 +14,14 @@ from maasi_planner.coordinator import Coordinator, Member
 from maasi_planner.node.filter_guard import FilterGuard
 from maasi_planner.node_settings import PlannerNodeSettings
 
-# Measurements that are remembered, to recognise duplicate updates.
-_MEASUREMENTS_KEPT = 1000
+_MEASUREMENTS_KEPT = 1000  # measurements that are remembered, to recognise duplicate updates
 
 
 class Batches:
     """Requests measurements, and hands the filter's updates to the coordinator.
 
-    last: id of the last batch; used: largest id of an update that was used; waiting: whether the
-    update of the last batch has not come; published_at: when the last batch was published,
-    monotonic clock [s]; update: the last one that was used, and measurements of all of them.
+    Ids of the last batch and of the last update used; whether one is waited for; when the batch was
+    published [s, monotonic clock]; the update used last, and the measurements of all.
     """
 
     def __init__(
@@ -46,8 +42,7 @@ class Batches:
         self.published_at = time.monotonic()
         self.update = FilterUpdate()
         self._message = MeasurementBatch()
-        # Last batch of an earlier planner process.
-        self._before = 0
+        self._before = 0  # last batch of an earlier planner process
         # Robot and index of the last measurements whose update was used.
         self._processed: deque[tuple[str, int]] = deque(maxlen=_MEASUREMENTS_KEPT)
 
@@ -99,8 +94,7 @@ class Batches:
         self._guard.watch.answered(number)
         measured = [(member.robot, int(member.measurement)) for member in message.members]
         if measured and all(item in self._processed for item in measured):
-            # Duplicate, from a restarted filter.
-            return
+            return  # duplicate, from a restarted filter
         self._processed.extend(measured)
         coordinator.absorb(poses, clusters)
         self.used = max(self.used, number)

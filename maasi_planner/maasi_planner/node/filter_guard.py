@@ -1,7 +1,5 @@
 """Supervision of the filter by the planner node, and found targets kept for it."""
 
-from __future__ import annotations
-
 import math
 import time
 
@@ -15,12 +13,9 @@ from maasi_planner.node_settings import PlannerNodeSettings
 
 
 class FilterWatch:
-    """Detects a silent filter by its heartbeat and by the oldest batch without an update.
+    """Detects a silent filter by its heartbeat and the oldest batch without an update; 0: never.
 
-    Both count only if there was something to wait for: a filter that never sent a heartbeat, while
-    no batch is open, is no fault.
-
-    A timeout of 0 disables the supervision.
+    A filter that never sent a heartbeat, while no batch is open, is no fault.
     """
 
     def __init__(self, timeout: float) -> None:
@@ -59,8 +54,7 @@ class FilterWatch:
 
 # A longer gap between two checks means that the planner itself was suspended [s].
 _LONGEST_GAP = 1.0
-# Period of updates of the names of filters [s].
-_NAMES_PERIOD = 1.0
+_NAMES_PERIOD = 1.0  # period of updates of the names of filters [s]
 
 
 class FilterGuard:
@@ -104,10 +98,7 @@ class FilterGuard:
 
 
 class FoundKeeper:
-    """Republishes found targets, latched: a latched message is lost with its publisher.
-
-    Targets are kept until a new search, even if the filter no longer has them.
-    """
+    """Republishes found targets, latched, until a new search, even if the filter has lost them."""
 
     def __init__(self, node: Node) -> None:
         self._targets: dict[int, FoundTarget] = {}

@@ -1,7 +1,5 @@
 """Goals of the robots: those of decisions, the way home, and those of other clients."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -48,8 +46,6 @@ class Orders:
         self.goals = TeamGoals(self._node, names, self._on_answer)
         return self.goals
 
-    # ---- commands ----------------------------------------------------------------------------
-
     def stop(self, names: Iterable[str]) -> None:
         """Cancel the goals of robots, and discard their plans."""
         for name in names:
@@ -77,8 +73,6 @@ class Orders:
         if name in self._homing:
             self._homing[name] = -1
         self._coordinator.plans[name].leave()
-
-    # ---- goals -------------------------------------------------------------------------------
 
     def send(self, name: str, number: int, waypoint: FloatArray, header: Header) -> None:
         """Send a goal to a robot."""

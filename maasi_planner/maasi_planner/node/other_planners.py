@@ -1,7 +1,5 @@
 """Destinations that planners of single robots tell each other (002, section 4)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 
@@ -41,8 +39,7 @@ class OtherPlanners:
             name: {-1: np.array(others[name].start)} for name in sorted(others)
         }
         self._silence: dict[str, Silence] = {}
-        #: In lockstep, who took part in the step before.
-        self.before: set[str] = set()
+        self.before: set[str] = set()  #: in lockstep, who took part in the step before
 
     def set_up(self) -> None:
         """Create publishers and subscriptions, where there are others."""
@@ -80,11 +77,7 @@ class OtherPlanners:
         self._heard()
 
     def missing(self, step: int, robots: Collection[str]) -> bool:
-        """Return whether destinations of other planners have not come yet, in lockstep.
-
-        Needed are those of this step from planners earlier by name, and of the previous step from
-        later ones.
-        """
+        """Return whether destinations are awaited, in lockstep: of later names the last step's."""
         for name, known in self._destinations.items():
             if name not in robots:
                 continue
@@ -96,10 +89,7 @@ class OtherPlanners:
         return False
 
     def taken(self, step: int, robots: Collection[str] | None) -> list[tuple[FloatArray, float]]:
-        """Return the known destinations of robots with their own planner, and their radii.
-
-        Those of `robots` at a step in lockstep; with None those heard recently.
-        """
+        """Return destinations of other planners' robots, and radii; recent ones if free running."""
         settings = self._node.settings
         taken = []
         for name, known in self._destinations.items():

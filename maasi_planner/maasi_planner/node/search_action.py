@@ -1,7 +1,5 @@
 """The action and the services that start, pause and end a search."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -19,13 +17,9 @@ Result: TypeAlias = SearchTargets.Result
 
 
 class SearchAction:
-    """Server of `search`.
+    """Server of `search`, which starts a search or takes over a running one.
 
-    A goal starts a search, or takes over a running one. A newer goal preempts an older one, which
-    is aborted, while the robots continue, so that a dead client does not block the next one.
-
-    node: owner of the server; on_begin, on_end: called when a search begins, and when the robots
-    must stop.
+    A newer goal aborts an older one, while the robots continue: a dead client blocks nobody.
     """
 
     def __init__(

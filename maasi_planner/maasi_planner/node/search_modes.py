@@ -1,7 +1,5 @@
 """The mode of each robot of a team in a search, and its commands. Without ROS."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from enum import Enum
 
@@ -29,10 +27,7 @@ _ALLOWED: dict[str, tuple[frozenset[Mode] | None, Mode]] = {
 
 
 class SearchModes:
-    """Mode of each robot, and its transitions by commands.
-
-    names: robots.
-    """
+    """Mode of each robot, and its transitions by commands."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.of = dict.fromkeys(sorted(names), Mode.WAITING)

@@ -20,10 +20,8 @@ from maasi_msgs.msg import AgentState
 from maasi_planner.motion import RobotState
 
 ENDED = (AgentState.IDLE, AgentState.REACHED, AgentState.CANCELED, AgentState.ABORTED)
-# Reason in the result of a preempted goal, set by the driver.
-REPLACED = 'replaced'
-# Reason of a driver that ends, as it does at the end of a run.
-_DRIVER_STOPS = 'the driver stops'
+REPLACED = 'replaced'  # reason in the result of a preempted goal, set by the driver
+_DRIVER_STOPS = 'the driver stops'  # reason of a driver that ends, as it does at the end of a run
 # Time after acceptance from which a state with another goal means that the goal is lost [s].
 _PATIENCE = 1.0
 
@@ -46,10 +44,8 @@ class GoalProgress(Enum):
 
     UNDER_WAY = 0
     ENDED = 1
-    #: The robot does not have it, or refused it.
-    LOST = 2
-    #: It was preempted by a goal of another client.
-    REPLACED = 3
+    LOST = 2  #: the robot does not have it, or refused it
+    REPLACED = 3  #: it was preempted by a goal of another client
 
 
 @dataclass
@@ -71,12 +67,9 @@ class _Sent:
 
 
 class TeamGoals:
-    """Clients of the action `go_to` of all robots of a team.
+    """Clients of the action `go_to` of all robots of a team, in lockstep by their states only.
 
-    In lockstep only states are used: they belong to a step, while results arrive at any time.
-
-    node: owner of the clients; names: robots; on_answer: called with robot and number of an
-    answered goal, and whether it was accepted.
+    `on_answer` is called with robot and number of an answered goal, and whether it was accepted.
     """
 
     def __init__(
@@ -189,8 +182,7 @@ class TeamGoals:
                 sent.handle = handle
                 handle.get_result_async().add_done_callback(partial(self._ended, name, sent))
             else:
-                # The goal was cancelled before it was answered.
-                handle.cancel_goal_async()
+                handle.cancel_goal_async()  # the goal was cancelled before it was answered
         self._on_answer(name, sent.number, accepted)
 
     def _ended(self, name: str, sent: _Sent, future: Any) -> None:

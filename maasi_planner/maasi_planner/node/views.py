@@ -1,7 +1,5 @@
 """What the planner node publishes for viewers, at a limited rate."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -20,10 +20,8 @@ from maasi_sim.run.buildings.picture import draw_mission, legend
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Largest number of steps of a mission.
-_LIMIT = 1000
-# Without a limit on wall time a decision does not depend on the machine [s].
-_FOR_EVER = 1e9
+_LIMIT = 1000  # largest number of steps of a mission
+_FOR_EVER = 1e9  # without a limit on wall time a decision does not depend on the machine [s]
 
 STEPS = Quantity('steps', 'time until all cuboids are visited', 's', 'restricted')
 QUANTITIES = (
@@ -50,7 +48,6 @@ def mission_settings(settings: dict[str, Any]) -> CuboidSettings:
 
 
 def _mission(settings: dict[str, Any], seed: int, scheme: Any) -> CuboidMission:
-    """Return the mission of a case; robots start at given places, or random ones."""
     search, area = mission_settings(settings), settings['area']
     rng = np.random.default_rng(seed)
     starts = settings.get('starts')
@@ -221,10 +218,10 @@ def draw_decision_times(figure: Figure, results: Results) -> None:
     for offset, quantity in ((-0.2, 'centralized'), (0.2, 'distributed')):
         ours = [float(np.mean(results.values(name, quantity))) for name in names]
         axes.bar(places + offset, ours, 0.35, label=f'{quantity}, ours')
-        theirs = {p.case: p.value for p in results.experiment.published if p.quantity == quantity}
+        theirs = results.experiment.published_of(quantity)
         axes.plot(
             places + offset,
-            [theirs.get(name, np.nan) for name in names],
+            [theirs[name].value if name in theirs else np.nan for name in names],
             '_',
             ms=22,
             color=_PAPER_COLOUR,

@@ -1,11 +1,8 @@
 """Makes the runs of experiments, keeps them, and what the commands that do so share.
 
-The seed of a run is that of the map and does not depend on the worker. Stored runs are not
-repeated. Another processor or other versions may change the last bits of numbers, so that runs of
-different machines are mixed only on request (docs/repeatability.md).
+Seeds do not depend on the worker. Other processors or versions may change the last bits of numbers:
+runs of different machines are mixed only on request (docs/repeatability.md).
 """
-
-from __future__ import annotations
 
 import argparse
 import contextlib
@@ -22,14 +19,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from maasi_sim.arguments import count
-from maasi_sim.experiments.experiment import (
-    Case,
-    Experiment,
-    Outcome,
-    Results,
-    Run,
-    WrongInput,
-)
+from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Results, Run, WrongInput
 from maasi_sim.experiments.runs import DamagedRun, NoRoom, load_run, run_of, to_text, write_file
 from maasi_sim.machine import code_digest, machine_difference, this_machine
 from maasi_sim.run.progress import ProgressDisplay
@@ -42,13 +32,11 @@ EXIT_CODES = (
     'Exit codes: 0 all runs are there, 1 some failed, 2 wrong input, 3 stopped: no room on the '
     'disk, or the workers are gone, 130 interrupted.'
 )
-# Longest wait for the scheduler of a cluster and for its first worker [s].
-PATIENCE = 20.0
+PATIENCE = 20.0  # longest wait for the scheduler of a cluster and for its first worker [s]
 # One thread for each worker; the number of workers sets the load.
 _ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS')
 _MIXED = '--mixed-workers allows it'
-# Wall time between two lines of progress without a terminal [s].
-_QUIET_PERIOD = 10.0
+_QUIET_PERIOD = 10.0  # wall time between two lines of progress without a terminal [s]
 
 
 class WorkersLost(RuntimeError):
@@ -163,8 +151,7 @@ def execute(task: Task) -> Run | str:
 class Campaign:
     """The runs of one experiment: those that are there, by case and map, and those to be made.
 
-    Tasks go map by map: an interrupted campaign has all cases on the first maps. Complaints are by
-    damaged file.
+    Tasks go map by map: an interrupted campaign has all cases on the first maps.
     """
 
     experiment: Experiment
@@ -193,8 +180,7 @@ class Campaign:
     ) -> list[str]:
         """Make the missing runs, store each when it is done, and return the errors.
 
-        `advance` is called after each run. With a `machine`, all must have been made on it, also
-        by workers that join later.
+        `advance` is called after each. With a `machine`, runs of others are not kept.
         """
         problems = []
         for task, run in workers.make(execute, self.tasks):
@@ -220,17 +206,9 @@ def maps_in(folder: Path) -> int:
 
 
 def plan(
-    experiment: Experiment,
-    out: Path,
-    runs: int,
-    seed: int = 1,
-    small: bool = False,
-    first: int = 0,
+    experiment: Experiment, out: Path, runs: int, seed: int = 1, small: bool = False, first: int = 0
 ) -> Campaign:
-    """Compare the stored runs in the folder of all experiments with the wanted ones.
-
-    Wanted are `runs` maps from number `first`, with the seed of the campaign.
-    """
+    """Compare the stored runs with the wanted ones: `runs` maps from number `first`."""
     cases = {case.name: case for case in experiment.cases(small)}
     result = Campaign(experiment, cases, out / experiment.name)
     for number in range(first, first + runs):
@@ -317,9 +295,7 @@ def carry_out_all(
 ) -> list[str]:
     """Make the missing runs of all campaigns, print a summary, and return the errors.
 
-    `workers` and `cluster` are those of `make_workers`; `mixed` allows runs of different
-    processors or versions. `finished` is called when the runs of a campaign are done, and returns
-    a line to print, '' for none.
+    `mixed` allows runs of different machines; `finished` returns a line to print after a campaign.
     """
     for work in campaigns:
         for complaint in work.complaints.values():

@@ -1,7 +1,5 @@
 """The papers' claims: what our runs say about each, and a verdict by one rule."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -20,19 +18,11 @@ from maasi_sim.experiments.statistics import (
     paired_difference,
     student,
 )
-from maasi_sim.experiments.tables import (
-    interval,
-    markdown_table,
-    median,
-    number,
-    paired,
-    shown,
-)
+from maasi_sim.experiments.tables import interval, markdown_table, median, number, paired, shown
 
 HOLDS, NOT_SHOWN, NOT_HERE, DIFFERS = 'holds', 'not shown', 'not here', 'differs'
 ONE_RUN, NOT_RUN = 'no interval', 'not run'
-# What is within this share of the other is alike.
-ALIKE = 0.2
+ALIKE = 0.2  # what is within this share of the other is alike
 # The summary in README.md stands between these lines.
 BEGIN, END = '<!-- claims: begin -->\n', '<!-- claims: end -->\n'
 _WORDS = {'less': 'less', 'greater': 'more', 'alike': 'alike', 'number': ''}
@@ -40,21 +30,16 @@ _WORDS = {'less': 'less', 'greater': 'more', 'alike': 'alike', 'number': ''}
 
 @dataclass(frozen=True)
 class Finding:
-    """What our runs say about a claim, stored beside the figure of its experiment.
-
-    `gap` is first minus second, or ours minus the paper's number, with half of its 95 % interval
-    (None of one run) and Student's `degrees`; `size` is the second, or the paper's number. `paper`
-    and `here` are the cells of the table.
-    """
+    """What our runs say about a claim, stored beside the figure of its experiment."""
 
     says: str
     expects: str
-    paper: str
-    here: str
-    gap: float
-    half_width: float | None
-    degrees: float
-    size: float
+    paper: str  # cell of the table
+    here: str  # cell of the table
+    gap: float  # first minus second, or ours minus the paper's number
+    half_width: float | None  # of the 95 % interval; None of one run
+    degrees: float  # of Student's distribution
+    size: float  # the second, or the paper's number
     earlier: bool = False
 
     def verdict(self, level: float = LEVEL) -> str:
@@ -96,7 +81,6 @@ def _finding(claim: Claim, paper: str, here: Sequence[str], gap: Interval, size:
 
 
 def _number(results: Results, claim: Claim, quantity: Quantity) -> Finding | None:
-    """Return the mean of a case beside the paper's number."""
     if not results.runs.get(claim.case):
         return None
     ours = interval(results, claim.case, quantity)
@@ -115,7 +99,6 @@ def _number(results: Results, claim: Claim, quantity: Quantity) -> Finding | Non
 
 
 def _pair(results: Results, claim: Claim, quantity: Quantity) -> Finding | None:
-    """Return the difference of two cases on the same maps."""
     names = claim.first, claim.second
     raw = results.pairs(*names, claim.quantity)
     both = paired(results, *names, quantity)
@@ -138,10 +121,8 @@ def _pair(results: Results, claim: Claim, quantity: Quantity) -> Finding | None:
 
 
 def _published(experiment: Experiment, case: str, quantity: str) -> Interval | None:
-    for item in experiment.published:
-        if (item.case, item.quantity) == (case, quantity):
-            return from_published(item.value, item.half_width, item.runs)
-    return None
+    item = experiment.published_of(quantity).get(case)
+    return from_published(item.value, item.half_width, item.runs) if item else None
 
 
 def _printed(item: Interval, quantity: Quantity) -> str:
@@ -159,7 +140,6 @@ def _difference(gap: Interval) -> str:
 
 
 def _ratio(first: np.ndarray, second: np.ndarray) -> str:
-    """Return the mean ratio on the same maps with its bootstrap interval, '' if there is none."""
     known = ~np.isnan(first) & ~np.isnan(second)
     first, second = first[known], second[known]
     if (first <= 0.0).any() or (second <= 0.0).any() or (first == second).all():
@@ -170,7 +150,6 @@ def _ratio(first: np.ndarray, second: np.ndarray) -> str:
 
 
 def _finished(quantity: Quantity, *values: np.ndarray) -> str:
-    """Return how many runs of each case got there, '' of what each run has."""
     if quantity.kind == 'mean':
         return ''
     parts = [f'{int((~np.isnan(one)).sum())} of {len(one)}' for one in values]

@@ -1,7 +1,5 @@
 """Compare planners and filters: searches of scenarios in one process each, on the same seeds."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
@@ -134,7 +132,6 @@ def compare(options: argparse.Namespace) -> int:
 
 
 def _unfinished(wanted: dict[str, Any]) -> Path | None:
-    """Return the newest folder of an interrupted comparison with the same request."""
     for folder in sorted(_RUNS.glob('compare_*'), reverse=True):
         try:
             read = json.loads((folder / 'request.json').read_text(encoding='utf-8'))
@@ -155,7 +152,6 @@ def _new_folder() -> Path:
 
 
 def _refuse_others(campaigns: Sequence[Campaign], out: Path) -> None:
-    """Refuse a folder with whole searches of the same names and seeds but other settings."""
     other = sum(
         file.exists() and file not in work.complaints
         for work in campaigns
@@ -169,7 +165,6 @@ def _refuse_others(campaigns: Sequence[Campaign], out: Path) -> None:
 
 
 def _write(out: Path, tables: Sequence[SearchTable], seeds: Sequence[int]) -> None:
-    """Write tables, picture and JSON; NoRoom is raised if one cannot be written."""
     for table in tables:
         write_file(out / table.name / 'runs.csv', runs_text(table.results.every()))
     write_file(out / 'comparison.csv', compared_text(tables))

@@ -31,16 +31,12 @@ class OpenPoint:
 
 @dataclass(frozen=True)
 class Case:
-    """One configuration of an experiment, such as a method, that is run on every map.
+    """One configuration of an experiment, such as a method, that is run on every map."""
 
-    `name` is unique within the experiment, `settings` is all that a run needs, as plain values. The
-    preset is the best reading of the paper, or our own choice; `runs` is the most maps.
-    """
-
-    name: str
-    settings: dict[str, Any]
-    preset: Literal['paper', 'recommended'] = 'paper'
-    runs: int | None = None
+    name: str  # unique within the experiment
+    settings: dict[str, Any]  # all that a run needs, as plain values
+    preset: Literal['paper', 'recommended'] = 'paper'  # the paper's best reading, or ours
+    runs: int | None = None  # the most maps
 
     @property
     def slug(self) -> str:
@@ -57,8 +53,7 @@ class Case:
 class Quantity:
     """A measured quantity: a key of `Outcome.summary` or `Outcome.timing`.
 
-    A restricted one is a duration that is None in unfinished runs; its mean is restricted to the
-    shortest of the limits, which have the key `limit`.
+    A restricted one is a duration, None in unfinished runs; its mean is up to the key `limit`.
     """
 
     name: str
@@ -75,17 +70,14 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Published:
-    """A number that the paper reports, as printed or (then the note says so) as read from a figure.
-
-    `half_width` is that of its 95 % confidence interval, and `note` its place in the paper.
-    """
+    """A number that the paper reports, as printed, or as read from a figure."""
 
     case: str
     quantity: str
     value: float
-    half_width: float | None = None
+    half_width: float | None = None  # of its 95 % confidence interval
     runs: int = 10
-    note: str = ''
+    note: str = ''  # its place in the paper
 
 
 @dataclass(frozen=True)
@@ -99,51 +91,38 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Claim:
-    """Something that a paper says, and the cases here that it rests on.
-
-    Of two cases the paper expects the quantity of `first` to be less than, greater than or alike
-    that of `second`; of one `case` it prints a number, the one in `published`. `note` is added to
-    the words; `cause` says why it does not hold here, '' if no run has shown it.
-    """
+    """Something that a paper says, and the cases here that it rests on."""
 
     says: str
     quantity: str
-    first: str = ''
-    second: str = ''
-    case: str = ''
+    first: str = ''  # whose quantity is expected to be less than (or as `expects` says)
+    second: str = ''  # that of this one
+    case: str = ''  # instead of two: one whose number is `published`
     expects: Literal['less', 'greater', 'alike', 'number'] = 'less'
-    note: str = ''
-    cause: str = ''
+    note: str = ''  # added to the words
+    cause: str = ''  # why it does not hold here, '' if no run has shown it
 
 
 @dataclass
 class Outcome:
-    """Results of one run: numbers, texts or None by quantity, and columns with a row for each step.
+    """Results of one run."""
 
-    Details are other data of figures, such as true positions; timing is wall times, which differ
-    when a run is repeated.
-    """
-
-    summary: dict[str, Any]
-    columns: Mapping[str, Any] = field(default_factory=dict)
-    details: dict[str, Any] = field(default_factory=dict)
-    timing: dict[str, float] = field(default_factory=dict)
+    summary: dict[str, Any]  # numbers, texts or None by quantity
+    columns: Mapping[str, Any] = field(default_factory=dict)  # by row for each step
+    details: dict[str, Any] = field(default_factory=dict)  # other data of figures
+    timing: dict[str, float] = field(default_factory=dict)  # wall times, not the same again
 
 
 @dataclass(kw_only=True)
 class Run(Outcome):
-    """The outcome of one run of one case on one map.
-
-    `number` is that of the map, from 0, `digest` that of the case's settings, and `machine` what
-    made it, see `this_machine`.
-    """
+    """The outcome of one run of one case on one map."""
 
     experiment: str
     case: str
-    number: int
+    number: int  # of the map, from 0
     seed: int
-    digest: str
-    machine: dict[str, str]
+    digest: str  # of the case's settings
+    machine: dict[str, str]  # what made it, see `this_machine`
 
     def value(self, quantity: str) -> float | None:
         """Return a measured quantity; None if the run has none."""
@@ -164,34 +143,24 @@ def plain(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A figure or table of a paper.
-
-    `cases` returns the cases; with True small ones that take a second, for tests and a first look.
-    `run` runs a case once, from its settings and the seed of the map, the same for every case.
-    `quantities` are the columns of the table. `draw` draws a figure in the form of the paper's.
-    `published` are the paper's numbers, `comparisons` paired differences, `claims` what the paper
-    says of them, and `choices` open points of the paper. `tested` are causes of differences from
-    the paper that runs have shown. `runs` are the maps in the paper, `seconds` the approximate time
-    of a run on one core. Experiments with the same `maps` have the same maps; None: maps of its
-    own. `compared`: searches are compared, and the seed is the number of the map.
-    """
+    """A figure or table of a paper."""
 
     name: str
     title: str
-    cases: Callable[[bool], list[Case]]
-    run: Callable[[dict[str, Any], int], Outcome]
-    quantities: Sequence[Quantity]
-    draw: Callable[[Figure, Results], None]
-    published: Sequence[Published] = ()
-    comparisons: Sequence[Comparison] = ()
+    cases: Callable[[bool], list[Case]]  # with True small ones, which take a second
+    run: Callable[[dict[str, Any], int], Outcome]  # by settings and the seed of the map
+    quantities: Sequence[Quantity]  # columns of the table
+    draw: Callable[[Figure, Results], None]  # a figure in the form of the paper's
+    published: Sequence[Published] = ()  # the paper's numbers
+    comparisons: Sequence[Comparison] = ()  # paired differences
     claims: Sequence[Claim] = ()
-    choices: Sequence[OpenPoint] = ()
-    tested: str = ''
-    runs: int = 10
-    seconds: float = 2.0
-    maps: str | None = None
+    choices: Sequence[OpenPoint] = ()  # open points of the paper
+    tested: str = ''  # causes of differences from the paper that runs have shown
+    runs: int = 10  # maps in the paper
+    seconds: float = 2.0  # of a run on one core, about
+    maps: str | None = None  # those with the same name have the same maps; None: its own
     note: str = ''
-    compared: bool = False
+    compared: bool = False  # searches are compared: the seed is the number of the map
 
     def seed(self, number: int, seed: int = 1) -> int:
         """Return the seed of a map of a campaign; it depends on `maps` and the arguments only."""
@@ -207,6 +176,10 @@ class Experiment:
     def quantity(self, name: str) -> Quantity:
         """Return a quantity by its name."""
         return next(item for item in self.quantities if item.name == name)
+
+    def published_of(self, quantity: str) -> dict[str, Published]:
+        """Return the paper's numbers for a quantity by case."""
+        return {item.case: item for item in self.published if item.quantity == quantity}
 
 
 @dataclass

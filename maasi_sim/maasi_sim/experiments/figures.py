@@ -54,7 +54,6 @@ def as_png(draw: Callable[[Figure], None], dpi: int = 110) -> bytes:
 
 
 def _found_over(run: Run, grid: FloatArray, by: str) -> FloatArray:
-    """Return the true targets found at or before each point of a grid of another column."""
     if not len(run.columns[by]):
         return np.zeros(len(grid))
     index = np.searchsorted(run.columns[by], grid, side='right') - 1
@@ -72,9 +71,8 @@ def draw_curves(
 ) -> None:
     """Draw the mean number of targets found, of four or more runs with its 95 % confidence.
 
-    Over measurements, triangles mark where the paper's methods have found all. `styles` has the
-    cases to draw with the key in `STYLES` of each, `path` is the case whose first run is drawn
-    beside the curves, and `by` the column of the horizontal axis, up to `end`.
+    `styles` has a key of `STYLES` by case; the first run of the case `path` is drawn beside the
+    curves. Over measurements, triangles mark where the paper's methods have found all.
     """
     if path is not None:
         figure.set_size_inches(10.5, 4.6)
@@ -116,13 +114,8 @@ def _frame(axes: Axes) -> None:
 
 
 def _mark_published(axes: Axes, results: Results, styles: Mapping[str, str]) -> None:
-    """Mark on the top line when the paper's methods have found all, with its confidence."""
     label: str | None = "all found, the paper's"
-    published = {
-        item.case: item
-        for item in results.experiment.published
-        if item.quantity == 'measurements_to_find_all'
-    }
+    published = results.experiment.published_of('measurements_to_find_all')
     for name, key in styles.items():
         if name in published:
             axes.errorbar(
@@ -140,7 +133,6 @@ def _mark_published(axes: Axes, results: Results, styles: Mapping[str, str]) -> 
 
 
 def _draw_path(figure: Figure, place: tuple[int, int, int], results: Results, run: Run) -> None:
-    """Draw where the robots measured, the true targets, and those found, in 2D or 3D."""
     scenario = results.case(run.case).settings['scenario']
     bounds = np.array(scenario['environment']['bounds'], dtype=float)
     dimension = len(bounds)
@@ -205,16 +197,9 @@ def draw_paths(figure: Figure, results: Results, cases: Sequence[str] | None = N
 
 
 def draw_against(
-    figure: Figure,
-    results: Results,
-    setting: Sequence[str],
-    label: str,
-    quantities: Sequence[str],
+    figure: Figure, results: Results, setting: Sequence[str], label: str, quantities: Sequence[str]
 ) -> None:
-    """Draw means of quantities with their 95 % confidence against a number that cases differ in.
-
-    `setting` are the keys of the number in the scenario; each quantity has a picture.
-    """
+    """Draw means, with 95 % confidence, against the number of the scenario at keys `setting`."""
     figure.set_size_inches(4.6 * len(quantities), 3.8)
     for index, quantity in enumerate(map(results.experiment.quantity, quantities)):
         axes = figure.add_subplot(1, len(quantities), index + 1)
@@ -231,19 +216,14 @@ def draw_against(
 def draw_table(
     figure: Figure, results: Results, axes: Sequence[Sequence[str]], quantity: str
 ) -> None:
-    """Draw a table of means as the papers print theirs, the paper's number below ours.
-
-    `axes` are the heads of the rows and, if any, of the columns: joined they name the cases.
-    """
+    """Draw a table of means above the papers' as they print it; joined heads name the cases."""
     measured = results.experiment.quantity(quantity)
     rows = axes[0]
     columns = axes[1] if len(axes) > 1 else [textwrap.fill(measured.label, 20)]
     figure.set_size_inches(1.3 + 1.45 * len(columns), 0.8 + 0.62 * len(rows))
     plot = figure.add_subplot()
     plot.axis('off')
-    published = {
-        item.case: item for item in results.experiment.published if item.quantity == quantity
-    }
+    published = results.experiment.published_of(quantity)
     cells, means = [], np.full((len(rows), len(columns)), np.nan)
     for i, row in enumerate(rows):
         line = []

@@ -79,7 +79,6 @@ def write_outputs(work: Campaign, seed: int) -> None:
 def _described(
     experiment: Experiment, cases: dict[str, dict[str, str]], pairs: list[list[str]]
 ) -> list[str]:
-    """Return tables, note and causes in Markdown."""
     parts = [*beside_paper(cases, pairs), experiment.note and f'{experiment.note}\n']
     if experiment.tested:
         parts.append(f'Causes of differences, tested: {experiment.tested}\n')
@@ -93,11 +92,7 @@ def listed(choices: Sequence[OpenPoint]) -> str:
 
 @dataclass
 class Section:
-    """What the page shows of an experiment, stored beside its figure.
-
-    `rests` is the number of runs in words, `duration` the time of a run in words or '', `cases` and
-    `pairs` are the cells of its tables, and `claims` what the runs say about the paper's.
-    """
+    """What the page shows of an experiment, in words and cells, stored beside its figure."""
 
     rests: str
     duration: str
@@ -190,21 +185,16 @@ def wrapped(text: str) -> str:
         mark = line.split(' ', 1)[0]
         indent = ' ' * (len(mark) + 1) if mark == '-' or mark.rstrip('.').isdecimal() else ''
         lines += textwrap.wrap(
-            line,
-            _COLUMNS,
-            subsequent_indent=indent,
-            break_long_words=False,
-            break_on_hyphens=False,
+            line, _COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
         )
     return '\n'.join(lines)
 
 
 def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) -> list[str]:
-    """Write the page of the experiments in the folder `out`, and return those that have runs there.
+    """Write the pages of the experiments and of the claims; return what has runs in `out`.
 
-    The page of the claims, `claims.md`, is written beside it, and their summary to the README.md of
-    the folder above, if that has its marks. Figures and tables are written to `reproduction/`
-    beside the page; experiments and cases without runs keep theirs.
+    Figures and tables go to `reproduction/` beside the page; those without runs stay. The claims'
+    summary goes to the README.md of the folder above, if that has its marks.
     """
     sections, shown = {}, []
     for name, experiment in experiments().items():

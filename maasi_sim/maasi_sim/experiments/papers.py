@@ -1,11 +1,8 @@
 """Experiments of the papers, from the YAML files in `papers/`, one per paper.
 
-The settings of a case are its layers, merged one over the other, with its own values on top. The
-layers are those of the experiment, the one with the name of its preset, if any, and those of the
-case. A list of mappings of cases means all combinations of them.
+A case's settings are the layers of the experiment, of its preset and of the case, merged, and its
+own values on top. A list of mappings of cases means all combinations of them.
 """
-
-from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Mapping
@@ -122,7 +119,6 @@ def _axes(cases: Any) -> list[dict[str, dict[str, Any]]]:
 
 
 def _combined(cases: Any) -> dict[str, dict[str, Any]]:
-    """Return the values of each case by its name."""
     return {
         ', '.join(name for name, _ in items): merged(*(values for _, values in items))
         for items in product(*(axis.items() for axis in _axes(cases)))

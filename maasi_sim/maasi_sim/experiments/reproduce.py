@@ -1,7 +1,5 @@
 """Run the papers' experiments and compare the results with the papers'."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence
@@ -96,7 +94,6 @@ def _reproduce(options: argparse.Namespace) -> int:
 
 
 def _line(item: Experiment) -> str:
-    """Return name, cases, runs, time and title of an experiment."""
     cases = item.cases(False)
     runs = sum(item.runs if case.runs is None else case.runs for case in cases)
     minutes = runs * item.seconds / 60.0
@@ -105,7 +102,6 @@ def _line(item: Experiment) -> str:
 
 
 def _run(wanted: Sequence[Experiment], options: argparse.Namespace) -> list[str]:
-    """Run experiments one after the other and return the errors."""
     campaigns = []
     for experiment in wanted:
         runs = options.runs or experiment.runs

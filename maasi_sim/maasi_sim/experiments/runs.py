@@ -1,7 +1,5 @@
 """Files of runs, one each: JSON with a checksum, written atomically; and tables of all runs."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import errno

@@ -1,7 +1,5 @@
 """Searches in one process as experiments: cases, runs and measured quantities."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import pkgutil
@@ -74,8 +72,7 @@ def search_case(
 ) -> Case:
     """Return a case that is a search; robots stop at each waypoint, as in the papers.
 
-    `values` is the content of a scenario file, `most_measurements` the cap on those of all robots;
-    a small case has few measurements and particles.
+    `most_measurements` is a cap on those of all robots; a small case has few, and few particles.
     """
     if small:
         most_measurements = min(most_measurements, _SMALL)
@@ -131,10 +128,9 @@ def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: 
 
 
 def lane_share(places: FloatArray, side: float) -> float:
-    """Return which share of a way is lanes as of a lawnmower, from 0 to 1.
+    """Return which share of a way through places (n, 3) is lanes as of a lawnmower, from 0 to 1.
 
-    A lane is straight along an axis, without turning back, for at least half a side. `places` are
-    those of the measurements, (n, 3); `side` is the longest side of the environment [m].
+    A lane is straight along an axis, without turning back, for at least half of `side` [m].
     """
     steps = np.diff(places, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -152,10 +148,7 @@ def lane_share(places: FloatArray, side: float) -> float:
 
 
 def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a search and measure the explored share of the environment, the mean of 1 - e, and lanes.
-
-    Column 'explored' is after each measurement batch, that of the summary at the end.
-    """
+    """Run a search and measure the explored share (mean of 1 - e) after each batch, and lanes."""
     outcome = run_search(settings, seed)
     scenario = scenario_from_values(settings['scenario'], 'settings')
     bounds = scenario.environment.array()
@@ -225,11 +218,7 @@ def littered(
     margin: float,
     generator: np.random.Generator,
 ) -> FloatArray:
-    """Return targets in two clusters: around the lowest and around the highest place.
-
-    Of ten places drawn around each, with deviation `spread`, the lowest (highest) one is taken, one
-    target after the other, at least `margin` from the bounds.
-    """
+    """Return targets in two clusters: each the lowest (highest) of ten places at an extreme."""
     nodes = heights.shape[0]
     low, high = bounds[:, 0] + margin, bounds[:, 1] - margin
     sides = [np.linspace(bounds[axis, 0], bounds[axis, 1], nodes) for axis in (0, 1)]
@@ -270,10 +259,7 @@ def run_on_terrain(settings: dict[str, Any], seed: int) -> Outcome:
 
 
 def comparison_of(name: str, cases: Sequence[Case]) -> Experiment:
-    """Return searches as an experiment; differences are to the first case.
-
-    The cases have settings from `search_settings`.
-    """
+    """Return searches, of `search_settings`, as an experiment; the first case is compared with."""
     return Experiment(
         name=name,
         title='Searches on the same seeds',
@@ -286,11 +272,7 @@ def comparison_of(name: str, cases: Sequence[Case]) -> Experiment:
 
 
 def search_settings(scenario: Scenario, planner: str | None = None) -> dict[str, Any]:
-    """Return the settings of a case.
-
-    `planner` is a function to make planners, as of `search`, as `module:function`; None: the
-    scenario's planner.
-    """
+    """Return the settings of a case; `planner`, `module:function`, makes planners for `search`."""
     return {'scenario': scenario.content(), 'planner': planner, 'code': code_of(scenario)}
 
 
@@ -323,10 +305,7 @@ def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
 
 
 def find_times(result: SearchResult, limit: float) -> FloatArray:
-    """Return when the first, second and so on of the true targets was found, (n,) [s].
-
-    A target that was not found counts with the limit.
-    """
+    """Return when the first, second and so on of n targets was found, or the limit [s]."""
     times = np.full(len(result.truth), limit)
     for item in reversed(result.progress):
         times[: item.true_found] = np.minimum(times[: item.true_found], item.time)
@@ -339,11 +318,7 @@ def compared(
     filters: Sequence[str] = (),
     time_limit: float | None = None,
 ) -> Experiment:
-    """Return the comparison of planners and filters in a scenario.
-
-    `planners` and `filters` are values of `planner.name` and `filter.method`; without any, the
-    scenario's own. `time_limit` is instead of the scenario's [s].
-    """
+    """Return the comparison of planners and filters in a scenario, by default of its own."""
     path = find_scenario(scenario)
     if is_cuboid_scenario(read_scenario(path)):
         raise ScenarioError(f'{path}: is a search of buildings, allowed are searches for targets')

@@ -1,7 +1,5 @@
 """Means with confidence intervals: of numbers, and of paired differences."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -60,10 +58,9 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> Interval:
 
 @dataclass(frozen=True)
 class Difference:
-    """The mean of paired differences with the bounds of its bootstrap interval, and their median.
+    """Mean and median of paired differences, and a bootstrap interval; nan if too few.
 
-    What too few values do not give is nan. `needed` is the number of pairs for a power of 0.8 at a
-    difference of this size; None without difference or spread, and above a million.
+    `needed` pairs give a power of 0.8 at this size; None without difference, spread or a number.
     """
 
     mean: float
@@ -82,8 +79,7 @@ class Difference:
 def bootstrap_difference(first: ArrayLike, second: ArrayLike) -> Difference:
     """Return the mean of first minus second on the same maps; pairs with a nan are left out.
 
-    The interval is the bias-corrected and accelerated bootstrap (Efron) of pairs, with fixed random
-    numbers.
+    The bootstrap is bias-corrected and accelerated (Efron), with fixed random numbers.
     """
     gaps = _gaps(first, second)
     gaps = gaps[~np.isnan(gaps)]

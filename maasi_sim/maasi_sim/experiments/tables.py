@@ -1,7 +1,5 @@
 """Tables: of our results beside the papers', and of comparisons of searches."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -25,10 +23,8 @@ from maasi_sim.experiments.statistics import (
 )
 from maasi_sim.machine import code_digest, this_machine
 
-# Version of comparison.json.
-VERSION = 1
-# Bootstrap intervals of fewer pairs are too narrow.
-FEWEST = 10
+VERSION = 1  # version of comparison.json
+FEWEST = 10  # bootstrap intervals of fewer pairs are too narrow
 
 
 def capped(values: FloatArray, limit: float) -> FloatArray:
@@ -73,10 +69,9 @@ def markdown_table(rows: Iterable[Sequence[str]]) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One number of ours beside the paper's.
+    """One number of ours beside the paper's, and ours minus theirs.
 
-    `finished` of the `runs` have the quantity; `median` counts the others as longest, and is nan
-    if they are half or more. `difference` is ours minus the paper's.
+    `finished` runs have the quantity; the others count as longest in the median, nan if it is one.
     """
 
     case: str
@@ -109,7 +104,6 @@ class Row:
 def rows(results: Results) -> Iterator[Row]:
     """Yield the table of an experiment: every quantity of every case."""
     experiment = results.experiment
-    published = {(item.case, item.quantity): item for item in experiment.published}
     for name in results.names():
         preset = results.case(name).preset
         for quantity in experiment.quantities:
@@ -119,7 +113,7 @@ def rows(results: Results) -> Iterator[Row]:
                 continue
             ours = interval(results, name, quantity)
             middle = median(values, quantity) if finished else math.nan
-            theirs = published.get((name, quantity.name))
+            theirs = experiment.published_of(quantity.name).get(name)
             paper = gap = None
             if theirs is not None:
                 paper = from_published(theirs.value, theirs.half_width, theirs.runs)
@@ -221,8 +215,7 @@ QUANTITIES = (
     Quantity('filter_time', 'filter step', 's'),
     Quantity('processor_time', 'computation of a search', 's'),
 )
-# Shown in milliseconds in Markdown.
-_SHORT = ('planning_time', 'filter_time')
+_SHORT = ('planning_time', 'filter_time')  # shown in milliseconds in Markdown
 
 
 @dataclass(frozen=True)

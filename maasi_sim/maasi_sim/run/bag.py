@@ -1,9 +1,4 @@
-"""Write and read rosbag2 recordings (MCAP) from serialised messages, without ROS.
-
-The writer of `rosbags`, which also writes by time.
-"""
-
-from __future__ import annotations
+"""Write recordings (rosbag2, MCAP) of serialised messages without ROS, by time; read runs'."""
 
 import contextlib
 import queue
@@ -31,13 +26,10 @@ from rosbags.typesys.store import Typestore
 
 from maasi_drivers.calibration.bag_reader import BagError, BagReader
 
-__all__ = ['Bag', 'BagError', 'BagWriteError', 'BagWriter', 'load_types', 'topic_qos']
-
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 SCENARIO_TOPIC = '/scenario'
-# Reason in one word, then a line in words.
-ENDING_TOPIC = '/ending'
+ENDING_TOPIC = '/ending'  # reason in one word, then a line in words
 
 ImageFormat = Literal['jpeg', 'png', 'raw']
 
@@ -112,22 +104,14 @@ def _with_distribution(metadata: str) -> str:
 class BagWriter(contextlib.AbstractContextManager['BagWriter']):
     """Writes a recording in its own thread; after any error it can be closed, and is readable then.
 
-    Messages are in the file after `FLUSH_PERIOD`: a killed process loses no more. They keep their
-    order: times that do not increase are moved up by a nanosecond.
-
-    Images are stored as `sensor_msgs/msg/CompressedImage` on `<topic>/compressed`, in the encoding
-    that image_transport would use. JPEG has quality 95 without chroma subsampling; PNG costs ten
-    times the time. `write` blocks while more than `backlog` bytes wait.
-
-    An error of the thread is raised by `write` and `close`, after it.
+    Messages are in the file after `FLUSH_PERIOD`; times that do not increase go up by 1 ns. Images
+    are stored compressed on `<topic>/compressed` as by image_transport (JPEG of quality 95 without
+    chroma subsampling, or PNG, ten times slower). `write` blocks while more than `backlog` bytes
+    wait; it and `close` raise the errors of the thread.
     """
 
     def __init__(
-        self,
-        path: Path,
-        types: Typestore,
-        images: ImageFormat = 'jpeg',
-        backlog: int = 8 * 2**20,
+        self, path: Path, types: Typestore, images: ImageFormat = 'jpeg', backlog: int = 8 * 2**20
     ) -> None:
         self.path = Path(path)
         self._types = types

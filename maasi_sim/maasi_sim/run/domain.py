@@ -1,7 +1,5 @@
 """ROS domains of runs, and the shared memory that processes with Fast DDS leave in them."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import hashlib
@@ -15,10 +13,8 @@ from pathlib import Path
 
 from maasi_filter.ros.loopback import loopback_fault
 
-# Domains whose ports lie below the ephemeral ports of Linux (from 32768).
-DOMAINS = range(0, 102)
-# Environment variable of the profiles of Fast DDS.
-_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+DOMAINS = range(0, 102)  # domains whose ports lie below the ephemeral ports of Linux (from 32768)
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'  # environment variable of the profiles of Fast DDS
 # A port or a segment, its locks, and the semaphore under which a port is opened (Fast DDS 2.14).
 _NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
 # Ports of the RTPS specification: this many for each domain, from this one.
@@ -32,14 +28,11 @@ class DomainError(RuntimeError):
 
 
 class Domain(contextlib.AbstractContextManager['Domain']):
-    """A ROS domain that no other run on this host uses, until `release`.
+    """A ROS domain that no other run on this host uses, until `release`; the first free one from 1.
 
-    A domain, and a namespace in it, is locked by the name of an abstract Unix socket: it is valid
-    for all users, makes no file, and ends with the process.
-
-    Without a number it is the first free one from 1 (0 is the ROS default). Locks of different
-    purposes are independent. If `shared`, other runs may use it as well, in other namespaces than
-    `team`.
+    It, and a namespace in it, is locked by the name of an abstract Unix socket: valid for all
+    users, without a file, until the process ends. Locks of different purposes are independent; of a
+    `shared` one, only the namespace `team` is locked.
     """
 
     def __init__(
@@ -73,7 +66,6 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         raise DomainError(f'no ROS domain from 1 to {DOMAINS[-1]} is free')
 
     def _take(self, number: int, team: str, shared: bool) -> str:
-        """Lock a domain and a namespace in it; return the name of a taken one, else empty."""
         wanted = {} if shared else {f'{number}': f'{number}'}
         wanted[f'{number} {team}'] = f'namespace /{team} in {number}'
         for name, words in wanted.items():
@@ -88,10 +80,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         return ''
 
     def environment(self) -> dict[str, str]:
-        """Return the variables that keep nodes in this domain, and on this host.
-
-        Without a profile of the user for Fast DDS, one with faster discovery is set.
-        """
+        """Return variables for nodes of this domain, on this host, with fast discovery."""
         variables = {
             'ROS_DOMAIN_ID': str(self.number),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
@@ -114,7 +103,6 @@ class Domain(contextlib.AbstractContextManager['Domain']):
 
 
 def _port_used(port: int) -> bool:
-    """Return whether some process on this host listens on a UDP port."""
     for table in ('/proc/net/udp', '/proc/net/udp6'):
         try:
             lines = Path(table).read_text().splitlines()[1:]
@@ -128,12 +116,10 @@ def _port_used(port: int) -> bool:
 def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> list[str]:
     """Remove segments and ports of this user that no process has open; return the removed files.
 
-    They fill the memory, and a process that opens a port whose creator died before it was ready
-    waits for ever, on this host in all domains.
-
-    Of `domain`, which no process uses, all ports are removed; of others only those that were never
-    ready. New processes use the names of ports again, some of them in all domains: who opens a port
-    while it is removed shares it with nobody.
+    They fill the memory, and who opens a port whose creator died before it was ready waits for
+    ever. Of `domain`, which no process uses, all ports are removed; of others, whose names new
+    processes use again, only those that were never ready: an opener would share a removed one with
+    nobody.
     """
     parts: dict[str, list[Path]] = defaultdict(list)
     for path in folder.iterdir() if folder.is_dir() else ():
@@ -151,7 +137,6 @@ def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> l
 
 
 def _may_go(path: Path, domain: int | None) -> bool:
-    """Return whether no process can be about to open an unused port or segment again."""
     number = path.name.removeprefix('fastrtps_port')
     if number == path.name:
         return True
@@ -165,8 +150,7 @@ def _may_go(path: Path, domain: int | None) -> bool:
 def _is_unused(path: Path) -> bool:
     """Return whether no process, of any container, has this user's file open or mapped.
 
-    Owners keep their locks open and their memory mapped while they live, also in creation. Linux
-    grants a lease for writing on a file only that is not open elsewhere.
+    Owners keep them so while they live; Linux grants a lease for writing only where none has.
     """
     try:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)

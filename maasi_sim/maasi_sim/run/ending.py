@@ -1,7 +1,5 @@
 """How a run ends: the reason with its exit code, and signals as a condition that a run polls."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 from collections.abc import Collection, Iterator

@@ -21,31 +21,22 @@ if TYPE_CHECKING:
     from maasi_sim.run.node_plan import NodePlan
     from maasi_sim.run.run_options import Options
 
-# Goal status of `AgentState`.
-UNAVAILABLE = 5
+UNAVAILABLE = 5  # goal status of `AgentState`
 
 
 @dataclass(frozen=True)
 class RunEnd:
-    """How a run ended.
+    """How a run ended."""
 
-    `reason` is a key of `END_REASONS`, `time` simulated, `wall_time` from the first step [s].
-    Events are nodes that died, hung or were restarted.
-    """
-
-    reason: str
-    time: float
-    wall_time: float
+    reason: str  # a key of `END_REASONS`
+    time: float  # simulated [s]
+    wall_time: float  # from the first step [s]
     events: list[dict[str, Any]] = field(default_factory=list)
 
 
 @dataclass
 class RunRecord:
-    """Data of the reports of all kinds of runs.
-
-    Trajectories are time [s], x, y, z [m] by robot, (n, 4). Events are robots lost and back, nodes
-    restarted or dead, in order of time.
-    """
+    """Data of the reports of all kinds of runs; trajectories are time [s], x, y, z [m], (n, 4)."""
 
     name: str
     scenario: Any
@@ -64,20 +55,14 @@ class Observer(ABC):
     update_topics: Sequence[str] = ()
     #: Targets or cuboids there are, and found so far; measurements so far, of all robots.
     total = found = measurements = 0
-    #: Share of the environment explored.
-    explored = 0.0
-    #: Whether something was found since the caller last reset it.
-    news = False
-    #: Time and step at which all was found, where the scenario stops then.
-    completed: Any = None
-    #: The reason, once all planners report that nothing is left to gain.
-    settled: str | None = None
-    #: Step at which the search ended by itself.
-    end_step: int | None = None
+    explored = 0.0  #: share of the environment explored
+    news = False  #: whether something was found since the caller last reset it
+    completed: Any = None  #: time and step at which all was found, where the scenario stops then
+    settled: str | None = None  #: the reason, once all planners report that nothing is left to gain
+    end_step: int | None = None  #: step at which the search ended by itself
     #: Time of the first step [s]: a clock that the run follows may start at any time.
     begin: float | None = None
-    #: That take part, as the simulation says.
-    robots: list[str] | None = None
+    robots: list[str] | None = None  #: that take part, as the simulation says
 
     def __init__(
         self, name: str, scenario: Any, seed: int, types: Typestore, topics: Sequence[str]
@@ -121,7 +106,6 @@ class Observer(ABC):
         return seconds(stamp) - (self.begin or 0.0)
 
     def _note_step(self, step: Any) -> None:
-        """Note the robots that take part."""
         if self.begin is None:
             self.begin = seconds(step.stamp)
         before, self.robots = self.robots, list(step.robots)
@@ -139,7 +123,6 @@ class Observer(ABC):
                 yield item
 
     def _complete(self, record: RunRecord, end: RunEnd) -> None:
-        """Add how the run ended, ways and events to a record; the time of its end is set."""
         record.end_reason, record.wall_time = end.reason, end.wall_time
         # Several steps after the end may have been taken.
         own = [event for event in self._events if event['time'] <= record.end_time]
@@ -173,8 +156,7 @@ class Mission(Protocol[Record]):
     #: Name of the scenario, and the scenario with all layers.
     name: str
     scenario: Any
-    #: Word for a success in the progress line.
-    found_word: str
+    found_word: str  #: word for a success in the progress line
 
     def prepare(self) -> None:
         """Assign addresses on this host to simulated robots."""

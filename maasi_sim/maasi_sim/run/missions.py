@@ -1,7 +1,5 @@
 """The one place where a scenario file becomes a mission."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Which nodes a scenario needs, with their parameters."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,8 +16,7 @@ from maasi_sim.run.topics import within
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import to_yaml
 
-# Time of the simulation.
-SIMULATED = {'use_sim_time': True}
+SIMULATED = {'use_sim_time': True}  # time of the simulation
 
 
 @dataclass(frozen=True)
@@ -39,8 +36,7 @@ class NodePlan:
     remaps: Mapping[str, str] = field(default_factory=dict)
     #: Parameters on the command line, as the file must not start a search on real robots.
     given: Mapping[str, Any] = field(default_factory=dict)
-    #: Before those of ROS.
-    arguments: tuple[str, ...] = ()
+    arguments: tuple[str, ...] = ()  #: before those of ROS
 
     @property
     def full_name(self) -> str:
@@ -52,10 +48,7 @@ class NodePlan:
         return to_yaml({'/**': {'ros__parameters': dict(self.parameters)}})
 
     def process(self, folder: Path, team: str = '', log_level: str | None = None) -> NodeProcess:
-        """Write its parameter file, and return its process, not started yet, with its log there.
-
-        Topics of other teams are not remapped.
-        """
+        """Write its parameter file, and return its process, not started yet, with its log there."""
         name = within(team, self.full_name)
         file = name.strip('/').replace('/', '_')
         parameters = folder / 'parameters' / f'{file}.yaml'

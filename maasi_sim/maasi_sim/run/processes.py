@@ -1,10 +1,7 @@
 """Nodes as processes: found, forked from a server, watched, and stopped in bounded time.
 
-The fork server of `multiprocessing` has imported the modules and compiled the kernels that nodes
-share: a node starts in a tenth of the time.
+The fork server of `multiprocessing` has loaded what nodes share: they start in a tenth of the time.
 """
-
-from __future__ import annotations
 
 import contextlib
 import ctypes
@@ -43,8 +40,7 @@ _ENVIRONMENT = {
 }
 # Addresses of Unix sockets have at most 107 bytes; multiprocessing adds 32 to the folder.
 _LONGEST_FOLDER = 75
-# A heartbeat this soon after a restart is from the previous process [s].
-_LEAST_START = 0.5
+_LEAST_START = 0.5  # a heartbeat this soon after a restart is from the previous process [s]
 # Signals of a shutdown, and the timeout of each [s].
 ENDING = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5.0))
 
@@ -123,10 +119,7 @@ def find_executable(package: str, executable: str) -> Path:
 
 
 def beside(function: Callable[..., None], *arguments: Any) -> Iterator[Any]:
-    """Run a function beside this process, which it cannot outlive, in what the server has loaded.
-
-    Returned is what it sends by its last argument, until it ends.
-    """
+    """Run a function in a fork of the server, and return what it sends by its last argument."""
     receives, sends = Pipe(duplex=False)
     words = (function, *arguments, sends.send)
     with sends, contextlib.suppress(OSError, EOFError):
@@ -148,11 +141,9 @@ def _received(connection: Connection) -> Iterator[Any]:
 class NodeProcess(ForkServerProcess):
     """A node that runs as a process and cannot outlive this one.
 
-    Its command is the path of its executable and its arguments, also shown by `ps`. Its log is kept
-    over restarts. A node of this suite inherits what the server has loaded.
-
-    Its executor publishes a heartbeat each second. Until the first one it is starting, which may
-    include compilation. Times are of the wall [s].
+    A node of this suite inherits what the server has loaded. Until the first heartbeat of its
+    executor, one a second, it is starting, which may include compilation. Times are of the wall
+    [s].
     """
 
     def __init__(self, name: str, command: list[str], log: Path) -> None:
@@ -265,8 +256,7 @@ def stop(processes: Sequence[NodeProcess]) -> list[str]:
         deadline = time.monotonic() + patience
         while any(process.is_alive() for process in rest) and time.monotonic() < deadline:
             time.sleep(0.005)
-    # The last signal is SIGKILL.
-    return [process.name for process in rest]
+    return [process.name for process in rest]  # the last signal is SIGKILL
 
 
 if _STARTED_BY in os.environ:

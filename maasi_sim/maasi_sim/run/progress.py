@@ -1,22 +1,16 @@
 """Progress of a run: one updated line on a terminal, else plain lines."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import sys
 import time
 from typing import TextIO
 
-# ECMA-48: back to the begin of the line, which is erased.
-_ERASE = '\r\x1b[K'
+_ERASE = '\r\x1b[K'  # ECMA-48: back to the begin of the line, which is erased
 
 
 class ProgressDisplay:
-    """Shows progress: on a terminal one line that changes, else lines now and then.
-
-    Without a terminal `period` is the time between lines without news [s].
-    """
+    """Shows progress: on a terminal a line that changes, else lines, at least each period [s]."""
 
     def __init__(self, stream: TextIO | None = None, period: float = 5.0) -> None:
         self._stream = stream or sys.stderr
@@ -24,8 +18,7 @@ class ProgressDisplay:
         self._period = 0.1 if self._terminal else period
         self._last = -1e9
         self._found = -1
-        # On a terminal: the line that changes.
-        self._line = ''
+        self._line = ''  # on a terminal: the line that changes
 
     @property
     def due(self) -> bool:

@@ -1,10 +1,7 @@
 """Search a recording of robots' cameras and poses, as `ros2 bag record` makes it of real robots.
 
-The scenario says what the recording lacks: sensors, start and filter. The robots went where they
-went: there are no decisions, and each robot measures once in each period of its sensor.
+Sensors, start and filter are the scenario's; each robot measures once in each sensor period.
 """
-
-from __future__ import annotations
 
 from pathlib import Path
 
@@ -28,8 +25,7 @@ from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, planner_settings
 
-# Where a robot was, and what it saw there.
-Measured = tuple[StampedPose, AgentMeasurement]
+Measured = tuple[StampedPose, AgentMeasurement]  # where a robot was, and what it saw there
 
 
 def search_recording(scenario: str, bag: Path, out: Path | None, seed: int | None) -> int:
@@ -100,10 +96,7 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Meas
 def search_measurements(
     scenario: Scenario, recorded: list[Measured]
 ) -> tuple[list[FoundTarget], float, SearchTrace]:
-    """Feed a filter with measurements in the order of their stamps.
-
-    Return what is found, the share explored, and the events.
-    """
+    """Feed a filter with measurements by stamp; return what is found, share explored, events."""
     common = {'step': scenario.step, 'seed': scenario.seed, 'lockstep': True}
     coordinator = Coordinator(planner_settings(scenario, scenario.names(), common))
     generator = np.random.default_rng(scenario.seed)

@@ -1,7 +1,5 @@
 """The recorder: subscribes to all topics of a run, records them, and takes part in lockstep."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import struct
@@ -37,23 +35,17 @@ from maasi_sim.run.view.messages import is_shown
 NAME = 'recorder'
 READY, DONE = '/lockstep/ready', '/lockstep/done'
 DIAGNOSTICS, ROSOUT = '/diagnostics', '/rosout'
-# Topics shared by all teams of a domain.
-_SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)
-# Not recorded: of no use to readers of the recording.
-_SKIPPED = ('/parameter_events', READY)
-# A copy of the found targets for a restarted filter.
-_KEPT = '/found_targets/kept'
+_SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)  # topics shared by all teams of a domain
+_SKIPPED = ('/parameter_events', READY)  # not recorded: of no use to readers of the recording
+_KEPT = '/found_targets/kept'  # a copy of the found targets for a restarted filter
 # Topics still recorded during shutdown.
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
 # The clock may come after messages of its time: by so much [s], in lockstep by so many steps. A
 # larger lead is of another clock.
 _LARGEST_LEAD, _MOST_STEPS = 1.0, 50
-# Between two calls to take off [s].
-_ARMING_PERIOD = 2.0
-# Longest wait for the acknowledgement of stop commands [s].
-_STOP_PATIENCE = 1.0
-# Until they are sent again.
-_ACKNOWLEDGED = Duration(seconds=0.1)
+_ARMING_PERIOD = 2.0  # between two calls to take off [s]
+_STOP_PATIENCE = 1.0  # longest wait for the acknowledgement of stop commands [s]
+_ACKNOWLEDGED = Duration(seconds=0.1)  # until they are sent again
 
 
 class Recorder:
@@ -92,9 +84,7 @@ class Recorder:
     ) -> None:
         self.context = Context()
         rclpy.init(
-            context=self.context,
-            domain_id=domain,
-            signal_handler_options=SignalHandlerOptions.NO,
+            context=self.context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
         )
         self.node = Node(
             NAME,
@@ -119,10 +109,8 @@ class Recorder:
         #: Robots at the first step, and time of the first message of each recorded topic [ns].
         self.robots: list[str] = []
         self.first: dict[str, int] = {}
-        #: Share of the environment explored, published by planners each second.
-        self.explored = 0.0
-        # Planners whose present error is among the complaints.
-        self._faulty: set[str] = set()
+        self.explored = 0.0  #: share of the environment explored, published by planners each second
+        self._faulty: set[str] = set()  # planners whose present error is among the complaints
         #: Time of the last diagnostics of each node [s of wall time].
         self.heartbeats: dict[str, float] = {}
         self._arming: dict[str, Client] = {}
@@ -159,7 +147,6 @@ class Recorder:
         return self.node.create_subscription(kind, full, lambda _: None, qos, raw=True)
 
     def _full(self, topic: str) -> str:
-        """Return the full name of a topic of the team."""
         return topic if topic in _SHARED else within(self._team, topic)
 
     def relative(self, topic: str) -> str | None:
@@ -310,16 +297,12 @@ class Recorder:
         self._record(taken)
 
     def _logged(self, before: int, topic: str, data: bytes) -> int:
-        """Return the time under which a message is recorded [ns]: its stamp, or now.
-
-        A stamp before `before` [ns] is too old, and one far ahead is not of this clock.
-        """
+        """Return a message's recorded time [ns]: now, if its stamp is far ahead or too old."""
         stamp = stamp_of(topic, self._subscriptions[topic].msg_type, data)
         known = 0 <= stamp <= self.time + self._lead
         return max(stamp, before) if known else self.time
 
     def _note_planner(self, status: DiagnosticStatus) -> None:
-        """Note what a planner says between its decisions: its error, and the exploration."""
         if not status.name.endswith('/planner_node'):
             return
         if status.level != DiagnosticStatus.ERROR:
@@ -338,7 +321,6 @@ class Recorder:
         return 0.0 if self._begun is None else (min(self.time, self._end) - self._begun) / 1e9
 
     def _is_own(self, topic: str, data: bytes) -> bool:
-        """Return whether a message on a topic shared by all teams is the team's own."""
         if self._team and topic == DIAGNOSTICS:
             names = [item.name for item in deserialize_message(data, DiagnosticArray).status]
             return any(name.startswith(f'/{self._team}/') for name in names)
@@ -360,10 +342,7 @@ class Recorder:
                 raise
 
     def gaps(self, joined: bool, patience: float) -> list[str]:
-        """Return what the recording lacks of the topics with a message at each step.
-
-        They may begin late by `patience` [s]; if `joined`, the clock ran before the run.
-        """
+        """Return topics of every step that are missing, or late by more than `patience` [s]."""
         topics = [STEP, *(f'/{name}/state' for name in self.robots)]
         times = [self.first.get(topic, self.time) for topic in topics]
         begin = min(times) if joined else 0
@@ -384,7 +363,6 @@ class Recorder:
             self._last_step = self.step
 
     def _belongs(self, topic: str, data: bytes) -> bool:
-        """Return whether a message is not of a step after the last one."""
         if self._last_step < 0:
             return True
         kind = self._subscriptions[topic].msg_type
@@ -395,7 +373,6 @@ class Recorder:
         return not _has_step(kind) or deserialize_message(data, kind).step <= self._last_step
 
     def _take(self, topics: Sequence[str]) -> list[tuple[str, bytes]]:
-        """Return the topics and messages that wait in subscriptions."""
         return [
             (topic, data)
             for topic in topics
@@ -412,10 +389,7 @@ class Recorder:
         return steps
 
     def arm(self, robots: Iterable[str]) -> None:
-        """Call the service `arm` of drivers that are not ready, as a person does with real robots.
-
-        To be called again and again: the first call may come before a driver is active.
-        """
+        """Call the service `arm` of drivers that are not ready, now and then, as a person would."""
         if time.monotonic() - self._armed_at < _ARMING_PERIOD:
             return
         self._armed_at = time.monotonic()
@@ -471,13 +445,11 @@ class Recorder:
 
 @cache
 def _has_step(kind: Any) -> bool:
-    """Return whether messages of a type name the step that they belong to."""
     # In other packages it is something else: the length of an image's row.
     return kind.__module__.startswith('maasi_msgs.') and 'step' in kind.get_fields_and_field_types()
 
 
 def _queued(subscription: Subscription) -> list[bytes]:
-    """Return all serialised messages queued in a subscription."""
     taken: list[bytes] = []
     handle = subscription.handle
     while True:

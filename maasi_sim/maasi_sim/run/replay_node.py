@@ -1,7 +1,5 @@
 """Replay the measurements of a recording to the filter node, and compare the found targets."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys
@@ -55,10 +53,7 @@ REPLAYED = {
 
 @dataclass
 class Batch:
-    """One recorded update of a filter, in a namespace, and its serialised measurements in order.
-
-    `late` is a measurement that arrived after its batch, or without a request.
-    """
+    """One recorded update of a filter, and its serialised measurements; late: after their batch."""
 
     update: FilterUpdate
     detections: list[bytes]
@@ -70,8 +65,7 @@ class Batch:
 class Recording:
     """Contents of a recording for a replay."""
 
-    #: Scenario, seed and parameters of each node.
-    facts: dict[str, Any]
+    facts: dict[str, Any]  #: scenario, seed and parameters of each node
     #: Of several filters in the order of steps and names.
     batches: list[Batch] = field(default_factory=list)
     #: By namespace of the filter: found targets at the end.
@@ -137,9 +131,7 @@ class ReplayNode:
     ) -> None:
         self.context = Context()
         rclpy.init(
-            context=self.context,
-            domain_id=domain,
-            signal_handler_options=SignalHandlerOptions.NO,
+            context=self.context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
         )
         self.node = Node('replay', context=self.context, use_global_arguments=False)
         self.updates: list[FilterUpdate] = []
@@ -216,10 +208,7 @@ def differences(recorded: list[Any], found: list[Any]) -> list[str]:
 
 
 def replay(path: Path, out: Path | None, domain_id: int | None, interruption: Interruption) -> int:
-    """Replay a recording, print whether the found targets are equal, and return the exit code.
-
-    Logs and parameters of the nodes are written to a folder.
-    """
+    """Replay a recording, print whether the found targets are equal, and return the exit code."""
     recording = read_recording(path)
     folder = make_folder(out, '_replay')
     with Domain(domain_id) as domain, contextlib.ExitStack() as ends:
@@ -245,10 +234,7 @@ def replay(path: Path, out: Path | None, domain_id: int | None, interruption: In
 
 
 def _feed(
-    node: ReplayNode,
-    recording: Recording,
-    processes: list[NodeProcess],
-    interruption: Interruption,
+    node: ReplayNode, recording: Recording, processes: list[NodeProcess], interruption: Interruption
 ) -> int:
     first_difference = None
 

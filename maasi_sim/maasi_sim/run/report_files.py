@@ -1,7 +1,5 @@
 """The files of a report, and the common part of all reports."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
@@ -15,8 +13,7 @@ from maasi_sim.machine import this_machine
 from maasi_sim.run.mission import Mission, RunRecord
 from maasi_sim.run.run_folder import ResultsError, remove, write_text, write_whole
 
-# Of the format of `report.json`, see `report.schema.json`.
-REPORT_VERSION = 1
+REPORT_VERSION = 1  # of the format of `report.json`, see `report.schema.json`
 
 END_REASONS = {
     'all_found': 'all targets found',
@@ -31,10 +28,7 @@ END_REASONS = {
 
 
 def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> dict[str, Any]:
-    """Return a report: what was run, what came of it, and how it ended; `mission`: see the schema.
-
-    Nothing in it is infinite or not a number.
-    """
+    """Return a report: what was run, what came of it, how it ended; no number is infinite."""
     wall = record.wall_time
     moves = {name: np.diff(way[:, 1:], axis=0) for name, way in record.trajectories.items()}
     return {
@@ -92,11 +86,10 @@ def write_report(mission: Mission[Any], record: RunRecord, folder: Path) -> dict
 def store_report(
     mission: Mission[Any], record: RunRecord, folder: Path
 ) -> tuple[dict[str, Any], Path | None, str]:
-    """Write a report into the folder of the run, or, if that fails, into another one.
+    """Write a report into the folder of the run, or, if that fails, into a new one elsewhere.
 
-    The other one is a new folder below the first of these with space: that of temporary files, the
-    home of the user, `/dev/shm`. Returned are the report, its folder, None if it could not be
-    written, and why it is not in the folder of the run.
+    Elsewhere is the first with space: temporary files, home, `/dev/shm`. Return the report, its
+    folder (None: nowhere), and why it is not in that of the run.
     """
     problem = ''
     for base in (None, Path(tempfile.gettempdir()), Path.home(), Path('/dev/shm')):

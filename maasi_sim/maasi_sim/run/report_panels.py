@@ -1,7 +1,5 @@
 """The frame of the figures of reports: the map from above and the sides, ways, plots and text."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,12 +20,10 @@ from maasi_filter.arrays import FloatArray
 from maasi_sim.run.mission import RunRecord
 
 PALE, GRID, UNSEEN = '#9A9A9A', '#E6E6E6', '#CFCFCF'
-# Of axes to the right of the last value, or a step at the end cannot be seen.
-MARGIN = 1.015
+MARGIN = 1.015  # of axes to the right of the last value, or a step at the end cannot be seen
 # Size [inch], and the parts of it that a legend takes beside a text, and for a letter.
 _SIZE, _HANDLE, _LETTER = (13.0, 8.0), 0.75, 0.068
-# A side view is at least this share of the size of the view from above.
-_THINNEST = 0.22
+_THINNEST = 0.22  # a side view is at least this share of the size of the view from above
 
 
 @dataclass(frozen=True)
@@ -68,9 +64,8 @@ def draw_report(
 ) -> Figure:
     """Return the figure of a report.
 
-    The map shows an area, (d, 2) [m], from above, in 3D also from the south and the east, with the
-    ways of the robots. Beside it are the first plot, over time, with a heading; the shades of the
-    ways; the other plots; and rows of text, names and values, with the first events.
+    The map (d, 2) [m] from above, in 3D also from the south and the east, with the robots' ways;
+    beside it the first plot, over time, the shades of the ways, the other plots, and rows of text.
     """
     figure = Figure(figsize=_SIZE, layout='constrained')
     FigureCanvasAgg(figure)
@@ -135,7 +130,6 @@ def _map_views(figure: Figure, place: SubplotSpec, area: FloatArray) -> list[Map
 
 
 def _shades(colour: str) -> LinearSegmentedColormap:
-    """Return the shades of a robot's colour, from light at the beginning to dark at the end."""
     middle = np.array(to_rgb(colour))
     return LinearSegmentedColormap.from_list(
         colour, [0.4 * middle + 0.6, middle, 0.6 * middle], N=64
@@ -143,7 +137,6 @@ def _shades(colour: str) -> LinearSegmentedColormap:
 
 
 def _draw_way(view: MapView, path: FloatArray, colour: str, end: float, label: str) -> None:
-    """Draw a way of rows time [s], x, y, z [m], darker with time up to `end` [s]."""
     if len(path):
         places = view.points(path[:, 1:]).T
         lines = LineCollection(
@@ -162,7 +155,6 @@ def _draw_way(view: MapView, path: FloatArray, colour: str, end: float, label: s
 
 
 def _draw_times(axes: Axes, colours: Mapping[str, str], end: float) -> None:
-    """Draw a band for each robot: which shade of its way is which time [s]."""
     for row, colour in enumerate(colours.values()):
         axes.imshow(
             np.linspace(0.0, 1.0, 256)[None, :],
@@ -179,7 +171,6 @@ def _draw_times(axes: Axes, colours: Mapping[str, str], end: float) -> None:
 
 
 def _add_legend(figure: Figure, views: Sequence[MapView]) -> None:
-    """Add a legend of all views with each label once."""
     unique: dict[str, Any] = {}
     for view in views:
         handles, labels = view.axes.get_legend_handles_labels()
@@ -198,7 +189,6 @@ def _add_legend(figure: Figure, views: Sequence[MapView]) -> None:
 
 
 def _write_rows(axes: Axes, rows: Sequence[tuple[str, str]]) -> None:
-    """Write names and values below each other, with space for at least ten."""
     axes.set_axis_off()
     for index, (key, value) in enumerate(rows):
         height = 1.0 - (index + 0.5) / max(len(rows), 10)

@@ -1,7 +1,5 @@
 """The folder of a run, and files that are written whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import itertools
@@ -12,8 +10,7 @@ from typing import Any
 
 from maasi_sim.scenario.layering import ScenarioError
 
-# Disk full, quota exceeded, or file too large.
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk full, quota exceeded, or file too large
 
 
 class ResultsError(RuntimeError):

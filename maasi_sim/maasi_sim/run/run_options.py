@@ -15,16 +15,7 @@ from maasi_sim.run.ending import EXIT_CODES
 
 LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 # Options that are arguments of a launch as well.
-_LAUNCH_OPTIONS = (
-    'out',
-    'seed',
-    'rate',
-    'planner',
-    'time_limit',
-    'namespace',
-    'log_level',
-    'port',
-)
+_LAUNCH_OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'namespace', 'log_level', 'port')
 _LAUNCH_FLAGS = ('lockstep', 'follow_clock', 'view')
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
@@ -188,10 +179,7 @@ def parse(arguments: list[str] | None) -> Options:
 
 
 def launch_arguments() -> dict[str, tuple[str, str]]:
-    """Return default and description of each argument of `scenario.launch.py`.
-
-    An empty one leaves an option out.
-    """
+    """Return default (empty: left out) and description of each argument of the launch."""
     arguments = {'scenario': ('mambo_turtlebot', 'scenario file, or name of one in maasi_config')}
     for action in build_parser()._actions:
         if action.dest in _LAUNCH_OPTIONS:
@@ -213,10 +201,7 @@ def is_true(given: Mapping[str, str], name: str) -> bool:
 
 
 def scenario_options(given: Mapping[str, str]) -> list[str]:
-    """Return the command line of `run_scenario` for the arguments of a launch.
-
-    The nodes are in the ROS domain of the launch, so that other tools see them.
-    """
+    """Return the command line of `run_scenario` for a launch, in the ROS domain of that."""
     values = {name: text.strip() for name, text in given.items()}
     flags = {name: is_true(given, name) for name in (*_LAUNCH_FLAGS, 'record', 'rviz')}
     if not flags['view']:

@@ -1,7 +1,5 @@
 """Run a scenario: its nodes as processes, watched, recorded, and reported on."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

@@ -1,7 +1,5 @@
 """RViz's view of a run: the files of maasi_config, with the cameras of the scenario's robots."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """One run of a scenario: its nodes are started, monitored and stopped, and reported on."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
@@ -40,12 +38,10 @@ from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning, to_
 
 # Between two checks of processes and topics; while the nodes start, and while they run [s].
 _START_POLL, _POLL = 0.02, 0.05
-# Between two checks for runs that follow the clock [s].
-_FOLLOWERS_PERIOD = 0.5
+_FOLLOWERS_PERIOD = 0.5  # between two checks for runs that follow the clock [s]
 # Longest wait for a publisher of others, which may not fit the recorder [s].
 _CONNECTION_PATIENCE = 5.0
-# Wall time between two messages about missing nodes [s].
-_START_PATIENCE = 10.0
+_START_PATIENCE = 10.0  # wall time between two messages about missing nodes [s]
 
 
 class ScenarioRun:
@@ -75,8 +71,7 @@ class ScenarioRun:
         self._follows = options.follow_clock or self.mission.scenario.external_clock
         self._bag: BagWriter | None = None
         self._page: RunPage | None = None
-        #: Errors of writing.
-        self.unwritten: list[str] = []
+        self.unwritten: list[str] = []  #: errors of writing
         # Wall time when all nodes were ready, and of the first step.
         self._complete: float | None = None
         self._begun: float | None = None
@@ -153,7 +148,6 @@ class ScenarioRun:
             return code
 
     def _facts(self) -> str:
-        """Return the data for a replay, as YAML."""
         options = self.options
         facts = {
             'name': self.mission.name,
@@ -176,7 +170,6 @@ class ScenarioRun:
         return to_yaml(facts)
 
     def _serve(self, domain: int) -> RunPage | None:
-        """Serve the page of the run, if it is asked for; an error does not end the run."""
         options = self.options.view
         if options is None:
             return None
@@ -193,7 +186,6 @@ class ScenarioRun:
         return page
 
     def _note_ending(self) -> None:
-        """Tell the recording and the page how the run ended."""
         reason, text = self.ending.reason, self.ending.text
         if self._bag is not None:
             # An error is reported where the recording is closed.
@@ -207,7 +199,6 @@ class ScenarioRun:
             self.display.say(f'warning: {text}')
 
     def _monitor(self) -> None:
-        """Monitor the run from the start to the end of its nodes."""
         self._name_external_robots()
         self.ending = self._wait_until_ready() or self._follow()
         now = time.monotonic()
@@ -274,7 +265,6 @@ class ScenarioRun:
                 )
 
     def _follow(self) -> Ending:
-        """Monitor the run until it ends, and return its ending."""
         recorder, self.supervisor.running = self.recorder, True
         last: tuple[int | None, int] = (None, 0)
         while (ending := self._turn()) is None:
@@ -290,7 +280,6 @@ class ScenarioRun:
         return ending
 
     def _turn(self) -> Ending | None:
-        """Take what nodes have sent; return an ending if the run is over, or a node has failed."""
         recorder, observer, limit = self.recorder, self.observer, self._limits.time
         time.sleep(_POLL if self.supervisor.running else _START_POLL)
         recorder.drain(round(limit * 1e9))
@@ -326,7 +315,6 @@ class ScenarioRun:
         )
 
     def _check_recording(self) -> None:
-        """Note which topics with a message at each step lack a recording of their beginning."""
         if not self.options.record or self.ending.code not in (DONE, NOT_ALL_FOUND):
             return
         patience = _CONNECTION_PATIENCE * (self.options.rate or 1.0)
@@ -342,14 +330,12 @@ class ScenarioRun:
             self.unwritten.append(str(error))
 
     def _is_followed(self) -> bool:
-        """Return whether another run follows the clock of this one."""
         if self._follows or self.options.lockstep or self.interruption:
             return False
         alive = all(clock.is_alive() for clock in self.supervisor.nodes('clock'))
         return alive and bool(self.recorder.followers())
 
     def _report(self) -> int:
-        """Write the report, print a summary, and return the exit code."""
         ending = self.ending
         elapsed, events = self.recorder.elapsed, self.supervisor.events
         end = RunEnd(ending.reason, elapsed, self.wall_time, events)
@@ -381,7 +367,6 @@ class ScenarioRun:
         return NOT_WRITTEN if self.unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
     def _leave_replay(self) -> None:
-        """Wait until the replay is written."""
         if not self.options.record:
             return
         problem = 'it was not written'

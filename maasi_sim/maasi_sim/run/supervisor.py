@@ -1,7 +1,5 @@
 """The nodes of a run: planned, watched, restarted and stopped."""
 
-from __future__ import annotations
-
 import signal
 import time
 from pathlib import Path
@@ -19,17 +17,14 @@ from maasi_sim.run.topics import within
 
 # Wall time between two checks of the processes, where steps come in quick succession [s].
 _CHECK_PERIOD = 0.05
-# A longer gap between two checks means that the run itself was suspended [s].
-_LONGEST_GAP = 1.0
-# For the last messages of drivers to arrive [s].
-_LAST_MESSAGES = 0.02
+_LONGEST_GAP = 1.0  # a longer gap between two checks means that the run itself was suspended [s]
+_LAST_MESSAGES = 0.02  # for the last messages of drivers to arrive [s]
 
 
 class Supervisor:
     """Watches the nodes of a run: one that dies or hangs is restarted, or ends the run."""
 
-    #: What the nodes say; it may be made while they start.
-    recorder: Recorder
+    recorder: Recorder  #: what the nodes say; it may be made while they start
 
     def __init__(
         self, mission: Mission[Any], options: Options, folder: Path, display: ProgressDisplay
@@ -40,8 +35,7 @@ class Supervisor:
         self.processes = {
             name: plan.process(folder, team, level) for name, plan in self.plans.items()
         }
-        #: Nodes that died, hung or were restarted.
-        self.events: list[dict[str, Any]] = []
+        self.events: list[dict[str, Any]] = []  #: nodes that died, hung or were restarted
         #: Whether all nodes were ready once; until then they may take long.
         self.running = False
         self._scenario = mission.scenario
@@ -92,8 +86,7 @@ class Supervisor:
             text = f'{name} not ready {limits.start:g} s after the start'
             return Ending('not_ready', NODE_FAILED, text, [name])
         elif self._options.lockstep:
-            # A step may take long: `limits.silence` applies to awaited nodes.
-            return None
+            return None  # a step may take long: `limits.silence` applies to awaited nodes
         elif process.hangs(now, limits.heartbeat):
             text = f'{name} hangs: no heartbeat for {now - process.beaten:.1f} s'
         else:
@@ -125,7 +118,6 @@ class Supervisor:
         self.events.append({'time': time_, 'node': name, 'event': event, **details})
 
     def _standstill(self, now: float) -> Ending:
-        """Return the ending of a run whose time has stopped."""
         silence = f'for {self._scenario.limits.silence:g} s'
         if self._options.follow_clock:
             text = f'/clock, which this run follows, stands still {silence}'

@@ -1,7 +1,5 @@
 """Names of topics; times and classes of messages, also of serialised ones (CDR)."""
 
-from __future__ import annotations
-
 import importlib
 import struct
 from functools import cache

@@ -1,7 +1,5 @@
 """What nodes need at their start, done once in the process that they are forked from."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 
@@ -27,7 +25,6 @@ def warm_up() -> None:
 
 
 def _simulate(*names: str) -> None:
-    """Simulate one step of the robots of scenarios, and look for markers."""
     MarkerDetector(CameraSettings()).segment(np.zeros((120, 160, 3), np.uint8))
     for name in names:
         simulation = Simulation(load_scenario(name), 1)
@@ -36,17 +33,12 @@ def _simulate(*names: str) -> None:
 
 
 def prepare_nodes() -> None:
-    """Do once what nodes would do at their start, for nodes that are forked from here.
-
-    Kernels are those of robots and cameras, which several nodes use: filters and planners load
-    their own beside each other.
-    """
+    """Do once what nodes would do at their start, for nodes that are forked from here."""
     with compiling_said():
         _simulate('mambo_turtlebot')
     for name in (*(f'{name}_msgs.msg' for name in _MESSAGES), *_SERVICES):
         importlib.import_module(name)
-    # Messages import it at their first use.
-    importlib.import_module('rosidl_generator_py')
+    importlib.import_module('rosidl_generator_py')  # messages import it at their first use
     # Searches of all installed packages and of all modules, which a node needs for its parameters
     # and for its first log message.
     PLANNERS.names()

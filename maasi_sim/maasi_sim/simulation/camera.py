@@ -1,13 +1,8 @@
-"""A simulated camera: images of the floor with its markers.
-
-The geometry is that of `maasi_drivers.vision.camera_model.Camera`, distortion included; light,
-noise, blur and distractors are set by `RenderSettings`. The image is linear in the light.
+"""A simulated camera: images of the floor with its markers, geometry as in `vision.camera_model`.
 
 Arrays by pixel are (h, w). The floor's coordinates under each pixel are in the map frame [m], NaN
-above the horizon.
+above the horizon. The image is linear in the light.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -27,36 +22,27 @@ DISC, RECTANGLE = 0, 1
 
 
 class Shot(NamedTuple):
-    """A camera in the map, and the motion of its robot during the exposure.
+    """A camera in the map, and the motion of its robot during the exposure."""
 
-    Centre (3,) [m], turn (3, 3) from camera to map, and the camera's model; origin of the robot
-    (3,) [m], its velocities in the map (3,) [m/s, rad/s], and the exposure's time [s].
-    """
-
-    centre: FloatArray
-    turn: FloatArray
+    centre: FloatArray  # (3,) [m]
+    turn: FloatArray  # (3, 3) from camera to map
     matrix: FloatArray
     distortion: FloatArray
     largest_radius: float
-    origin: FloatArray
-    velocity: FloatArray
-    rotation_rate: FloatArray
-    exposure_time: float
+    origin: FloatArray  # (3,) of the robot [m]
+    velocity: FloatArray  # (3,) in the map [m/s]
+    rotation_rate: FloatArray  # (3,) in the map [rad/s]
+    exposure_time: float  # [s]
 
 
 class Exposure(NamedTuple):
-    """How light becomes grey levels.
+    """How light becomes grey levels."""
 
-    Share of the light that passes the lens, (h, w); amplitude, wave vector [turns/m] and phase
-    [turns] of the light, (4,); gains of R, G, B; deviation in the dark, and variance for each grey
-    level of signal.
-    """
-
-    lens: FloatArray
-    light: FloatArray
-    gains: FloatArray
-    read_noise: float
-    shot_noise: float
+    lens: FloatArray  # share of the light that passes, (h, w)
+    light: FloatArray  # amplitude, wave vector [turns/m] and phase [turns], (4,)
+    gains: FloatArray  # of R, G, B
+    read_noise: float  # deviation in the dark
+    shot_noise: float  # variance for each grey level of signal
 
 
 @njit(cache=True, error_model='numpy')
@@ -98,8 +84,7 @@ def _project(points, shot):  # type: ignore[no-untyped-def]
 def place(shapes, rims, floor_x, floor_y, shot, margin, boxes, drift):  # type: ignore[no-untyped-def]
     """Find the pixels that each shape may touch, and how far it moves during the exposure.
 
-    boxes (n, 4): left, top, right, bottom; empty where the shape is out of view. drift (n, 2): in
-    the floor's coordinates of mid exposure [m].
+    boxes (n, 4): left, top, right, bottom; empty out of view. drift (n, 2): on the floor [m].
     """
     centre, matrix = shot.centre, shot.matrix
     origin, exposure_time = shot.origin, shot.exposure_time
@@ -254,10 +239,7 @@ def floor_albedo(floor_x, floor_y, colour, texture, albedo):  # type: ignore[no-
 
 @njit(cache=True)
 def expose(albedo, floor_x, floor_y, exposure, noise, offsets, image):  # type: ignore[no-untyped-def]
-    """Turn albedo (3, h, w) into grey levels (h, w, 3): light, gains, noise, quantisation.
-
-    The light is a wave of parabolas, a cheap approximation of a sine.
-    """
+    """Turn albedo (3, h, w) into grey levels (h, w, 3); parabolas stand for the light's sine."""
     lens, light, gains = exposure.lens, exposure.light, exposure.gains
     read, shot = exposure.read_noise, exposure.shot_noise
     height, width = floor_x.shape

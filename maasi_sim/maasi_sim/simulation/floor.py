@@ -32,21 +32,16 @@ class RenderSettings(Settings):
 
     marker_diameter: float = Field(default=0.03, gt=0, description='Diameter of the markers [m]')
     marker_colour: Vector3 = Field(
-        default=[0.08, 0.17, 0.62],
-        description='Reflectance of the markers in R, G, B, 0 to 1',
+        default=[0.08, 0.17, 0.62], description='Reflectance of the markers in R, G, B, 0 to 1'
     )
     floor_colour: Vector3 = Field(
-        default=[0.47, 0.47, 0.46],
-        description='Reflectance of the floor in R, G, B, 0 to 1',
+        default=[0.47, 0.47, 0.46], description='Reflectance of the floor in R, G, B, 0 to 1'
     )
     floor_texture: float = Field(
         default=0.03, ge=0, le=1, description='Relative amplitude of the speckle of the floor [-]'
     )
     light_variation: float = Field(
-        default=0.15,
-        ge=0,
-        lt=1,
-        description='Relative amplitude of the light over the floor [-]',
+        default=0.15, ge=0, lt=1, description='Relative amplitude of the light over the floor [-]'
     )
     light_wavelength: float = Field(
         default=3.0, gt=0, description='Wavelength of the light over the floor [m]'
@@ -80,10 +75,7 @@ class RenderSettings(Settings):
     )
     blur: float = Field(default=0.5, ge=0, description='Deviation of the blur of the lens [px]')
     jpeg_quality: int | None = Field(
-        default=None,
-        ge=1,
-        le=100,
-        description='Quality of JPEG compression; none: no JPEG [1]',
+        default=None, ge=1, le=100, description='Quality of JPEG compression; none: no JPEG [1]'
     )
     distractors: DistractorSettings = Field(
         default_factory=DistractorSettings, description='Objects like markers'

@@ -1,7 +1,5 @@
 """Simulated odometry: starts at zero, with noise, and drift that grows with the distance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -14,8 +12,7 @@ from maasi_filter.settings import Settings
 from maasi_planner.motion import RobotState
 from maasi_sim.simulation.world import noise_stream
 
-# Reported variances stay positive: consumers invert them.
-_LEAST_VARIANCE = 1e-12
+_LEAST_VARIANCE = 1e-12  # reported variances stay positive: consumers invert them
 
 
 class OdometrySettings(Settings):
@@ -51,24 +48,19 @@ class OdometrySettings(Settings):
 
 @dataclass(frozen=True)
 class OdometryReading:
-    """Odometry of one step, as in ``nav_msgs/Odometry``.
+    """Odometry of one step, as in ``nav_msgs/Odometry``."""
 
-    The pose is in the frame of the robot at the start, with its covariance (6, 6) [m, rad]; the
-    velocities are in the robot's frame [m/s, rad/s].
-    """
-
-    pose: Pose
-    covariance: FloatArray
-    velocity: FloatArray
-    angular_velocity: FloatArray
+    pose: Pose  # in the frame of the robot at the start
+    covariance: FloatArray  # (6, 6) of the pose [m, rad]
+    velocity: FloatArray  # in the robot's frame [m/s]
+    angular_velocity: FloatArray  # in the robot's frame [rad/s]
 
 
 class OdometryModel:
     """A robot's odometry, which stands at zero at its start.
 
-    Height, roll and pitch are measured absolutely and have noise at most; x, y and heading are
-    integrated, and drift. The covariance describes the errors of `reported`, by default those of
-    `settings`.
+    Height, roll and pitch have noise only; x, y and heading drift. The covariance describes the
+    errors of `reported`, by default those of `settings`.
     """
 
     def __init__(
@@ -92,8 +84,7 @@ class OdometryModel:
         self._offset = (0.0, 0.0)
         self._turn = 0.0
         axes = 3 if start.position[2] > 0.0 else 2
-        # The constant error of the position [m].
-        self._constant = np.zeros(3)
+        self._constant = np.zeros(3)  # the constant error of the position [m]
         if settings.position_offset > 0.0:
             drawn = noise_stream(seed, robot, 0, 'offset').standard_normal(axes)
             self._constant[:axes] = drawn * (settings.position_offset / math.hypot(*drawn))
@@ -152,22 +143,13 @@ class OdometryModel:
         )
 
     def _from_start(self, x: float, y: float, z: float) -> tuple[float, float, float]:
-        """Return a position of the map in the frame of the start."""
         (a, b, c), (d, e, f), (g, h, i) = self._rotation
         tx, ty, tz = self._shift
-        return (
-            tx + a * x + b * y + c * z,
-            ty + d * x + e * y + f * z,
-            tz + g * x + h * y + i * z,
-        )
+        return (tx + a * x + b * y + c * z, ty + d * x + e * y + f * z, tz + g * x + h * y + i * z)
 
     def _place(self, x: float, y: float) -> tuple[float, float]:
-        """Return the estimated position of a robot at x, y."""
         cosine, sine = math.cos(self._turn), math.sin(self._turn)
-        return (
-            self._offset[0] + cosine * x - sine * y,
-            self._offset[1] + sine * x + cosine * y,
-        )
+        return (self._offset[0] + cosine * x - sine * y, self._offset[1] + sine * x + cosine * y)
 
     def _grow(self, move_x: float, move_y: float, way: float) -> None:
         """Propagate the covariance of the drift over a move; an error of heading turns the move."""
@@ -199,7 +181,6 @@ class OdometryModel:
 
 
 def _product(first: list[float], second: list[float]) -> tuple[float, float, float, float]:
-    """Return the Hamilton product of two quaternions w, x, y, z."""
     w1, x1, y1, z1 = first
     w2, x2, y2, z2 = second
     return (

@@ -1,7 +1,5 @@
 """What the simulation node publishes: topics of robots, the truth; and who receives it."""
 
-from __future__ import annotations
-
 import array
 import contextlib
 import math
@@ -78,8 +76,7 @@ class RobotTopics:
         unit = getattr(robot, 'battery_unit', 'fraction')
         self._full = 100.0 if unit == 'percent' else 1.0
         self._battery.header.frame_id = f'{name}/base_link'
-        #: Full names of the topics that its driver needs.
-        self.needed: list[str] = []
+        self.needed: list[str] = []  #: full names of the topics that its driver needs
         if self._odometry_publisher is not None:
             self.needed.append(self._odometry_publisher.topic_name)
         if self.robot.camera is not None:
@@ -224,10 +221,7 @@ def publish_truth(node: Node, world: World, frame: str) -> None:
 
 
 class Connections:
-    """Tells whether expected nodes would receive what is published now.
-
-    `expected` are topics that each node subscribes to, by its full name.
-    """
+    """Tells whether nodes would receive what is published now, by the topics expected of each."""
 
     def __init__(self, node: Node, expected: Mapping[str, Sequence[str]]) -> None:
         self._node = node
@@ -267,17 +261,12 @@ class Connections:
 
 
 class ExternalRobot:
-    """A robot moved by another program: an autopilot's simulator, or a real vehicle.
+    """A robot moved by another program: sensors measure where its driver says that it is."""
 
-    Its state is what its driver publishes; simulated sensors measure from there.
-    """
-
-    #: The simulation does not wait for it at shutdown.
-    obeys = False
+    obeys = False  #: the simulation does not wait for it at shutdown
 
     def __init__(self, start: Pose) -> None:
-        #: In the map.
-        self.state = RobotState(start)
+        self.state = RobotState(start)  #: in the map
 
     def take(self, message: AgentState) -> None:
         """Store the newest state."""

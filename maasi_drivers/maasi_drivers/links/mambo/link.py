@@ -1,14 +1,10 @@
 """Connection to a Parrot Mambo: pyparrot over WiFi or Bluetooth, in one thread. Without ROS.
 
-Over WiFi pyparrot keeps handing out its last packet after the link is cut, and the stamp in a
-position event is the time since the one before. So an event counts as new only when one of the
-acquisition stamps that come with it (of speed, altitude or orientation) has changed. Bluetooth
-delivers few of them, each notification once (pyparrot, docs/minidronecommands.rst: "more
-information via wifi than via BLE"): there each one counts, and so does the acknowledgement of a
-command, which is sent for that purpose when nothing else is received.
+Over WiFi pyparrot repeats its last packet after the link is cut: a position event is new only with
+a new stamp of speed, altitude or orientation. Over Bluetooth each notification comes once and
+counts, and so does the acknowledgement of a command, sent when nothing else is received (pyparrot,
+docs/minidronecommands.rst: "more information via wifi than via BLE").
 """
-
-from __future__ import annotations
 
 import errno
 import importlib
@@ -29,21 +25,16 @@ HANDSHAKE_PORT = 44444
 AIRBORNE = ('takingoff', 'hovering', 'flying', 'landing')
 
 _STAMPS = ('DroneSpeed_ts', 'DroneAltitude_ts', 'DroneQuaternion_ts')
-# Period of the thread's loop [s]; requests wake it.
-_ROUND = 0.05
-# Silence of its caller after which the drone is commanded to hover [s].
-CALLER_TIMEOUT = 0.5
-# From one take-off or landing command to the next while the drone does not obey [s].
-_REPEAT = 0.7
-# Age of what was heard last after which a reported landing does not count [s].
-_OUTDATED = 1.0
+_ROUND = 0.05  # period of the thread's loop [s]; requests wake it
+CALLER_TIMEOUT = 0.5  # silence of its caller after which the drone is commanded to hover [s]
+_REPEAT = 0.7  # from one take-off or landing command to the next while the drone does not obey [s]
+_OUTDATED = 1.0  # age of what was heard last after which a reported landing does not count [s]
 # Over Bluetooth: silence after which a command is sent that the drone has to acknowledge [s].
 _PROBE_PERIOD = 0.3
 # From one try to connect to the next [s].
 _RECONNECT = 1.0
 _BLUETOOTH = re.compile(r'([0-9a-fA-F]{2}:){5}[0-9a-fA-F]{2}')
-# Farthest that a position can be from the take-off point [m].
-_FARTHEST = 1000.0
+_FARTHEST = 1000.0  # farthest that a position can be from the take-off point [m]
 
 
 class MamboLinkError(RuntimeError):
@@ -59,42 +50,30 @@ class PositionEvent:
     received: float  # monotonic clock [s]
 
 
+@dataclass(eq=False)
 class MamboLink:
-    """A connection to one Mambo.
+    """A connection to one Mambo, whose own thread talks to pyparrot: no call waits.
 
-    All calls return at once; a thread of its own talks to pyparrot, which sleeps in its commands. A
-    piloting command is sent once. That thread is a dead man's switch too: once the caller has not
-    called `keep_alive` for `CALLER_TIMEOUT`, the drone is commanded to hover, and to land after
-    `land_after` [s] more. `tilt` [rad] and `climb` [m/s] are set in the drone.
+    That thread is a dead man's switch, too: `CALLER_TIMEOUT` after the last `keep_alive` the drone
+    hovers, and `land_after` later it lands.
     """
 
-    def __init__(
-        self,
-        kind: Literal['wifi', 'ble'] = 'wifi',
-        address: str = '192.168.99.3',
-        port: int = 43210,
-        tilt: float = math.radians(10.0),
-        climb: float = 0.5,
-        land_after: float = 3.0,
-    ) -> None:
-        self.kind = kind
-        self.address = address
-        self.port = port
-        self.tilt = tilt
-        self.climb = climb
-        self.land_after = land_after
-        #: Fault of the link; while it is not connected it keeps trying.
-        self.error = ''
-        #: Whether the drone has answered.
-        self.connected = False
+    kind: Literal['wifi', 'ble'] = 'wifi'
+    address: str = '192.168.99.3'
+    port: int = 43210
+    tilt: float = math.radians(10.0)  # set in the drone [rad]
+    climb: float = 0.5  # set in the drone [m/s]
+    land_after: float = 3.0  # [s]
+
+    def __post_init__(self) -> None:
+        self.error = ''  #: fault of the link; while it is not connected it keeps trying
+        self.connected = False  #: whether the drone has answered
         #: Of the drone, as pyparrot calls it: landed, takingoff, hovering, flying, ...
         self.flying_state = ''
-        #: Charge, 0 to 1; negative: not received yet.
-        self.battery = -1.0
+        self.battery = -1.0  #: charge, 0 to 1; negative: not received yet
         #: Time of the last new data or acknowledgement, monotonic clock [s].
         self.heard_at = -math.inf
-        #: The last position event.
-        self.position: PositionEvent | None = None
+        self.position: PositionEvent | None = None  #: the last position event
         #: Position events that could not be used.
         self.bad_events = 0
         self._drone: Any = None
@@ -111,8 +90,6 @@ class MamboLink:
         self._probed_at = -math.inf
         self._was_silent = False
         self._thread: threading.Thread | None = None
-
-    # ---- what the caller asks for ------------------------------------------------------------
 
     def connect(self) -> None:
         """Begin to connect."""
@@ -204,8 +181,6 @@ class MamboLink:
                     ) from error
         return minidrone
 
-    # ---- the thread --------------------------------------------------------------------------
-
     def _make_drone(self) -> Any:
         minidrone = self.check()
         link = self
@@ -274,11 +249,9 @@ class MamboLink:
                 drone.disconnect()
             else:
                 connection.is_listening = False
-                # Its listener closes the sockets itself.
-                connection.listener_thread.join(2.0)
+                connection.listener_thread.join(2.0)  # its listener closes the sockets itself
 
     def _watch_caller(self) -> None:
-        """Have the drone hover, and then land, where the caller hangs."""
         late = time.monotonic() - self._called_at - CALLER_TIMEOUT
         if late <= 0.0 or not self.airborne:
             return
@@ -289,14 +262,12 @@ class MamboLink:
                 self._steering = [0, 0, 0, 0]
 
     def _ask_again(self) -> None:
-        """Ask for the drone's state when the link is back: it tells each change once."""
         silent = math.isfinite(self.heard_at) and time.monotonic() - self.heard_at > _OUTDATED
         if self._was_silent and not silent:
             self._drone.ask_for_state_update()
         self._was_silent = silent
 
     def _try_to_connect(self, drone: Any) -> str:
-        """Return why there is no connection, or nothing."""
         try:
             return '' if drone.connect(num_retries=3) else 'it refused the connection'
         except Exception as error:
@@ -330,10 +301,7 @@ class MamboLink:
         if steering is not None:
             self._drone.fly_direct(*steering)
 
-    # ---- what comes in -----------------------------------------------------------------------
-
     def _take(self, name: str, value: Any, sensors: Any) -> None:
-        """Take one number of an event; called by pyparrot's thread."""
         if self.kind == 'ble':
             self._fresh = True
             self.heard_at = time.monotonic()

@@ -1,7 +1,5 @@
 """A Parrot Mambo on WiFi or Bluetooth as a driver's robot."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,8 +21,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_planner.motion import MotionModel, RobotState
 
-# Longest time between two updates of the pilot [s].
-POLL_PERIOD = 0.05
+POLL_PERIOD = 0.05  # longest time between two updates of the pilot [s]
 # At the end: longest wait until the drone reports that it lands, and between two checks [s].
 _LANDING_TIME, _LANDING_PERIOD = 1.0, 0.02
 # Share of a new difference of positions in the velocity.
@@ -70,8 +67,6 @@ class MamboRobotLink(RobotLink):
             self._link.check()
         except MamboLinkError as error:
             raise SettingsError(f'parameter link: {error}') from error
-
-    # ---- link and life cycle -----------------------------------------------------------------
 
     def connect(self) -> None:
         """Connect; it takes off once the driver is active."""
@@ -140,8 +135,6 @@ class MamboRobotLink(RobotLink):
             **{f'datagrams dropped: {key}': number for key, number in link.dropped.items()},
         }
 
-    # ---- what comes in -----------------------------------------------------------------------
-
     def _update(self) -> None:
         driver = self.driver
         now, pilot, link = time.monotonic(), self._pilot, self._link
@@ -152,12 +145,10 @@ class MamboRobotLink(RobotLink):
         pilot.update(now)
         self._judge(pilot)
         if link.battery >= 0.0:
-            # The drone reports only changes.
-            driver.take_charge(link.battery)
+            driver.take_charge(link.battery)  # the drone reports only changes
         state, stamp = pilot.state, driver.arrivals.stamp(now)
         if stamp is None:
-            # A simulated time has not begun: nothing is late.
-            driver.silence.end()
+            driver.silence.end()  # a simulated time has not begun: nothing is late
         elif self._mambo.pose == 'events' and pilot.has_pose and state is not None:
             driver.restart_if_back('the clock', stamp)
             latest, covariance = driver.history.latest, pilot.reckoning.covariance()
@@ -169,7 +160,6 @@ class MamboRobotLink(RobotLink):
                 )
 
     def _judge(self, pilot: MamboPilot) -> None:
-        """Log the phase, and report the fault of the pilot."""
         phase, problem = pilot.phase, pilot.problem
         if phase is not self._phase:
             self._phase = phase
@@ -195,8 +185,6 @@ class MamboRobotLink(RobotLink):
         velocity = before + _SMOOTHING * (placed.velocity - before)
         covariance = self._mambo.pose_covariance()
         driver.take_pose(replace(placed, covariance=covariance, velocity=velocity))
-
-    # ---- goals and control -------------------------------------------------------------------
 
     def make_motion(self) -> MotionModel:
         """Return the controller, which the pilot uses as well."""

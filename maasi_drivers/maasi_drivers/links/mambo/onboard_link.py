@@ -1,9 +1,4 @@
-"""A Mambo with a program of its own as a driver's robot: poses by the feed, orders by UDP (001).
-
-The layout of the orders is in docs/measurement_feed.md; everything is little-endian.
-"""
-
-from __future__ import annotations
+"""A Mambo with a program of its own as a driver's robot: the feed's poses, orders by UDP (001)."""
 
 import socket
 import struct
@@ -16,12 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import (
-    UNTIL_ARM,
-    ArmPermission,
-    make_fence,
-    outside_fence,
-)
+from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission, make_fence, outside_fence
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import FeedPeer, RobotNode
@@ -32,8 +22,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.lifecycle_node import SettingsError
 
-# Magic and version, kind, nothing, sequence, position and yaw.
-_ORDER = struct.Struct('<4sBBHI4f')
+_ORDER = struct.Struct('<4sBBHI4f')  # magic and version, kind, nothing, sequence, position and yaw
 
 
 class OrderKind(IntEnum):
@@ -45,21 +34,15 @@ class OrderKind(IntEnum):
 
 
 def encode(sequence: int, kind: OrderKind, position: FloatArray) -> bytes:
-    """Return an order as a datagram.
-
-    The position (3,) [m] is from where it took off, in the axes of its heading then: forward, left,
-    up; the heading stays.
-    """
+    """Return an order as a datagram; position (3,) [m] forward, left, up from the take-off."""
     if not np.isfinite(position).all():
         raise ValueError(f'order: got {position}, allowed are finite numbers [m]')
     data = _ORDER.pack(b'MSWO', 1, kind, 0, sequence % 2**32, *position, 0.0)
     return data + struct.pack('<I', zlib.crc32(data))
 
 
-# Between two orders [s]; without them the program on board hovers, then lands.
-_PERIOD = 0.1
-# At the end: orders to land, and the time between them [s].
-_LAST_ORDERS, _LAST_PERIOD = 5, 0.05
+_PERIOD = 0.1  # between two orders [s]; without them the program on board hovers, then lands
+_LAST_ORDERS, _LAST_PERIOD = 5, 0.05  # at the end: orders to land, and the time between them [s]
 
 
 class OnboardLink(RobotLink):
@@ -98,8 +81,6 @@ class OnboardLink(RobotLink):
         # Positions of the feed are relative to this.
         self._origin = Pose.from_yaw([*settings.start[:2], mambo.ground], settings.yaw)
 
-    # ---- link and life cycle -----------------------------------------------------------------
-
     def connect(self) -> None:
         """Send orders from now on: to be on the ground until it is active and may fly."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -120,7 +101,6 @@ class OnboardLink(RobotLink):
         self._lost_since: float | None = None
 
     def _arm(self) -> str:
-        """Let the drone take off; return why not, empty where it may."""
         problem = '' if self._mambo.arm else NOT_ALLOWED
         if not problem and self._feed_state is not FeedState.GROUND:
             problem = 'it is in the air, or not heard'
@@ -186,10 +166,7 @@ class OnboardLink(RobotLink):
             text = f'orders to {address}: {error.strerror or error}'
             self.driver.warn_throttled('orders', text)
 
-    # ---- the flight --------------------------------------------------------------------------
-
     def _take_feed_pose(self, stamp: int, pose: FeedPose) -> None:
-        """Take the drone's own pose at an image of the feed."""
         driver = self.driver
         if not driver.active or not driver.is_new_pose('feed', stamp):
             return
@@ -203,7 +180,6 @@ class OnboardLink(RobotLink):
         driver.take_pose(replace(placed, covariance=self._mambo.pose_covariance()))
 
     def _next_order(self, pose: FeedPose, place: Pose) -> str:
-        """Order what the flight needs next; return why no goals are taken, or nothing."""
         mambo, now = self._mambo, time.monotonic()
         self._feed_state = pose.state
         if self._landed_for:

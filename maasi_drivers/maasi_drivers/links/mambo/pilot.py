@@ -1,8 +1,7 @@
 """A Mambo's flight: its commands from take-off to landing. Without ROS."""
 
-from __future__ import annotations
-
 import math
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -15,20 +14,16 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import MotionModel, RobotState
 
-# Acceleration per speed error [1/s].
-_SPEED_GAIN = 2.5
-# Acceleration of the desired speed: little tilt, as images are taken meanwhile [m/s^2].
-_RAMP = 0.4
-# A desired velocity older than this is discarded [s].
-_DESIRED_AGE = 0.5
+_SPEED_GAIN = 2.5  # acceleration per speed error [1/s]
+_RAMP = 0.4  # acceleration of the desired speed: little tilt, as images are taken meanwhile [m/s^2]
+_DESIRED_AGE = 0.5  # a desired velocity older than this is discarded [s]
 # Share of the largest acceleration that stops it before the geofence: the rest is for wind.
 _BRAKE_SHARE = 0.5
 # Largest speed per metre to the geofence, well below the bandwidth of the speed [1/s].
 _NEAR_RATE = 1.0
 # Placeholder until the speed at the largest tilt is measured; never used in flight [m/s].
 _UNKNOWN_SPEED = 1.0
-# How far from its altitude a Mambo counts as there after take-off [m].
-ALTITUDE_TOLERANCE = 0.1
+ALTITUDE_TOLERANCE = 0.1  # how far from its altitude a Mambo counts as there after take-off [m]
 # Under a command faster than this, an event equal to the bit is no new position [m/s].
 _LEAST_SPEED = 0.05
 _STILL = np.zeros(4)
@@ -46,26 +41,18 @@ class MamboPhase(Enum):
     LANDING = 'landing'
 
 
+@dataclass(eq=False)
 class MamboPilot:
-    """Flies a Mambo from take-off to landing, and lands it on a fault.
+    """Flies a Mambo from take-off to landing, in a fence (3, 2) [m, map]; lands it on a fault."""
 
-    `fence` is (3, 2) [m, map]; `problem` says why it takes no goals; times are of the monotonic
-    clock [s].
-    """
+    link: MamboLink
+    motion: MotionModel
+    settings: MamboSettings
+    home: Pose
+    fence: FloatArray
 
-    def __init__(
-        self,
-        link: MamboLink,
-        motion: MotionModel,
-        settings: MamboSettings,
-        home: Pose,
-        fence: FloatArray,
-    ) -> None:
-        self.link = link
-        self.motion = motion
-        self.settings = settings
-        self.home = home
-        self.fence = fence
+    def __post_init__(self) -> None:
+        link, settings, home = self.link, self.settings, self.home
         self.phase = MamboPhase.CONNECTING
         self.problem = 'connecting to the Mambo'
         speed = settings.full_speed or _UNKNOWN_SPEED
@@ -88,8 +75,6 @@ class MamboPilot:
         # Reason of the final landing.
         self._ended = ''
         self._permission = ArmPermission(settings.arm_timeout)
-
-    # ---- where it is -------------------------------------------------------------------------
 
     @property
     def flying(self) -> bool:
@@ -126,8 +111,6 @@ class MamboPilot:
             self._moved_at = now
         self._place, self._placed_at = place, now
 
-    # ---- control -----------------------------------------------------------------------------
-
     def fly(self, command: FloatArray) -> None:
         """Fly a velocity command (4,), once; without another one the drone hovers."""
         if not np.isfinite(command).all():
@@ -143,7 +126,6 @@ class MamboPilot:
             self._send(_STILL, _STILL)
 
     def _steer(self, command: FloatArray) -> None:
-        """Steer towards the commanded speed, limited to what can be stopped."""
         model, course = self.reckoning.model, self.reckoning.ahead()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         turned = np.array([[cosine, sine], [-sine, cosine]])
@@ -174,8 +156,6 @@ class MamboPilot:
         self.reckoning.command(self._now, shares)
         self.link.steer(*shares.tolist())
 
-    # ---- what it is to do --------------------------------------------------------------------
-
     def permit(self, now: float) -> str:
         """Let it take off once; return why not, empty where it may."""
         problem = self._permission.ask(now, self._objection(now))
@@ -193,7 +173,6 @@ class MamboPilot:
         return self.link.error or self._unfit() or self._low_battery() or unheard or silent
 
     def _unfit(self) -> str:
-        """Return which parameter keeps it on the ground, or nothing."""
         if not self.settings.arm:
             return NOT_ALLOWED
         if self.settings.full_speed is None:
@@ -234,8 +213,6 @@ class MamboPilot:
         self.reckoning.command(self._now, _STILL)
         self.link.land()
 
-    # ---- the flight --------------------------------------------------------------------------
-
     def update(self, now: float) -> None:
         """Advance to `now`; at least ten times a second."""
         self._now = now
@@ -248,7 +225,6 @@ class MamboPilot:
         self.problem = self._advance(now)
 
     def _advance(self, now: float) -> str:
-        """Do what the phase needs; return why it takes no goals, or nothing."""
         link = self.link
         if self.phase is MamboPhase.CONNECTING:
             if not link.connected:
@@ -280,7 +256,6 @@ class MamboPilot:
         return self._ended
 
     def _stand(self, now: float) -> str:
-        """Take off if nothing prevents it."""
         state, low = self.link.flying_state, self._low_battery()
         if low or self._is_silent(now):
             self._permission.end()
@@ -311,7 +286,6 @@ class MamboPilot:
         return phase.value
 
     def _stay_up(self, now: float) -> str:
-        """Continue a flight, or land it."""
         if low := self._low_battery():
             return self.end(low)
         if self._lost_since is not None:
@@ -349,15 +323,11 @@ class MamboPilot:
             return 'landing: its goal was cancelled'
         return ''
 
-    # ---- faults ------------------------------------------------------------------------------
-
     def _low_battery(self) -> str:
-        """Return that the charge is too low, or nothing; an unknown one is negative."""
         charge, minimum = self.link.battery, self.settings.battery_minimum
         return f'battery at {charge:.2f}, below {minimum:.2f}' if 0.0 <= charge < minimum else ''
 
     def _missing(self, now: float) -> str:
-        """Return what has been missing for longer than the timeout, or nothing."""
         for text, since in (
             ('link lost: nothing from the Mambo', self.link.heard_at),
             ('no position', self._placed_at),

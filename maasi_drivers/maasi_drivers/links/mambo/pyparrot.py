@@ -1,15 +1,10 @@
-"""Additions to pyparrot's connections to a Mambo, by Bluetooth and by UDP. Without ROS.
+"""What pyparrot 1.5.20 lacks for a Mambo by Bluetooth and by UDP. Without ROS.
 
-pyparrot 1.5.20 (`pyparrot/networking/bleConnection.py`) cannot send one piloting command, only
-repeat one and wait meanwhile; and its acknowledged commands wait half a second at least. The
-packets are those of its own methods, without the waiting.
-
-Its UDP socket (`pyparrot/networking/wifiConnection.py`) is bound to all interfaces, takes every
-datagram for one of the drone's, returns the last one again after a timeout, and its listener
+`bleConnection.py` cannot send one piloting command, only repeat one and wait meanwhile, and waits
+half a second for acknowledgements. The socket of `wifiConnection.py` is bound to all interfaces,
+takes every datagram for the drone's, returns the last one again after a timeout, and its listener
 dies on a truncated frame, or loops forever on one of size zero.
 """
-
-from __future__ import annotations
 
 import math
 import socket
@@ -17,8 +12,7 @@ import struct
 from collections import Counter
 from typing import Any
 
-# Project, class and command of the largest tilt.
-_MAX_TILT = (2, 8, 1)
+_MAX_TILT = (2, 8, 1)  # project, class and command of the largest tilt
 
 
 def mend(connection: Any) -> None:
@@ -51,8 +45,7 @@ def _write(
 # Type, buffer, sequence, total size.
 _HEADER = struct.Struct('<BBBI')
 _TYPES = range(1, 5)
-# Longest wait for a datagram: then the listener checks whether it has to end [s].
-_TIMEOUT = 0.3
+_TIMEOUT = 0.3  # longest wait for a datagram: then the listener checks whether it has to end [s]
 
 
 def has_whole_frames(data: bytes) -> bool:
@@ -102,11 +95,7 @@ class DroneSocket:
 
 
 def guard(connection: Any, drone: str, port: int) -> None:
-    """Make a connection of pyparrot receive through a `DroneSocket`.
-
-    The content of a frame may still be too short for pyparrot's parser: such a frame is dropped
-    instead of ending the listener.
-    """
+    """Make a connection receive by a `DroneSocket`, and drop frames that it cannot parse."""
     handle = connection.handle_data
 
     def open_sockets() -> None:

@@ -1,15 +1,10 @@
-"""Where a Mambo is between its position events, by a model of the commands. Without ROS.
+"""Where a Mambo is between its position events (two a second), by a model of the commands.
 
-Position events come twice a second. In between, a model flies the commands that were sent (dead
-reckoning), and each event corrects it where it was when the event was made.
-
-Roll and pitch of a command are shares of the largest tilt. A tilt accelerates by g tan(tilt), and
-drag opposes the speed, in proportion to it (R. Mahony, V. Kumar, P. Corke, "Multirotor
-aerial vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). So one measured number is
-enough: the steady speed at the largest tilt. A command acts after a delay.
+Each event corrects it where it was when the event was made. A tilt accelerates by g tan(tilt), and
+drag opposes the speed, in proportion to it (R. Mahony, V. Kumar, P. Corke, "Multirotor aerial
+vehicles", IEEE Robotics & Automation Magazine 19(3), 2012), so that one measured number is enough:
+the steady speed at the largest tilt. A command acts after a delay.
 """
-
-from __future__ import annotations
 
 import math
 from collections import deque
@@ -60,10 +55,7 @@ class TiltModel:
     def advance(
         self, course: Course, shares: FloatArray, h: float, push: FloatArray = _STILL_AIR
     ) -> Course:
-        """Return the course after `h` seconds under shares (4,): forward, left, up, turn.
-
-        `push` (2,) is a steady acceleration by what is not commanded [m/s^2, map].
-        """
+        """Return the course `h` s later under shares (4,) and another push (2,) [m/s^2, map]."""
         forward, left, up, turn = shares.tolist()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         rate = self.drag if forward or left else self.drag + _HOVER_RATE
@@ -89,8 +81,7 @@ class TiltModel:
 # Share of the difference to an event by which position and velocity are corrected.
 _POSITION_GAIN, _VELOCITY_GAIN = 0.8, 0.25
 _EVENT_PERIOD = 0.5
-# Above this difference an event replaces the estimate [m].
-_JUMP = 0.5
+_JUMP = 0.5  # above this difference an event replaces the estimate [m]
 # Longest time of one prediction [s].
 _LONGEST = 1.0
 _HISTORY = 64
@@ -113,8 +104,7 @@ class DeadReckoning:
         #: Time of flight since the last correction [s].
         self.age = 0.0
         self._turn = origin.rotation()
-        # By the last event [m].
-        self._measured = origin.position
+        self._measured = origin.position  # by the last event [m]
         # Recent commands, and the time at which each takes effect.
         self._sent: deque[tuple[float, FloatArray]] = deque([(-math.inf, np.zeros(4))])
         self._now = -math.inf
@@ -145,7 +135,6 @@ class DeadReckoning:
         return np.diag([position] * 3 + [tilt, tilt, attitude])
 
     def _acting(self) -> FloatArray:
-        """Return the shares that the drone flies now."""
         return next(shares for acts, shares in reversed(self._sent) if acts <= self._now)
 
     def command(self, now: float, shares: FloatArray) -> None:
@@ -214,7 +203,6 @@ class DeadReckoning:
             self.push = np.clip(self.push + change[:2], -_MOST_PUSH, _MOST_PUSH)
 
     def _at(self, time: float) -> tuple[FloatArray, float]:
-        """Return position and heading at a time, from the sample before it."""
         if not self._past:
             return self.course.position, self.course.yaw
         earlier = (item for item in reversed(self._past) if item[0] <= time)

@@ -1,7 +1,5 @@
 """The messages of an autopilot: its type, mode and parameters, and requests to it."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections import deque
@@ -59,14 +57,12 @@ class Autopilot:
         self.mode = -1
         self.lost = False
         self.estimate = Estimate(settings, self.place, self.on_restart)
-        #: Commands that were not answered yet.
-        self.commands: deque[_Command] = deque()
+        self.commands: deque[_Command] = deque()  #: commands that were not answered yet
         #: Numbers of those that were accepted in this phase of the flight.
         self.accepted: set[int] = set()
         self._sender = sender
         self._received_at = self._heartbeat_at = self._setpoint_at = -math.inf
-        # Of the last request for messages.
-        self._requested_at = -math.inf
+        self._requested_at = -math.inf  # of the last request for messages
 
     @property
     def in_external_mode(self) -> bool:
@@ -76,13 +72,8 @@ class Autopilot:
     def on_restart(self) -> None:
         """Take note that the autopilot was restarted."""
 
-    # ---- what comes in -----------------------------------------------------------------------
-
     def take(self, message: Any, now: float) -> tuple[bool, int] | None:
-        """Take a message; after a heartbeat return whether it was armed before, and the mode then.
-
-        Of other systems only messages with the driver's own id count.
-        """
+        """Take a message; of a heartbeat return whether it was armed before, and the mode then."""
         kind, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         if self._shows_own_id(message):
             if self.failsafes is not None:
@@ -113,11 +104,7 @@ class Autopilot:
         return None
 
     def _shows_own_id(self, message: Any) -> bool:
-        """Return whether another program has the driver's system id.
-
-        The driver does not receive its own messages. Behind a router that keeps programs apart,
-        the answers to the other one's commands are all that comes.
-        """
+        """Return whether another program has the driver's id; a router passes answers only."""
         own = self.settings.own_system
         if message.get_srcSystem() == own:
             return True
@@ -151,8 +138,6 @@ class Autopilot:
             # PX4 sends the bytes of an integer in the place of a float.
             value = float(struct.unpack('<i', struct.pack('<f', value))[0])
         self.failsafes.take(message.param_id.rstrip('\0'), value)
-
-    # ---- what goes out -----------------------------------------------------------------------
 
     def send_heartbeat(self, now: float) -> None:
         """Send the driver's heartbeat if it is due."""
@@ -202,7 +187,6 @@ class Autopilot:
         self.commands.append(_Command(number, parameters))
 
     def _conclude(self, result: int | None) -> None:
-        """Take the result of the oldest command; None: it was not answered."""
         command = self.commands.popleft()
         if result == mavlink.MAV_RESULT_ACCEPTED:
             self.accepted.add(command.number)

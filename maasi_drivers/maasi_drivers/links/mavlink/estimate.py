@@ -1,7 +1,5 @@
 """The state of a vehicle by its autopilot: pose, batteries, fix, landed or not."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -55,11 +53,7 @@ _SAME_BOOT = 5.0
 
 
 class FlightOrigin:
-    """The place in the local frame that stands at the start in the map.
-
-    A local frame lasts as long as its autopilot is on: a file has the place for a driver that is
-    started again meanwhile, in the air or after a landing elsewhere.
-    """
+    """The place of the map's start in the local frame, in a file as long as the autopilot is on."""
 
     def __init__(
         self, settings: MavlinkSettings, start: list[float], path: Path | None, log: ReportLog
@@ -71,10 +65,7 @@ class FlightOrigin:
         self._log = log
 
     def find(self, position: FloatArray, booted: float, armed: bool) -> FloatArray | None:
-        """Return the place (3,), ENU [m], or None where it cannot be known.
-
-        `booted` is when the autopilot was switched on, on the steady clock [s].
-        """
+        """Return the place (3,), ENU [m], if known; `booted` [s, steady clock]: switched on."""
         kept = self._load(booted)
         if kept is not None:
             x, y, z = (position - kept).tolist()
@@ -109,7 +100,6 @@ class FlightOrigin:
             self._log.add(WARNING, f'the origin of the flight cannot be kept: {error}')
 
     def _load(self, booted: float) -> FloatArray | None:
-        """Return what was kept of this autopilot since it is on, for this place in the map."""
         try:
             item = json.loads(self._path.read_text()) if self._path is not None else {}
             host, before = item['boot']
@@ -126,10 +116,8 @@ def _host_boot() -> str:
     return Path('/proc/sys/kernel/random/boot_id').read_text().strip()
 
 
-# A time since boot that is smaller by more than this means a restart [ms].
-_RESTART = 1000
-# Of GPS_RAW_INT: the least fix with a height.
-_FIX_3D = 3
+_RESTART = 1000  # a time since boot that is smaller by more than this means a restart [ms]
+_FIX_3D = 3  # of GPS_RAW_INT: the least fix with a height
 # Of EKF_STATUS_REPORT: a level or absolute position, and none that is only assumed.
 _EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
 # A status counts for this time; it is asked for twice a second [s].
@@ -190,7 +178,6 @@ class Estimate:
         return min(self.heard_at, self._status_at.get(_EKF, math.inf), fixes)
 
     def _silence(self, name: str) -> str:
-        """Return that a status does not come any more, or nothing."""
         silent = self._now - self._status_at.get(name, math.inf) > _STATUS_AGE
         return f'no {name} any more' if silent else ''
 
@@ -265,8 +252,7 @@ class Estimate:
         self._note_time(message.time_boot_ms, now)
         before = self._position
         if before is not None and message.time_boot_ms <= before[0]:
-            # A duplicate.
-            return
+            return  # a duplicate
         self._position = (message.time_boot_ms, values)
         if before is not None and before[1] == values and armed:
             # An estimate that moves at all never repeats to the bit: it is frozen.

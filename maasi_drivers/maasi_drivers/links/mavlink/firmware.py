@@ -1,7 +1,5 @@
 """What sets the autopilots apart: their modes, how they start, and the check of their failsafes."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping
@@ -131,15 +129,13 @@ def identify(autopilot: int, vehicle_type: int) -> Firmware:
 _STATION, _HIGHEST = ('SYSID_MYGCS', 'MAV_GCS_SYSID'), 'MAV_GCS_SYSID_HI'
 # Period and number of requests for a parameter that is not answered [s, 1].
 _ANSWER_TIMEOUT, _TRIES = 0.5, 5
-# A message with our system id counts for this time [s].
-_FOREIGN_AGE = 5.0
+_FOREIGN_AGE = 5.0  # a message with our system id counts for this time [s]
 
 
 class FailsafeCheck:
     """Whether a vehicle stops by itself when the driver is gone.
 
-    ArduPilot's ground station failsafe checks the system id of heartbeats alone
-    (`GCS::sysid_is_gcs`): any program with the driver's id keeps it from acting.
+    ArduPilot looks at the system id alone (`GCS::sysid_is_gcs`): any program with it prevents that.
     """
 
     def __init__(
@@ -219,7 +215,6 @@ class FailsafeCheck:
         )
 
     def _station_problem(self) -> str:
-        """Return why the autopilot would not miss the driver alone, or nothing."""
         known = [(name, self.values.get(name)) for name in self._station]
         name, low = next((item for item in known if item[1] is not None), ('', None))
         if low is None:

@@ -1,7 +1,5 @@
 """Connection to a vehicle, which one thread alone reads and writes."""
 
-from __future__ import annotations
-
 import random
 import threading
 import time
@@ -12,24 +10,17 @@ from maasi_drivers.links.mavlink.protocol import mavlink, mavutil
 from maasi_drivers.links.mavlink.vehicle import Vehicle
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 
-# Longest time until the next check of what is due [s].
-_PERIOD = 0.02
-# Between two tries to open a device that is not there [s].
-_RETRY = 1.0
+_PERIOD = 0.02  # longest time until the next check of what is due [s]
+_RETRY = 1.0  # between two tries to open a device that is not there [s]
 # Component ids that MAVLink leaves to private networks: no ground station has one of them.
 _COMPONENTS = range(mavlink.MAV_COMP_ID_USER1, mavlink.MAV_COMP_ID_USER43 + 1)
 
 
-class LinkError(RuntimeError):
-    """A connection that cannot be opened."""
-
-
 def make_sender(system: int) -> Any:
-    """Return what packs the messages of a driver, without a wire.
+    """Return what packs the messages of a driver, with another component id at each start.
 
-    Its component id is another one at each start: ArduPilot does not pass a heartbeat on to a link
-    on which it knows the same system and component (`MAVLink_routing::handle_heartbeat`), so a
-    program with both ids of the driver could not be heard.
+    ArduPilot passes no heartbeat to a link with the same system and component
+    (`MAVLink_routing::handle_heartbeat`): a program with both ids of the driver would not be heard.
     """
     return mavlink.MAVLink(None, system, random.choice(_COMPONENTS))
 
@@ -37,7 +28,7 @@ def make_sender(system: int) -> Any:
 def open_connection(url: str, system: int, component: int, baud: int = 57600) -> Any:
     """Return pymavlink's connection, which speaks MAVLink 2."""
     if mavlink.WIRE_PROTOCOL_VERSION != '2.0':
-        raise LinkError(
+        raise ValueError(
             'pymavlink was imported before maasi_drivers.links.mavlink and speaks MAVLink 1: set '
             'MAVLINK20=1'
         )
@@ -51,14 +42,11 @@ def open_connection(url: str, system: int, component: int, baud: int = 57600) ->
             robust_parsing=True,
         )
     except (OSError, ValueError, IndexError) as error:
-        raise LinkError(f'mavlink.url: read {url!r}: {error}') from error
+        raise ValueError(f'mavlink.url: read {url!r}: {error}') from error
 
 
 class VehicleLink:
-    """A vehicle on a wire; `failure` says why the wire cannot be opened, which is retried.
-
-    Its thread holds `lock` while it works on `vehicle`, and so has everybody else, but for a flag.
-    """
+    """A vehicle on a wire, which is opened again after a `failure`; `lock` guards `vehicle`."""
 
     def __init__(self, settings: MavlinkSettings, start: list[float], memory: Path) -> None:
         self.settings = settings
@@ -77,10 +65,7 @@ class VehicleLink:
         self._thread.start()
 
     def finish(self, ending: Ending, patience: float) -> bool:
-        """Have it hold or land; return whether it confirms within `patience` seconds.
-
-        Where nothing flies there is nothing to wait for.
-        """
+        """Have it hold or land; return whether it confirms within `patience` [s], or is down."""
         with self.lock:
             self.vehicle.finish(ending)
         deadline = time.monotonic() + patience
@@ -104,7 +89,7 @@ class VehicleLink:
             connection = open_connection(
                 settings.url, settings.own_system, component, settings.baud
             )
-        except LinkError as error:
+        except ValueError as error:
             self.failure = str(error)
             return
         self._connection = self._sender.file = connection

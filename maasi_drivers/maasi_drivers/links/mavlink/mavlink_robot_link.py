@@ -1,7 +1,5 @@
 """A vehicle that speaks MAVLink as a driver's robot."""
 
-from __future__ import annotations
-
 import math
 import os
 import time
@@ -23,14 +21,11 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 
 POLL_PERIOD = 0.02
-# Kinds of faults.
-_VEHICLE, _GEOFENCE = 'vehicle', 'geofence'
-# At the end: longest wait until the autopilot confirms that it holds or lands [s].
-_STOP_TIME = 1.0
+_VEHICLE, _GEOFENCE = 'vehicle', 'geofence'  # kinds of faults
+_STOP_TIME = 1.0  # at the end: longest wait until the autopilot confirms that it holds or lands [s]
 # Between a localiser's pose and the autopilot's for the same instant, at most [ns].
 _LONGEST_LAG = 300_000_000
-# Closer than this to its target, the vehicle keeps its heading [m].
-_TURNING = 0.3
+_TURNING = 0.3  # closer than this to its target, the vehicle keeps its heading [m]
 
 
 class MavlinkRobotLink(RobotLink):
@@ -63,8 +58,6 @@ class MavlinkRobotLink(RobotLink):
         self._ending = False
         self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], self._mavlink)
 
-    # ---- link and life cycle -----------------------------------------------------------------
-
     def prepare(self) -> None:
         """Make the link; it remembers the origin of a flight."""
         folder = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
@@ -85,7 +78,6 @@ class MavlinkRobotLink(RobotLink):
         self._link.close()
 
     def _arm(self) -> str:
-        """Let the vehicle take off; return why not, empty where it may."""
         driver, link = self.driver, self._link
         if self._localised and (driver.history.latest is None or ODOMETRY in driver.health):
             return f'no {driver.pose_name}'
@@ -151,10 +143,11 @@ class MavlinkRobotLink(RobotLink):
         """Return the state of the vehicle."""
         with self._link.lock:
             vehicle = self._link.vehicle
+            read = {} if vehicle.failsafes is None else vehicle.failsafes.values
             return {
                 'vehicle': vehicle.phase.name,
                 'in the air': vehicle.in_air,
-                **{f'parameter {key}': item for key, item in vehicle.parameters.items()},
+                **{f'parameter {key}': item for key, item in read.items()},
                 **{f'ignored: {key}': number for key, number in vehicle.estimate.dropped.items()},
             }
 
@@ -162,8 +155,6 @@ class MavlinkRobotLink(RobotLink):
         goal = compose(inverse(self._map_from_local), Pose.from_yaw(self._inside(position), yaw))
         with self._link.lock:
             self._link.vehicle.set_target(goal.position + self._local_origin, goal.yaw)
-
-    # ---- what comes in -----------------------------------------------------------------------
 
     def _update(self) -> None:
         driver, link = self.driver, self._link
@@ -196,7 +187,6 @@ class MavlinkRobotLink(RobotLink):
             self._take_telemetry(telemetry)
 
     def _log_reports(self) -> None:
-        """Log the reports of the vehicle."""
         with self._link.lock:
             reports = self._link.vehicle.log.take()
         logger = self.driver.get_logger()
@@ -247,7 +237,6 @@ class MavlinkRobotLink(RobotLink):
             self.driver.follower.stay()
 
     def _align(self, placed: StampedPose) -> None:
-        """Compute where the autopilot's frame is in the map, from its pose at the same time."""
         local = self._local_poses.at(placed.stamp) or self._local_poses.latest
         if local is None or abs(local.stamp - placed.stamp) > _LONGEST_LAG:
             return

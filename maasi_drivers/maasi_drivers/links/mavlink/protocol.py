@@ -1,19 +1,13 @@
 """MAVLink 2 by pymavlink, and reports for the log."""
 
-from __future__ import annotations
-
 from collections import deque
 
 from pymavlink import mavutil
 
 mavlink = mavutil.mavlink
 
-__all__ = ['mavlink', 'mavutil']
-
-# Of MAV_SEVERITY.
-ERROR, WARNING, INFO, DEBUG = 3, 4, 6, 7
-# Texts of the autopilot that are younger explain a refusal [s].
-_TEXT_AGE = 6.0
+ERROR, WARNING, INFO, DEBUG = 3, 4, 6, 7  # of MAV_SEVERITY
+_TEXT_AGE = 6.0  # texts of the autopilot that are younger explain a refusal [s]
 
 
 class ReportLog:

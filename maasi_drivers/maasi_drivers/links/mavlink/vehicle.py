@@ -1,9 +1,6 @@
 """One vehicle from its first heartbeat to the end: phases of a flight. No wire, no thread."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -46,12 +43,9 @@ COMMANDED = (
 
 
 _MODE, _TAKE_OFF = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_NAV_TAKEOFF
-# Period of requests for the final mode [s].
-_ENDING_PERIOD = 0.3
-# Period of attempts to arm; the autopilot reports refusals [s].
-_ARMING_PERIOD = 2.0
-# Time for which set-points are sent before a mode that needs them [s].
-_STREAM_AHEAD = 1.2
+_ENDING_PERIOD = 0.3  # period of requests for the final mode [s]
+_ARMING_PERIOD = 2.0  # period of attempts to arm; the autopilot reports refusals [s]
+_STREAM_AHEAD = 1.2  # time for which set-points are sent before a mode that needs them [s]
 # The height is reached within this; a smaller change is no progress [m].
 _REACHED, _PROGRESS = 0.2, 0.1
 # Phases in which the service `arm` is refused with the fault.
@@ -67,11 +61,7 @@ class Vehicle(Autopilot):
     """One vehicle, from the first heartbeat to the end; times are of the steady clock [s]."""
 
     def __init__(
-        self,
-        settings: MavlinkSettings,
-        start: list[float],
-        sender: Any,
-        memory: Path | None = None,
+        self, settings: MavlinkSettings, start: list[float], sender: Any, memory: Path | None = None
     ) -> None:
         super().__init__(settings, start, sender, memory)
         # Over its origin; a copter's is on the ground [m].
@@ -88,12 +78,8 @@ class Vehicle(Autopilot):
         self._phase_at = self._tried_at = -math.inf
         self._fix_needed = False
         self._ending: Ending | None = None
-        # Why it lands by itself.
-        self._reason = ''
-        # Restarted after a flight: its local frame may be anywhere.
-        self._displaced = False
-
-    # ---- state -------------------------------------------------------------------------------
+        self._reason = ''  # why it lands by itself
+        self._displaced = False  # restarted after a flight: its local frame may be anywhere
 
     @property
     def flying(self) -> bool:
@@ -105,12 +91,6 @@ class Vehicle(Autopilot):
         """Whether it is armed, and not on the ground."""
         landed = self.estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND
         return self.armed and not landed
-
-    @property
-    def parameters(self) -> Mapping[str, float | None]:
-        """Of the failsafes, as read; None where the autopilot does not have it."""
-        failsafes = self.failsafes
-        return {} if failsafes is None else failsafes.values
 
     @property
     def at_rest(self) -> bool:
@@ -142,14 +122,11 @@ class Vehicle(Autopilot):
 
     @property
     def _top(self) -> float:
-        """Height to which it rises, in its local frame [m]."""
         return float(self.estimate.origin[2]) + self.height
 
     def _position(self) -> FloatArray:
         telemetry = self.estimate.telemetry
         return np.zeros(3) if telemetry is None else telemetry.position.copy()
-
-    # ---- what the driver wants ---------------------------------------------------------------
 
     def set_target(self, position: ArrayLike, yaw: float) -> None:
         """Have it go to a position (3,) [m], with a yaw [rad], and stay there."""
@@ -182,7 +159,6 @@ class Vehicle(Autopilot):
         self.forbid()
 
     def _objection(self, now: float) -> str:
-        """Return why it must not be armed, or taken over."""
         if self.phase in (VehiclePhase.RISING, VehiclePhase.FLYING):
             return 'it is in the air already'
         if self._displaced:
@@ -198,10 +174,7 @@ class Vehicle(Autopilot):
         return ''
 
     def finish(self, ending: Ending, reason: str = '') -> None:
-        """Have it hold its position or land, and send it nowhere any more.
-
-        A vehicle that others fly is left alone; on the ground it is not armed any more.
-        """
+        """Have it hold or land, if it is the driver's to fly; neither arm nor move it any more."""
         self._permission.end()
         if self.phase is VehiclePhase.ENDING and self._ending == ending:
             return
@@ -212,8 +185,6 @@ class Vehicle(Autopilot):
             what = 'it lands' if ending == 'land' else 'it holds its position'
             self._enter(VehiclePhase.ENDING, what + self._reason)
         self.forbid()
-
-    # ---- what comes in -----------------------------------------------------------------------
 
     def handle(self, message: Any, now: float) -> None:
         """Take a message."""
@@ -255,7 +226,6 @@ class Vehicle(Autopilot):
                 self._detail = f'mode {name}'
 
     def _own_modes(self, before: int) -> set[int]:
-        """Return the allowed modes: any other one is the pilot's or a failsafe's."""
         external = self._firmware.external
         if self.phase in (VehiclePhase.ARMING, VehiclePhase.RISING, VehiclePhase.FLYING):
             return {external}
@@ -289,8 +259,6 @@ class Vehicle(Autopilot):
             self._displaced = True
             self._enter(VehiclePhase.STOPPED, f'{text}: start the driver again')
 
-    # ---- the phases --------------------------------------------------------------------------
-
     def tick(self, now: float) -> None:
         """Send what is due; at least 50 times a second."""
         self.send_heartbeat(now)
@@ -316,7 +284,6 @@ class Vehicle(Autopilot):
         return self._firmware.px4 and self.phase in (VehiclePhase.STARTING, VehiclePhase.ARMING)
 
     def _continue(self, now: float) -> None:
-        """Do what the present phase needs."""
         if self._phase_at == -math.inf:
             self._phase_at = now
         if self._permission.expired(now):
@@ -338,7 +305,6 @@ class Vehicle(Autopilot):
             work(now)
 
     def _is_due(self, now: float, period: float) -> bool:
-        """Return whether a request may be sent again, and note that it is."""
         if now - self._tried_at < period or self.commands:
             return False
         self._tried_at = now

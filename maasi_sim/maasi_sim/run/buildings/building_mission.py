@@ -13,13 +13,7 @@ from maasi_sim.run.buildings.observer import CuboidObserver, CuboidRecord
 from maasi_sim.run.buildings.report import build_cuboid_report, cuboid_summary
 from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.run.mission import Mission
-from maasi_sim.run.node_plan import (
-    SIMULATED,
-    NodePlan,
-    common_parameters,
-    guard_plan,
-    sim_plan,
-)
+from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
 from maasi_sim.run.run_options import Options
 
 if TYPE_CHECKING:
@@ -63,7 +57,6 @@ class BuildingMission(Mission[CuboidRecord]):
 
 
 def _planner_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -> NodePlan:
-    """Return the planner of a robot that searches buildings for itself."""
     robot, search = scenario.robots[name], scenario.planner
     floor = float(scenario.environment.array()[2, 0])
     settings = CuboidPlannerSettings.model_validate(

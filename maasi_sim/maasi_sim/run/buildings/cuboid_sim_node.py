@@ -1,7 +1,5 @@
 """The simulation node of searches of buildings: robots, time, and the link between the robots."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -17,8 +15,7 @@ from maasi_sim.run.buildings.scenario import load_cuboid_scenario
 from maasi_sim.run.buildings.simulation import CuboidSimulation
 from maasi_sim.simulation.sim_node import SimNode
 
-# Share of a step after which the link delivers, even if some robots sent nothing.
-_PATIENCE = 0.1
+_PATIENCE = 0.1  # share of a step after which the link delivers, even if some robots sent nothing
 
 
 class CuboidSimNode(SimNode):
@@ -107,7 +104,3 @@ class CuboidSimNode(SimNode):
 def main(arguments: list[str] | None = None) -> int:
     """Run the simulation node of a search of buildings."""
     return run(CuboidSimNode, arguments)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

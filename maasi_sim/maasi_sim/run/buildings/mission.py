@@ -1,7 +1,5 @@
 """A search of buildings (004) in one process: robots, batteries, and a link of limited range."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,30 +21,21 @@ Scheme = Literal['distributed', 'sequential', 'centralized']
 
 @dataclass
 class MissionRecord:
-    """What became of a mission.
-
-    steps, complete: until all cuboids were visited, or it was given up; whether all were; paths: by
-    robot: positions at all steps, (steps + 1, 3) [m]; visited, active (steps + 1,): cuboids visited
-    by the team, and robots that search; snapshots: in order of time; collisions, outside: steps on
-    which a robot's way cut an object or obstacle, or it was outside the area; how: number of
-    decisions by how they were made; solve_times: wall time of each decision, of all robots together
-    if centralized [s]; recharges: batteries that failed; plans: predicted positions of all robots
-    at the steps that were asked for.
-    """
+    """What became of a mission."""
 
     mission: CoveragePlan
     steps: int
-    complete: bool
-    paths: dict[str, FloatArray]
-    visited: NDArray[np.int64]
-    active: NDArray[np.int64]
+    complete: bool  # whether all cuboids were visited after these steps
+    paths: dict[str, FloatArray]  # positions at all steps, (steps + 1, 3) [m]
+    visited: NDArray[np.int64]  # (steps + 1,): cuboids visited by the team
+    active: NDArray[np.int64]  # (steps + 1,): robots that search
     snapshots: list[Snapshot]
-    collisions: int
-    outside: int
-    how: dict[str, int]
-    solve_times: FloatArray
-    recharges: int
-    plans: dict[int, dict[str, FloatArray]]
+    collisions: int  # steps on which a way cut an object or obstacle
+    outside: int  # steps on which a robot was outside the area
+    how: dict[str, int]  # decisions by how they were made
+    solve_times: FloatArray  # of each decision, of all robots together if centralized [s]
+    recharges: int  # batteries that failed
+    plans: dict[int, dict[str, FloatArray]]  # predicted positions at the steps asked for
 
 
 def within_range(
@@ -68,13 +57,9 @@ def within_range(
 class CuboidMission:
     """Robots that search the faces of objects, step by step of dT [s].
 
-    `scheme`: distributed is each for itself, as in P2; sequential one after the other, each knowing
-    the new plans of those before it; centralized all together, P1.
-
-    Raises
-    ------
-    ValueError
-        If a robot cannot fly, an object is outside the area, or no cuboid can be reached.
+    Distributed is each for itself, as in P2; sequential one after the other, with the new plans of
+    those before; centralized all together, P1. ValueError: a robot cannot fly, an object is outside
+    the area, or no cuboid can be reached.
     """
 
     def __init__(
@@ -100,10 +85,7 @@ class CuboidMission:
         self.choices: dict[str, Plan] = {}
 
     def run(self, limit: int = 2000, keep: tuple[int, ...] = ()) -> MissionRecord:
-        """Run until the team has visited all cuboids, or for `limit` steps.
-
-        The end is that of the union of what the robots have visited, which none of them may know.
-        """
+        """Run until the team, which may not know it, has visited all cuboids, or to a limit."""
         paths: dict[str, list[FloatArray]] = {name: [] for name in self.agents}
         visited, active, times = [], [], []
         how: dict[str, int] = {}
@@ -158,7 +140,6 @@ class CuboidMission:
         )
 
     def _decide(self, broadcasts: dict[str, Broadcast]) -> list[float]:
-        """Let all robots decide, and return how long each took, or all together [s]."""
         if self.scheme == 'centralized':
             return [self._decide_jointly()]
         places = {name: message.position for name, message in broadcasts.items()}

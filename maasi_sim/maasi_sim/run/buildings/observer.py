@@ -1,7 +1,5 @@
 """Gathers the data of the report of a search of buildings from its messages."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -24,20 +22,15 @@ class Moment(NamedTuple):
 
 @dataclass
 class CuboidRecord(RunRecord):
-    """The record of a search of buildings.
-
-    mission: searched objects; snapshots: as in the report, in the order of time and robots; of a
-    cuboid there can be several; choices: decisions by the way they were made; active (n, 2): time
-    [s] and robots that search; solve_times: of decisions [s]; most_heard: largest number of robots
-    received at once; completed: when the last cuboid was visited.
-    """
+    """The record of a search of buildings."""
 
     mission: CoveragePlan
-    snapshots: list[dict[str, Any]] = field(default_factory=list)
-    choices: dict[str, int] = field(default_factory=dict)
+    snapshots: list[dict[str, Any]] = field(default_factory=list)  # several may be of one cuboid
+    choices: dict[str, int] = field(default_factory=dict)  # decisions by how they were made
+    # Time [s] and robots that search.
     active: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    solve_times: FloatArray = field(default_factory=lambda: np.zeros(0))
-    most_heard: int = 0
+    solve_times: FloatArray = field(default_factory=lambda: np.zeros(0))  # of decisions [s]
+    most_heard: int = 0  # largest number of robots received at once
     completed: Moment | None = None
 
 

@@ -1,7 +1,5 @@
 """Pictures of a search of buildings (004): objects, cuboids and trajectories in 3D."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from typing import Any
 

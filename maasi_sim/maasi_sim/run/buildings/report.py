@@ -1,7 +1,5 @@
 """The report of a search of buildings as plain values, and in words."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -11,10 +9,7 @@ from maasi_sim.run.report_files import summary, whole_report
 
 
 def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
-    """Return the report of a run as plain values.
-
-    There are no targets; visited cuboids count as found, `cuboids` in the report.
-    """
+    """Return the report of a run as plain values; visited cuboids count as found."""
     mission, shots = record.mission, record.snapshots
     visited = {shot['cuboid'] for shot in shots}
     total = len(mission.cells)

@@ -1,7 +1,5 @@
 """The figure of a search of buildings: from above and the sides, and its course."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
@@ -35,7 +33,6 @@ def plot_cuboid_report(record: CuboidRecord) -> Figure:
 
 
 def _area(record: CuboidRecord) -> FloatArray:
-    """Return the part of the area with everything in it, (3, 2) [m]."""
     mission = record.mission
     boxes = [*mission.objects, *mission.obstacles, *mission.boxes]
     corners = [np.asarray(box, dtype=float).T for box in boxes]

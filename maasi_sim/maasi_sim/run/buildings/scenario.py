@@ -1,7 +1,5 @@
 """Scenario files of searches of buildings (004): `planner: {name: cuboid_mpc}`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -96,7 +94,6 @@ def load_cuboid_scenario(
 
 
 def _problems(scenario: CuboidScenario) -> Problems:
-    """Yield what is wrong between the keys."""
     if scenario.dimension != 3:
         yield (
             f'environment.bounds: read {scenario.dimension} axes, allowed are three: buildings are '
@@ -119,8 +116,7 @@ def _problems(scenario: CuboidScenario) -> Problems:
         try:
             SearchAgent(name, scenario.planner, mission, robot, scenario.step)
         except ValueError as error:
-            # It begins with `name: key: `.
-            yield f'robots.{str(error).replace(": ", ".", 1)}'
+            yield f'robots.{str(error).replace(": ", ".", 1)}'  # it begins with `name: key: `
 
 
 def mission_of(scenario: CuboidScenario) -> CuboidMission:

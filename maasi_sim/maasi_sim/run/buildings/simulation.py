@@ -1,7 +1,5 @@
 """Robots that search buildings, on one clock, and their link of limited range (004)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -19,8 +17,7 @@ from maasi_sim.simulation.simulated_world import SimulatedTeam
 class SearchingRobot:
     """A simulated robot that searches buildings: a mass point under bounded forces, 004, (1).
 
-    A command holds for one step: the force that reaches its velocity. Without one it brakes and
-    hovers, as autopilots do.
+    The force of a command holds for one step; without one it brakes and hovers, as autopilots do.
     """
 
     camera = ranging = laser = None

@@ -1,7 +1,5 @@
 """Calls the services that pause, resume, send home and stop, for a page."""
 
-from __future__ import annotations
-
 import argparse
 import threading
 
@@ -11,15 +9,11 @@ from rclpy.signals import SignalHandlerOptions
 
 from maasi_planner.search_command import call_all
 
-# Longest wait for the answers of all services [s].
-_PATIENCE = 5.0
+_PATIENCE = 5.0  # longest wait for the answers of all services [s]
 
 
 class Control:
-    """Calls the services of planners and drivers; no command waits for another one.
-
-    The namespace is that of the team, without slashes at its ends.
-    """
+    """Calls the services of planners and drivers of a team; no command waits for another one."""
 
     def __init__(self, domain: int | None, namespace: str = '') -> None:
         self._namespace = namespace
@@ -27,9 +21,7 @@ class Control:
         self._running = 0
         self._context = Context()
         rclpy.init(
-            context=self._context,
-            domain_id=domain,
-            signal_handler_options=SignalHandlerOptions.NO,
+            context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
         )
 
     def __call__(self, command: str, robot: str | None) -> tuple[bool, str]:

@@ -33,8 +33,6 @@ Covariances are their upper triangle: xx, xy, xz, yy, yz, zz. Lengths are in met
 radians, in the frame of the map.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json
@@ -47,8 +45,7 @@ Event = list[Any]
 Scene = dict[str, Any]
 Listener = Callable[[Event], None]
 
-# Largest packed log: with the page around it a replay stays below 5 MB.
-LARGEST = 4_500_000
+LARGEST = 4_500_000  # largest packed log: with the page around it a replay stays below 5 MB
 # Shortest time between states of a robot, and between other events that may be thinned [s].
 STATE_PERIOD = 0.1
 _THINNED = ('robot', 'seen', 'filter', 'map', 'way', 'score', 'cuboid', 'picture')
@@ -74,9 +71,8 @@ class EventLog:
     def packed(self, largest: int = LARGEST) -> str:
         """Return the log compressed (gzip) in base64, thinned until it is at most so large.
 
-        Half of it may be pictures. What else was thinned stands in `thinned` of its scene: the
-        period of states and, where that was not enough, of all that changes gradually. Decisions,
-        found targets and messages stay.
+        Half of it may be pictures. `thinned` in its scene has the periods of what else was thinned:
+        states, then all that changes gradually. Decisions, found targets and messages stay.
         """
         period = 0.0
         events = fewer_pictures(self.events, largest // 2)
@@ -103,8 +99,7 @@ def fewer_pictures(events: list[Event], room: int) -> list[Event]:
 class Thinning:
     """Decides which events are kept so that those of a kind and owner are a period apart.
 
-    Kept are all events of other kinds, the first state of a robot with another status or reason,
-    and detections, except empty ones.
+    Other kinds, the first state of a new status or reason, and detections that are not empty stay.
     """
 
     def __init__(self, period: float) -> None:
@@ -128,10 +123,7 @@ class Thinning:
 
 
 def thin(events: Iterable[Event], period: float) -> list[Event]:
-    """Return events with at least a period between those that change gradually [s].
-
-    The last event of each kind and owner is kept, so that the end is shown as it was.
-    """
+    """Return events with at least a period [s] between gradual ones, and the last of each."""
     thinning = Thinning(period)
     every = list(events)
     last = {(event[1], event[2]): index for index, event in enumerate(every)}

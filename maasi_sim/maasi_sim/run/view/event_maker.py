@@ -1,7 +1,5 @@
 """Makes the events of a run from what its filter, planner and robots say, as their records."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -16,16 +14,12 @@ from maasi_sim.run.targets.scoring import score
 from maasi_sim.run.topics import point
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning
 
-# Objectives below this stand for candidates that are not allowed.
-_NOT_ALLOWED = -1e29
+_NOT_ALLOWED = -1e29  # objectives below this stand for candidates that are not allowed
 # Status of a robot: of AgentState, and what only those who watch know.
 MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
-# Of a `CuboidDecision`.
-_ACTIVITIES = ('searching', 'returning', 'recharging')
-# A robot is silent when others say where they are for so long without it [s].
-_SILENCE = 3.0
-# Points of a planned way that are shown.
-_MOST_POINTS = 40
+_ACTIVITIES = ('searching', 'returning', 'recharging')  # of a `CuboidDecision`
+_SILENCE = 3.0  # a robot is silent when others say where they are for so long without it [s]
+_MOST_POINTS = 40  # points of a planned way that are shown
 
 
 def padded(values: ArrayLike) -> FloatArray:
@@ -42,7 +36,6 @@ def significant(value: float) -> float:
 
 
 def _upper(covariance: ArrayLike) -> list[float]:
-    """Return the upper triangle of a covariance with three axes: xx, xy, xz, yy, yz, zz."""
     return [significant(value) for value in padded(covariance)[np.triu_indices(3)]]
 
 
@@ -80,8 +73,7 @@ class EventMaker:
         self._modes: dict[str, str] = {}
         self._planned: dict[str, list[int]] = {}
         self._measured: set[tuple[str, str, int]] = set()
-        #: Latest time of an event [s].
-        self.latest = 0.0
+        self.latest = 0.0  #: latest time of an event [s]
 
     def _put(self, time: float, kind: str, owner: str, *content: Any) -> None:
         key = kind, owner
@@ -263,10 +255,7 @@ class EventMaker:
         values: NDArray[Any],
         explored: float | None = None,
     ) -> None:
-        """Add e on a grid (nx, ny) or (nx, ny, nz), 1 is unseen, or its ninths as bytes.
-
-        The explored share follows from e where it is not given.
-        """
+        """Add e on a grid of two or three axes, or its ninths as bytes, and the explored share."""
         shape = [*values.shape, 1][:3]
         ninths = values if values.dtype == np.uint8 else np.clip(np.rint(9.0 * values), 0, 9)
         text = (ninths.astype(np.uint8) + ord('0')).tobytes().decode('ascii')

@@ -1,7 +1,5 @@
 """The page of a running run, of its messages, and of a search in this process."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys
@@ -30,23 +28,17 @@ from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.server import Commander, Hub, ViewServer
 from maasi_sim.scenario.schema import Scenario
 
-# For browsers to take the last events [s].
-_FAREWELL = 2.0
-# Between exploration functions of a search [s].
-_MAP_PERIOD = 1.0
+_FAREWELL = 2.0  # for browsers to take the last events [s]
+_MAP_PERIOD = 1.0  # between exploration functions of a search [s]
 # Calls that wait at most, and wait for more before they are made, so that the run has the
 # processor [s].
 MOST_WAITING = 50_000
 _PERIOD = 0.05
-# Patience at the end for calls that wait [s].
-_PATIENCE = 5.0
+_PATIENCE = 5.0  # patience at the end for calls that wait [s]
 
 
 class LiveView:
-    """Serve the page of a run in progress; address and commands as of `ViewServer`.
-
-    Its events are made in a thread of its own, for which nothing waits.
-    """
+    """Serve the page of a run in progress, its events made in a thread for which nothing waits."""
 
     def __init__(
         self,
@@ -76,10 +68,7 @@ class LiveView:
             open_browser(server.address)
 
     def put(self, function: Callable[..., object], *arguments: Any) -> None:
-        """Have a function called with the maker of events and further arguments; never wait.
-
-        Where too many wait it is dropped.
-        """
+        """Have a function called with the event maker and arguments; drop it if too many wait."""
         if len(self._waiting) < MOST_WAITING:
             self._waiting.append((function, arguments))
 
@@ -129,8 +118,7 @@ class LiveView:
 class RunPage(LiveView):
     """Serves the page of a scene with serialised messages; OSError if it cannot be served.
 
-    `waits`: the run begins with a `LockstepStep`; what comes before it is shown at its time, and
-    the page says when the run has ended.
+    `waits`: the run begins with a `LockstepStep`, and what comes before is shown at its time.
     """
 
     def __init__(
@@ -175,10 +163,7 @@ class RunPage(LiveView):
 
 
 class SearchTrace:
-    """Gathers calls that make the events of a search; they are carried out when it is shown.
-
-    Only references are kept, so that it costs a search little.
-    """
+    """Gathers calls that make the events of a search, cheaply: they are made when it is shown."""
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self.scenario = scenario

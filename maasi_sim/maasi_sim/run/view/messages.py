@@ -1,10 +1,7 @@
 """Makes events from the messages of a run: of a recording, of a run, or of any ROS graph.
 
-Topics are known by their types, and by the last part of their names where a type says too little,
-so that recordings of `ros2 bag record -a` and teams in a namespace are read as well.
+Topics are known by types, or the last part of their names: any bag and namespace is read.
 """
-
-from __future__ import annotations
 
 import contextlib
 import math
@@ -28,8 +25,7 @@ from maasi_sim.run.view.scene import empty_scene, scene_of_facts
 
 STEP = 'maasi_msgs/msg/LockstepStep'
 MARKERS = 'visualization_msgs/msg/MarkerArray'
-# Messages between two words on the progress.
-_PROGRESS = 1000
+_PROGRESS = 1000  # messages between two words on the progress
 # Fields of a `RobotDecision`, and of the message of a candidate.
 _SAME = ('control_cost', 'target_refinement', 'exploration', 'objective', 'measurements')
 _COLUMNS = {**dict(zip(_SAME, _SAME)), 'lengths': 'length'}
@@ -78,9 +74,8 @@ def is_shown(topic: str, type_name: str) -> bool:
 class MessageEvents:
     """Take messages, of `rosbags` or of ROS, and hand their events to a maker.
 
-    The run begins at its first step where it `waits`, and what comes before is taken then; else
-    with the first state. `on_restart` is called when the time jumps back, as a bag that is played
-    again does: nothing is then kept.
+    The run begins at its first step where it `waits`, else with the first state. `on_restart` is
+    called when the time jumps back, as in a bag that is played again: nothing is then kept.
     """
 
     def __init__(
@@ -98,8 +93,7 @@ class MessageEvents:
         # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
-        #: Images that wait for their detections.
-        self.pictures = Pictures()
+        self.pictures = Pictures()  #: images that wait for their detections
 
     def take(self, topic: str, type_name: str, message: Any) -> None:
         """Take a message of a topic for which `is_shown` is true."""
@@ -112,10 +106,7 @@ class MessageEvents:
             self.take(*self._early.pop(0))
 
     def _now(self, topic: str, message: Any) -> float:
-        """Return the time of a message with the time of the run; begin again if it jumps back.
-
-        Of each topic by itself, as messages of a bag that is played fast overtake each other.
-        """
+        """Return the run's time of a message; begin again if time jumps back on its topic."""
         now = seconds(message.stamp if hasattr(message, 'stamp') else message.header.stamp)
         if self._begin is None:
             self._begin = now
@@ -127,7 +118,6 @@ class MessageEvents:
         return max(now - self._begin, 0.0)
 
     def _time(self, message: Any) -> float:
-        """Return the time of any other message: a latched one may be old [s]."""
         if self._begin is None:
             return 0.0
         return max(seconds(message.header.stamp) - self._begin, 0.0)
@@ -254,7 +244,6 @@ class MessageEvents:
         self.maker.truth(self.maker.latest, np.array(points).reshape(-1, 3)[:, :size])
 
     def _take_markers(self, topic: str, message: Any) -> None:
-        """Take obstacles and buildings of a run without scenario."""
         parts: dict[str, list[Any]] = {}
         for item in message.markers:
             part = _PARTS.get((topic.rpartition('/')[2], item.ns.rpartition('/')[2]), '')
@@ -295,15 +284,11 @@ class MessageEvents:
 
 
 def _space(topic: str) -> str:
-    """Return the namespace of a topic, without slashes at its ends."""
     return topic.rpartition('/')[0].strip('/')
 
 
 def read_events(path: Path, progress: Callable[[float], None] | None = None) -> EventLog:
-    """Return the event log of a recording, or of the run whose folder holds one.
-
-    `progress` is called now and then with the share that is read.
-    """
+    """Return the event log of a recording or a run's folder; `progress` takes the share read."""
     with Bag(path) as bag:
         shown = {topic: kind for topic, kind in bag.types.items() if is_shown(topic, kind)}
         if not any(kind.startswith('maasi_msgs/') for kind in shown.values()):

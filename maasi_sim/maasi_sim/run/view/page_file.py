@@ -1,7 +1,5 @@
 """The page that shows a run, as one HTML file: alone for a live run, or with a run inside."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -34,7 +32,6 @@ def write_replay(log: EventLog, path: Path, largest: int = LARGEST) -> None:
 
 @cache
 def _page() -> str:
-    """Return the page with style and modules: browsers load no modules beside a local file."""
     names = ('index.html', 'page.css', *(f'{name}.js' for name in _MODULES.split()))
     text, style, *modules = ((FOLDER / name).read_text(encoding='utf-8') for name in names)
     # In one scope nothing is imported.

@@ -1,7 +1,5 @@
 """Small pictures of what cameras saw as their robots measured, and where detections are in them."""
 
-from __future__ import annotations
-
 import base64
 from collections import defaultdict, deque
 from collections.abc import Callable
@@ -17,8 +15,7 @@ from maasi_sim.run.bag import COMPRESSED_TYPE, IMAGE_TYPE
 IMAGES = {IMAGE_TYPE: 'camera/image_raw', COMPRESSED_TYPE: 'camera/image_raw/compressed'}
 # Largest width [px], quality as JPEG, and time from one of a robot to the next [s].
 _WIDTH, _QUALITY, _PERIOD = 240, 60, 0.5
-# Images of a camera that are kept until the detections in them come.
-_KEPT = 16
+_KEPT = 16  # images of a camera that are kept until the detections in them come
 
 
 class Pictures:

@@ -1,12 +1,9 @@
 """Serves the page of a live run, its events, and its controls where they are allowed.
 
 GET / is the page, GET /events a stream of Server-Sent Events, POST /control a command. Commands
-need a token, and so does all else unless the server listens on this machine only. Everything else
-is refused. A browser is served by a thread of its own, which alone waits for it: neither does the
-run wait for a browser, nor one browser for another.
+need a token, and so does all else unless the server listens on this machine only. A browser has a
+thread of its own: neither the run nor another browser waits for it.
 """
-
-from __future__ import annotations
 
 import contextlib
 import errno
@@ -27,15 +24,12 @@ from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Scene, line, thin
 from maasi_sim.run.view.page_file import empty_page
 
 PORT = 8420
-# Further ports that are tried where one is in use.
-_MORE_PORTS = 20
+_MORE_PORTS = 20  # further ports that are tried where one is in use
 # Takes a command and a robot (None: all); returns whether it was followed, and an answer.
 Commander = Callable[[str, 'str | None'], 'tuple[bool, str]']
 COMMANDS = ('start', 'pause', 'resume', 'home', 'stop', 'release')
-# Browsers at once; further ones are refused.
-MOST_BROWSERS = 32
-# Other connections at once; beyond them the oldest is closed.
-MOST_IDLE = 64
+MOST_BROWSERS = 32  # browsers at once; further ones are refused
+MOST_IDLE = 64  # other connections at once; beyond them the oldest is closed
 # Longest body of a request [bytes], and longest wait for a browser that reads or writes [s].
 LARGEST_BODY = 4096
 PATIENCE = 10.0
@@ -49,10 +43,7 @@ _MOST_AT_ONCE = 2000
 
 
 class Hub:
-    """Keeps the events of a run; nothing that puts an event waits for a browser.
-
-    With more than `most` events those that change gradually are thinned, and browsers start over.
-    """
+    """Keeps the events of a run, about `most`; nothing that puts one waits for a browser."""
 
     def __init__(self, scene: Scene, most: int = MOST_EVENTS) -> None:
         self._scene = dict(scene)
@@ -89,10 +80,9 @@ class Hub:
     def next(
         self, generation: int, position: int, patience: float
     ) -> tuple[str, tuple[int, int], bool]:
-        """Return what follows a position, as Server-Sent Events.
+        """Return Server-Sent Events after a position, the next one, and whether nothing follows.
 
-        And generation and position of the next portion, and whether nothing follows. A browser
-        begins with generation -1; where another one has begun it gets the scene, and starts over.
+        A browser begins with generation -1; in another one than its own it gets the scene again.
         Nothing new within the patience [s] is a comment.
         """
         with self._changed:
@@ -117,7 +107,6 @@ class Hub:
         return text or ': \n\n', (generation, position), closed
 
     def _thin(self) -> None:
-        """Halve what changes gradually, until a tenth of the room is free."""
         while len(self._events) > 0.9 * self._most and self._period < 1e5:
             self._period *= 2.0
             self._events = thin(self._events, self._period)
@@ -128,15 +117,9 @@ class Hub:
 
 
 class ViewServer(ThreadingHTTPServer):
-    """Serve a hub to browsers until it is closed.
+    """Serve a hub to browsers until it is closed; without `commander` read only.
 
-    Where the port is in use, the next one that is free is taken; 0: any that is free. `commander`
-    carries out commands; None: read only.
-
-    Raises
-    ------
-    OSError
-        If the address cannot be listened on.
+    The next free port is taken (0: any); OSError if the address cannot be listened on.
     """
 
     daemon_threads = True
@@ -169,8 +152,7 @@ class ViewServer(ThreadingHTTPServer):
             except OSError as error:
                 if error.errno != errno.EADDRINUSE or wanted == last:
                     raise
-        # That it listens on.
-        self.port = int(self.server_address[1])
+        self.port = int(self.server_address[1])  # that it listens on
         threading.Thread(target=self.serve_forever, name='view server', daemon=True).start()
 
     @property
@@ -206,10 +188,7 @@ class ViewServer(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def keep(self, connection: Any, browsers: int = 0) -> bool:
-        """Do not close a connection for others: it has a command, or a stream.
-
-        Count so many browsers in; return whether there is room for them.
-        """
+        """Keep a command, or streams of so many browsers, open; return whether there is room."""
         with self._lock:
             self._idle.pop(connection, None)
             if self.browsers + browsers > MOST_BROWSERS:
@@ -222,14 +201,12 @@ class ViewServer(ThreadingHTTPServer):
 
 
 def _number(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """Return the address that a host is given by, None where it is given by a name."""
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host)
     return None
 
 
 def _own_address() -> str:
-    """Return an address by which other machines reach this one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             # Of a documentation network: only the route to it is looked up, nothing is sent.
@@ -282,7 +259,6 @@ class _Handler(BaseHTTPRequestHandler):
                 self._report(HTTPStatus.OK, *commander(*command))
 
     def _read_command(self) -> tuple[str, str | None] | None:
-        """Return command and robot; None: it was refused."""
         length, body = self.headers.get('Content-Length', ''), None
         if not (length.isascii() and length.isdecimal()):
             self._refuse(HTTPStatus.LENGTH_REQUIRED, 'Content-Length: allowed is a number')
@@ -323,7 +299,6 @@ class _Handler(BaseHTTPRequestHandler):
         return allowed
 
     def _stream(self) -> None:
-        """Send events until the run or the browser ends."""
         self.close_connection = True
         if not self.server.keep(self.connection, 1):
             self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_BROWSERS} browsers are here')
@@ -337,8 +312,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(text.encode())
                 time.sleep(0.0 if closed else _PORTION_PERIOD)
         except OSError:
-            # The client has disconnected, or does not read.
-            pass
+            pass  # the client has disconnected, or does not read
         finally:
             self.server.keep(self.connection, -1)
 

@@ -1,7 +1,5 @@
 """Renders the events of a run as a video, without a browser."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -27,15 +25,12 @@ from maasi_sim.run.run_folder import write_whole
 from maasi_sim.run.view.event_log import Event, EventLog, Scene
 from maasi_sim.run.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
-# Called with the share that is done.
-Progress = Callable[[float], object]
+Progress = Callable[[float], object]  # called with the share that is done
 # Pictures per second; GIFs would be large. Size [in] at a resolution [px/in].
 RATE, GIF_RATE = 30, 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80
-# The last picture is shown for so long [s].
-_HOLD = 2.0
-# Detections are shown for so long [s].
-_FADE = 1.0
+_HOLD = 2.0  # the last picture is shown for so long [s]
+_FADE = 1.0  # detections are shown for so long [s]
 # Points of a way that are drawn, and those of a circle.
 _MOST_POINTS = 600
 _CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 40)) for f in (np.cos, np.sin)], axis=1)
@@ -144,7 +139,6 @@ def _write_gif(path: Path, pictures: Iterator[ImageArray]) -> None:
 
 
 def _pictures(log: EventLog, speed: float, rate: int, progress: Progress) -> Iterator[ImageArray]:
-    """Yield pictures of the run, (height, width, 3)."""
     now = Moments(log)
     places = [event[3][:2] for event in log.events if event[1] == 'robot'] or [[0, 0], [1, 1]]
     extent = [np.min(places, axis=0) - 1.0, np.max(places, axis=0) + 1.0]
@@ -219,7 +213,6 @@ class Sheet:
         self._used.clear()
 
     def _next(self, kind: str, make: Callable[[], Any]) -> Any:
-        """Have an artist of a kind drawn, and return it; it is made where none is free."""
         pool, number = self._pool[kind], self._used[kind]
         if number == len(pool):
             pool.append(make())
@@ -228,7 +221,6 @@ class Sheet:
         return pool[number]
 
     def _line(self, places: ArrayLike, style: str, **options: Any) -> None:
-        """Draw places (n, 2 or 3) [m]; in the plane without their height."""
         points = np.asarray(places, dtype=float)
         points = points.reshape(-1, points.shape[-1] if points.ndim > 1 else 3)[:, : self.size].T
         line = self._next(style, lambda: self._axes.plot(*points, style)[0])
@@ -241,7 +233,6 @@ class Sheet:
         label.set(text=text, **options)
 
     def _mark(self, row: list[float], deviations: float, **style: Any) -> None:
-        """Draw a place [m]; in the plane with the ellipse of its covariance."""
         x, y, z, xx, xy, _, yy, *_ = row
         self._line([x, y, z], 'o', ms=4, **style)
         if self.size == 2:
@@ -270,7 +261,6 @@ class Sheet:
             self._line(centre[:2] + (radius + kept) * _CIRCLE, '--', color=_SOLID, lw=1.0)
 
     def _draw_boxes(self, now: Moments) -> None:
-        """Draw buildings and cuboids."""
         for key, colour, alpha in (('objects', OBJECT, 0.35), ('blocks', OBSTACLE, 0.6)):
             for box in now.scene.get(key, []):
                 self._box(box, colour, alpha)
@@ -282,7 +272,6 @@ class Sheet:
         self._next(f'{box} {alpha}', lambda: draw_box(self._axes, sides, colour, alpha, ''))
 
     def _draw_known(self, now: Moments) -> None:
-        """Draw fences, and true and found targets."""
         for name, colour in self._colours.items():
             fence = self._robots.get(name, {}).get('fence')
             if fence and self.size == 3:
@@ -298,7 +287,6 @@ class Sheet:
                 self._text([x, y, z], f'  {number}', fontsize=8, weight='normal')
 
     def _draw_expected(self, now: Moments) -> None:
-        """Draw potential targets, detections, and lines to robots that one hears."""
         for event in now.last['filter'].values():
             for x, y, z, mass, *covariance in event[4]:
                 style: Any = {'color': POTENTIAL, 'alpha': min(0.3 + mass, 1.0)}
@@ -356,13 +344,11 @@ class Sheet:
 
 
 def _turn(yaw: float) -> FloatArray:
-    """Return what turns rows x, y by a yaw [rad]."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return np.array([[cos, sin], [-sin, cos]])
 
 
 def _view(view: dict[str, Any], place: list[float], yaw: float) -> FloatArray:
-    """Return the outline of a field of view from above, (n, 2) [m]."""
     if view['kind'] != 'box':
         return np.asarray(_CIRCLE * view['size'][:2] + place[:2])
     corners = _outline(*np.array([view['lower'][:2], view['upper'][:2]]))
@@ -370,6 +356,5 @@ def _view(view: dict[str, Any], place: list[float], yaw: float) -> FloatArray:
 
 
 def _outline(lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return the outline of a rectangle from its corners, (5, 2) [m]."""
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
     return np.asarray(lower + corners * (upper - lower))

@@ -1,7 +1,5 @@
 """A node that shows any search: beside real robots, or beside a bag that is played."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable
@@ -25,8 +23,7 @@ from maasi_sim.run.view.scene import empty_scene, scene_of
 from maasi_sim.scenario.layering import ScenarioError
 
 DONE, WRONG_INPUT = 0, 2
-# Period of looks for new topics [s].
-_DISCOVERY = 0.5
+_DISCOVERY = 0.5  # period of looks for new topics [s]
 
 
 class ViewNode(Node):
@@ -47,7 +44,6 @@ class ViewNode(Node):
         self._discover()
 
     def _discover(self) -> None:
-        """Subscribe to the topics that have appeared."""
         for topic, types in self.get_topic_names_and_types():
             # Raw images would load the network of real robots.
             unknown = topic not in self._known and types[0] != IMAGE_TYPE
@@ -113,7 +109,3 @@ def main(arguments: list[str] | None = None) -> int:
         page.close()
         rclpy.try_shutdown()
     return DONE
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

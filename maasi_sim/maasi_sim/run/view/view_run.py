@@ -1,7 +1,5 @@
 """Make the page, or a video, that shows a recorded run."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Robots behind a link: simulated with their protocol in real time, or external."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings

@@ -5,8 +5,6 @@ The protocol is that of pyparrot 1.5.20: a handshake in JSON over TCP, then fram
 as in Parrot's minidrone.xml.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json
@@ -74,22 +72,17 @@ def frames(data: bytes) -> Iterator[Frame]:
 
 ALL_STATES = (0, 4, 0)
 _TAKE_OFF, _PILOTING, _LAND, _EMERGENCY = (2, 0, 1), (2, 0, 2), (2, 0, 3), (2, 0, 4)
-# Commands that set a limit.
-_LIMITS = {(2, 8, 1): 'tilt', (2, 1, 0): 'climb', (2, 1, 1): 'turn'}
+_LIMITS = {(2, 8, 1): 'tilt', (2, 1, 0): 'climb', (2, 1, 1): 'turn'}  # commands that set a limit
 
 
 def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) -> None:
-    """Execute a command on a firmware; `ValueError` where the content is no such command's.
-
-    Unknown ones are ignored.
-    """
+    """Execute a command on a firmware, ignore an unknown one; ValueError: its content is wrong."""
     try:
         if number == _PILOTING:
             flag, roll, pitch, yaw, climb, _ = struct.unpack('<BbbbbI', content)
             values = [max(-100, min(value, 100)) for value in (roll, pitch, yaw, climb)]
             if not flag:
-                # Without the flag the drone keeps itself level.
-                values[:2] = [0, 0]
+                values[:2] = [0, 0]  # without the flag the drone keeps itself level
             firmware.pilot(Piloting(*values))
         elif number == _TAKE_OFF:
             firmware.take_off()
@@ -106,10 +99,8 @@ def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) 
         raise ValueError(f'command {number}: {error}') from error
 
 
-#: Port of the handshake, fixed in pyparrot.
-HANDSHAKE_PORT = 44444
-#: Port of commands, announced in the handshake.
-COMMAND_PORT = 6000
+HANDSHAKE_PORT = 44444  #: port of the handshake, fixed in pyparrot
+COMMAND_PORT = 6000  #: port of commands, announced in the handshake
 
 COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS = 10, 11, 12
 EVENTS, ACKED_EVENTS = 126, 127
@@ -148,9 +139,8 @@ def free_port() -> int:
 class FakeMambo:
     """A Mambo on this host, in real time, which a client such as pyparrot connects to.
 
-    For tests: `position_sent` is 'true', 'none' (no position events), 'stuck' (always the same) or
-    'nan'; `cut_up` and `cut_down` lose received, and sent, datagrams; `refused` counts what was
-    invalid, `heard` the commands by (project, class, id).
+    For tests: `position_sent` is 'true', 'none' or 'nan'; `cut_up` and `cut_down` lose
+    datagrams; `refused` counts invalid ones, `heard` commands by (project, class, id).
     """
 
     def __init__(
@@ -170,7 +160,6 @@ class FakeMambo:
         self._unacked: dict[int, tuple[Frame, int, float]] = {}
         self._done: dict[int, int] = {}
         self._sensors_at = 0.0
-        self._stuck: Pose | None = None
         self._said: tuple[int, int] | None = None
         self._door = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._air = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -233,7 +222,6 @@ class FakeMambo:
                     last = now
 
     def _advance(self, dt: float) -> None:
-        """Advance by `dt` seconds, and send due messages."""
         firmware = self.firmware
         firmware.advance(dt)
         self._tell_state()
@@ -247,8 +235,6 @@ class FakeMambo:
                 if tries <= 1:
                     del self._unacked[sequence]
                 self._transmit(frame)
-
-    # ---- sending -----------------------------------------------------------------------------
 
     def _transmit(self, frame: Frame) -> None:
         if self._controller is not None and not self.cut_down:
@@ -289,18 +275,12 @@ class FakeMambo:
         self._event((2, 18, 4), struct.pack('<ffffH', *turn.orientation, stamp))
         if self.position_sent == 'none':
             return
-        if self.position_sent == 'stuck':
-            self._stuck = estimate = self._stuck or estimate
-        else:
-            self._stuck = None
         x, y, z = (100.0 * estimate.position).tolist()
         if self.position_sent == 'nan':
             x = math.nan
         psi = round(math.degrees(-estimate.yaw))
         # Its stamp is the time since the one before, unlike that of the others.
         self._event((2, 18, 0), struct.pack('<ffhhh', x, y, round(z), psi, round(1000.0 * elapsed)))
-
-    # ---- receiving ---------------------------------------------------------------------------
 
     def _answer_door(self) -> None:
         visitor, (host, _) = self._door.accept()
@@ -339,8 +319,7 @@ class FakeMambo:
         if frame.kind == DATA_WITH_ACK:
             self._send(ACK, frame.buffer + 128, bytes([frame.sequence]))
             if self._done.get(frame.buffer) == frame.sequence:
-                # Retransmission after a lost acknowledgement.
-                return
+                return  # retransmission after a lost acknowledgement
             self._done[frame.buffer] = frame.sequence
         if frame.buffer not in (COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS):
             return

@@ -23,8 +23,6 @@ reference" (minidrone.xml, PilotingModeChanged, mode easy).
 Frames: the position is relative to the take-off point and heading, x forward, y left, z up.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence
@@ -41,8 +39,7 @@ from maasi_sim.simulation.odometry import OdometryModel, OdometrySettings
 from maasi_sim.simulation.robots import Battery
 
 _GRAVITY = 9.81
-# Deceleration for each m/s while it hovers [1/s].
-_HOVER_GAIN = 2.0
+_HOVER_GAIN = 2.0  # deceleration for each m/s while it hovers [1/s]
 # Time constants of tilt, vertical speed and rotation rate [s].
 _TILT_TIME, _CLIMB_TIME, _TURN_TIME = 0.1, 0.2, 0.1
 
@@ -61,11 +58,7 @@ class FirmwareSettings:
 
 
 class TiltBody:
-    """A quadrotor under commanded tilts and drag [1/s], without a floor.
-
-    Position and velocity are in the map [m, m/s]; roll, pitch and yaw right-handed about forward,
-    left and up [rad].
-    """
+    """A quadrotor under commanded tilts and drag [1/s], without a floor [m, m/s, rad, map]."""
 
     def __init__(self, drag: float, pose: Pose) -> None:
         self.drag = drag
@@ -86,10 +79,9 @@ class TiltBody:
         return cosine * vx + sine * vy, cosine * vy - sine * vx
 
     def step(self, command: Sequence[float], most_tilt: float, h: float) -> None:
-        """Go on for `h` seconds, at most 0.05; hovering it tilts by `most_tilt` [rad] at most.
+        """Advance by `h` s: tilt forward and right [rad], climb, turn; without tilt it hovers.
 
-        The command is the tilt that accelerates it forward, and to the right [rad], the vertical
-        speed [m/s], and the rotation rate, anticlockwise [rad/s]; without tilt it hovers.
+        It brakes by `most_tilt` [rad] at most then; `h` is at most 0.05 s.
         """
         ahead, left = self.level_speed()
         pitch, roll, climb, turn_rate = command
@@ -207,8 +199,6 @@ class MamboFirmware:
         self._readings += 1
         return self._odometry.step(self.state, self._readings).pose
 
-    # ---- commands ----------------------------------------------------------------------------
-
     def hear(self) -> None:
         """Note the time of a message from the controller."""
         self._heard_at = self.time
@@ -238,8 +228,6 @@ class MamboFirmware:
         (low, high), unit = LIMITS[name]
         self.limits[name] = min(max(value, low), high) * unit
 
-    # ---- time --------------------------------------------------------------------------------
-
     def advance(self, dt: float) -> None:
         """Advance by `dt` seconds."""
         pieces = max(1, math.ceil(dt / _PIECE - 1e-9))
@@ -262,7 +250,6 @@ class MamboFirmware:
         return self.charge.charge <= self.settings.critical_charge
 
     def _look_after(self) -> None:
-        """Land, or change the flying state, without a command."""
         state, settings = self.flying_state, self.settings
         if state in (FlyingState.LANDED, FlyingState.LANDING, FlyingState.EMERGENCY):
             return
@@ -284,7 +271,6 @@ class MamboFirmware:
         return piloting if acts else Piloting()
 
     def _command(self) -> tuple[float, float, float, float]:
-        """Return the command of the body."""
         if self.flying_state == FlyingState.TAKING_OFF:
             return 0.0, 0.0, _TAKE_OFF_SPEED, 0.0
         if self.flying_state == FlyingState.LANDING:

@@ -1,7 +1,5 @@
 """Settings and parameters of a fake autopilot, without MAVLink: scenarios have them."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator

@@ -6,12 +6,8 @@ is refused in the air (`Mode::do_user_takeoff_U_m`) and ends within a tenth of i
 (`_AutoTakeoff::run`), EXTENDED_SYS_STATE tells take-off from flight
 (`GCS_MAVLINK_Copter::landed_state`), and the ground station failsafe looks at the system id of
 heartbeats alone (`GCS::sysid_is_gcs`). Positions that it reports are from the EKF's origin, which
-is where the vehicle is when the EKF starts, also after a restart. What comes on one link is passed
-on to others, heartbeats only where their system and component are not known
-(`MAVLink_routing::check_and_forward`, `handle_heartbeat`).
+is where the vehicle is when the EKF starts, also after a restart.
 """
-
-from __future__ import annotations
 
 import math
 import struct
@@ -37,14 +33,12 @@ from maasi_sim.simulation.emulators.mavlink.autopilot_settings import (
 )
 from maasi_sim.simulation.emulators.mavlink.flight_model import FlightModel
 
-# ArduCopter disarms on the ground after so long [s].
-_DISARM_DELAY = 10.0
+_DISARM_DELAY = 10.0  # ArduCopter disarms on the ground after so long [s]
 # PX4 wants setpoints for so long, and not so long ago, before OFFBOARD [s].
 _OFFBOARD_STREAM, _OFFBOARD_AGE = 1.0, 0.5
 _LANDING, _SURFACING = 0.5, 0.3
 _POSITION_IGNORED, _YAW_IGNORED = 0b111, 1 << 10
-# Of EKF_STATUS_REPORT.
-_EKF_GOOD, _EKF_START = 1 | 2 | 4 | 8 | 16 | 32, 1 | 128
+_EKF_GOOD, _EKF_START = 1 | 2 | 4 | 8 | 16 | 32, 1 | 128  # of EKF_STATUS_REPORT
 # From the loss of GNSS to that of the position estimate [s].
 _DEAD_RECKONING = 8.0
 _ACCEPTED, _FAILED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED
@@ -53,18 +47,13 @@ _ACCEPTED, _FAILED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED
 class FakeAutopilot:
     """One vehicle with its autopilot, without a connection and a clock.
 
-    A setpoint that is not finite crashes it, as it did ArduPilot: `crashed` says why, and it is
-    silent. For tests: `gnss_lost_at` is when the first receiver loses its fix, `muted` has the
-    messages that do not come any more, `frozen` position and velocity that are sent instead of the
+    A setpoint that is not finite crashes it, as it did ArduPilot. For tests: when the first
+    receiver loses its fix, messages that do not come, position and velocity sent instead of the
     true ones.
     """
 
     def __init__(
-        self,
-        settings: AutopilotSettings,
-        sender: Any,
-        yaw: float,
-        generator: np.random.Generator,
+        self, settings: AutopilotSettings, sender: Any, yaw: float, generator: np.random.Generator
     ) -> None:
         self.settings = settings
         self.firmware = FIRMWARES[settings.firmware]
@@ -91,12 +80,9 @@ class FakeAutopilot:
         self.origin = np.zeros(3)
         self._sender = sender
         self._generator = generator
-        # True height at arming [m].
-        self._home = 0.0
+        self._home = 0.0  # true height at arming [m]
         # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
-        # System, component and link of what was heard; the driver is on link 0.
-        self._routes: set[tuple[int, int, int]] = set()
         self._armed_at = -math.inf
         self._station_at = math.inf
         self._failed: set[str] = set()
@@ -104,7 +90,6 @@ class FakeAutopilot:
         self._reset_messages()
 
     def _reset_messages(self) -> None:
-        """Send the messages that are sent by default, at their periods [s]."""
         self._sent_at: dict[str, float] = {}
         self.periods = dict.fromkeys(
             ('HEARTBEAT', 'BATTERY_STATUS', 'EXTENDED_SYS_STATE', 'GPS_RAW_INT'), 1.0
@@ -133,7 +118,6 @@ class FakeAutopilot:
         self.armed = self._reported_ready = False
         # The barometer is calibrated again.
         self.now = self.height_error = 0.0
-        self._routes.clear()
         self.take_mode(self._first_mode)
         self._reset_messages()
 
@@ -142,12 +126,9 @@ class FakeAutopilot:
         if isinstance(mode, str):
             mode = next(key for key, name in self.firmware.modes.items() if name == mode)
         self.mode = mode
-        # Height of a take-off [m].
-        self._rising_to: float | None = None
+        self._rising_to: float | None = None  # height of a take-off [m]
         # Place and yaw of the last set-point.
         self._setpoint: tuple[FloatArray, float | None] | None = (self.body.position.copy(), None)
-
-    # ---- the clock ---------------------------------------------------------------------------
 
     def advance(self, dt: float) -> None:
         """Advance by `dt` seconds: move, check failsafes, send due messages."""
@@ -159,8 +140,7 @@ class FakeAutopilot:
             self._reported_ready = True
             self.origin = self.body.position.copy()
             if self.body.submarine:
-                # Depths are from the surface.
-                self.origin[2] = 0.0
+                self.origin[2] = 0.0  # depths are from the surface
             self.say(6, 'EKF3 IMU0 is using GPS')
         self._move(dt)
         self._look_after_failsafes(dt)
@@ -229,14 +209,11 @@ class FakeAutopilot:
             self.take_mode(firmware.land)
 
     def _acts(self, kind: str, *names: str) -> bool:
-        """Return whether a failsafe acts now, for the first time since arming."""
         if kind in self._failed or not any(self.parameters.get(name, 0) for name in names):
             return False
         self._failed.add(kind)
         self.say(3, f'{kind} Failsafe')
         return True
-
-    # ---- sending -----------------------------------------------------------------------------
 
     def say(self, severity: int, text: str) -> None:
         """Send a text."""
@@ -309,30 +286,14 @@ class FakeAutopilot:
                 self._milliseconds * 1000, fix, 0, 0, 0, 100, 100, 0, 0xFFFF, 12, 0, 0
             )
 
-    # ---- receiving ---------------------------------------------------------------------------
-
-    def handle(self, message: Any, link: int = 0) -> None:
-        """Take a message from one of its links, 0 is the driver's."""
+    def handle(self, message: Any) -> None:
+        """Take a message."""
         if self.crashed:
             return
-        self._route(message, link)
         target = getattr(message, 'target_system', self.settings.system)
         handler = _HANDLERS.get(message.get_type())
         if handler is not None and target in (0, self.settings.system):
             handler(self, message)
-
-    def _route(self, message: Any, link: int) -> None:
-        """Pass a message for all on to the driver, as ArduPilot does."""
-        ids = message.get_srcSystem(), message.get_srcComponent()
-        self._routes.add((*ids, link))
-        if link == 0 or getattr(message, 'target_system', 0) != 0:
-            return
-        if message.get_type() == 'HEARTBEAT':
-            passes = (*ids, 0) not in self._routes
-        else:
-            passes = any(route[2] == 0 for route in self._routes)
-        if passes:
-            self._sender.file.write(bytes(message.get_msgbuf()))
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.get_srcSystem() == self.parameters.get('SYSID_MYGCS'):

@@ -1,7 +1,5 @@
 """A simulated MAVLink vehicle on a real link, in real time."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import signal
@@ -14,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from maasi_drivers.links.mavlink.firmware import FIRMWARES
-from maasi_drivers.links.mavlink.link import LinkError, open_connection
+from maasi_drivers.links.mavlink.link import open_connection
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
@@ -22,8 +20,7 @@ from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotS
 from maasi_sim.simulation.emulators.mavlink.fake_autopilot import FakeAutopilot
 
 _PERIOD = 0.02
-# Longest time simulated at once after a delay [s].
-_LONGEST = 0.5
+_LONGEST = 0.5  # longest time simulated at once after a delay [s]
 
 
 class FakeVehicle:
@@ -133,7 +130,7 @@ def main(arguments: list[str] | None = None) -> int:
         vehicle = FakeVehicle(
             settings, options.url, Pose.from_yaw(np.zeros(3), 0.0), np.random.default_rng(1)
         )
-    except (ValueError, LinkError) as error:
+    except ValueError as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
     ended = threading.Event()
@@ -154,4 +151,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == '__main__':
-    raise SystemExit(main())
+    sys.exit(main())

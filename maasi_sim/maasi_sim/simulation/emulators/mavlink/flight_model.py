@@ -1,8 +1,7 @@
 """How a vehicle moves under the position controller of its autopilot."""
 
-from __future__ import annotations
-
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,32 +9,21 @@ from maasi_filter.arrays import FloatArray
 
 # Speed for each metre of way left, of the position controller [1/s]; largest yaw rate [rad/s].
 _GAIN, _YAW_RATE = 1.0, 1.0
-# Speed without power: a submarine rises [m/s].
-_FALL, _BUOYANCY = -3.0, 0.1
+_FALL, _BUOYANCY = -3.0, 0.1  # speed without power: a submarine rises [m/s]
 
 
+@dataclass(eq=False)
 class FlightModel:
-    """A vehicle in its local frame, ENU, with the ground or the surface at height 0.
+    """A vehicle in its local frame, ENU, above a surface at height 0 [m, m/s, m/s^2]."""
 
-    Units: speed (level), climb (up or down) [m/s]; acceleration [m/s^2].
-    """
-
-    def __init__(
-        self,
-        position: FloatArray,
-        yaw: float = 0.0,
-        submarine: bool = False,
-        speed: float = 2.0,
-        acceleration: float = 1.0,
-    ) -> None:
-        self.speed = speed
-        self.climb = 1.0
-        self.acceleration = acceleration
-        self.submarine = submarine
-        self.position = np.array(position, dtype=float)
-        self.velocity = np.zeros(3)
-        self.yaw = yaw
-        self.yaw_rate = 0.0
+    position: FloatArray
+    yaw: float = 0.0
+    submarine: bool = False
+    speed: float = 2.0
+    acceleration: float = 1.0
+    climb: float = 1.0
+    yaw_rate: float = 0.0
+    velocity: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def grounded(self) -> bool:
