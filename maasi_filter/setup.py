@@ -15,8 +15,10 @@ setup(
     install_requires=[
         'numba>=0.59',
         'numpy>=1.26,<3',
+        'Pillow>=10',
         'pydantic>=2.7',
         'pymap3d>=2.9',
+        'PyYAML>=6.0.1',
         'scipy>=1.11.4',
         'shapely>=2.0',
         'typing_extensions>=4.10',

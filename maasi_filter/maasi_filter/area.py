@@ -12,7 +12,13 @@ from shapely.geometry import box
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.environment import EnvironmentSettings, PriorSettings, Zone, read_shape
+from maasi_filter.environment import (
+    EnvironmentSettings,
+    PriorSettings,
+    Zone,
+    read_image,
+    read_shape,
+)
 
 # Of coordinates, also of those that are large [m].
 _ROUNDING = 1e-6
@@ -236,23 +242,8 @@ def read_raster(path: str) -> FloatArray:
 
     ValueError if it cannot be read, or is not of finite numbers from 0.
     """
-    suffix = Path(path).suffix.lower()
     try:
-        if suffix == '.npy':
-            found = np.load(path)
-        elif suffix in ('.tif', '.tiff'):
-            import rasterio  # type: ignore[import-not-found]
-
-            with rasterio.open(path) as file:
-                found = file.read(1)
-        else:
-            import cv2
-
-            found = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
-            if found is None:
-                raise ValueError('is no image')
-    except ImportError as error:
-        raise ValueError(f'prior.raster: {path} needs the package {error.name}') from None
+        found = np.load(path) if Path(path).suffix.lower() == '.npy' else read_image(path)
     except (OSError, ValueError) as error:
         raise ValueError(f'prior.raster: {path}: {error}') from None
     raster = np.asarray(found, dtype=float)

@@ -19,8 +19,10 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geodesy import OriginSettings, to_map
 from maasi_filter.settings import Finite, Positive, Settings, Vector2
 
+# With which a number begins.
+_NUMBER = '-+.0123456789'
 # Of files that an environment names.
-FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff', '.yaml')
+FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.yaml')
 
 
 class Zone(Settings):
@@ -42,7 +44,10 @@ class Zone(Settings):
             return value
         if value[:1].isalpha():
             return {'polygon': value}
-        *centre, radius = map(float, value.split())
+        words = value.split()
+        if len(words) not in (3, 4):
+            raise ValueError(f'got {value!r}, allowed are x y radius, x y z radius, or a polygon')
+        *centre, radius = map(float, words)
         return {'centre': centre, 'radius': radius}
 
     @model_validator(mode='after')
@@ -82,7 +87,7 @@ class PriorSettings(Settings):
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
         default=None,
-        description='File of densities, first row north: .npy, an image, or GeoTIFF (extra geo)',
+        description='File of densities, first row north: .npy or an image',
     )
     extent: list[Vector2] | None = Field(
         default=None,
@@ -115,7 +120,10 @@ class EnvironmentSettings(Settings):
     keep_outs: list[Zone] = Field(
         default_factory=list, description='No target is expected there, and no robot goes there'
     )
-    obstacles: list[Zone] = Field(default_factory=list, description='Solid things in the way')
+    obstacles: list[Zone] = Field(
+        default_factory=list,
+        description='Solid things in the way; also names of maps of Nav2 (YAML), in a list',
+    )
     prior: PriorSettings = Field(
         default_factory=PriorSettings, description='Where targets are likely'
     )
@@ -175,6 +183,8 @@ def read_shape(value: Any, project: Callable[[FloatArray], FloatArray] | None = 
     """
     if isinstance(value, str) and value.lstrip().upper().startswith(('POLYGON', 'MULTIPOLYGON')):
         found = shapely.from_wkt(value)
+    elif isinstance(value, str) and value.endswith('.yaml'):
+        found = read_map(value)
     elif isinstance(value, (list, tuple)):
         rings = value if value and np.ndim(value[0][0]) else [value]
         found = Polygon(rings[0], rings[1:])
@@ -215,6 +225,35 @@ def _geometry(feature: Mapping[str, Any]) -> Any:
         raise ValueError(f'got {str(feature)[:60]}, allowed are features with geometry') from None
 
 
+def read_image(path: str) -> FloatArray:
+    """Return the grey values of an image, 0 to 255 (rows, columns)."""
+    # Deferred: only maps and priors that are images need it.
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image.convert('L'), dtype=float)
+
+
+def read_map(path: str) -> Any:
+    """Return the occupied cells of a map of Nav2 (YAML and PGM or PNG) as polygons [m, map]."""
+    import yaml
+
+    try:
+        facts = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        cell, (west, south, yaw) = float(facts['resolution']), map(float, facts['origin'])
+        grey = read_image(str(Path(path).parent / facts['image'])) / 255.0
+        occupied = (grey if facts['negate'] else 1.0 - grey) > float(facts['occupied_thresh'])
+    except (OSError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+        raise ValueError(f'{path}: is no map of Nav2: {error}') from None
+    if yaw != 0.0:
+        raise ValueError(f'{path}: origin: got a yaw of {yaw}, allowed is 0')
+    row, column = np.nonzero(occupied)
+    x, y = west + cell * column, south + cell * (len(occupied) - 1 - row)
+    cells = shapely.union_all(shapely.box(x, y, x + cell, y + cell))
+    # Slanted walls are stairs of cells; the result covers them.
+    return cells.buffer(0.5 * cell, join_style='mitre').simplify(0.5 * cell)
+
+
 def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of an environment with all shapes as well-known text in the map."""
     values = dict(given)
@@ -252,7 +291,7 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
         out: list[Any] = []
         for index, item in enumerate([*(values.get(key) or []), *more]):
             round_one = isinstance(item, Zone) or (isinstance(item, Mapping) and 'centre' in item)
-            row = isinstance(item, str) and not item[:1].isalpha() and not _is_geojson(item)
+            row = isinstance(item, str) and Path(item).suffix not in FILES and item[:1] in _NUMBER
             if not (round_one or row):
                 inner = item['polygon'] if isinstance(item, Mapping) and 'polygon' in item else item
                 item = {'polygon': text(inner, f'{key}[{index}]')}

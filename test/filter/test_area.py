@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import shapely
+from PIL import Image
 from pydantic import ValidationError
 
 from maasi_filter import BoxDetection, Pose, UnexploredMap
@@ -104,6 +105,28 @@ def test_wrong_environments_are_refused_by_their_key(values, words):
 def test_areas_that_cannot_be_used_are_refused(values, words):
     with pytest.raises(ValueError, match=words):
         Area(environment(area=RING, **values))
+
+
+def test_a_map_of_nav2_is_obstacles(tmp_path):
+    """Walls and a pillar; unknown cells (205) are free."""
+    cells = np.full((40, 60), 254, np.uint8)
+    cells[0], cells[-1], cells[:, 0], cells[:, -1] = 0, 0, 0, 0
+    cells[10:14, 20:24], cells[30:, 40:50] = 0, 205
+    Image.fromarray(cells).save(tmp_path / 'room.pgm')
+    file = tmp_path / 'room.yaml'
+    facts = {'image': 'room.pgm', 'resolution': 0.05, 'origin': [-1.0, -0.5, 0.0], 'negate': 0}
+    file.write_text(json.dumps({**facts, 'occupied_thresh': 0.65, 'free_thresh': 0.25}))
+    area = Area(environment(bounds=[[-1.0, 2.0], [-0.5, 1.5]], obstacles=[str(file)]))
+    places = np.random.default_rng(901).uniform([-1.0, -0.5, 0.0], [2.0, 1.5, 0.0], (2000, 3))
+    columns = ((places[:, 0] + 1.0) / 0.05).astype(int)
+    rows = 39 - ((places[:, 1] + 0.5) / 0.05).astype(int)
+    gaps = np.array([area.distances(place).min() for place in places])
+    assert (gaps[cells[rows, columns] == 0] == 0.0).all()
+    # A pillar of 0.2 m around (0.1, 0.9), and half a cell more.
+    assert area.distances([0.5, 0.9, 0.0]).min() == pytest.approx(0.3 - 0.025, abs=1e-6)
+    assert area.distances([1.3, 0.0, 0.0]).min() > 0.3
+    with pytest.raises(ValidationError, match=r'obstacles\[0\]: .*no map of Nav2'):
+        environment(bounds=[[-1.0, 2.0], [-0.5, 1.5]], obstacles=['none.yaml'])
 
 
 def test_the_density_is_prior_times_inside_with_mean_one(tmp_path):

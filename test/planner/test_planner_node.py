@@ -381,7 +381,7 @@ def test_keep_outs_are_taken_by_service_published_and_checked(team):
 
     before = len(team.tested.coordinator.plans['a'].candidates.at([0.0, 0.0, 0.0]))
     wrong = ask('0.5 0.5')
-    assert not wrong.success and 'keep_outs: 0: centre: ' in wrong.message
+    assert not wrong.success and "got '0.5 0.5', allowed are x y radius" in wrong.message
     assert not heard
     assert ask('POLYGON ((0 0, 1 0, 1 1, 0 1, 0 0))', '0.2 0.2 0.1').success
     team.until(lambda: heard)
