@@ -5,6 +5,7 @@ Used by the planner node and the in-process search (000, algorithms 1 and 2).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -17,23 +18,25 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap, default_spacing
 from maasi_planner.candidates import CandidateSet, half_view
+from maasi_planner.endurance import Endurance
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
 from maasi_planner.planners.base import check_decision, keep_apart
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
 
 
 @dataclass
 class PresentRobot:
     """A robot that takes part in a step.
 
-    free: whether it has no goal, or its goal has ended.
+    free: whether it has no goal, or its goal has ended; charge: of its battery, 0 to 1, or unknown.
     """
 
     state: RobotState
     free: bool
+    charge: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,7 @@ class RobotPlan:
     radius: float
     # Distance from a waypoint at which the next one is decided [m]; 0: it stops at each.
     arrival_radius: float
+    endurance: Endurance | None = None
     exploration: UnexploredMap | None = None
     decision: int = -1
     decided_at: int | None = None
@@ -152,6 +156,7 @@ class RobotPlan:
             period_steps=self.period,
             planning=planning,
             radius=self.radius,
+            endurance=self.endurance,
             exploration=self.exploration,
         )
         if not planning and self.decided_at is not None:
@@ -195,6 +200,9 @@ class Coordinator:
                 period=max(1, round(robot.sensor.period / settings.step)),
                 radius=robot.radius,
                 arrival_radius=arrival_radius(motion, sensor, self.planner),
+                endurance=None
+                if robot.endurance is None
+                else Endurance(robot.endurance, motion, robot.start),
                 exploration=self.exploration.copy() if own else None,
             )
 
@@ -235,6 +243,17 @@ class Coordinator:
         chosen = []
         for name in sorted(robots):
             plan, robot = self.plans[name], robots[name]
+            if plan.endurance is not None:
+                plan.endurance.hear(robot.charge)
+                here = robot.state.pose.position
+                if plan.endurance.charging:
+                    # Its way home has ended elsewhere.
+                    if robot.free and not plan.endurance.is_home(here):
+                        chosen.append(name)
+                    continue
+                if not robot.free and plan.endurance.must_return(here):
+                    chosen.append(name)
+                    continue
             waited = plan.decided_at is None or step - plan.decided_at >= plan.period
             if plan.nears(robot) or (robot.free and (not plan.staying or waited)):
                 chosen.append(name)
@@ -279,6 +298,10 @@ class Coordinator:
             return Decision(step=step, reason=finished)
         decision = self.planner.decide(team)
         check_decision(self.planner, team, decision)
+        for name in planning:
+            home = self._way_home(team, name, decision.robots[name])
+            if home is not None:
+                decision.robots[name] = home
         keep_apart(team, decision)
         for name in planning:
             plan, chosen = self.plans[name], decision.robots[name]
@@ -290,6 +313,23 @@ class Coordinator:
             way = chosen.positions, chosen.yaws
             self.trigger.begin(name, plan.sensor, *way, plan.period, *knowledge)
         return decision if decision.robots else None
+
+    def _way_home(self, team: TeamView, name: str, chosen: RobotDecision) -> RobotDecision | None:
+        """Return the way to a charger of a robot that can afford nothing else, or None."""
+        view, endurance = team.robots[name], self.plans[name].endurance
+        if endurance is None or math.isnan(endurance.charge):
+            return None
+        here = view.state.pose.position
+        spent = chosen.stays and endurance.spent
+        if not (spent or endurance.charging or endurance.must_return(here)):
+            return None
+        endurance.spent, endurance.charging = False, True
+        battery = f'its battery is at {100.0 * endurance.charge:.0f} %'
+        if endurance.is_home(here):
+            return stay(view, f'charges: {battery}')
+        goal = endurance.way_home(here)[1]
+        prediction = view.motion.predict(view.state, goal[None, :], team.step_time)
+        return single_choice(goal[None, :], prediction, 0, f'goes home to charge: {battery}')
 
     def measuring(
         self, step: int, robots: Mapping[str, PresentRobot], able: Collection[str] | None = None

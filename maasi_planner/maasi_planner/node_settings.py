@@ -10,6 +10,7 @@ from typing_extensions import Self
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.settings import SensorSettings, Settings, Vector3
+from maasi_planner.endurance import EnduranceSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 
 
@@ -25,6 +26,9 @@ class PlannedRobotSettings(Settings):
     start: Vector3 = Field(
         default=[0.0, 0.0, 0.0],
         description='Position at the start; its height is that of the waypoints in 2D [m, map]',
+    )
+    endurance: EnduranceSettings | None = Field(
+        default=None, description='So that it is home before its battery is empty; none: no matter'
     )
 
 

@@ -320,7 +320,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 return
             self._restart(f'{name}/state.step went back from {before.step} to {message.step}')
         goal = message.goal_id, message.goal_status, message.reason
-        self._heard[name] = HeardState(message.step, state, *goal, Silence(self))
+        self._heard[name] = HeardState(
+            message.step, state, *goal, Silence(self), float(message.battery)
+        )
         if self.settings.lockstep:
             self._try_step()
         else:
@@ -432,7 +434,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             free = self._orders.is_free(name, heard, step)
             if free:
                 self._orders.send_home(name, header)
-            robots[name] = PresentRobot(heard.state, free and self.modes.of[name] is Mode.SEARCHING)
+            searches = free and self.modes.of[name] is Mode.SEARCHING
+            robots[name] = PresentRobot(heard.state, searches, heard.charge)
         searching = Mode.SEARCHING in self.modes.of.values() and not self._held
         begin = time.perf_counter()
         decision = self.coordinator.plan(step, robots, taken) if searching else None

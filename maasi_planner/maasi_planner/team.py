@@ -13,6 +13,7 @@ from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
+from maasi_planner.endurance import Endurance
 from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 
 
@@ -44,6 +45,8 @@ class RobotView:
         that plans measures now.)
     radius : float
         Radius of a circle around the robot, metres; separates waypoints of different robots.
+    endurance : Endurance, optional
+        What its battery allows. None: everything.
     exploration : UnexploredMap, optional
         e after the robot's own measurements only, iota of 002, eq. (12). None: that of the team.
     """
@@ -58,6 +61,7 @@ class RobotView:
     remaining_yaws: FloatArray | None = None
     phase: int = 0
     radius: float = 0.0
+    endurance: Endurance | None = None
     exploration: UnexploredMap | None = None
 
     def __post_init__(self) -> None:

@@ -163,7 +163,8 @@ class _Search:
             follower, plan = here[name].follower, plans[name]
             ended = follower.goal is not None and follower.goal.id == plan.decision + 1
             ended = ended and follower.status != GoalStatus.MOVING
-            present[name] = PresentRobot(here[name].state, plan.staying or ended)
+            free, charge = plan.staying or ended, here[name].body.battery.charge
+            present[name] = PresentRobot(here[name].state, free, charge)
         taken = [
             (self._destinations[name], self.scenario.robots[name].radius)
             for other in self._groups

@@ -36,6 +36,7 @@ class HeardState:
     status: int
     reason: str
     silence: Silence
+    charge: float  # of its battery, 0 to 1; else unknown
     heard_at: float = field(default_factory=time.monotonic)
 
 

@@ -16,6 +16,7 @@ from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
+from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import (
     Decision,
@@ -200,6 +201,9 @@ def options_of(
         allowed &= ways_apart(team, name, prediction.positions, {})
         if not allowed.any():
             return 'other robots are on all ways'
+        allowed &= affordable(team, name, prediction)
+        if not allowed.any():
+            return 'it has to save its battery for the way home'
         return UsableCandidates(points, prediction, allowed)
     if not free.any():
         return 'other robots stand at all candidates'
@@ -280,6 +284,16 @@ def ways_apart(
             reach = min(view.radius + radius, now)
             free &= _gaps(ways, np.ascontiguousarray(path, dtype=float)) >= reach - 1e-9
     return free
+
+
+def affordable(team: TeamView, name: str, prediction: Trajectories) -> BoolArray:
+    """Return which predicted ways leave a robot enough of its battery to come home, (W,)."""
+    endurance = team.robots[name].endurance
+    if endurance is None:
+        return np.ones(len(prediction.lengths), dtype=bool)
+    allowed = endurance.affords(prediction, team.step_time)
+    endurance.spent = not allowed.any()
+    return allowed
 
 
 def keep_apart(team: TeamView, decision: Decision) -> None:

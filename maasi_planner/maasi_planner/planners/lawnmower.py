@@ -12,7 +12,7 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.candidates import half_view
-from maasi_planner.planners.base import Planner, explain, ways_apart
+from maasi_planner.planners.base import Planner, affordable, explain, ways_apart
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 
@@ -155,6 +155,9 @@ class Lawnmower(Planner):
             if not ways_apart(team, name, prediction.positions, decided)[0]:
                 self._pending[name].insert(0, target)
                 return stay(view, 'waits: others are on its way')
+            if not affordable(team, name, prediction)[0]:
+                self._pending[name].insert(0, target)
+                return stay(view, 'stays: it has to save its battery for the way home')
             return single_choice(point[None, :], prediction, 0, 'next point of the lawnmower')
 
     def finished(self, team: TeamView) -> str | None:

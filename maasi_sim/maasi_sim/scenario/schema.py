@@ -21,6 +21,7 @@ from maasi_filter.settings import (
     Settings,
     Vector3,
 )
+from maasi_planner.endurance import EnduranceSettings
 from maasi_planner.node_settings import PlannedRobotSettings, PlannerNodeSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 from maasi_sim.scenario.base import BaseScenario
@@ -85,6 +86,9 @@ class BatterySettings(Settings):
     capacity: float = Field(default=7200.0, gt=0.0, description='Energy of a full battery [J]')
     charge: float = Field(default=1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
     idle_power: float = Field(default=2.0, ge=0.0, description='Drain at rest or hovering [W]')
+    charging_power: float = Field(
+        default=0.0, ge=0.0, description='Power at a charger, where it stands; 0: never charged [W]'
+    )
     motion_power: float = Field(
         default=4.0, ge=0.0, description='Drain for each metre per second on top of it [W/(m/s)]'
     )
@@ -140,6 +144,9 @@ class RobotSettings(Settings):
     )
     battery: BatterySettings = Field(
         default_factory=BatterySettings, description='Its battery, simulated'
+    )
+    endurance: EnduranceSettings | None = Field(
+        default=None, description='So that it is home before its battery is empty; none: no matter'
     )
     battery_unit: BatteryUnit = Field(
         default='fraction',

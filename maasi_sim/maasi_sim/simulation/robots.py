@@ -39,6 +39,12 @@ class Battery:
         power = self.settings.idle_power + self.settings.motion_power * speed
         self.charge = max(self.charge - power * dt / self.settings.capacity, 0.0)
 
+    def charging(self, dt: float) -> None:
+        """Charge it for `dt` seconds."""
+        self.charge = min(
+            self.charge + self.settings.charging_power * dt / self.settings.capacity, 1.0
+        )
+
 
 class Leader(Protocol):
     """Moves a robot instead of its simulated body."""
@@ -80,6 +86,9 @@ class SimulatedRobot:
         self._flies = settings.motion.model != 'unicycle' and start.position[2] > 0.0
         self._resting = False
         self.battery = Battery(settings.battery)
+        chargers = settings.endurance.chargers if settings.endurance else []
+        self._chargers = np.array(chargers or [settings.start])
+        self._at_charger = 2.0 * settings.motion.tolerance + settings.radius
         odometry = settings.simulated.odometry or settings.odometry
         self._odometry = OdometryModel(odometry, start, seed, name, settings.odometry)
         self.odometry: OdometryReading = self._odometry.step(self.state, 0)
@@ -133,7 +142,12 @@ class SimulatedRobot:
                 self._halt(Pose(np.array([position[0], position[1], 0.0]), before.pose.orientation))
                 self._resting = True
         velocity = self.state.velocity
-        self.battery.drain(float(np.sqrt((velocity * velocity).sum())), dt)
+        speed = float(np.sqrt((velocity * velocity).sum()))
+        gaps = np.linalg.norm(self._chargers - self.state.pose.position, axis=1)
+        if self.battery.settings.charging_power and speed < 0.1 and gaps.min() < self._at_charger:
+            self.battery.charging(dt)
+        else:
+            self.battery.drain(speed, dt)
         self.odometry = self._odometry.step(self.state, step)
 
     def stand(self, step: int) -> None:
