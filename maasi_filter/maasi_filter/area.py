@@ -64,12 +64,7 @@ class Area:
         self.solid = _circles(environment.obstacles)
         self._solid_polygons = _polygons(environment.obstacles)
         self._fence = read_shape(environment.area) if environment.area else None
-        closed = [
-            shapely.Point(zone.centre).buffer(zone.radius or 0.0, quad_segs=32)
-            if zone.centre
-            else read_shape(zone.polygon)
-            for zone in environment.keep_outs
-        ]
+        closed = list(map(level_shape, environment.keep_outs))
         #: Of what is shown: level shapes by what they are, but for round obstacles.
         self.shapes = {'area': [self._fence] if self._fence else [], 'keep_out': closed}
         self.shapes['obstacle'] = self._solid_polygons
@@ -200,6 +195,14 @@ class Area:
             raise ValueError('environment.prior: promises nothing inside the area')
         density = (prior.floor + (1.0 - prior.floor) * likely / promised) * inside
         return density, float(inside.mean())
+
+
+def level_shape(zone: Zone) -> BaseGeometry:
+    """Return the polygon of a zone; a round one as one of 128 corners."""
+    if zone.centre is not None:
+        return shapely.Point(zone.centre).buffer(zone.radius or 0.0, quad_segs=32)
+    shape: BaseGeometry = read_shape(zone.polygon)
+    return shape
 
 
 def edges_of(polygons: Iterable[BaseGeometry]) -> FloatArray:

@@ -44,7 +44,8 @@ class Endurance:
 
     def __init__(self, settings: EnduranceSettings, motion: MotionModel, start: ArrayLike) -> None:
         self.settings, self.motion = settings, motion
-        self.chargers = np.asarray(settings.chargers or [start], dtype=float)  # type: ignore
+        chargers: list[ArrayLike] = [*settings.chargers]
+        self.chargers = np.array(chargers or [start], dtype=float)
         #: Charge as it was last heard, 0 to 1; not a number: unknown.
         self.charge = math.nan
         #: Whether it is on its way to a charger, or charges.

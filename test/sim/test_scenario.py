@@ -71,7 +71,11 @@ def test_our_scenarios_load_are_written_the_same_and_every_point_can_be_seen(pat
     scenario = load_scenario(path)
     assert never_seen(scenario) == ''
     for seed in range(10):
-        assert len(scenario.world(seed).targets) == {'no_targets': 0, 'field': 8}.get(path.stem, 12)
+        assert len(scenario.world(seed).targets) == {
+            'no_targets': 0,
+            'field': 8,
+            'field_batteries': 6,
+        }.get(path.stem, 12)
     assert load(scenario.text()) == scenario
 
 

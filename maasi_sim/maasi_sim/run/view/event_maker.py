@@ -265,6 +265,10 @@ class EventMaker:
         share = round(explored, 4)
         self._put(time, 'map', space, self._place(corner), steps, shape, text, share)
 
+    def zones(self, time: float, zones: list[dict[str, Any]]) -> None:
+        """Add the zones of the area that hold from now on, see `scene.zones_of`."""
+        self._put(time, 'zones', '', zones)
+
     def truth(self, time: float, targets: ArrayLike) -> None:
         """Add the true targets, (n, 2 or 3) [m]."""
         now = np.asarray(targets, dtype=float)

@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from maasi_filter.area import level_shape
 from maasi_filter.arrays import FloatArray
+from maasi_filter.environment import Zone
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
 from maasi_planner.team import Decision, RobotDecision
@@ -21,7 +23,7 @@ from maasi_sim.run.topics import point, seconds
 from maasi_sim.run.view.event_log import Event, EventLog
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.pictures import IMAGES, Pictures, picture
-from maasi_sim.run.view.scene import empty_scene, scene_of_facts
+from maasi_sim.run.view.scene import empty_scene, scene_of_facts, zones_as
 
 STEP = 'maasi_msgs/msg/LockstepStep'
 MARKERS = 'visualization_msgs/msg/MarkerArray'
@@ -49,6 +51,7 @@ TOPICS: dict[str, tuple[str, ...]] = {
     'maasi_msgs/msg/DetectionArray': ('_take_detections',),
     'maasi_msgs/msg/FilterUpdate': ('_take_update',),
     'maasi_msgs/msg/FoundTargetArray': ('_take_found', 'found_targets'),
+    'maasi_msgs/msg/KeepOuts': ('_take_keep_outs',),
     'maasi_msgs/msg/PlanDecision': ('_take_plan',),
     'maasi_msgs/msg/CuboidDecision': ('_take_cuboid',),
     'nav_msgs/msg/Path': ('_take_path', 'plan'),
@@ -187,6 +190,11 @@ class MessageEvents:
     def _take_found(self, topic: str, message: Any) -> None:
         targets = [found_target(item, self._begin or 0.0) for item in message.targets]
         self.maker.found(self._time(message), _space(topic), targets)
+
+    def _take_keep_outs(self, _: str, message: Any) -> None:
+        shapes = [level_shape(Zone.model_validate(text)) for text in message.zones]
+        zones = [zone for zone in self.maker.scene.get('zones', []) if zone['kind'] != 'keep_out']
+        self.maker.zones(self._time(message), [*zones, *zones_as('keep_out', shapes)])
 
     def _take_plan(self, topic: str, message: Any) -> None:
         robots = {}

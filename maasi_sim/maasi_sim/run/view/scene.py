@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike
+from shapely.geometry.base import BaseGeometry
 
 from maasi_drivers.agent.flight_rules import make_fence
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
@@ -66,9 +67,13 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
 
 def zones_of(area: Area) -> list[dict[str, Any]]:
     """Return the shapes of an area: what each is, and its rings [m, map], the first the outer."""
+    return [zone for kind, shapes in area.shapes.items() for zone in zones_as(kind, shapes)]
+
+
+def zones_as(kind: str, shapes: Sequence[BaseGeometry]) -> list[dict[str, Any]]:
+    """Return shapes of one kind, see `zones_of`."""
     return [
         {'kind': kind, 'rings': [rounded(shapely.get_coordinates(ring)) for ring in rings]}
-        for kind, shapes in area.shapes.items()
         for rings in map(shapely.get_rings, shapely.get_parts(shapes))
     ]
 

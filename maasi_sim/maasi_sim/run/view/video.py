@@ -251,7 +251,8 @@ class Sheet:
             # The frame again, which the map covers.
             image = self._axes.imshow(values, extent=extent, **shades)
             self._drawn += [image, *self._axes.spines.values()]
-        for zone in now.scene.get('zones', []):
+        changed = now.last['zones'].get('')
+        for zone in changed[3] if changed else now.scene.get('zones', []):
             colour = {'area': '0.1', 'keep_out': AWAY, 'obstacle': _SOLID}[zone['kind']]
             for ring in zone['rings']:
                 self._line(np.array(ring), '-', color=colour, lw=1.2)

@@ -10,7 +10,7 @@ const HEAT = 'linear-gradient(90deg, rgba(var(--heat-low), .25), rgba(var(--heat
 function entries(log, time, selected, layers) {
   const isEmpty = !(log.potential.at(time) >= 0.005);
   const robots = Object.values(log.scene.robots);
-  const hasZone = (kind) => (log.scene.zones || []).some((zone) => zone.kind === kind);
+  const hasZone = (kind) => log.zones(time).some((zone) => zone.kind === kind);
   const cividis = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(scaleColour).join(', ')})`;
   const faceGradient = `linear-gradient(90deg, ${faceColour(0)}, ${faceColour(1)})`;
   const of = (...list) => list.filter(Boolean);

@@ -55,7 +55,7 @@ export class MapView {
     this.unexplored.update(log, time);
     if (this.layers.unseen) this.unexplored.draw(this);
     if (this.layers.belief && !log.isOfBuildings) this.belief.draw(this, log, time);
-    this.drawZones(log);
+    this.drawZones(log, time);
     this.drawObstacles(log);
     this.drawFences(log);
     if (log.isOfBuildings || log.scene.objects) drawBuildings(this, log, time);
@@ -107,9 +107,9 @@ export class MapView {
   }
 
   // The border of the area, keep-outs and solid polygons.
-  drawZones(log) {
+  drawZones(log, time) {
     const { context, camera } = this;
-    for (const { kind, rings } of log.scene.zones || []) {
+    for (const { kind, rings } of log.zones(time)) {
       const colour = themed({ area: '--text', keep_out: '--fault', obstacle: '--quiet' }[kind]);
       const heights = camera.spatial && log.isSpatial ? log.bounds[2] : [this.floor];
       for (const z of heights) {

@@ -90,6 +90,12 @@ export class RunLog {
     return slot && slot.at(time);
   }
 
+  // Border, keep-outs and solid polygons: keep-outs may have changed since the start.
+  zones(time) {
+    const event = this.at('zones', '', time);
+    return event ? event[3] : this.scene.zones || [];
+  }
+
   // Where a robot is and points to; on the way also between two of its states.
   pose(name, time) {
     const slot = this.slot('robot', name);
