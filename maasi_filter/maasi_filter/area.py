@@ -111,6 +111,12 @@ class Area:
             return True
         return bool(shapely.dwithin(self.region, shapely.Point(position[:2]), _ROUNDING))
 
+    def outside_by(self, position: ArrayLike) -> float:
+        """Return how far a place (3,) is outside of the area's border [m]; 0: inside, or none."""
+        if self._fence is None:
+            return 0.0
+        return float(self._fence.distance(shapely.Point(np.asarray(position)[:2])))
+
     def density(self, points: FloatArray) -> FloatArray:
         """Return how likely targets are at points (n, d or more), (n,): prior times inside.
 

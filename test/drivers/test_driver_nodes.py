@@ -15,6 +15,7 @@ from sensor_msgs.msg import CameraInfo
 from maasi_filter.ros.conversions import pose_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import LATCHED, RELIABLE
 from maasi_msgs.msg import AgentState, DetectionArray, KeepOuts, RangeArray, RangeMeasurement
+from maasi_planner.motion import RobotState
 
 
 @pytest.mark.parametrize(
@@ -125,6 +126,25 @@ def test_a_keep_out_on_the_way_stops_the_robot_and_goals_in_it_are_refused(play)
     assert np.hypot(*(places[-1] - [1.8, 0.3, 0.0])[:2]) < 0.1
     zone = shapely.from_wkt(wall)
     assert min(zone.distance(shapely.Point(place[:2])) for place in places) >= 0.11
+
+
+def test_a_flying_robot_outside_of_its_area_gives_its_goal_up_and_returns(play):
+    """Whatever pushed it; the border has a margin of half a metre."""
+    area = 'POLYGON ((-0.3 -0.3, 2.4 -0.3, 2.4 2.4, -0.3 2.4, -0.3 -0.3))'
+    place = {'area': area, 'altitude': [0.0, 9.0]}
+    _, team = play('ranging', environment=place, start=[1.0, 1.0, 5.0])
+    team.move()
+    assert 'area' in team.refused([2.45, 1.0, 5.0])
+    _, result = team.send_accepted([2.0, 1.0, 5.0])
+    team.move(3)
+    team.body = team.motion.body(RobotState.at_rest([3.2, 1.0, 5.0]))
+    team.move()
+    status, reason = team.ended(result)
+    assert status == GoalStatus.STATUS_ABORTED and '0.8 m outside of the area' in reason
+    assert team.state.goal_status == AgentState.UNAVAILABLE
+    team.move(40)
+    assert team.state.goal_status != AgentState.UNAVAILABLE
+    assert 2.0 < team.body.robot_state().pose.position[0] < 2.4
 
 
 def test_a_goal_that_makes_no_sense_is_refused(play, capfd):

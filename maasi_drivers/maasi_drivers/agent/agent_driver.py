@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
+from maasi_drivers.agent.flight_rules import MARGIN
 from maasi_drivers.agent.goal_server import GoalServer
 from maasi_drivers.agent.measurement_responder import MeasurementResponder
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.robot_frames import RobotFrames
 from maasi_drivers.agent.robot_link import RobotLink
-from maasi_drivers.agent.robot_node import FROZEN_POSE, ODOMETRY, STOP, RobotNode
+from maasi_drivers.agent.robot_node import AREA, FROZEN_POSE, ODOMETRY, STOP, RobotNode
 from maasi_drivers.agent.robot_topics import PoseTopic
 from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
@@ -186,6 +187,11 @@ class AgentDriver(RobotNode):
         """Take the robot's pose, and do the control step for it."""
         self.link.observe(placed)
         self.silence.end()
+        outside = self.area.outside_by(placed.pose.position)
+        if outside > MARGIN:
+            self.health.begin(AREA, f'{outside:.1f} m outside of the area')
+        elif not outside:
+            self.health.end(AREA, 'inside the area again')
         if self.health.end(ODOMETRY, f'{self.pose_name}: received again'):
             self._watchdog.sensed_at = None  # it may have been silent with the odometry
         if self.settings.lockstep:

@@ -51,7 +51,7 @@ class ArrivalClock:
 
 # Kinds of faults that every robot can have.
 ODOMETRY, FROZEN_POSE, SENSOR = 'odometry', 'frozen pose', 'sensor'
-BATTERY, STOP = 'battery', 'stop'
+AREA, BATTERY, STOP = 'area', 'battery', 'stop'
 
 
 class Health:
