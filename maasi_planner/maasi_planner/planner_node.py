@@ -475,6 +475,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             if robot.stays:
                 self.warn_throttled(f'{name} stays', f'{name} stays: {robot.reason}')
                 continue
+            endurance = self.coordinator.plans[name].endurance
+            if endurance is not None and endurance.charging:
+                self.get_logger().info(f'{name} {robot.reason}')
             self._orders.send(name, indices[name] + 1, robot.waypoint, header)
             self._path_publishers[name].publish(path_to_ros(robot.positions, header))
 
