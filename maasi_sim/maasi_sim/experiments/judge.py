@@ -28,7 +28,7 @@ from maasi_sim.experiments.experiment import WrongInput
 from maasi_sim.experiments.runs import NoRoom, write_file
 from maasi_sim.experiments.tables import markdown_table
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 Result = dict[str, Any]
 
 DRONES, SIZE = 5, 'medium'
@@ -78,7 +78,7 @@ def squares(heat: Array, bounds: Sequence[float], side: float) -> tuple[Array, A
 
 def _axis(low: float, high: float, cells: int, side: float) -> tuple[Array, Array, Array]:
     """Return middles of cells and of squares, from the middle [m], and each cell's shares."""
-    edges: Array = np.linspace(low - high, high - low, cells + 1) / 2.0
+    edges = np.linspace(low - high, high - low, cells + 1) / 2.0
     number = int(np.ceil((high - low) / side))
     borders = side * (np.arange(number + 1) - number / 2.0)
     left = np.maximum(borders[:-1, None], edges[:-1])
@@ -206,7 +206,7 @@ def page(results: Sequence[Result], budgets: Sequence[float], seed: int) -> str:
     """Return the tables in Markdown: means over the classes of terrain, then each terrain."""
     judged = [one for one in results if 'refused' not in one]
     kinds = [one['class'] for one in judged]
-    numbers = ', '.join(f'{kinds.count(kind)} {kind}' for kind in sorted(set(kinds)))
+    numbers = '; '.join(f'{kinds.count(kind)} {kind}' for kind in sorted(set(kinds)))
     rows = [['ways'], *([name] for name in (*BASELINES, FREE, CENTRE, BOUND))]
     parts = []
     for budget in budgets:
