@@ -36,7 +36,7 @@ PARTS = {
     ],
     'Explanation': [
         *('architecture', 'filter', 'planners', 'cuboid_mpc', 'reliability', 'repeatability'),
-        *('claims', 'reproduction'),
+        *('claims', 'reproduction', 'judge'),
     ],
 }
 LAST = 'Explanation'
@@ -56,6 +56,7 @@ PARSERS = [
     'maasi_sim.run.view.view_run',
     'maasi_sim.experiments.reproduce',
     'maasi_sim.experiments.compare',
+    'maasi_sim.experiments.judge',
     'maasi_planner.search_command',
     'maasi_drivers.robot_command',
     'maasi_drivers.calibrate_sensor',

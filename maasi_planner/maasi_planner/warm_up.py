@@ -11,6 +11,7 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planners import make_planner
+from maasi_planner.planners.orienteering import plan_ways
 from maasi_planner.settings import MotionSettings, PlannerSettings
 from maasi_planner.team import RobotView, TeamView
 
@@ -62,3 +63,4 @@ def warm_up() -> None:
                 )
             team = TeamView(0, 0.05, robots, clusters, exploration)
             _decide(team)
+        plan_ways(exploration.nodes(), np.ones(len(exploration.nodes())), None, np.ones(2))

@@ -218,8 +218,8 @@ def claims_page(
     return '\n'.join(parts)
 
 
-def with_summary(text: str, table: str) -> str:
+def with_summary(text: str, table: str, name: str = 'claims') -> str:
     """Return a document with the summary between its two marks; without marks as it is."""
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
+    before, begin, rest = text.partition(BEGIN.replace('claims', name))
+    _, end, after = rest.partition(END.replace('claims', name))
     return f'{before}{begin}\n{table}\n{end}{after}' if begin and end else text

@@ -1,0 +1,319 @@
+"""An outside judge: SAREnv's evaluator, terrains and victims, its planners beside our ways."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import multiprocessing
+import random
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from maasi_planner.planners.orienteering import plan_ways
+from maasi_sim.arguments import Parser, count, positive, whole
+from maasi_sim.experiments.campaign import DONE, SOME_FAILED, WRONG_INPUT
+from maasi_sim.experiments.claims import with_summary
+from maasi_sim.experiments.experiment import WrongInput
+from maasi_sim.experiments.runs import NoRoom, write_file
+from maasi_sim.experiments.tables import markdown_table
+
+Array = NDArray[Any]
+Result = dict[str, Any]
+
+DRONES, SIZE = 5, 'medium'
+BASELINES = ('Greedy', 'Spiral', 'Concentric', 'Pizza')
+FREE, CENTRE, BOUND = 'maasi, free start', 'maasi, from the centre', 'best squares of the heatmap'
+# What SAREnv has published for five drones: means [%] of the baselines by class and budget [km].
+PUBLISHED = {
+    'flat, temperate': {100.0: (49.2, 63.1, 63.7, 58.7), 300.0: (79.9, 97.9, 100.0, 100.0)},
+    'flat, dry': {100.0: (40.3, 45.2, 41.8, 36.7), 300.0: (64.5, 99.0, 97.8, 97.8)},
+    'mountainous, temperate': {100.0: (22.3, 19.7, 19.5, 22.9), 300.0: (47.7, 64.7, 62.7, 64.2)},
+    'mountainous, dry': {100.0: (18.5, 19.0, 19.9, 16.9), 300.0: (42.2, 56.5, 56.6, 56.5)},
+}
+# Points of a free start above the best baseline, by budget [km].
+GOALS = {100.0: 10.0, 300.0: 5.0}
+# Share of the victims that may be anywhere, as in the planner's prior.
+FLOOR = 0.02
+# Among how many squares ways are planned, in squares that the budget reaches: the best ones.
+CHOICE = 1.2
+_FEATURES, _HEATMAP = 'features.geojson', 'heatmap.npy'
+_KEYS = ('center_point', 'meter_per_bin', 'bounds', 'climate', 'environment_type', 'features')
+
+
+def toolkit() -> Any:
+    """Return the module of SAREnv's evaluator; WrongInput is raised where it is not installed."""
+    try:
+        module = import_module('sarenv.analytics.evaluator')
+    except ImportError as error:
+        raise WrongInput(f'SAREnv is not installed ({error}); docs/judge.md says how') from None
+    logging.getLogger('sarenv').setLevel(logging.ERROR)
+    return module
+
+
+def squares(heat: Array, bounds: Sequence[float], side: float) -> tuple[Array, Array]:
+    """Return the squares of a terrain's disc: middles (n, 2) [m] and prior (n,), of sum 1.
+
+    `heat` has a row for each northing, from the south, and fills `bounds` [m]: west, south, east,
+    north. The prior is the heat, and everywhere in the disc the floor.
+    """
+    low, high = np.reshape(bounds, (2, 2))
+    rows, columns = (_axis(low[axis], high[axis], heat.shape[1 - axis], side) for axis in (1, 0))
+    disc = np.hypot(rows[0][:, None], columns[0]) <= (high[0] - low[0]) / 2.0
+    prior = (1.0 - FLOOR) * heat / heat.sum() + FLOOR * disc / disc.sum()
+    in_squares = rows[2] @ prior @ columns[2].T
+    middles = np.stack(np.meshgrid(columns[1], rows[1]), axis=-1) + (low + high) / 2.0
+    return middles[in_squares > 0.0], in_squares[in_squares > 0.0]
+
+
+def _axis(low: float, high: float, cells: int, side: float) -> tuple[Array, Array, Array]:
+    """Return middles of cells and of squares, from the middle [m], and each cell's shares."""
+    edges = np.linspace(low - high, high - low, cells + 1) / 2.0
+    number = int(np.ceil((high - low) / side))
+    borders = side * (np.arange(number + 1) - number / 2.0)
+    left = np.maximum(borders[:-1, None], edges[:-1])
+    right = np.minimum(borders[1:, None], edges[1:])
+    shares = np.maximum(right - left, 0.0) / np.diff(edges)
+    return edges[:-1] + np.diff(edges) / 2.0, borders[:-1] + side / 2.0, shares
+
+
+def our_ways(swath: float, free: bool, **task: Any) -> list[Any]:
+    """Return our ways as one of SAREnv's path generators, of which `task` has the arguments.
+
+    With `free` one way is cut into equal ones, else all begin at the middle of the disc. Nodes are
+    one swath [m] apart; nearer where the budget suffices, until a middle sees its whole square.
+    """
+    drones, budget, line = task['num_drones'], task['budget'], toolkit().LineString
+    apart = np.pi * task['max_radius'] ** 2 / budget
+    side = float(np.clip(apart, swath / np.sqrt(2.0), swath))
+    nodes, prizes = squares(task['probability_map'], task['bounds'], side)
+    best = np.sort(np.argsort(-prizes)[: int(CHOICE * budget / side)])
+    nodes, prizes = nodes[best], prizes[best]
+    if free:
+        [order] = plan_ways(nodes, prizes, None, np.array([budget]))
+        return list(toolkit().paths.split_path_for_drones(line(nodes[order]), drones))
+    middle = np.reshape(task['bounds'], (2, 2)).mean(axis=0)
+    starts = np.tile(middle, (drones, 1))
+    orders = plan_ways(nodes, prizes, starts, np.full(drones, budget / drones))
+    return [line(np.vstack([middle, nodes[order]])) for order in orders if len(order)]
+
+
+class Terrain:
+    """A terrain in SAREnv's own evaluator, with seeded victims, and ours among its planners."""
+
+    def __init__(self, folder: Path, victims: int, seed: int) -> None:
+        _check_files(folder)
+        # SAREnv draws victims from the two global generators.
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        tools, self._seed = toolkit(), seed
+        evaluator = tools.ComparativeEvaluator(str(folder), [SIZE], DRONES, victims)
+        item, points = (evaluator.environments[SIZE][key] for key in ('item', 'victims'))
+        if len(points) == 0:
+            raise ValueError(f'{_FEATURES}: no victim can be drawn from it')
+        self._evaluator, self._config = evaluator, evaluator.path_generator_config
+        half_angle = np.radians(self._config.fov_degrees / 2.0)
+        self._swath = float(2.0 * self._config.altitude_meters * np.tan(half_angle))
+        known, make = evaluator.path_generators, tools.PathGenerator
+        ours = {name: partial(our_ways, self._swath, name == FREE) for name in (FREE, CENTRE)}
+        evaluator.path_generators = {name: known[name] for name in BASELINES} | {
+            name: make(name, function, self._config) for name, function in ours.items()
+        }
+        self._kind = f'{item.environment_type}, {item.environment_climate}'
+        middles, self._prior = squares(item.heatmap, item.bounds, self._swath)
+        xy = np.column_stack([points.geometry.x, points.geometry.y])
+        self._square_of_victim = cKDTree(middles).query(xy)[1]
+
+    def judge(self, budgets: Sequence[float]) -> Result:
+        """Return the shares [%] of victims; `unpromised` of those with less heat than floor."""
+        promised = self._prior[self._square_of_victim]
+        return {
+            'class': self._kind,
+            'victims': len(promised),
+            'unpromised': 100.0 * float(np.mean(promised < 2.0 * FLOOR * self._prior.mean())),
+            'found': {f'{budget:g}': self._found(budget) for budget in budgets},
+        }
+
+    def _found(self, budget: float) -> dict[str, float]:
+        self._config.budget = 1000.0 * budget
+        make = np.random.default_rng
+        # Greedy breaks ties by a generator of its own.
+        with patch.object(np.random, 'default_rng', lambda *given: make(*given or [self._seed])):
+            table, _ = self._evaluator.run_baseline_evaluations()
+        names, lengths = table['Algorithm'], table['Total Path Length (km)']
+        if longest := [name for name, km in zip(names, lengths) if km > 1.0001 * budget]:
+            raise ValueError(f'{", ".join(longest)}: ways longer than {budget:g} km')
+        # The area that is swept by straight ways, which no others exceed.
+        number = int(np.ceil(self._config.budget / self._swath + DRONES * np.pi / 4.0))
+        best = np.argsort(-self._prior, kind='stable')[:number]
+        share = 100.0 * float(np.isin(self._square_of_victim, best).mean())
+        return dict(zip(names, map(float, table['Victims Found (%)']))) | {BOUND: share}
+
+
+def _check_files(folder: Path) -> None:
+    """Raise ValueError for files that SAREnv cannot read, or of which the shapes do not fit."""
+    for name in (_FEATURES, _HEATMAP):
+        with (folder / name).open('rb') as stream:
+            if b'git-lfs' in stream.read(40):
+                raise ValueError(f'{name} is a large-file pointer; `git lfs pull` brings the file')
+    facts = json.loads((folder / _FEATURES).read_text(encoding='utf-8'))
+    missing = [key for key in _KEYS if key not in facts]
+    if missing:
+        raise ValueError(f'{_FEATURES} lacks {", ".join(missing)}')
+    heat = np.load(folder / _HEATMAP)
+    low, high = np.reshape(facts['bounds'], (2, 2))
+    wanted = ((high - low) / facts['meter_per_bin'])[::-1]
+    if heat.ndim != 2 or np.any(np.abs(heat.shape - wanted) > 1.0):
+        need = tuple(wanted.round().astype(int).tolist())
+        raise ValueError(f'{_HEATMAP}: read shape {heat.shape}, its bounds need {need}')
+    if not (np.all(heat >= 0.0) and 0.0 < heat.sum() < np.inf):
+        raise ValueError(f'{_HEATMAP}: allowed are finite numbers from 0, not all of them 0')
+
+
+def judge_terrain(folder: Path, budgets: Sequence[float], victims: int, seed: int) -> Result:
+    """Return what was measured on one terrain, or as `refused` why nothing was."""
+    try:
+        result = Terrain(folder, victims, seed).judge(budgets)
+    except FileNotFoundError as error:
+        result = {'refused': f'{Path(error.filename).name} is missing'}
+    except (OSError, ValueError, LookupError) as error:
+        result = {'refused': str(error)}
+    return {'terrain': folder.name, **result}
+
+
+def class_means(judged: Sequence[Result], budget: float) -> dict[str, float]:
+    """Return each row's share [%]: the mean over classes of the means over their terrains."""
+    kinds: dict[str, list[dict[str, float]]] = {}
+    for one in judged:
+        kinds.setdefault(one['class'], []).append(one['found'][f'{budget:g}'])
+    return {
+        name: float(np.mean([np.mean([found[name] for found in kind]) for kind in kinds.values()]))
+        for name in (*BASELINES, FREE, CENTRE, BOUND)
+    }
+
+
+def page(results: Sequence[Result], budgets: Sequence[float], seed: int) -> str:
+    """Return the tables in Markdown: means over the classes of terrain, then each terrain."""
+    judged = [one for one in results if 'refused' not in one]
+    kinds = [one['class'] for one in judged]
+    numbers = '; '.join(f'{kinds.count(kind)} {kind}' for kind in sorted(set(kinds)))
+    rows = [['ways'], *([name] for name in (*BASELINES, FREE, CENTRE, BOUND))]
+    parts = []
+    for budget in budgets:
+        means = class_means(judged, budget)
+        rows[0] += [f'{budget:g} km, published', f'{budget:g} km, measured']
+        for row in rows[1:]:
+            row += [_published(budget, row[0], set(kinds)), f'{means[row[0]]:.1f}']
+        parts += [_verdict(budget, means), _each(judged, budget)]
+    parts += [
+        f'Not judged: {one["terrain"]}, {one["refused"]}' for one in results if one not in judged
+    ]
+    victims = min(one['victims'] for one in judged)
+    head = (
+        f'{len(judged)} terrains ({numbers}), {victims} victims on each, seed {seed}. Share of '
+        'victims found [%], mean over the classes of terrain:\n'
+    )
+    return '\n'.join([head, markdown_table(rows), *parts])
+
+
+def _published(budget: float, name: str, kinds: set[str]) -> str:
+    rows = [PUBLISHED.get(kind, {}).get(budget) for kind in kinds]
+    if name not in BASELINES or None in rows:
+        return ''
+    return f'{np.mean([row[BASELINES.index(name)] for row in rows if row]):.1f}'
+
+
+def _verdict(budget: float, means: dict[str, float]) -> str:
+    best = max(means[name] for name in BASELINES)
+    gaps = ', '.join(f'{name} {means[name] - best:+.1f}' for name in (FREE, CENTRE))
+    goal = GOALS.get(budget, -np.inf)
+    met = f'; goal {goal:g}: {"met" if means[FREE] - best >= goal else "missed"}'
+    return f'{budget:g} km, points above the best baseline: {gaps}{met * (budget in GOALS)}.\n'
+
+
+def _each(judged: Sequence[Result], budget: float) -> str:
+    rows = [['terrain', 'class', 'best baseline', FREE, CENTRE, BOUND, 'unpromised', 'lost']]
+    for one in judged:
+        found = one['found'][f'{budget:g}']
+        best = max(BASELINES, key=lambda name: found[name])
+        shares = [found[best], found[FREE], found[CENTRE], found[BOUND], one['unpromised']]
+        lost = f'to {best}' if found[FREE] < found[best] else ''
+        rows.append([one['terrain'], one['class'], *(f'{share:.1f}' for share in shares), lost])
+    return markdown_table(rows)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = Parser(
+        prog='judge',
+        description="Judge the tour planner's ways by SAREnv: its own evaluator, terrains, victims "
+        'and planners. Exit codes: 0 all terrains are judged, 1 some are not, 2 wrong input.',
+    )
+    add = parser.add_argument
+    add('judge', choices=['sarenv'], help='the outside judge')
+    add('--data', type=Path, required=True, metavar='FOLDER', help="its folder 'sarenv_dataset'")
+    add('--terrains', nargs='+', metavar='NAME', help='folders in it (default: all)')
+    add('--budget', nargs='+', type=positive, default=[*GOALS], metavar='KM', help='of all drones')
+    add('--victims', type=count, default=1000, metavar='N', help='on each (default: %(default)s)')
+    add('--seed', type=whole, default=1, metavar='N', help='of the victims (default: %(default)s)')
+    add('--jobs', type=count, default=1, metavar='N', help='processes (default: %(default)s)')
+    add('--out', type=Path, metavar='DIR', help='folder of judge.json')
+    add('--document', type=Path, metavar='FILE', help='writes the tables between its marks')
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    options = build_parser().parse_args(arguments)
+    try:
+        return judge(options)
+    except (WrongInput, NoRoom) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return WRONG_INPUT
+
+
+def judge(options: argparse.Namespace) -> int:
+    """Judge the terrains, write what is asked for, and return the exit code."""
+    toolkit()
+    folders = _folders(options.data, options.terrains)
+    one = partial(judge_terrain, budgets=options.budget, victims=options.victims, seed=options.seed)
+    results = []
+    with ProcessPoolExecutor(options.jobs, multiprocessing.get_context('spawn')) as pool:
+        for result in pool.map(one, folders):
+            print(json.dumps(result), file=sys.stderr, flush=True)
+            results.append(result)
+    refused = [result for result in results if 'refused' in result]
+    if len(refused) == len(results):
+        raise WrongInput(f'{folders[0]}: {refused[0]["refused"]}; no terrain could be judged')
+    text = page(results, options.budget, options.seed)
+    print(text)
+    if options.out is not None:
+        facts = {'seed': options.seed, 'terrains': results}
+        write_file(options.out / 'judge.json', json.dumps(facts, indent=1) + '\n')
+    if options.document is not None:
+        before = options.document.read_text(encoding='utf-8')
+        write_file(options.document, with_summary(before, text, 'judge'))
+    return SOME_FAILED if refused else DONE
+
+
+def _folders(data: Path, names: list[str] | None) -> list[Path]:
+    known = {path.parent.name: path.parent for path in sorted(data.glob(f'*/{_HEATMAP}'))}
+    chosen = names or sorted(known, key=lambda name: (len(name), name))
+    wrong = [name for name in chosen if name not in known]
+    if wrong or not chosen:
+        raise WrongInput(f'{data}: no {_HEATMAP} in {", ".join(wrong) or "any folder there"}')
+    return [known[name] for name in chosen]
+
+
+if __name__ == '__main__':
+    sys.exit(main())

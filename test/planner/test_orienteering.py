@@ -1,0 +1,98 @@
+"""Ways that collect prizes: against brute force on small cases, budgets, and teams."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from maasi_planner.planners.orienteering import plan_ways
+
+
+def arrivals(points, start, way, end=None):
+    """Return the way to each node of a way [m], and its length."""
+    places = [*([] if start is None else [start]), *points[way], *([] if end is None else [end])]
+    gaps = np.linalg.norm(np.diff(places, axis=0), axis=1) if len(places) > 1 else np.zeros(0)
+    passed = np.cumsum([*([0.0] if start is None else []), *gaps])
+    return passed[: len(way)], passed[-1] if len(passed) else 0.0
+
+
+def drawn(seed, number=6, dimension=2):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.0, 1.0, (number, dimension)), rng.uniform(0.1, 1.0, number), rng
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_without_budget_prizes_come_early(dimension):
+    """The mean time to a prize is close to the least of all orders, and mostly equal to it."""
+    ratios = []
+    for seed in range(15):
+        points, prizes, rng = drawn(seed, dimension=dimension)
+        start = rng.uniform(0.0, 1.0, dimension)
+
+        def late(way, points=points, prizes=prizes, start=start):
+            return float(prizes[list(way)] @ arrivals(points, start, list(way))[0])
+
+        least = min(late(way) for way in itertools.permutations(range(6)))
+        (way,) = plan_ways(points, prizes, start[None, :], np.array([np.inf]))
+        assert sorted(way) == list(range(6))
+        ratios.append(late(way) / least)
+    assert max(ratios) < 1.1 and np.median(ratios) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize('home', [False, True])
+@pytest.mark.parametrize('free', [False, True])
+def test_budgets_are_kept_and_prizes_are_close_to_the_most(home, free):
+    ratios = []
+    for seed in range(15):
+        points, prizes, rng = drawn(seed)
+        start, end, budget = *rng.uniform(0.0, 1.0, (2, 2)), rng.uniform(0.7, 2.0)
+        start, end = None if free else start, end if home else None
+        most = 0.0
+        for size in range(7):
+            for way in itertools.permutations(range(6), size):
+                if arrivals(points, start, list(way), end)[1] <= budget:
+                    most = max(most, prizes[list(way)].sum())
+        given = [None if place is None else place[None, :] for place in (start, end)]
+        (way,) = plan_ways(points, prizes, given[0], np.array([budget]), given[1])
+        if len(way):
+            assert arrivals(points, start, way, end)[1] <= budget + 1e-9
+        ratios.append(prizes[way].sum() / max(most, 1e-9) if most else 1.0)
+    assert min(ratios) > 0.8 and np.median(ratios) == pytest.approx(1.0)
+
+
+def lattice(rows, columns):
+    return np.stack(np.meshgrid(range(columns), range(rows)), axis=-1).reshape(-1, 2) + 0.5
+
+
+@pytest.mark.parametrize('robots', [1, 3])
+def test_a_team_shares_a_field_in_lanes(robots):
+    points = lattice(12, 15)
+    starts = np.random.default_rng(3).uniform(0.0, 12.0, (robots, 2))
+    ways = plan_ways(points, np.ones(180), starts, np.full(robots, np.inf))
+    assert sorted(np.concatenate(ways)) == list(range(180))
+    mean = np.mean(np.concatenate([arrivals(points, s, way)[0] for s, way in zip(starts, ways)]))
+    assert mean < 1.06 * 90.0 / robots
+    again = plan_ways(points, np.ones(180), starts, np.full(robots, np.inf))
+    assert all(np.array_equal(*pair) for pair in zip(ways, again))
+
+
+def test_a_budget_is_spent_where_the_prizes_are():
+    points = lattice(20, 20)
+    prizes = np.exp(-((points - [4.0, 14.0]) ** 2).sum(axis=1) / 20.0)
+    starts, budgets = np.array([[10.0, 10.0], [0.0, 0.0]]), np.array([60.0, 40.0])
+    ways = plan_ways(points, prizes, starts, budgets, starts)
+    for start, way, budget in zip(starts, ways, budgets):
+        assert arrivals(points, start, way, start)[1] <= budget
+    best = np.sort(prizes)[::-1][:70].sum()
+    assert prizes[np.concatenate(ways)].sum() > 0.85 * best
+
+
+def test_a_faster_robot_does_more_and_none_without_prizes():
+    points, starts = lattice(10, 10), np.array([[0.0, 5.0], [10.0, 5.0]])
+    fast, slow = plan_ways(
+        points, np.ones(100), starts, np.full(2, np.inf), speeds=np.array([3.0, 1.0])
+    )
+    assert 65 < len(fast) < 85 and len(slow) == 100 - len(fast)
+    assert [len(way) for way in plan_ways(points, np.zeros(100), starts, np.ones(2))] == [0, 0]
+    one = plan_ways(points[:1], np.ones(1), starts, np.full(2, np.inf))
+    assert [len(way) for way in one] == [1, 0]
