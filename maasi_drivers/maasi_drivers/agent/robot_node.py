@@ -161,10 +161,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         return round(stamp * 1e-9 / self.settings.step)
 
     def is_new_pose(self, what: str, stamp: int) -> bool:
-        """Return whether a pose of a stamp [ns] is to be used; one far back restarts the driver.
-
-        `what` is its topic and field, for messages.
-        """
+        """Return whether a pose of a stamp [ns] is to be used; one far back restarts the driver."""
         if not (self.settings.lockstep or self._gate.accepts(stamp)):
             self.drop(
                 'odometry stamp',

@@ -24,18 +24,15 @@ class GoalStatus(IntEnum):
 
 @dataclass(eq=False)
 class Goal:
-    """A waypoint (3,) of a robot [m, map] by the id of its decision, in effect after `step`.
+    """A waypoint of a robot."""
 
-    Reached within `tolerance` [m], 0: the robot's own. `reason` says why it ended without success.
-    """
-
-    id: int
-    step: int
-    waypoint: FloatArray
-    tolerance: float = 0.0
-    handle: Any = None
+    id: int  # index of its decision plus one
+    step: int  # it takes effect in the next one
+    waypoint: FloatArray  # (3,) [m, map]
+    tolerance: float = 0.0  # within this it counts as reached; 0: the robot's own [m]
+    handle: Any = None  # that of its client
     status: GoalStatus = GoalStatus.MOVING
-    reason: str = ''
+    reason: str = ''  # why it ended without success
 
 
 class WaypointFollower:

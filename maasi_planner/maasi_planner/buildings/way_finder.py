@@ -11,11 +11,7 @@ _BERTH = 3.0  # distance of intermediate targets from the corners of obstacles [
 
 
 class WayFinder:
-    """Paths around boxes: a visibility graph over their corners, weighted by travel time.
-
-    solids (n, 3, 2): boxes [m]; area (3, 2): where robots may be [m]; speed, climb: largest speed
-    on each axis, and of a steady climb [m/s].
-    """
+    """Paths around boxes (n, 3, 2) [m]: a visibility graph over their corners, by travel time."""
 
     def __init__(self, solids: FloatArray, area: FloatArray, speed: float, climb: float) -> None:
         self.solids = solids

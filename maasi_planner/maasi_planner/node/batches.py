@@ -18,11 +18,7 @@ _MEASUREMENTS_KEPT = 1000  # measurements that are remembered, to recognise dupl
 
 
 class Batches:
-    """Requests measurements, and hands the filter's updates to the coordinator.
-
-    Ids of the last batch and of the last update used; whether one is waited for; when the batch was
-    published [s, monotonic clock]; the update used last, and the measurements of all.
-    """
+    """Requests measurements, and hands the filter's updates to the coordinator."""
 
     def __init__(
         self,
@@ -37,10 +33,11 @@ class Batches:
     def reset(self, coordinator: Coordinator) -> None:
         """Reset for a new search."""
         self._coordinator = coordinator
+        # Ids of the last batch and of the last update used; measurements of all.
         self.last = self.used = self.measurements = 0
         self.waiting = False
         self.published_at = time.monotonic()
-        self.update = FilterUpdate()
+        self.update = FilterUpdate()  # the one used last
         self._message = MeasurementBatch()
         self._before = 0  # last batch of an earlier planner process
         # Robot and index of the last measurements whose update was used.

@@ -149,17 +149,14 @@ def execute(task: Task) -> Run | str:
 
 @dataclass
 class Campaign:
-    """The runs of one experiment: those that are there, by case and map, and those to be made.
-
-    Tasks go map by map: an interrupted campaign has all cases on the first maps.
-    """
+    """The runs of one experiment: those that are there, by case and map, and those to be made."""
 
     experiment: Experiment
     cases: dict[str, Case]
     folder: Path
     done: dict[tuple[str, int], Run] = field(default_factory=dict)
     tasks: list[Task] = field(default_factory=list)
-    complaints: dict[Path, str] = field(default_factory=dict)
+    complaints: dict[Path, str] = field(default_factory=dict)  # by damaged file
 
     def file(self, case: str, number: int) -> Path:
         """Return the file of a run."""

@@ -51,16 +51,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A measured quantity: a key of `Outcome.summary` or `Outcome.timing`.
-
-    A restricted one is a duration, None in unfinished runs; its mean is up to the key `limit`.
-    """
+    """A measured quantity: a key of `Outcome.summary` or `Outcome.timing`."""
 
     name: str
     label: str
     unit: str = ''
-    kind: Literal['mean', 'restricted'] = 'mean'
-    limit: str = 'limit'
+    kind: Literal['mean', 'restricted'] = 'mean'  # restricted: a duration, None if unfinished
+    limit: str = 'limit'  # of restricted: the key of what its mean is up to
 
     def title(self, unit: str | None = None) -> str:
         """Return label and unit, or another unit."""

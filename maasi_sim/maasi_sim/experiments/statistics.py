@@ -16,15 +16,12 @@ _MOST_PAIRS = 1_000_000
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with half the width of its confidence interval, and Student's degrees of freedom.
+    """A mean with half the width of its confidence interval."""
 
-    The mean is nan without values, the half width with fewer than two.
-    """
-
-    mean: float
-    half_width: float
+    mean: float  # nan without values
+    half_width: float  # nan with fewer than two
     number: int
-    degrees: float
+    degrees: float  # of freedom of Student's distribution
 
 
 def student(degrees: float, level: float = LEVEL) -> float:
@@ -58,17 +55,14 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> Interval:
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean and median of paired differences, and a bootstrap interval; nan if too few.
-
-    `needed` pairs give a power of 0.8 at this size; None without difference, spread or a number.
-    """
+    """Mean and median of paired differences; what too few values do not give is nan."""
 
     mean: float
-    low: float
+    low: float  # bounds of the bootstrap interval
     high: float
     median: float
     number: int
-    needed: int | None
+    needed: int | None  # pairs for a power of 0.8 at this size; None: no difference, no spread
 
     @property
     def told_from_zero(self) -> bool:

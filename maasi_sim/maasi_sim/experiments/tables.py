@@ -69,20 +69,17 @@ def markdown_table(rows: Iterable[Sequence[str]]) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One number of ours beside the paper's, and ours minus theirs.
-
-    `finished` runs have the quantity; the others count as longest in the median, nan if it is one.
-    """
+    """One number of ours beside the paper's."""
 
     case: str
     preset: str
     quantity: Quantity
     runs: int
-    finished: int
+    finished: int  # runs that have the quantity
     ours: Interval
-    median: float
+    median: float  # others count as longest; nan if they are half or more
     paper: Interval | None
-    difference: Interval | None
+    difference: Interval | None  # ours minus the paper's
     note: str
 
     def cell(self) -> str:

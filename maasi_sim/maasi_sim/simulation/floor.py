@@ -99,17 +99,13 @@ class RenderSettings(Settings):
 
 @dataclass(frozen=True)
 class Shape:
-    """A flat object on the floor: centre [m, map], colour (reflectance, 0 to 1).
+    """A flat object on the floor."""
 
-    Half its size is its radius twice, or half the sides of a rectangle [m]; the angle is that of
-    its first side from the x axis [rad].
-    """
-
-    centre: tuple[float, float]
-    half_size: tuple[float, float]
-    colour: Sequence[float]
+    centre: tuple[float, float]  # [m, map]
+    half_size: tuple[float, float]  # the radius twice, or half the sides [m]
+    colour: Sequence[float]  # reflectance, 0 to 1
     rectangle: bool = False
-    angle: float = 0.0
+    angle: float = 0.0  # of the first side from the x axis [rad]
 
 
 def disc(centre: ArrayLike, radius: float, colour: Sequence[float]) -> Shape:
