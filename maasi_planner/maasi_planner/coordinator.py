@@ -23,7 +23,7 @@ from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
-from maasi_planner.planners.base import check_decision, keep_apart
+from maasi_planner.planners.base import check_decision, explain, keep_apart
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
 
 
@@ -296,13 +296,19 @@ class Coordinator:
                 plan.decided_at = plan.measured_from = step
                 plan.staying = True
             return Decision(step=step, reason=finished)
+        for name in planning:
+            if (endurance := self.plans[name].endurance) is not None:
+                endurance.spent = False
         decision = self.planner.decide(team)
         check_decision(self.planner, team, decision)
+        decided = dict(decision.robots)
         for name in planning:
             home = self._way_home(team, name, decision.robots[name])
             if home is not None:
                 decision.robots[name] = home
         keep_apart(team, decision)
+        if any(decision.robots[name] is not chosen for name, chosen in decided.items()):
+            explain(decision)
         for name in planning:
             plan, chosen = self.plans[name], decision.robots[name]
             if name not in arrived and chosen.stays:

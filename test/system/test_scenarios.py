@@ -1,8 +1,14 @@
 """Whole scenarios: separate processes over DDS, from camera image to found target."""
 
+import json
+from collections import Counter
+
+import numpy as np
 import pytest
+import shapely
 from scenario_runs import check_replay, of_topic, run_scenario, start
 
+from maasi_filter.area import Area
 from maasi_sim.run.bag import Bag
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
@@ -136,3 +142,23 @@ def test_independent_robots_share_what_they_find_and_nothing_else(tmp_path):
     ]
     assert report['measurements'] == result.measurements
     check_replay(run, tmp_path)
+
+
+@pytest.mark.parametrize(('name', 'seed', 'homes'), [('field', 901, 0), ('field_batteries', 1, 2)])
+def test_a_field_is_searched_within_its_area(name, seed, homes, tmp_path):
+    """Keep-outs, a hole and a prior; or a battery that has to be charged twice."""
+    run = run_scenario(name, tmp_path, '--seed', seed, '--lockstep')
+    assert run.code == 0, run.output
+    report, area = run.report, Area(load_scenario(name).environment)
+    assert report['missed'] == report['false_found'] == 0
+    log = (run.folder / 'planner_node.log').read_text()
+    assert log.count('goes home to charge') >= homes
+    for robot in load_scenario(name).robots:
+        states = of_topic(run, f'/{robot}/state')
+        places = np.array([list(item['pose']['pose']['position'].values()) for item in states])
+        assert shapely.contains_xy(area.region, places[:, 0], places[:, 1]).all()
+        assert min(item['battery'] for item in states if item['battery'] >= 0.0) > 0.05
+    if area.settings.origin is not None:
+        features = json.loads((run.folder / 'ways.geojson').read_text())['features']
+        kinds = Counter(item['properties']['kind'] for item in features)
+        assert kinds == {'area': 1, 'keep_out': 2, 'explored': 1, 'way': 3}

@@ -201,7 +201,7 @@ def options_of(
         allowed &= ways_apart(team, name, prediction.positions, {})
         if not allowed.any():
             return 'other robots are on all ways'
-        allowed &= affordable(team, name, prediction)
+        allowed = affordable(team, name, prediction, allowed)
         if not allowed.any():
             return 'it has to save its battery for the way home'
         return UsableCandidates(points, prediction, allowed)
@@ -286,12 +286,14 @@ def ways_apart(
     return free
 
 
-def affordable(team: TeamView, name: str, prediction: Trajectories) -> BoolArray:
-    """Return which predicted ways leave a robot enough of its battery to come home, (W,)."""
+def affordable(
+    team: TeamView, name: str, prediction: Trajectories, allowed: BoolArray
+) -> BoolArray:
+    """Return which of the allowed ways leave a robot enough of its battery to come home, (W,)."""
     endurance = team.robots[name].endurance
     if endurance is None:
-        return np.ones(len(prediction.lengths), dtype=bool)
-    allowed = endurance.affords(prediction, team.step_time)
+        return allowed
+    allowed = allowed & endurance.affords(prediction, team.step_time)
     endurance.spent = not allowed.any()
     return allowed
 

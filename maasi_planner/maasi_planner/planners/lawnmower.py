@@ -155,7 +155,7 @@ class Lawnmower(Planner):
             if not ways_apart(team, name, prediction.positions, decided)[0]:
                 self._pending[name].insert(0, target)
                 return stay(view, 'waits: others are on its way')
-            if not affordable(team, name, prediction)[0]:
+            if not affordable(team, name, prediction, prediction.reached)[0]:
                 self._pending[name].insert(0, target)
                 return stay(view, 'stays: it has to save its battery for the way home')
             return single_choice(point[None, :], prediction, 0, 'next point of the lawnmower')
