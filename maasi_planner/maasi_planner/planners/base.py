@@ -119,7 +119,7 @@ def _problem_of(robot: RobotDecision, area: Area) -> str:
     if not (isinstance(robot.chosen, int | np.integer) and -1 <= robot.chosen < rows[0]):
         return f'chosen: got {robot.chosen!r:.80}, allowed are -1 (stay) to {rows[0] - 1}'
     if not robot.stays and not area.inside(robot.waypoint[None, :]).all():
-        allowed = f'inside the area, in {area.bounds.tolist()} [m]'
+        allowed = f'inside {area.bounds.tolist()} [m], and inside the area'
         return f'waypoint: got {robot.waypoint.tolist()}, allowed is {allowed}'
     return ''
 
