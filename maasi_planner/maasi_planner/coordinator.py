@@ -152,6 +152,7 @@ class RobotPlan:
             period_steps=self.period,
             planning=planning,
             radius=self.radius,
+            arrival_radius=self.arrival_radius,
             exploration=self.exploration,
         )
         if not planning and self.decided_at is not None:

@@ -44,6 +44,8 @@ class RobotView:
         that plans measures now.)
     radius : float
         Radius of a circle around the robot, metres; separates waypoints of different robots.
+    arrival_radius : float
+        Distance from its waypoint at which the robot takes its next decision, metres.
     exploration : UnexploredMap, optional
         e after the robot's own measurements only, iota of 002, eq. (12). None: that of the team.
     """
@@ -58,6 +60,7 @@ class RobotView:
     remaining_yaws: FloatArray | None = None
     phase: int = 0
     radius: float = 0.0
+    arrival_radius: float = 0.0
     exploration: UnexploredMap | None = None
 
     def __post_init__(self) -> None:
