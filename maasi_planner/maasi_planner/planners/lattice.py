@@ -80,9 +80,12 @@ class Lattice:
             share = np.moveaxis(np.tensordot(part, share, (1, axis)), 0, axis)
         return np.ascontiguousarray(share.reshape(self.shape))
 
-    def choose(self, exploration: UnexploredMap) -> tuple[IntArray, FloatArray]:
-        """Return places from which what is unseen is seen, and the share each adds (m,)."""
-        return _choose(self.unseen(exploration), self.kernel, OVERLAP, LEAST)
+    def choose(self, exploration: UnexploredMap, enough: int = 1) -> tuple[IntArray, FloatArray]:
+        """Return places from which what is unseen is seen, and the share each adds (m,).
+
+        enough: so many are chosen even if they overlap.
+        """
+        return _choose(self.unseen(exploration), self.kernel, OVERLAP, LEAST, enough)
 
     def gains(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
         """Return the share that each of some places adds to those before it, (m,)."""
@@ -115,7 +118,7 @@ def _gains(unseen, kernel, chosen):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _choose(unseen, kernel, overlap, least):  # type: ignore[no-untyped-def]
+def _choose(unseen, kernel, overlap, least, enough):  # type: ignore[no-untyped-def]
     """Take the place that sees most, as long as it is not mostly seen from those before."""
     alone = np.empty(unseen.size)
     for place in range(unseen.size):
@@ -131,7 +134,7 @@ def _choose(unseen, kernel, overlap, least):  # type: ignore[no-untyped-def]
         if fresh[place] < number:
             bound[place] = _seen(unseen, kernel, place, False)
             fresh[place] = number
-            if bound[place] < overlap * alone[place]:
+            if number >= enough and bound[place] < overlap * alone[place]:
                 bound[place] = 0.0
             continue
         chosen[number], gains[number] = place, _seen(unseen, kernel, place, True)

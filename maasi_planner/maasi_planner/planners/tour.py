@@ -17,7 +17,11 @@ CHANGE = 0.2
 STALE = 0.8
 # Most places on a straight line that are one leg.
 STRAIGHT = 100
-OVER = 1.0
+OVER = 0.5
+NEAR = 0.1
+ENOUGH = 3
+SPLIT = 1.0
+LEG = 5.0
 
 
 class Tour(Planner):
@@ -96,7 +100,7 @@ class Tour(Planner):
             if not len(self._points):
                 return prizes, True
             gaps = np.linalg.norm(self._points[number:] - cluster.position, axis=1)
-            near = gaps < 0.25 * self._lattice.pitch
+            near = gaps < NEAR * self._lattice.pitch
             prizes[number:][near] = cluster.mass
             new = new or not near.any()
         return prizes, new
@@ -112,7 +116,7 @@ class Tour(Planner):
     def _plan(self, team: TeamView) -> FloatArray:
         """Plan the tours of all robots from where they are, or will be; return the prizes."""
         assert self._lattice is not None
-        self._chosen, gains = self._lattice.choose(team.exploration)
+        self._chosen, gains = self._lattice.choose(team.exploration, ENOUGH * len(team.robots))
         heavy = self.heavy(team)
         centres = np.array([item.position for item in heavy]).reshape(-1, team.dimension)
         self._points = np.vstack([self._lattice.points[self._chosen], centres])
@@ -156,11 +160,23 @@ class Tour(Planner):
             if team.dimension == 2 and len(view.candidates):
                 target[2] = view.candidates[0, 2]
             target[: team.dimension] = self._points[index]
-            point = view.motion.keep_out.moved_out(here, self._beyond(team, view, target))
+            gap = float(np.linalg.norm(target - here))
+            longest = max(SPLIT * self._lattice.pitch, LEG * view.arrival_radius)
+            if view.arrival_radius > 0.0 and gap > 1.5 * longest:
+                target = here + (target - here) * longest / gap
+                way.insert(0, index)
+                ahead = target
+            else:
+                ahead = self._beyond(team, view, target)
+            point = view.motion.keep_out.moved_out(here, ahead)
             if point is None or not free_of_robots(point[None, :], view.radius, places)[0]:
+                if way and way[0] == index:
+                    way.pop(0)
                 continue
             prediction = view.motion.predict(view.state, point[None, :], team.step_time)
             if not prediction.reached[0] or prediction.lengths[0] == 0:
+                if way and way[0] == index:
+                    way.pop(0)
                 continue
             self._target[name] = target
             reason = f'next place of its tour, prize {prizes[index]:.3g}, {len(way)} to follow'
