@@ -1,4 +1,4 @@
-"""Places from which an area is seen on passing: a lattice, and a choice that covers what is unseen."""
+"""Places that show an area on passing: a lattice, and a choice that covers what is unseen."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ class Lattice:
     """Squares (in 3D: cubes) as wide as is seen almost surely on passing.
 
     points (n, d): their centres [m]; kernel: probability of detection on passing, by offset in
-    squares from the place that is passed.
+    squares from the place that is passed; trust (n,): in what a visit gains, for
+    its user to reduce.
     """
 
     def __init__(self, exploration: UnexploredMap, beside: FloatArray, detected: FloatArray):
@@ -64,6 +65,7 @@ class Lattice:
             self._parts.append(np.maximum(end - begin, 0.0) / (last - first))
         points = np.stack(np.meshgrid(*centres, indexing='ij'), axis=-1)
         self.points = points.reshape(-1, exploration.dimension)
+        self.trust = np.ones(len(self.points))
         self.shape = (*points.shape[:-1], 1)[:3]
         far = float(beside[detected >= 0.05].max(initial=0.0))
         counts = [min(int(far / width), size) for width, size in zip(widths, self.shape)]
@@ -85,11 +87,12 @@ class Lattice:
 
         enough: so many are chosen even if they overlap.
         """
-        return _choose(self.unseen(exploration), self.kernel, OVERLAP, LEAST, enough)
+        unseen = self.unseen(exploration)
+        return _choose(unseen, self.kernel, self.trust, OVERLAP, LEAST, enough)
 
     def gains(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
         """Return the share that each of some places adds to those before it, (m,)."""
-        return _gains(self.unseen(exploration), self.kernel, chosen)
+        return self.trust[chosen] * _gains(self.unseen(exploration), self.kernel, chosen)
 
 
 @njit(cache=True)
@@ -118,25 +121,25 @@ def _gains(unseen, kernel, chosen):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _choose(unseen, kernel, overlap, least, enough):  # type: ignore[no-untyped-def]
+def _choose(unseen, kernel, trust, overlap, least, enough):  # type: ignore[no-untyped-def]
     """Take the place that sees most, as long as it is not mostly seen from those before."""
     alone = np.empty(unseen.size)
     for place in range(unseen.size):
-        alone[place] = _seen(unseen, kernel, place, False)
+        alone[place] = trust[place] * _seen(unseen, kernel, place, False)
     # What a place adds only falls: it is computed again when it is the largest one.
     bound, fresh = alone.copy(), np.full(unseen.size, -1)
     chosen, gains = np.empty(unseen.size, np.int64), np.empty(unseen.size)
     number = 0
     while True:
-        place = np.argmax(bound)
+        place = int(np.argmax(bound))
         if bound[place] <= least * alone.max() or number == unseen.size:
             return chosen[:number], gains[:number]
         if fresh[place] < number:
-            bound[place] = _seen(unseen, kernel, place, False)
+            bound[place] = trust[place] * _seen(unseen, kernel, place, False)
             fresh[place] = number
             if number >= enough and bound[place] < overlap * alone[place]:
                 bound[place] = 0.0
             continue
-        chosen[number], gains[number] = place, _seen(unseen, kernel, place, True)
+        chosen[number], gains[number] = place, trust[place] * _seen(unseen, kernel, place, True)
         bound[place] = 0.0
         number += 1
