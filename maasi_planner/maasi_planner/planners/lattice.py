@@ -129,10 +129,10 @@ def _choose(unseen, kernel, trust, overlap, least, enough):  # type: ignore[no-u
     # What a place adds only falls: it is computed again when it is the largest one.
     bound, fresh = alone.copy(), np.full(unseen.size, -1)
     chosen, gains = np.empty(unseen.size, np.int64), np.empty(unseen.size)
-    number = 0
+    number, least = 0, least * alone.max()
     while True:
         place = int(np.argmax(bound))
-        if bound[place] <= least * alone.max() or number == unseen.size:
+        if bound[place] <= least or number == unseen.size:
             return chosen[:number], gains[:number]
         if fresh[place] < number:
             bound[place] = trust[place] * _seen(unseen, kernel, place, False)

@@ -67,8 +67,11 @@ class Tour(Planner):
         reason = super().finished(team)
         if reason is not None:
             return reason
-        gains = self._squares(team).choose(team.exploration)[1]
-        if self.settings.expected_targets * gains.max(initial=0.0) > self.settings.gain_threshold:
+        lattice, least = self._squares(team), self.settings.gain_threshold
+        least /= self.settings.expected_targets
+        # Of its own square a place sees about all: mostly that is enough to know.
+        here = 0.5 * lattice.trust * lattice.unseen(team.exploration).ravel()
+        if here.max() > least or lattice.choose(team.exploration)[1].max(initial=0.0) > least:
             return None
         explored = 100.0 * team.exploration.explored_fraction()
         return self._settled(
