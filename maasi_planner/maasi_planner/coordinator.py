@@ -157,6 +157,7 @@ class RobotPlan:
             planning=planning,
             radius=self.radius,
             endurance=self.endurance,
+            arrival_radius=self.arrival_radius,
             exploration=self.exploration,
         )
         if not planning and self.decided_at is not None:

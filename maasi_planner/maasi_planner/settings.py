@@ -26,6 +26,7 @@ PLANNERS = PluginGroup(
         'mutual_information': 'maasi_planner.planners.mutual_information:MutualInformation',
         'nearest_widest': 'maasi_planner.planners.nearest_widest:NearestWidest',
         'lawnmower': 'maasi_planner.planners.lawnmower:Lawnmower',
+        'tour': 'maasi_planner.planners.tour:Tour',
     },
 )
 _PLANNER = OwnSettings(PLANNERS, 'name')

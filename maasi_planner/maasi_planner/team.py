@@ -47,6 +47,8 @@ class RobotView:
         Radius of a circle around the robot, metres; separates waypoints of different robots.
     endurance : Endurance, optional
         What its battery allows. None: everything.
+    arrival_radius : float
+        Distance from its waypoint at which the robot takes its next decision, metres.
     exploration : UnexploredMap, optional
         e after the robot's own measurements only, iota of 002, eq. (12). None: that of the team.
     """
@@ -62,6 +64,7 @@ class RobotView:
     phase: int = 0
     radius: float = 0.0
     endurance: Endurance | None = None
+    arrival_radius: float = 0.0
     exploration: UnexploredMap | None = None
 
     def __post_init__(self) -> None:

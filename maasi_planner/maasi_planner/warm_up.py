@@ -11,7 +11,6 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planners import make_planner
-from maasi_planner.planners.orienteering import plan_ways
 from maasi_planner.settings import MotionSettings, PlannerSettings
 from maasi_planner.team import RobotView, TeamView
 
@@ -25,6 +24,9 @@ def _decide(team: TeamView) -> None:
     ):
         make_planner('maasi', settings).decide(team)
     make_planner('mutual_information').decide(team)
+    tour = make_planner('tour')
+    for _ in range(2):
+        tour.decide(team)
     last = team.robots[team.names()[-1]]
     last.planning = False
     start = np.array(last.state.pose.position)
@@ -63,4 +65,3 @@ def warm_up() -> None:
                 )
             team = TeamView(0, 0.05, robots, clusters, exploration)
             _decide(team)
-        plan_ways(exploration.nodes(), np.ones(len(exploration.nodes())), None, np.ones(2))

@@ -6,6 +6,8 @@ on.
 """
 
 import argparse
+import itertools
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -82,6 +84,37 @@ REGIMES = {
     ),
     'radians': Regime(CUBE, 600.0, NEAR_3D, [RADIANS]),
 }
+
+
+def large(squares, detection, number):
+    """Return the regime of an area of so many squares of a swath (20 m), and drones at its edge."""
+    side = 20.0 * math.sqrt(squares)
+    most = round(side / 20.0)
+    starts = [(side * (i + 0.5) / number, 1.0, 30.0) for i in range(number)]
+    grid = {'grid': [most, most], 'spacing': side / most, 'corner': [0.5 * side / most] * 2}
+    return Regime(
+        PAIR,
+        60.0 + 24.0 * squares / number,
+        {'ring': 8, 'distance': 20.0},
+        [
+            {'environment': {'bounds': [[0.0, side]] * 2}, 'targets': {'separation': 5.0}},
+            drones(*starts),
+            robots(
+                candidates=grid,
+                motion={'speed': 5.0, 'acceleration': 5.0},
+                sensor={'detection': DETECTIONS[detection]},
+            ),
+        ],
+    )
+
+
+# Both see 20 m beside a way of 5 m/s, with a measurement each second: the box all, the other half.
+DETECTIONS = {
+    'box': {'kind': 'box', 'lower': [-10.0] * 2, 'upper': [10.0] * 2, 'frame': 'world'},
+    'exponential': {'size': [3.0, 3.0]},
+}
+for squares, detection, number in itertools.product((30, 100, 300, 1000), DETECTIONS, (1, 3, 10)):
+    REGIMES[f'{squares} squares, {detection}, {number}'] = large(squares, detection, number)
 STOPS = [robots(motion={'arrival_radius': 0.0})]
 # What is compared; differences are to the first one.
 KINDS = {
@@ -91,6 +124,7 @@ KINDS = {
     'mutual_information': Kind({'name': 'mutual_information'}, 16, STOPS, neighbours=True),
     'paper': Kind({'name': 'maasi', **PAPER}, changes=STOPS),
     'maasi': Kind({'name': 'maasi'}),
+    'tour': Kind({'name': 'tour'}),
     'clairvoyant': Kind({'name': 'maasi'}, 32, maker='clairvoyant:clairvoyant'),
 }
 

@@ -298,6 +298,16 @@ def affordable(
     return allowed
 
 
+def held_back(team: TeamView, name: str, prediction: Trajectories, decision: Decision) -> str:
+    """Return why a robot must not go the only way of a prediction now, or an empty text."""
+    others = {key: robot.positions for key, robot in decision.robots.items()}
+    if not ways_apart(team, name, prediction.positions, others)[0]:
+        return 'waits: others are on its way'
+    if not affordable(team, name, prediction, prediction.reached)[0]:
+        return 'stays: it has to save its battery for the way home'
+    return ''
+
+
 def keep_apart(team: TeamView, decision: Decision) -> None:
     """Let robots wait whose ways would come too near to each other; the first by name has priority.
 

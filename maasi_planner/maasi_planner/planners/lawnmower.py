@@ -12,7 +12,7 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.candidates import half_view
-from maasi_planner.planners.base import Planner, affordable, explain, ways_apart
+from maasi_planner.planners.base import Planner, explain, held_back
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 
@@ -133,13 +133,10 @@ class Lawnmower(Planner):
         if not self._started:
             self._start(team)
         for name in team.planning():
-            decided = {key: robot.positions for key, robot in decision.robots.items()}
-            decision.robots[name] = self._decide_one(team, name, decided)
+            decision.robots[name] = self._decide_one(team, name, decision)
         return explain(decision)
 
-    def _decide_one(
-        self, team: TeamView, name: str, decided: dict[str, FloatArray]
-    ) -> RobotDecision:
+    def _decide_one(self, team: TeamView, name: str, decision: Decision) -> RobotDecision:
         view = team.robots[name]
         here = view.state.pose.position
         while True:
@@ -152,12 +149,9 @@ class Lawnmower(Planner):
             prediction = view.motion.predict(view.state, point[None, :], team.step_time)
             if not prediction.reached[0] or prediction.lengths[0] == 0:
                 continue
-            if not ways_apart(team, name, prediction.positions, decided)[0]:
+            if held := held_back(team, name, prediction, decision):
                 self._pending[name].insert(0, target)
-                return stay(view, 'waits: others are on its way')
-            if not affordable(team, name, prediction, prediction.reached)[0]:
-                self._pending[name].insert(0, target)
-                return stay(view, 'stays: it has to save its battery for the way home')
+                return stay(view, held)
             return single_choice(point[None, :], prediction, 0, 'next point of the lawnmower')
 
     def finished(self, team: TeamView) -> str | None:

@@ -34,7 +34,7 @@ class _Places(NamedTuple):
 class _Routes(NamedTuple):
     """Places in order (r + 1, n + 3), numbers of nodes (r + 1,), and where each place is (m, 2).
 
-    ways, sums, lates (r + 1, n + 3): way to each place, and prizes and prizes times way before it.
+    ways, sums, moments (r + 1, n + 3): way to each place, and prizes and prizes times way before it.
     """
 
     order: IntArray
@@ -42,7 +42,7 @@ class _Routes(NamedTuple):
     where: IntArray
     ways: FloatArray
     sums: FloatArray
-    lates: FloatArray
+    moments: FloatArray
 
     def lengths(self) -> FloatArray:
         """Return the way of each robot, (r,) [m]."""
@@ -243,7 +243,7 @@ def _take(places, routes, k, row):  # type: ignore[no-untyped-def]
             way += _gap(places.points, places.free, row[i - 1], row[i])
         routes.order[k, i] = row[i]
         routes.where[row[i], 0], routes.where[row[i], 1] = k, i
-        routes.ways[k, i], routes.sums[k, i], routes.lates[k, i] = way, total, late
+        routes.ways[k, i], routes.sums[k, i], routes.moments[k, i] = way, total, late
         total += places.prizes[row[i]]
         late += places.prizes[row[i]] * way
     # Ends have no prize: the sums before the end are those of the whole route.
@@ -259,7 +259,7 @@ def _weighed(term, length, late, prize):  # type: ignore[no-untyped-def]
 def _now(routes, terms, k):  # type: ignore[no-untyped-def]
     """Return the cost of a route."""
     end = routes.counts[k] + 1
-    return _weighed(terms[k], routes.ways[k, end], routes.lates[k, end], routes.sums[k, end])
+    return _weighed(terms[k], routes.ways[k, end], routes.moments[k, end], routes.sums[k, end])
 
 
 @njit(cache=True)
@@ -274,7 +274,7 @@ def _cost(places, routes, parts, term):  # type: ignore[no-untyped-def]
         # Ends have no prize.
         after = min(j + 1, counts[k] + 1)
         weight = routes.sums[k, after] - routes.sums[k, i]
-        moment = routes.lates[k, after] - routes.lates[k, i]
+        moment = routes.moments[k, after] - routes.moments[k, i]
         first, last = (order[k, j], order[k, i]) if back else (order[k, i], order[k, j])
         if end >= 0:
             length += _gap(places.points, places.free, end, first)

@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import math
 import pkgutil
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -300,6 +301,9 @@ def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
     outcome.summary['complete'] = complete is not None
     outcome.summary['time'] = limit if complete is None else complete
     outcome.summary['mean_time'] = float(times.mean()) if len(times) else None
+    for name, share in (('half_time', 0.5), ('most_time', 0.9)):
+        place = math.ceil(share * len(times)) - 1
+        outcome.summary[name] = float(np.sort(times)[place]) if len(times) else None
     outcome.timing['slowest_decision'] = max(result.planning_times, default=0.0)
     return outcome
 

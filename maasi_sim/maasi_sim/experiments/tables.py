@@ -208,6 +208,8 @@ _COMPARED = (
 )
 QUANTITIES = (
     *_COMPARED,
+    Quantity('half_time', 'time to find half', 's'),
+    Quantity('most_time', 'time to find 90 %', 's'),
     Quantity('planning_time', 'decision', 's'),
     Quantity('filter_time', 'filter step', 's'),
     Quantity('processor_time', 'computation of a search', 's'),

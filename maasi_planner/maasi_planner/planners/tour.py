@@ -1,0 +1,197 @@
+"""Tour: the team visits places of a lattice in an order that finds targets early."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maasi_filter.arrays import FloatArray
+from maasi_planner.planners.base import Planner, explain, free_of_robots, held_back, waiting_places
+from maasi_planner.planners.lattice import Lattice, passing
+from maasi_planner.planners.orienteering import plan_ways
+from maasi_planner.settings import PlannerSettings
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
+
+# Tours are planned again when prizes on them have changed by this share in all.
+CHANGE = 0.2
+# A place that keeps less than this share of its prize is passed over.
+STALE = 0.2
+# A cluster so near to one that was planned with is the same one [width of a square].
+SAME = 0.1
+# Places that are planned for each robot, even if they overlap.
+ENOUGH = 3
+# A leg has at most one square, or so many times the distance at which the robot turns.
+LEG = 5.0
+
+
+class Tour(Planner):
+    """A tour for each robot over places of a lattice, and over clusters.
+
+    The prize of a place is the number of targets that is expected to be detected on passing it,
+    that of a cluster its mass. Tours are planned again for all robots when the prizes on them have
+    changed, when a cluster has appeared, or when a robot has nothing left. The candidates are not
+    used.
+    """
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        super().__init__(settings)
+        self._lattice: Lattice | None = None
+        # What is planned with: places of the lattice, then clusters, and the prizes of both.
+        self._chosen = np.zeros(0, np.int64)
+        self._points = np.zeros((0, 0))
+        self._planned = np.zeros(0)
+        self._ways: dict[str, list[int]] = {}
+        # Where each robot was sent last.
+        self._target: dict[str, FloatArray] = {}
+
+    def decide(self, team: TeamView) -> Decision:
+        """See `Planner.decide`."""
+        decision, places = Decision(step=team.step), waiting_places(team)
+        prizes = self._prizes(team)
+        again = prizes is None
+        if prizes is None:
+            prizes = self._plan(team)
+        for name in team.planning():
+            chosen = self._next(team, name, prizes, places, decision)
+            if chosen is None and not again:
+                prizes, again = self._plan(team), True
+                chosen = self._next(team, name, prizes, places, decision)
+            if chosen is None:
+                self._target.pop(name, None)
+                chosen = stay(team.robots[name], 'stays: nothing is left for it')
+            decision.robots[name] = chosen
+            places.append((chosen.waypoint, team.robots[name].radius))
+        return explain(decision)
+
+    def finished(self, team: TeamView) -> str | None:
+        """See `Planner.finished`; also when no place is worth a visit."""
+        reason = super().finished(team)
+        if reason is not None:
+            return reason
+        lattice, least = self._squares(team), self.settings.gain_threshold
+        least /= team.area.expected_targets
+        # Of its own square a place sees about all: mostly that is enough to know.
+        here = 0.5 * lattice.trust * lattice.unseen(team.exploration).ravel()
+        if here.max() > least or lattice.choose(team.exploration)[1].max(initial=0.0) > least:
+            return None
+        explored = 100.0 * team.exploration.explored_fraction()
+        return self._settled(
+            team, f'no place is worth a visit ({explored:.1f} % of the environment is explored)'
+        )
+
+    def _squares(self, team: TeamView) -> Lattice:
+        """Return the lattice: of the robot that sees least to its sides."""
+        if self._lattice is None:
+            reach = float(np.linalg.norm(team.bounds[:, 1] - team.bounds[:, 0]))
+            seen = [passing(view, team.step_time, reach) for view in team.robots.values()]
+            lattices = [Lattice(team.exploration, *one) for one in seen]
+            self._lattice = min(lattices, key=lambda lattice: lattice.pitch)
+        return self._lattice
+
+    def _prizes(self, team: TeamView) -> FloatArray | None:
+        """Return what the places of the plan are worth now; None: it has to be made again."""
+        lattice, number = self._squares(team), len(self._chosen)
+        left = np.array([index for way in self._ways.values() for index in way], np.int64)
+        if set(team.names()) != set(self._ways):
+            return None
+        prizes = np.zeros(len(self._points))
+        # In the order of choice, as each sees what those before it leave.
+        rows = np.sort(left[left < number])
+        gains = lattice.gains(team.exploration, self._chosen[rows])
+        prizes[rows] = team.area.expected_targets * gains
+        for cluster in self.heavy(team):
+            gaps = np.linalg.norm(self._points[number:] - cluster.position, axis=1)
+            same = gaps < SAME * lattice.pitch
+            if not same.any():
+                return None
+            prizes[number:][same] = cluster.mass
+        moved = np.abs(prizes - self._planned)[left].sum()
+        return None if moved > CHANGE * self._planned[left].sum() else prizes
+
+    def _plan(self, team: TeamView) -> FloatArray:
+        """Plan the tours of all robots from where they are, or will be; return the prizes."""
+        lattice, names, heavy = self._squares(team), team.names(), self.heavy(team)
+        self._chosen, gains = lattice.choose(team.exploration, ENOUGH * len(names))
+        centres = np.array([item.position for item in heavy]).reshape(-1, team.dimension)
+        self._points = np.vstack([lattice.points[self._chosen], centres])
+        masses = [item.mass for item in heavy]
+        self._planned = np.concatenate([team.area.expected_targets * gains, masses])
+        prizes = self._planned.copy()
+        starts = []
+        for name in names:
+            view = team.robots[name]
+            path = None if view.planning else view.remaining_path
+            end = path[-1] if path is not None and len(path) else view.state.pose.position
+            starts.append(end[: team.dimension])
+            if name in self._target:
+                # It is on its way there.
+                gaps = np.linalg.norm(self._points - self._target[name], axis=1)
+                prizes[gaps < SAME * lattice.pitch] = 0.0
+        speeds = np.array([team.robots[name].motion.settings.speed for name in names])
+        budgets = np.full(len(names), np.inf)
+        ways = plan_ways(self._points, prizes, np.array(starts), budgets, speeds=speeds)
+        self._ways = {name: way.tolist() for name, way in zip(names, ways)}
+        return self._planned
+
+    def _next(
+        self,
+        team: TeamView,
+        name: str,
+        prizes: FloatArray,
+        places: list[tuple[FloatArray, float]],
+        decision: Decision,
+    ) -> RobotDecision | None:
+        """Return the next leg of a robot's tour, past what has lost its prize; None: none left."""
+        view, way, d = team.robots[name], self._ways[name], team.dimension
+        here = view.state.pose.position
+        while way:
+            index = way.pop(0)
+            if prizes[index] < STALE * self._planned[index]:
+                continue
+            passed = [index]
+            while way and self._straight(here[:d], passed[-1], way[0]):
+                passed.append(way.pop(0))
+            index = passed[-1]
+            place = np.array(here)
+            if d == 2 and len(view.candidates):
+                place[2] = view.candidates[0, 2]
+            place[:d] = self._points[index]
+            waypoint, whole = self._leg(team, view, place)
+            moved = view.motion.keep_out.moved_out(here, waypoint)
+            point = np.array([here if moved is None else moved])
+            prediction = view.motion.predict(view.state, point, team.step_time)
+            usable = prediction.reached[0] and prediction.lengths[0] > 0
+            usable = usable and free_of_robots(point, view.radius, places)[0]
+            if usable and (held := held_back(team, name, prediction, decision)):
+                way.insert(0, index)
+                return stay(view, held)
+            if not usable or not np.array_equal(point[0], waypoint):
+                squares = [self._chosen[i] for i in passed if i < len(self._chosen)]
+                self._squares(team).trust[squares] *= 0.5
+            elif not whole:
+                way.insert(0, index)
+            if usable:
+                self._target[name] = (place if whole else waypoint)[:d]
+                reason = f'next place of its tour, prize {prizes[index]:.3g}, {len(way)} to follow'
+                return single_choice(point, prediction, 0, reason)
+        return None
+
+    def _straight(self, here: FloatArray, index: int, following: int) -> bool:
+        """Return whether a place lies on the straight way to another one."""
+        there, end = self._points[index], self._points[following]
+        bent = np.linalg.norm(there - here) + np.linalg.norm(end - there)
+        return bool(bent <= 1.001 * np.linalg.norm(end - here))
+
+    def _leg(self, team: TeamView, view: RobotView, place: FloatArray) -> tuple[FloatArray, bool]:
+        """Return the waypoint of a leg towards a place, and whether it leads all the way.
+
+        The robot turns half the arrival radius behind what it would without: it cuts corners less.
+        """
+        here, turning = view.state.pose.position, view.arrival_radius
+        gap = max(float(np.linalg.norm(place - here)), 1e-9)
+        longest = max(self._squares(team).pitch, LEG * turning)
+        if turning > 0.0 and gap > 1.5 * longest:
+            return here + (place - here) * longest / gap, False
+        ahead = place + (place - here) * 0.5 * turning / gap
+        low, high = team.bounds.T
+        ahead[: team.dimension] = np.clip(ahead[: team.dimension], low, high)
+        return ahead, True

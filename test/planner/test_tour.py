@@ -1,0 +1,131 @@
+"""The planner `tour`: covers, goes on with its plan, answers clusters, and keeps robots apart."""
+
+import itertools
+
+import numpy as np
+import pytest
+from planner_helpers import random_team
+
+from maasi_filter.models.detection import BoxDetection, ExponentialDetection
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap
+from maasi_planner import (
+    MotionSettings,
+    Obstacles,
+    RobotState,
+    RobotView,
+    TeamView,
+    make_motion,
+    make_planner,
+)
+from maasi_planner.planners.base import check_decision
+from maasi_planner.planners.lattice import Lattice, passing
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.search import search
+
+BOX = BoxDetection([-1.0, -1.0], [1.0, 1.0], 0.98, 'world')
+
+
+def field(detection=BOX, starts=((1.0, 1.0, 0.0),), size=12.0, obstacles=None, arrival=0.0):
+    bounds = np.array([[0.0, size]] * 2)
+    robots = {
+        f'robot{number}': RobotView(
+            state=RobotState.at_rest(start),
+            candidates=np.zeros((0, 3)),
+            motion=make_motion(MotionSettings(speed=1.0), obstacles, 0.1),
+            sensor=Sensor.ranging('robot', detection, np.diag([0.1, 0.1]) ** 2),
+            period_steps=5,
+            radius=0.1,
+            arrival_radius=arrival,
+        )
+        for number, start in enumerate(starts)
+    }
+    return TeamView(0, 0.1, robots, [], UnexploredMap(bounds, size / 48.0))
+
+
+def fly(planner, team, name='robot0'):
+    """Send a robot to its next waypoint, with measurements on the way; return the waypoint."""
+    decision = planner.decide(team)
+    check_decision(planner, team, decision)
+    robot, view = decision.robots[name], team.robots[name]
+    if robot.stays:
+        return None
+    for place in robot.positions[::5]:
+        team.exploration.update(view.sensor.detection, Pose.from_yaw(place, 0.0))
+    view.state = RobotState.at_rest(robot.waypoint)
+    return robot.waypoint
+
+
+def test_a_box_gives_lanes_that_cover_the_area_once():
+    team, planner = field(), make_planner('tour')
+    way = [np.array([1.0, 1.0, 0.0])]
+    while team.exploration.explored_fraction() < 0.97:
+        way.append(fly(planner, team))
+    # 36 squares of 2 m: 70 m; straight runs are one leg.
+    assert np.linalg.norm(np.diff(way, axis=0), axis=1).sum() < 72.0
+    assert len(way) < 15
+    while planner.finished(team) is None:
+        fly(planner, team)
+    assert team.exploration.explored_fraction() > 0.998
+
+
+def test_a_wide_view_visits_few_places_and_then_those_between():
+    team, planner = field(ExponentialDetection(0.98, [0.4, 0.4])), make_planner('tour')
+    lattice = Lattice(team.exploration, *passing(team.robots['robot0'], 0.1, 17.0))
+    chosen, gains = lattice.choose(team.exploration)
+    assert 4 < len(chosen) < 0.5 * len(lattice.points)
+    assert gains.sum() <= 1.0 and (np.diff(gains) < 1e-9).all()
+    assert gains == pytest.approx(lattice.gains(team.exploration, chosen))
+    for _ in range(60):
+        fly(planner, team)
+    assert team.exploration.explored_fraction() > 0.97
+
+
+def test_others_keep_their_tours_until_a_cluster_appears():
+    team, planner = field(starts=((1.0, 1.0, 0.0), (11.0, 11.0, 0.0))), make_planner('tour')
+    planner.decide(team)
+    ways = {name: list(way) for name, way in planner._ways.items()}
+    other = team.robots['robot1']
+    other.planning, other.remaining_path = False, np.array([[11.0, 9.0, 0.0]])
+    fly(planner, team)
+    assert planner._ways['robot1'] == ways['robot1']
+    team.clusters = [Cluster(np.array([4.2, 6.3]), 0.01 * np.eye(2), 0.1, 0.9)]
+    seen = [fly(planner, team) for _ in range(30)]
+    assert min(np.linalg.norm(place[:2] - [4.2, 6.3]) for place in seen if place is not None) < 1e-6
+
+
+def test_a_tour_ends_where_an_obstacle_hides_a_part():
+    around = Obstacles(np.array([[6.0, 6.0, 0.0]]), np.array([3.0]), np.array([False]))
+    team, planner = field(obstacles=around), make_planner('tour')
+    legs = 0
+    while planner.finished(team) is None:
+        place = fly(planner, team)
+        legs += 1
+        assert legs < 200
+        assert place is None or np.linalg.norm(place[:2] - 6.0) > 3.1 - 1e-9
+    assert team.exploration.explored_fraction() < 0.95
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_robots_keep_apart_in_random_teams(dimension):
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        team = random_team(rng, dimension, planning=3, waiting=2, radius=0.02)
+        planner = make_planner('tour')
+        decision = planner.decide(team)
+        check_decision(planner, team, decision)
+        places = [(r.waypoint, team.robots[name].radius) for name, r in decision.robots.items()]
+        moving = [not robot.stays for robot in decision.robots.values()]
+        assert any(moving)
+        for (one, a), (two, b) in itertools.compress(
+            itertools.combinations(places, 2), map(any, itertools.combinations(moving, 2))
+        ):
+            assert np.linalg.norm(one - two) >= a + b
+
+
+def test_a_team_without_targets_covers_the_floor_and_is_done():
+    result = search(load_scenario('no_targets'), 1, planner='tour')
+    assert result.end_reason == 'planner_done'
+    assert result.steps * result.scenario.step < 150.0
