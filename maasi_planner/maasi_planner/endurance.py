@@ -76,6 +76,14 @@ class Endurance:
         seconds = metres / self.motion.settings.speed + 1.0 / self.motion.rate
         return self.settings.per_second * seconds + self.settings.per_metre * metres
 
+    def range_from(self, position: FloatArray) -> tuple[float, FloatArray]:
+        """Return the longest way [m] that leaves the reserve, and the charger to end at, (3,)."""
+        settings, speed = self.settings, self.motion.settings.speed
+        use = 1.1 * (settings.per_metre + settings.per_second / speed)
+        left = max(self.charge - settings.reserve, 0.0)
+        known = use > 0.0 and not math.isnan(self.charge)
+        return (left / use if known else math.inf), self.way_home(position)[1]
+
     def affords(self, ways: Trajectories, step: float) -> BoolArray:
         """Return which predicted ways leave enough to come home with the reserve, (W,)."""
         allowed = np.ones(len(ways.lengths), dtype=bool)

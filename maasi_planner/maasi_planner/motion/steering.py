@@ -12,11 +12,12 @@ from maasi_filter.arrays import FloatArray
 from maasi_planner.obstacles import (
     Surroundings,
     Vector,
+    dot,
+    from_centre,
     hold_back,
     minus,
     next_point,
     norm,
-    segment_distance,
 )
 
 # vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
@@ -59,11 +60,18 @@ def turned(x: float, y: float, yaw: float) -> tuple[float, float]:
 
 
 @njit(cache=True, forceinline=True)
-def _stoppable(position: Vector, steering: Steering, circles: FloatArray) -> float:
+def _stoppable(position: Vector, way: Vector, steering: Steering, circles: FloatArray) -> float:
     """Return the speed that can be stopped before the nearest circle, at most the largest."""
     room = np.inf
     for i in range(circles.shape[0]):
-        room = min(room, segment_distance(position, position, circles, i) - circles[i, 3])
+        offset = from_centre(position, circles, i)
+        gap = norm(offset)
+        if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
+            # Along a wall nothing has to be stopped.
+            towards = -dot(offset, way) / max(gap * norm(way), 1e-9)
+            room = min(room, (gap - circles[i, 3]) / towards if towards > 0.0 else np.inf)
+        else:
+            room = min(room, gap - circles[i, 3])
     speed = steering.speed
     return min(speed, math.sqrt(steering.acceleration * max(room, 0.0)) + 0.05 * speed)
 
@@ -106,7 +114,7 @@ def fly_among(
     way, speed = minus(target, position), steering.speed
     size = norm(way)
     if steering.acceleration < np.inf:
-        speed = _stoppable(position, steering, around.circles)
+        speed = _stoppable(position, way, steering, around.circles)
     scale = min(steering.rate * left, speed) / size if size > 0.0 else 0.0
     velocity = (scale * way[0], scale * way[1], scale * way[2])
     velocity = hold_back(position, around.circles, steering.barrier, velocity)

@@ -116,19 +116,24 @@ class Tour(Planner):
         masses = [item.mass for item in heavy]
         self._planned = np.concatenate([team.area.expected_targets * gains, masses])
         prizes = self._planned.copy()
-        starts = []
+        starts, ends, budgets = [], [], []
         for name in names:
             view = team.robots[name]
             path = None if view.planning else view.remaining_path
             end = path[-1] if path is not None and len(path) else view.state.pose.position
             starts.append(end[: team.dimension])
+            budget, home = (
+                (np.inf, end) if view.endurance is None else view.endurance.range_from(end)
+            )
+            budgets.append(budget)
+            ends.append(home[: team.dimension])
             if name in self._target:
                 # It is on its way there.
                 gaps = np.linalg.norm(self._points - self._target[name], axis=1)
                 prizes[gaps < SAME * lattice.pitch] = 0.0
         speeds = np.array([team.robots[name].motion.settings.speed for name in names])
-        budgets = np.full(len(names), np.inf)
-        ways = plan_ways(self._points, prizes, np.array(starts), budgets, speeds=speeds)
+        homes = np.array(ends) if np.isfinite(budgets).all() else None
+        ways = plan_ways(self._points, prizes, np.array(starts), np.array(budgets), homes, speeds)
         self._ways = {name: way.tolist() for name, way in zip(names, ways)}
         return self._planned
 
