@@ -220,8 +220,8 @@ def page(results: Sequence[Result], budgets: Sequence[float], seed: int) -> str:
     ]
     victims = min(one['victims'] for one in judged)
     head = (
-        f'{len(judged)} terrains ({numbers}), {victims} victims on each, seed {seed}. Share of '
-        'victims found [%], mean over the classes of terrain:\n'
+        f'{len(judged)} terrains ({numbers}),\n{victims} victims on each, seed {seed}. '
+        'Share of victims found [%], mean over the classes of terrain:\n'
     )
     return '\n'.join([head, markdown_table(rows), *parts])
 
