@@ -106,6 +106,7 @@ def test_command_writes_what_was_judged_and_why_the_rest_was_not(tmp_path, capsy
     assert main(written) == 1
     results = json.loads((out / 'judge.json').read_text())['terrains']
     assert [one['terrain'] for one in results] == ['1', '2', '10', '11', '12']
+    assert results[0] == judge_terrain(data / '1', [10.0, 100.0], 100, seed=900)
     reasons = {one['terrain']: one['refused'] for one in results if 'refused' in one}
     assert 'large-file pointer' in reasons['2'] and 'git lfs pull' in reasons['2']
     assert reasons['11'] == 'heatmap.npy: read shape (40, 30), its bounds need (40, 40)'

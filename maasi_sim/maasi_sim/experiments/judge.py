@@ -113,10 +113,10 @@ class Terrain:
 
     def __init__(self, folder: Path, victims: int, seed: int) -> None:
         _check_files(folder)
-        # SAREnv draws victims from the two global generators.
+        tools, self._seed = toolkit(), seed
+        # SAREnv draws victims from the two global generators, which imports use too.
         random.seed(seed)
         np.random.seed(seed)  # noqa: NPY002
-        tools, self._seed = toolkit(), seed
         evaluator = tools.ComparativeEvaluator(str(folder), [SIZE], DRONES, victims)
         item, points = (evaluator.environments[SIZE][key] for key in ('item', 'victims'))
         if len(points) == 0:
@@ -220,8 +220,8 @@ def page(results: Sequence[Result], budgets: Sequence[float], seed: int) -> str:
     ]
     victims = min(one['victims'] for one in judged)
     head = (
-        f'{len(judged)} terrains ({numbers}), {victims} victims on each, seed {seed}. Share of '
-        'victims found [%], mean over the classes of terrain:\n'
+        f'{len(judged)} terrains ({numbers}),\n{victims} victims on each, seed {seed}. '
+        'Share of victims found [%], mean over the classes of terrain:\n'
     )
     return '\n'.join([head, markdown_table(rows), *parts])
 

@@ -11,6 +11,8 @@ import shapely.ops
 from shapely import LineString
 
 __all__ = ['ComparativeEvaluator', 'LineString', 'PathGenerator', 'paths']
+# As imports of the real one do.
+random.random()
 # Metres of a degree on the equator, in UTM.
 DEGREE = 0.9996 * np.array([111319.49, 110574.3])
 
