@@ -1,4 +1,4 @@
-"""The planner `tour`: covers, goes on with its plan, answers clusters, and keeps robots apart."""
+"""The planner `tour`: covers, keeps its plan, answers clusters, and keeps robots apart."""
 
 import itertools
 

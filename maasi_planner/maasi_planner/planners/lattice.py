@@ -17,6 +17,8 @@ from maasi_planner.team import RobotView
 # that share of what the best place does.
 OVERLAP = 0.3
 LEAST = 0.01
+# Squares of half the best detection in an area from which on lanes of them are regular enough.
+MANY = 30
 
 
 def passing(view: RobotView, step_time: float, reach: float) -> tuple[FloatArray, FloatArray]:
@@ -42,7 +44,9 @@ def passing(view: RobotView, step_time: float, reach: float) -> tuple[FloatArray
 
 
 class Lattice:
-    """Squares (in 3D: cubes) as wide as is seen almost surely on passing.
+    """Squares (in 3D: cubes) as wide as is seen on passing: with half the best detection or more.
+
+    Where that gives few squares, as wide as with 0.9 of it, so that places can be chosen finely.
 
     points (n, d): their centres [m]; kernel: probability of detection on passing, by offset in
     squares from the place that is passed; trust (n,): in what a visit gains, for
@@ -50,7 +54,10 @@ class Lattice:
     """
 
     def __init__(self, exploration: UnexploredMap, beside: FloatArray, detected: FloatArray):
-        self.pitch = 2.0 * float(beside[detected >= 0.9 * detected.max()].max())
+        sure, half = (
+            2.0 * float(beside[detected >= share * detected.max()].max()) for share in (0.9, 0.5)
+        )
+        self.pitch = half if exploration.volume >= MANY * half**exploration.dimension else sure
         centres, self._parts, widths = [], [], []
         for (low, high), nodes, step in zip(
             exploration.bounds, exploration.axes(), exploration.step

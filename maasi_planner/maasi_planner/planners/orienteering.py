@@ -34,7 +34,8 @@ class _Places(NamedTuple):
 class _Routes(NamedTuple):
     """Places in order (r + 1, n + 3), numbers of nodes (r + 1,), and where each place is (m, 2).
 
-    ways, sums, moments (r + 1, n + 3): to each place, and prizes and prizes times way before.
+    ways, sums, moments (r + 1, n + 3): way to each place, and sums of prizes, and of prizes times
+    way, before it.
     """
 
     order: IntArray
