@@ -1,7 +1,5 @@
 """The filter that the settings name: new, from a file, or resumed; its kernels compiled."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, field
 from typing import Any
@@ -86,10 +84,7 @@ def load_state(path: str | os.PathLike[str]) -> tuple[SearchFilter, Progress | N
 
 
 def warm_up(method: str | None = None) -> None:
-    """Compile, or load from the cache, every kernel that a step uses; of one method, or of all.
-
-    A node calls this before it reports ready, so that no step waits for a compiler.
-    """
+    """Compile, or load from the cache, every kernel that a step uses; of one method, or of all."""
     for dimension in (2, 3):
         bounds = np.array([[0.0, 10.0]] * dimension)
         for detection in (

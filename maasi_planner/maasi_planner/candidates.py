@@ -1,7 +1,5 @@
 """Candidate waypoints, and what can never be seen from them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -235,11 +233,7 @@ def _mark_seen(
 
 
 def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
-    """Return places (n, 3) and headings (n,) on all ways between candidates.
-
-    They are thinned to about 1/100 of `size` and 16 headings, or to one heading where the view
-    does not depend on it.
-    """
+    """Return places (n, 3) and headings (n,), thinned, on all ways between candidates."""
     points = np.vstack([viewer.start[None, :], viewer.candidates])
     ways = viewer.candidates[None, :, :] - points[:, None, :]
     lengths = np.sqrt((ways * ways).sum(axis=2))

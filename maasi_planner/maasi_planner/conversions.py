@@ -1,7 +1,4 @@
-"""Between messages and the records of the planner, and checks of what its node receives.
-
-The checks raise `ValueError` naming the field, what was read, and what is allowed.
-"""
+"""Between messages and the records of the planner, and checks of what its node receives."""
 
 import array
 import math

@@ -1,7 +1,5 @@
 """The planner node: waypoints and measurements of each robot."""
 
-from __future__ import annotations
-
 import time
 from functools import partial
 from typing import Any

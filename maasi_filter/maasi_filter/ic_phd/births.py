@@ -1,7 +1,5 @@
 """Births of particles (000, section 3.2; 001, (A1); 003), and resampling of all of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

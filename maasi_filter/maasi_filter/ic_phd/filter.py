@@ -1,7 +1,5 @@
 """Particle PHD filter with an iterated corrector, as in the papers (000, sections 3.2, 3.3)."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence
@@ -51,10 +49,7 @@ LEAST_BIRTHS = 20
 
 
 class IcPhdFilter(SearchFilter):
-    """Particle PHD filter with an iterated corrector, K-means, and removal of found targets.
-
-    Settings that are None have the value of the preset. Everything is as of `SearchFilter`.
-    """
+    """Particle PHD filter with an iterated corrector, K-means, and removal of found targets."""
 
     method = 'ic_phd'
     particles: FloatArray = np.empty((0, 0))

@@ -1,7 +1,5 @@
 """Association by loopy belief propagation (Williams and Lau 2014)."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

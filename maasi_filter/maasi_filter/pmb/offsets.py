@@ -6,8 +6,6 @@ target is found; later b drifts with the robot's way. A detection of a found tar
 measures b - a, as in simultaneous localisation and mapping (Smith, Self and Cheeseman 1990).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

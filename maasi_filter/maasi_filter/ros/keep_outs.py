@@ -1,7 +1,5 @@
 """Keep-outs that change while a search runs: the topic `keep_outs` of the team."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

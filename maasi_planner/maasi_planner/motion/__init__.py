@@ -1,7 +1,5 @@
 """Motion models: each has its controller, its prediction and its body."""
 
-from __future__ import annotations
-
 from maasi_filter.area import Area
 from maasi_planner.motion.base import Body, MotionModel, RobotState, Trajectories
 from maasi_planner.motion.models import ConstantSpeed, Mambo, Quadrotor, Unicycle

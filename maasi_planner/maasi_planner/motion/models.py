@@ -59,10 +59,7 @@ class Kernel(NamedTuple):
 
 @njit(cache=True, forceinline=True)
 def _point_step(state: FloatArray, command: Command, steering: Steering, dt: float) -> None:
-    """Move a point for `dt`, in place; state: position, heading, velocity and turn rate.
-
-    The velocity changes by at most the acceleration, and the position by its mean.
-    """
+    """Move a point for `dt`, in place, with a limited change of its velocity."""
     x, y = turned(command[0], command[1], state[3])
     wanted = (x, y, command[2])
     if dot(wanted, wanted) > steering.speed * steering.speed:
@@ -227,10 +224,7 @@ class CompiledBody(Body):
 
 
 class CompiledMotion(MotionModel):
-    """Motion model of the suite: its controller and its body are compiled.
-
-    kind: which functions its steps use; steering: how it approaches its waypoint.
-    """
+    """Motion model of the suite: its controller and its body are compiled, by their `kind`."""
 
     kind: int
     steering: Steering
@@ -322,10 +316,7 @@ class CompiledMotion(MotionModel):
 
 
 class ConstantSpeed(CompiledMotion):
-    """A point with a largest speed and, if wanted, a largest acceleration.
-
-    Its input is the velocity command.
-    """
+    """A point with a largest speed and, if wanted, acceleration; its input is the command."""
 
     kind = POINT
 

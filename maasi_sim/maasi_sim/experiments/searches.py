@@ -70,10 +70,7 @@ def search_case(
     small: bool = False,
     runs: int | None = None,
 ) -> Case:
-    """Return a case that is a search; robots stop at each waypoint, as in the papers.
-
-    `most_measurements` is a cap on those of all robots; a small case has few, and few particles.
-    """
+    """Return a search with stops at waypoints, of few measurements, and few particles if small."""
     if small:
         most_measurements = min(most_measurements, _SMALL)
         values = merged(values, {'filter': {'particles': _SMALL_PARTICLES}})

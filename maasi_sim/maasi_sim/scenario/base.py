@@ -1,7 +1,5 @@
 """The common part of scenario files of all missions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """Checks between the settings of a scenario."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator
@@ -76,10 +74,7 @@ def _world_problems(scenario: Scenario) -> Problems:
 
 
 def _room_for_targets(scenario: Scenario) -> int:
-    """Return how many targets can be drawn one after the other at their separation, at most.
-
-    Balls that are placed at random, none moved again, fill 0.547 of a plane and 0.382 of space.
-    """
+    """Return how many targets fit: balls at random fill 0.547 of a plane and 0.382 of space."""
     targets = scenario.targets
     bounds = scenario.environment.array()
     sides = bounds[:, 1] - bounds[:, 0] - 2.0 * targets.margin

@@ -1,7 +1,5 @@
 """The schema of scenario files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal

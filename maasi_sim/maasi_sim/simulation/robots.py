@@ -1,7 +1,5 @@
 """Simulated robots: a body under velocity commands, with battery, odometry and sensors."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The simulation node: publishes the clock, and simulates every robot behind its topics."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

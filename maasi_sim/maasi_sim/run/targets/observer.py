@@ -1,7 +1,5 @@
 """Gathers the data of the report of a search for targets from its messages."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from typing import Any

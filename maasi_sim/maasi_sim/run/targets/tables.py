@@ -1,7 +1,5 @@
 """Found targets as rows of a table, for CSV, GeoJSON and data frames."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Sequence
