@@ -15,12 +15,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.records import AgentMeasurement
 from maasi_filter.search_filter import SearchFilter
-from maasi_filter.settings import (
-    DetectionSettings,
-    FilterSettings,
-    NoiseSettings,
-    SensorSettings,
-)
+from maasi_filter.settings import DetectionSettings, FilterSettings, NoiseSettings, SensorSettings
 from maasi_filter.state_file import StateFileError, read_state
 
 

@@ -6,14 +6,7 @@ import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import (
@@ -319,8 +312,7 @@ class FilterSettings(Settings):
         description='ic_phd: p_s, that a target still exists after one step [1]',
     )
     births: Literal['measurement', 'uniform', 'gaussian'] | None = Field(
-        default=None,
-        description='ic_phd: births at each measurement, anywhere (001), or as in 003',
+        default=None, description='ic_phd: births at each measurement, anywhere (001), or as in 003'
     )
     birth_particles: int | None = Field(
         default=None,

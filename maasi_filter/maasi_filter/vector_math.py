@@ -33,10 +33,7 @@ use_wide_vectors: Any = intrinsic(_generate_wide_vectors)
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})
 def arctan2(y: float, x: float) -> float:
-    """Return the angle of (x, y), to about one unit in the last place; 0 at the origin.
-
-    fdlibm's polynomial, with one division.
-    """
+    """Return the angle of (x, y) to about a last place (fdlibm's polynomial); 0 at the origin."""
     ax = abs(x)
     ay = abs(y)
     small = min(ax, ay)

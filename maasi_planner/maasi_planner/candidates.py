@@ -18,23 +18,7 @@ from maasi_planner.settings import CandidateSettings
 
 
 class CandidateSet:
-    """Candidate waypoints of one robot.
-
-    Parameters
-    ----------
-    settings : CandidateSettings
-        Grid, ring or list.
-    area : Area or (d, 2) array
-        Where robots may go, or the bounds of a box, metres.
-    height : float
-        z of the waypoints in 2D problems, metres (the flying height, or 0).
-
-    Raises
-    ------
-    ValueError
-        If a waypoint of a grid lies outside the bounds, or one of a list outside the area, or the
-        numbers of axes differ.
-    """
+    """Candidate waypoints of one robot in its area: a grid, a ring, or a list."""
 
     def __init__(
         self, settings: CandidateSettings, area: Area | ArrayLike, height: float = 0.0

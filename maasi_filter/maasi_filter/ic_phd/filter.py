@@ -32,13 +32,7 @@ from maasi_filter.measurement_check import (
     within_range,
 )
 from maasi_filter.models.sensor import LEAST_PER_SCAN
-from maasi_filter.records import (
-    UNLABELLED,
-    AgentMeasurement,
-    FilterResult,
-    FoundTarget,
-    Label,
-)
+from maasi_filter.records import UNLABELLED, AgentMeasurement, FilterResult, FoundTarget, Label
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
 
@@ -109,11 +103,7 @@ class IcPhdFilter(SearchFilter):
         before: Sequence[CheckedMeasurement],
         dropped: dict[str, int],
     ) -> None:
-        """Correct with the detections of one robot, 000 (13) and (16).
-
-        D^o(x) = (1 - pi(x) + sum over z of psi_z(x) / C(z)) D^{o-1}(x), where
-        C(z) = kappa(z) + <psi_z, D^{o-1}>, and births are part of D^{o-1}.
-        """
+        """Correct with the detections of one robot, 000 (13) and (16); births are in D^{o-1}."""
         births, intensity = self._births(member, before)
         space = member.sensor.measurement_space(self.bounds)
         clutter = max(member.sensor.clutter, LEAST_PER_SCAN / space)
@@ -177,12 +167,7 @@ class IcPhdFilter(SearchFilter):
         self.weights = np.full(number, expected / number)
 
     def _extract(self, members: Sequence[CheckedMeasurement], time: float) -> list[FoundTarget]:
-        """Find clusters by K-means, and mark the narrow ones as found (000, section 3.3).
-
-        k is the rounded expected number. A cluster with a radius of at most T_r and a mass of at
-        least T_m is a found target, and its particles are removed, as are those of a narrow cluster
-        that matches an earlier found target.
-        """
+        """Find clusters by K-means; narrow and heavy ones are found and removed (000, 3.3)."""
         numbers = self._numbers
         if not members or not self.expected_number > 0.0:
             self.clusters = self.clusters if len(self.weights) else []
@@ -261,11 +246,7 @@ class IcPhdFilter(SearchFilter):
 def nearest_detection(
     position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
 ) -> tuple[CheckedMeasurement, Label]:
-    """Return the robot with the detection nearest to a position, and the nearest label.
-
-    The robot is the last one if there is no detection; the label is within T_z = `limit` metres, as
-    the PHD filter does not associate detections with targets.
-    """
+    """Return the robot with the nearest detection, else the last, and the label within T_z."""
     apart, labelled = [(math.inf, members[-1])], [(limit, UNLABELLED)]
     for member in members:
         centres = member.sensor.measurement.inverse(member.values, member.pose)

@@ -130,10 +130,7 @@ class Learnt:
         caused: FloatArray,
         blurred: bool,
     ) -> None:
-        """Count the innovations of the detections that found targets `caused` (n, m).
-
-        If an error of the position explains the scan (`blurred`), it does not tell the noise.
-        """
+        """Count innovations of detections `caused` (n, m), unless a position error blurs them."""
         rows = np.flatnonzero((caused > 0.5).any(axis=1)).tolist()
         rows = [i for i in rows if components[i].target and not components[i].foreign]
         if rows:

@@ -19,9 +19,7 @@ __all__ = [
 
 
 def make_motion(
-    settings: MotionSettings,
-    area: Area | None = None,
-    radius: float = 0.0,
+    settings: MotionSettings, area: Area | None = None, radius: float = 0.0
 ) -> MotionModel:
     """Return the motion model that `settings.model` names.
 

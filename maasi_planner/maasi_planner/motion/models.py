@@ -131,11 +131,7 @@ def _close_loop(
     positions: FloatArray,
     yaws: FloatArray,
 ) -> tuple[int, float]:
-    """Run controller and body against each other, `state` in place.
-
-    Return the steps to the waypoint, one too many where it is not reached, and the sum of squared
-    inputs.
-    """
+    """Run controller and body on `state`; return steps, one too many if not there, and u'u."""
     kind, steering, obstructed, _, _, parameters, table, tolerance, periods, h = kernel
     cost = 0.0
     for k in range(yaws.shape[0]):

@@ -100,10 +100,7 @@ def information_terms(
     first: int,
     centres: FloatArray,
 ) -> Terms:
-    """Return the terms of candidates: robots that plan, and their measurements from `first` on.
-
-    `settled`: robots whose measurements do not depend on the choice, and these.
-    """
+    """Return the terms of candidates by measurements from `first` on, beside `settled` ones."""
     d, clusters = team.dimension, team.clusters
     places, left = _unseen(team, settings, bool((planned[1].kind >= BOX).any()))
     for miss in _misses(settled[1], 0, places):

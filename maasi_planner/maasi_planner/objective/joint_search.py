@@ -13,10 +13,7 @@ from maasi_planner.settings import PlannerSettings
 
 
 class CandidateTable(NamedTuple):
-    """G candidates of R planning robots, with the terms of the objective in use.
-
-    With `shared` what two see counts for the one with the shorter way only.
-    """
+    """G candidates of R planning robots; if `shared`, what two see counts for the shorter way."""
 
     allowed: BoolArray
     waypoints: FloatArray

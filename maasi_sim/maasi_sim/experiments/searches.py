@@ -125,10 +125,7 @@ def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: 
 
 
 def lane_share(places: FloatArray, side: float) -> float:
-    """Return which share of a way through places (n, 3) is lanes as of a lawnmower, from 0 to 1.
-
-    A lane is straight along an axis, without turning back, for at least half of `side` [m].
-    """
+    """Return the share of a way (n, 3) that is straight along an axis over half of `side` [m]."""
     steps = np.diff(places, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     steps, lengths = steps[lengths > 0.0], lengths[lengths > 0.0]

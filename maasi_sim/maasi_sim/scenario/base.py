@@ -30,9 +30,7 @@ class LimitSettings(Settings):
         description='Wall time until all nodes are ready; they may have to compile [s]',
     )
     silence: float = Field(
-        default=30.0,
-        gt=0.0,
-        description='Wall time without a step until a node counts as hung [s]',
+        default=30.0, gt=0.0, description='Wall time without a step until a node counts as hung [s]'
     )
     heartbeat: float = Field(
         default=4.5,

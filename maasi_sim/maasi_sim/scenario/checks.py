@@ -25,10 +25,7 @@ _STEP_TOLERANCE = 1e-6
 # Drivers of robots that have no camera.
 _RANGING = ('ranging_driver', 'mavlink_driver')
 # Drivers by the link that they have.
-_DRIVERS = {
-    'mambo_wifi': ('mambo_driver',),
-    'mavlink': ('mavlink_driver', 'mavlink_camera_driver'),
-}
+_DRIVERS = {'mambo_wifi': ('mambo_driver',), 'mavlink': ('mavlink_driver', 'mavlink_camera_driver')}
 # URL of the driver of a simulated vehicle.
 _MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')
 

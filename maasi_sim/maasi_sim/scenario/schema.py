@@ -199,10 +199,7 @@ class Scenario(BaseScenario):
     scoring: ScoringSettings = Field(default_factory=ScoringSettings, description='Scores')
 
     def namespaces(self) -> dict[str, list[str]]:
-        """Return the robots that share filter and planner, by the namespace of those nodes.
-
-        The empty one stands for the root: all robots together.
-        """
+        """Return the robots that share filter and planner by namespace; all together have ''."""
         if self.planner.coordination == 'independent':
             return {name: [name] for name in self.names()}
         return {'': self.names()}

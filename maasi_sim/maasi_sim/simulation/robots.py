@@ -60,12 +60,7 @@ class SimulatedRobot:
     """
 
     def __init__(
-        self,
-        name: str,
-        settings: RobotSettings,
-        world: World,
-        floor: RenderSettings,
-        seed: int,
+        self, name: str, settings: RobotSettings, world: World, floor: RenderSettings, seed: int
     ) -> None:
         self.name = name
         self.settings = settings

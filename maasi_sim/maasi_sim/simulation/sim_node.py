@@ -426,8 +426,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self.simulation.robots[name].command(velocity)
         else:
             self.drop(
-                'bad command',
-                f'{name}/cmd_vel.twist: read {velocity}, allowed are finite numbers',
+                'bad command', f'{name}/cmd_vel.twist: read {velocity}, allowed are finite numbers'
             )
         if self.settings.lockstep:
             self._waiting.discard(f'{name}/cmd_vel')
