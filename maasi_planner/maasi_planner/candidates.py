@@ -80,10 +80,7 @@ class CandidateSet:
         return complete
 
     def at(self, position: ArrayLike) -> FloatArray:
-        """Return the candidates of a robot at `position` (3,), as a (W, 3) array.
-
-        Grids and rings lose what would lie outside the area.
-        """
+        """Return the candidates at a position (3,), (W, 3); of grids and rings, those inside."""
         if self._fixed is not None:
             return self._fixed.copy()
         points = np.asarray(position, dtype=float)[None, :] + self._ring

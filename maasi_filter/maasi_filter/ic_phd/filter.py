@@ -259,11 +259,7 @@ def nearest_detection(
 def kept_measurements(
     centres: FloatArray, targets: Sequence[FoundTarget], limit: float, every: bool
 ) -> BoolArray:
-    """Return which of m detections remain after removing those of found targets.
-
-    That is all within T_z = `limit` of one (`every`: 003, algorithm 1), or only the closest one to
-    each (000, section 3.3; 001, algorithm 1).
-    """
+    """Return which of m detections stay: without all, or the closest, within T_z of found ones."""
     keep = np.ones(len(centres), np.bool_)
     for target in targets:
         apart = np.sqrt(((centres - target.position) ** 2).sum(axis=1))

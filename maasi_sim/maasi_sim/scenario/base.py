@@ -95,10 +95,7 @@ class BaseScenario(Settings):
         return sorted(self.robots)
 
     def check_pace(self, lockstep: bool, rate: float | None) -> None:
-        """Raise a ScenarioError if it cannot be run in lockstep, or at a rate.
-
-        The rate is simulated over wall time; links other than topics run in real time.
-        """
+        """Raise a ScenarioError if it cannot run in lockstep, or at a rate of simulated time."""
 
     def content(self) -> dict[str, Any]:
         """Return all settings as plain values, that are read back the same."""
