@@ -15,6 +15,8 @@ from maasi_filter.settings import (
     FilterSettings,
     Finite,
     NoiseSettings,
+    NotNegative,
+    Positive,
     SensorSettings,
     Settings,
     Vector3,
@@ -81,14 +83,14 @@ class SimulatedSettings(Settings):
 class BatterySettings(Settings):
     """A robot's battery."""
 
-    capacity: float = Field(default=7200.0, gt=0.0, description='Energy of a full battery [J]')
+    capacity: Positive = Field(default=7200.0, description='Energy of a full battery [J]')
     charge: float = Field(default=1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
-    idle_power: float = Field(default=2.0, ge=0.0, description='Drain at rest or hovering [W]')
-    charging_power: float = Field(
-        default=0.0, ge=0.0, description='Power at a charger, where it stands; 0: never charged [W]'
+    idle_power: NotNegative = Field(default=2.0, description='Drain at rest or hovering [W]')
+    charging_power: NotNegative = Field(
+        default=0.0, description='Power at a charger, where it stands; 0: never charged [W]'
     )
-    motion_power: float = Field(
-        default=4.0, ge=0.0, description='Drain for each metre per second on top of it [W/(m/s)]'
+    motion_power: NotNegative = Field(
+        default=4.0, description='Drain for each metre per second on top of it [W/(m/s)]'
     )
 
 
@@ -127,7 +129,7 @@ class RobotSettings(Settings):
     )
     start: Vector3 = Field(description='Position at the start, x y z [m, map]')
     yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
-    radius: float = Field(default=0.1, gt=0.0, description='Of a circle around the robot [m]')
+    radius: Positive = Field(default=0.1, description='Of a circle around the robot [m]')
     candidates: CandidateSettings = Field(
         description='Waypoints to choose from; left out: a grid from which it sees everything'
     )

@@ -18,6 +18,7 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, SENSOR, sensor_reader
 from maasi_filter.ros.run_node import run
+from maasi_filter.settings import NotNegative, Positive
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, ScenarioError
@@ -53,9 +54,8 @@ class SimNodeSettings(NodeSettings):
     scenario: str = Field(
         min_length=1, description='Scenario file, or the name of one in config/scenarios'
     )
-    rate: float = Field(
+    rate: NotNegative = Field(
         default=1.0,
-        ge=0.0,
         description='Simulated over wall time, at most; 0: as fast as possible, in lockstep only',
     )
     follow_clock: bool = Field(
@@ -64,9 +64,8 @@ class SimNodeSettings(NodeSettings):
         'and `rate` does not count',
     )
     recorder: bool = Field(default=False, description='Whether it waits for the recorder, too')
-    command_age: float = Field(
+    command_age: Positive = Field(
         default=1.0,
-        gt=0.0,
         description='Simulated time after which a command is too old; in lockstep each is for its '
         'step [s]',
     )
