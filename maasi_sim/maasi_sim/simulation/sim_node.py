@@ -381,7 +381,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         for name in present:
             self._robots[name].publish_odometry(stamp)
         # In lockstep the step is the time of the nodes: a clock for each would cost a tenth more.
-        if self._clock_publisher is not None and self._is_time_due():
+        every = max(round(_CLOCK_PERIOD / self._length), 1) if self.settings.lockstep else 1
+        if self._clock_publisher is not None and self.step % every == 0:
             self._clock_publisher.publish(Clock(clock=stamp))
         again = [name for name in present if name in robots]
         imaging = [name for name in again if self.simulation.images_due(name)]
@@ -391,10 +392,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         # Last: robots and planners work while images are made.
         for name in again:
             self._robots[name].publish_sensors(stamp)
-
-    def _is_time_due(self) -> bool:
-        every = max(round(_CLOCK_PERIOD / self._length), 1) if self.settings.lockstep else 1
-        return self.step % every == 0
 
     def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
         """Pass every message: commands are compared with the step, and zeros always stop."""

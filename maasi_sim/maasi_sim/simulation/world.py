@@ -58,7 +58,6 @@ class TargetSettings(Settings):
         description='Deviation of a random walk on each axis after one second; ranging sensors '
         'only [m/sqrt(s)]',
     )
-
     identified: bool = Field(
         default=False,
         description='Whether sensors read the identity of each target, as from a transponder; '
