@@ -1,7 +1,4 @@
-"""Console scripts: imports end without a traceback on SIGINT.
-
-A package of its own, because importing a module of the others loads NumPy and rclpy first.
-"""
+"""Console scripts, imported before NumPy and rclpy so that SIGINT leaves no traceback."""
 
 import signal
 import sys

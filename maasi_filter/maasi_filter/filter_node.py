@@ -1,7 +1,5 @@
 """The filter node: from detections to clusters and found targets."""
 
-from __future__ import annotations
-
 import math
 import time
 from functools import partial
@@ -121,10 +119,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._batches = BatchAssembly(self, self._sensors, progress)
 
     def _restore(self, file: Path) -> None:
-        """Resume the saved search, or after the last batch of a process that died.
-
-        A file that is damaged, or of another environment, is refused if it is not of the run.
-        """
+        """Resume the saved search, or after the last batch of a process that died."""
         settings = self.settings
         try:
             saved, progress = load_state(file)

@@ -1,7 +1,5 @@
 """Where the map lies on the earth (WGS 84)."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydantic import Field
 

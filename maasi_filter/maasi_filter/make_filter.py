@@ -1,7 +1,5 @@
 """The filter that the settings name: new, from a file, or resumed; its kernels compiled."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,12 +15,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.records import AgentMeasurement
 from maasi_filter.search_filter import SearchFilter
-from maasi_filter.settings import (
-    DetectionSettings,
-    FilterSettings,
-    NoiseSettings,
-    SensorSettings,
-)
+from maasi_filter.settings import DetectionSettings, FilterSettings, NoiseSettings, SensorSettings
 from maasi_filter.state_file import StateFileError, read_state
 
 
@@ -86,10 +79,7 @@ def load_state(path: str | os.PathLike[str]) -> tuple[SearchFilter, Progress | N
 
 
 def warm_up(method: str | None = None) -> None:
-    """Compile, or load from the cache, every kernel that a step uses; of one method, or of all.
-
-    A node calls this before it reports ready, so that no step waits for a compiler.
-    """
+    """Compile, or load from the cache, every kernel that a step uses; of one method, or of all."""
     for dimension in (2, 3):
         bounds = np.array([[0.0, 10.0]] * dimension)
         for detection in (

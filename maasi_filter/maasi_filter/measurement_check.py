@@ -180,10 +180,7 @@ def within_range(member: CheckedMeasurement, dropped: dict[str, int]) -> Checked
 
 
 def without_repeats(member: CheckedMeasurement, dropped: dict[str, int]) -> CheckedMeasurement:
-    """Return a measurement with one detection where several are one by the sensor's resolution.
-
-    Detections with different identities are of different targets.
-    """
+    """Merge detections that are one by the sensor's resolution; different identities stay apart."""
     values, gate = member.values, member.sensor.resolution
     # Detections are sorted by range, which is within the gate first of all.
     reach = values[:, 0] - gate * np.sqrt(member.covariances[:, 0, 0])

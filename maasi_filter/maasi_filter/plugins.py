@@ -74,12 +74,8 @@ class PluginGroup:
     def load(self, name: str) -> type:
         """Return a class by one of `names`, or `module:Class`.
 
-        Modules beside the scenario file and in the current folder are found too.
-
-        Raises
-        ------
-        PluginError
-            If it is not known, cannot be imported, or is no subclass of `base`.
+        Modules beside the scenario file and in the current folder are found too. PluginError: it is
+        not known, cannot be imported, or is no subclass of `base`.
         """
         if name in self.own:
             return _attribute(self.own[name])

@@ -1,7 +1,5 @@
 """Input and output of a search filter: measurements, clusters, found targets, results."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

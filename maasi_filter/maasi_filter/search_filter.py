@@ -1,7 +1,5 @@
 """A search filter, for nodes, planners and searches in one process; what all filters share."""
 
-from __future__ import annotations
-
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

@@ -6,14 +6,7 @@ import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import (
@@ -93,10 +86,8 @@ class DetectionSettings(Settings):
         default='robot',
         description='Whether a box turns with the robot or stays aligned with the map',
     )
-    edge: float = Field(
-        default=0.0,
-        ge=0.0,
-        description='Half width of a ramp across the faces of a box; 0 is hard [m]',
+    edge: NotNegative = Field(
+        default=0.0, description='Half width of a ramp across the faces of a box; 0 is hard [m]'
     )
 
     @model_validator(mode='after')
@@ -119,18 +110,12 @@ class DetectionSettings(Settings):
 class NoiseSettings(Settings):
     """Noise of a measurement; the meaning of each number is explicit."""
 
-    range: float = Field(
-        default=1.5, gt=0.0, description='Noise of the range [m, or m^2 as variance]'
+    range: Positive = Field(default=1.5, description='Noise of the range [m, or m^2 as variance]')
+    bearing: Positive = Field(
+        default=0.175, description='Noise of the bearing [unit of `angles`, squared as variance]'
     )
-    bearing: float = Field(
-        default=0.175,
-        gt=0.0,
-        description='Noise of the bearing [unit of `angles`, squared as variance]',
-    )
-    elevation: float = Field(
-        default=0.295,
-        ge=0.0,
-        description='Noise of the elevation, 3D only [unit of `angles`, or squared]',
+    elevation: NotNegative = Field(
+        default=0.295, description='Noise of the elevation, 3D only [unit of `angles`, or squared]'
     )
     as_: Literal['deviation', 'variance'] = Field(
         default='deviation',
@@ -166,15 +151,13 @@ class SensorSettings(Settings):
     noise: NoiseSettings = Field(
         default_factory=NoiseSettings, description='Noise of a measurement'
     )
-    clutter: float = Field(
+    clutter: NotNegative = Field(
         default=0.0,
-        ge=0.0,
         description='Intensity of false detections [1/(m rad) in 2D, 1/(m rad^2) in 3D]',
     )
-    period: float = Field(default=0.0, ge=0.0, description='Time between possible measurements [s]')
-    resolution: float = Field(
+    period: NotNegative = Field(default=0.0, description='Time between possible measurements [s]')
+    resolution: NotNegative = Field(
         default=1.0,
-        ge=0.0,
         description='pmb: detections of one scan that are closer are of one target; 0: none are '
         '[deviations of the noise]',
     )
@@ -192,12 +175,11 @@ class SensorSettings(Settings):
 class OffsetSettings(Settings):
     """Errors of the robots' positions that last; both 0: their errors are independent."""
 
-    deviation: float = Field(
-        default=0.0, ge=0.0, description='Deviation of a constant offset on each axis [m]'
+    deviation: NotNegative = Field(
+        default=0.0, description='Deviation of a constant offset on each axis [m]'
     )
-    drift: float = Field(
+    drift: NotNegative = Field(
         default=0.0,
-        ge=0.0,
         description='Deviation of the drift of x and y after one metre; grows with its root [m]',
     )
 
@@ -220,9 +202,8 @@ class PmbSettings(Settings):
         le=0.5,
         description='Existence probability below which a found target is withdrawn [1]',
     )
-    walk: float = Field(
+    walk: NotNegative = Field(
         default=0.0,
-        ge=0.0,
         description='Standard deviation of a random walk of the targets on each axis after one '
         'second; 0: they stand still [m/sqrt(s)]',
     )
@@ -319,8 +300,7 @@ class FilterSettings(Settings):
         description='ic_phd: p_s, that a target still exists after one step [1]',
     )
     births: Literal['measurement', 'uniform', 'gaussian'] | None = Field(
-        default=None,
-        description='ic_phd: births at each measurement, anywhere (001), or as in 003',
+        default=None, description='ic_phd: births at each measurement, anywhere (001), or as in 003'
     )
     birth_particles: int | None = Field(
         default=None,

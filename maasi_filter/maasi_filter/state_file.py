@@ -68,10 +68,7 @@ def pack(tree: Any) -> dict[str, NDArray[Any]]:
 
 
 def write_state(path: str | os.PathLike[str], tree: Any, *, durable: bool = True) -> None:
-    """Write a tree to a file, which is replaced atomically.
-
-    `durable` forces it to the disk (fsync) first, so that it also survives a power failure.
-    """
+    """Write a tree to a file atomically; `durable` forces it to the disk first (fsync)."""
     target = Path(path)
     buffer = io.BytesIO()
     np.savez(buffer, **pack(tree))  # type: ignore[arg-type]

@@ -1,8 +1,4 @@
-"""The exploration function e(x): how much of each place is still unseen.
-
-e is kept at the nodes of a grid that spans the bounds of the area, starts at 1 and is multiplied by
-1 - pi at each measurement (000, eq. (20), (30)).
-"""
+"""The exploration function e(x) on a grid: what is still unseen (000, eq. (20), (30))."""
 
 from __future__ import annotations
 

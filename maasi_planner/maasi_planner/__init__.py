@@ -1,7 +1,5 @@
 """Planning of waypoints and measurements: motion models, objective and planners."""
 
-from __future__ import annotations
-
 from maasi_planner.candidates import CandidateSet, Unseen, Viewer, unseen_parts
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, Trajectories, make_motion

@@ -1,7 +1,5 @@
 """Candidate waypoints, and what can never be seen from them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -20,23 +18,7 @@ from maasi_planner.settings import CandidateSettings
 
 
 class CandidateSet:
-    """Candidate waypoints of one robot.
-
-    Parameters
-    ----------
-    settings : CandidateSettings
-        Grid, ring or list.
-    area : Area or (d, 2) array
-        Where robots may go, or the bounds of a box, metres.
-    height : float
-        z of the waypoints in 2D problems, metres (the flying height, or 0).
-
-    Raises
-    ------
-    ValueError
-        If a waypoint of a grid lies outside the bounds, or one of a list outside the area, or the
-        numbers of axes differ.
-    """
+    """Candidate waypoints of one robot in its area: a grid, a ring, or a list."""
 
     def __init__(
         self, settings: CandidateSettings, area: Area | ArrayLike, height: float = 0.0
@@ -98,10 +80,7 @@ class CandidateSet:
         return complete
 
     def at(self, position: ArrayLike) -> FloatArray:
-        """Return the candidates of a robot at `position` (3,), as a (W, 3) array.
-
-        Grids and rings lose what would lie outside the area.
-        """
+        """Return the candidates at a position (3,), (W, 3); of grids and rings, those inside."""
         if self._fixed is not None:
             return self._fixed.copy()
         points = np.asarray(position, dtype=float)[None, :] + self._ring
@@ -235,11 +214,7 @@ def _mark_seen(
 
 
 def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
-    """Return places (n, 3) and headings (n,) on all ways between candidates.
-
-    They are thinned to about 1/100 of `size` and 16 headings, or to one heading where the view
-    does not depend on it.
-    """
+    """Return places (n, 3) and headings (n,), thinned, on all ways between candidates."""
     points = np.vstack([viewer.start[None, :], viewer.candidates])
     ways = viewer.candidates[None, :, :] - points[:, None, :]
     lengths = np.sqrt((ways * ways).sum(axis=2))

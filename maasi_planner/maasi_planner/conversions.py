@@ -1,7 +1,4 @@
-"""Between messages and the records of the planner, and checks of what its node receives.
-
-The checks raise `ValueError` naming the field, what was read, and what is allowed.
-"""
+"""Between messages and the records of the planner, and checks of what its node receives."""
 
 import array
 import math
@@ -196,9 +193,7 @@ def checked_update(
 ) -> tuple[list[Cluster], dict[str, Pose]]:
     """Return the clusters of an update and the poses of its members, by name.
 
-    Members may be robots of `names`; `batch` is the id of the last batch.
-
-    Ids and indices so large that the planner could not continue from them are refused.
+    Members may be robots of `names`; ids beyond what may follow `batch`, the last, are refused.
     """
     _check_frame(message.header, settings.frame)
     dimension = settings.environment.dimension

@@ -9,7 +9,7 @@ from typing_extensions import Self
 
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.ros.node_settings import NodeSettings
-from maasi_filter.settings import SensorSettings, Settings, Vector3
+from maasi_filter.settings import NotNegative, Positive, SensorSettings, Settings, Vector3
 from maasi_planner.endurance import EnduranceSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 
@@ -22,7 +22,7 @@ class PlannedRobotSettings(Settings):
     sensor: SensorSettings = Field(
         default_factory=SensorSettings, description='Its sensor, as the planner believes'
     )
-    radius: float = Field(default=0.1, ge=0.0, description='Of a circle around the robot [m]')
+    radius: NotNegative = Field(default=0.1, description='Of a circle around the robot [m]')
     start: Vector3 = Field(
         default=[0.0, 0.0, 0.0],
         description='Position at the start; its height is that of the waypoints in 2D [m, map]',
@@ -35,7 +35,7 @@ class PlannedRobotSettings(Settings):
 class OtherRobotSettings(Settings):
     """Settings of a robot with its own planner."""
 
-    radius: float = Field(default=0.1, ge=0.0, description='Of a circle around the robot [m]')
+    radius: NotNegative = Field(default=0.1, description='Of a circle around the robot [m]')
     start: Vector3 = Field(description='Position at the start [m, map]')
 
 
@@ -71,20 +71,18 @@ class PlannerNodeSettings(NodeSettings):
         description='Whether the search starts as soon as the planner is active; otherwise with '
         'the service search/start or a goal of the action search',
     )
-    state_timeout: float = Field(
+    state_timeout: Positive = Field(
         default=1.0,
-        gt=0.0,
         description='Time without a state after which a robot is planned without; not in '
         'lockstep [s]',
     )
-    filter_timeout: float = Field(
+    filter_timeout: NotNegative = Field(
         default=4.0,
-        ge=0.0,
         description='Wall time without a heartbeat of the filter, or without the update of a '
         'batch, after which all robots are held; 0: never; not in lockstep [s]',
     )
-    views_rate: float = Field(
-        default=1.0, ge=0.0, description='Most publications of exploration and markers [1/s]'
+    views_rate: NotNegative = Field(
+        default=1.0, description='Most publications of exploration and markers [1/s]'
     )
 
     def resolved(self) -> Self:

@@ -1,7 +1,5 @@
 """The planner node: waypoints and measurements of each robot."""
 
-from __future__ import annotations
-
 import time
 from functools import partial
 from typing import Any
@@ -273,10 +271,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     # ---- input -------------------------------------------------------------------------------
 
     def _on_step(self, message: LockstepStep) -> None:
-        """Plan when all states of this step have arrived.
-
-        A step is republished for a restarted node: resend the messages that it may have missed.
-        """
+        """Plan when all states of a step are here; a repeated step is for a restarted node."""
         if not self.active:
             return
         if message.step < self.step:

@@ -107,8 +107,8 @@ class MotionSettings(Settings):
     acceleration: float | None = Field(
         default=None, gt=0.0, le=100.0, description='Largest acceleration; none: no limit [m/s^2]'
     )
-    tolerance: float = Field(
-        default=0.05, gt=0.0, description='Distance at which a waypoint counts as reached [m]'
+    tolerance: Positive = Field(
+        default=0.05, description='Distance at which a waypoint counts as reached [m]'
     )
     arrival_radius: float | None = Field(
         default=None,
@@ -151,21 +151,19 @@ class MotionSettings(Settings):
     control_inputs: Literal['all', 'torques'] = Field(
         default='all', description='Inputs of a flying robot that the control cost C counts'
     )
-    clearance: float = Field(
-        default=0.05, gt=0.0, description='Kept from obstacles beyond the radius of the robot [m]'
+    clearance: Positive = Field(
+        default=0.05, description='Kept from obstacles beyond the radius of the robot [m]'
     )
     obstacle_term: Literal['none', 'printed', 'away'] = Field(
         default='none',
         description='001, eq. (14), (15), in place of ways around obstacles: none, as printed, or '
         'pushing away from the obstacle',
     )
-    obstacle_distance: float = Field(
-        default=0.12,
-        gt=0.0,
-        description='d_l, distance to an obstacle below which the term acts [m]',
+    obstacle_distance: Positive = Field(
+        default=0.12, description='d_l, distance to an obstacle below which the term acts [m]'
     )
-    obstacle_gain: float = Field(
-        default=0.002, ge=0.0, description='k_obs, gain of the term [unit of the input]'
+    obstacle_gain: NotNegative = Field(
+        default=0.002, description='k_obs, gain of the term [unit of the input]'
     )
     avoidance: Literal['steer', 'dynamic_window'] = Field(
         default='steer', description='How a ground robot gets around obstacles'
@@ -209,8 +207,8 @@ class PlannerSettings(Settings):
         description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
         'expected new targets of all measurements of the team together',
     )
-    alpha: float = Field(
-        default=0.5, ge=0.0, description='Weight of target refinement T (001: of exploration) [1]'
+    alpha: NotNegative = Field(
+        default=0.5, description='Weight of target refinement T (001: of exploration) [1]'
     )
     beta: float | None = Field(
         default=None,
@@ -275,19 +273,16 @@ class PlannerSettings(Settings):
         description='Compare (24) with the threshold, or with the threshold times its mean along '
         'the trajectory',
     )
-    gamma: float = Field(default=1.0, ge=0.0, description='Weight of e in the trigger [1]')
-    threshold: float = Field(
-        default=4.0, ge=0.0, description='T_delta, threshold of the trigger [1]'
-    )
+    gamma: NotNegative = Field(default=1.0, description='Weight of e in the trigger [1]')
+    threshold: NotNegative = Field(default=4.0, description='T_delta, threshold of the trigger [1]')
     explored_threshold: float = Field(
         default=0.999, gt=0.0, le=1.0, description='Explored share at which the search may end [1]'
     )
-    mass_threshold: float = Field(
-        default=0.1, gt=0.0, description='Mass of a cluster that is still worth a visit [1]'
+    mass_threshold: Positive = Field(
+        default=0.1, description='Mass of a cluster that is still worth a visit [1]'
     )
-    gain_threshold: float = Field(
+    gain_threshold: NotNegative = Field(
         default=1e-3,
-        ge=0.0,
         description='Gain of all candidates below which nothing is left, information only [1]',
     )
     horizon: int = Field(default=1, ge=1, le=3, description='maas: waypoints planned ahead [1]')

@@ -1,7 +1,5 @@
 """Input and output of a planner: view of the team, and decision."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

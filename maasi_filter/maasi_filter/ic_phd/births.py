@@ -1,7 +1,5 @@
 """Births of particles (000, section 3.2; 001, (A1); 003), and resampling of all of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -143,11 +141,7 @@ def jittered(
     bounds: FloatArray,
     generator: np.random.Generator,
 ) -> FloatArray:
-    """Return resampled particles (number, d); those drawn more than once are moved apart.
-
-    A deviation from the papers: targets stand still, so that without it ever fewer different
-    particles are left.
-    """
+    """Return resampled particles (number, d), repeated ones moved apart: not in the papers."""
     copies = np.count_nonzero(index[1:] == index[:-1])
     noise = deviation * generator.standard_normal((copies, particles.shape[1]))
     return np.asarray(_moved(particles, index, noise, bounds))

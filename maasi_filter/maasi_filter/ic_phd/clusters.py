@@ -1,7 +1,5 @@
 """Clusters of particles by K-means: potential targets (000, section 3.3)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 
@@ -16,11 +14,7 @@ SQUARES = np.array([[1, 2, 4], [2, 3, 5], [4, 5, 6]])
 
 @njit(cache=True, error_model='numpy')
 def _assign(particles, low, high, centres, label, owner, changed):  # type: ignore[no-untyped-def]
-    """Fill the nearest centre of each particle, and which centres got or lost one, (k + 1,).
-
-    A centre is not compared with a part if all of the part's box, from `low` to `high` (parts, d),
-    is nearer to another one (Kanungo et al. 2002). `owner` (parts,) is the only one left, or -1.
-    """
+    """Fill nearest centres, pruned by boxes (Kanungo et al. 2002); return which centres changed."""
     d = particles.shape[1]
     least, nearest, gaps = np.empty(PART), np.empty(PART), np.empty(len(centres))
     changed[:] = False
@@ -145,10 +139,7 @@ def kmeans(
     start: FloatArray,
     iterations: int = 20,
 ) -> tuple[IntArray, FloatArray]:
-    """Return labels (n,) and centres (k, d) of weighted K-means.
-
-    `start` (s, d) are the centres of the step before; K-means++ adds what is missing of `number`.
-    """
+    """Return labels (n,) and centres (k, d) of weighted K-means from `start`, else K-means++."""
     centres = _starting_centres(particles, weights, number, start, generator)
     starts = np.arange(0, len(particles), PART)
     low, high = np.minimum.reduceat(particles, starts), np.maximum.reduceat(particles, starts)

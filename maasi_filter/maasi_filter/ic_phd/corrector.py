@@ -1,10 +1,4 @@
-"""The PHD corrector Psi on weighted particles (000, (13), (16)).
-
-Particles are worked on in chunks of fixed size whose sums are added in order, so that results do
-not depend on the number of threads.
-"""
-
-from __future__ import annotations
+"""The PHD corrector Psi (000, (13), (16)), with the same sums for any number of threads."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Particle PHD filter with an iterated corrector, as in the papers (000, sections 3.2, 3.3)."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence
@@ -34,13 +32,7 @@ from maasi_filter.measurement_check import (
     within_range,
 )
 from maasi_filter.models.sensor import LEAST_PER_SCAN
-from maasi_filter.records import (
-    UNLABELLED,
-    AgentMeasurement,
-    FilterResult,
-    FoundTarget,
-    Label,
-)
+from maasi_filter.records import UNLABELLED, AgentMeasurement, FilterResult, FoundTarget, Label
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
 
@@ -51,10 +43,7 @@ LEAST_BIRTHS = 20
 
 
 class IcPhdFilter(SearchFilter):
-    """Particle PHD filter with an iterated corrector, K-means, and removal of found targets.
-
-    Settings that are None have the value of the preset. Everything is as of `SearchFilter`.
-    """
+    """Particle PHD filter with an iterated corrector, K-means, and removal of found targets."""
 
     method = 'ic_phd'
     particles: FloatArray = np.empty((0, 0))
@@ -114,11 +103,7 @@ class IcPhdFilter(SearchFilter):
         before: Sequence[CheckedMeasurement],
         dropped: dict[str, int],
     ) -> None:
-        """Correct with the detections of one robot, 000 (13) and (16).
-
-        D^o(x) = (1 - pi(x) + sum over z of psi_z(x) / C(z)) D^{o-1}(x), where
-        C(z) = kappa(z) + <psi_z, D^{o-1}>, and births are part of D^{o-1}.
-        """
+        """Correct with the detections of one robot, 000 (13) and (16); births are in D^{o-1}."""
         births, intensity = self._births(member, before)
         space = member.sensor.measurement_space(self.bounds)
         clutter = max(member.sensor.clutter, LEAST_PER_SCAN / space)
@@ -182,12 +167,7 @@ class IcPhdFilter(SearchFilter):
         self.weights = np.full(number, expected / number)
 
     def _extract(self, members: Sequence[CheckedMeasurement], time: float) -> list[FoundTarget]:
-        """Find clusters by K-means, and mark the narrow ones as found (000, section 3.3).
-
-        k is the rounded expected number. A cluster with a radius of at most T_r and a mass of at
-        least T_m is a found target, and its particles are removed, as are those of a narrow cluster
-        that matches an earlier found target.
-        """
+        """Find clusters by K-means; narrow and heavy ones are found and removed (000, 3.3)."""
         numbers = self._numbers
         if not members or not self.expected_number > 0.0:
             self.clusters = self.clusters if len(self.weights) else []
@@ -266,11 +246,7 @@ class IcPhdFilter(SearchFilter):
 def nearest_detection(
     position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
 ) -> tuple[CheckedMeasurement, Label]:
-    """Return the robot with the detection nearest to a position, and the nearest label.
-
-    The robot is the last one if there is no detection; the label is within T_z = `limit` metres, as
-    the PHD filter does not associate detections with targets.
-    """
+    """Return the robot with the nearest detection, else the last, and the label within T_z."""
     apart, labelled = [(math.inf, members[-1])], [(limit, UNLABELLED)]
     for member in members:
         centres = member.sensor.measurement.inverse(member.values, member.pose)
@@ -283,11 +259,7 @@ def nearest_detection(
 def kept_measurements(
     centres: FloatArray, targets: Sequence[FoundTarget], limit: float, every: bool
 ) -> BoolArray:
-    """Return which of m detections remain after removing those of found targets.
-
-    That is all within T_z = `limit` of one (`every`: 003, algorithm 1), or only the closest one to
-    each (000, section 3.3; 001, algorithm 1).
-    """
+    """Return which of m detections stay: without all, or the closest, within T_z of found ones."""
     keep = np.ones(len(centres), np.bool_)
     for target in targets:
         apart = np.sqrt(((centres - target.position) ** 2).sum(axis=1))

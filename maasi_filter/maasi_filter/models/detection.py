@@ -1,9 +1,4 @@
-"""Probability that a sensor detects a target, pi(x, q).
-
-Every model has a kernel that other numba kernels evaluate inline, except a user's own function,
-which they call (`OwnDetection`). Arrays of the sensor's parameters always have PARAMETERS entries,
-so that one compiled kernel serves all kinds.
-"""
+"""Probability of detection pi(x, q), as kernels whose parameters are alike for all kinds."""
 
 from __future__ import annotations
 
@@ -51,10 +46,7 @@ def _call(typing_context, function, values, length, forward, left, up):  # type:
 
 
 def register(function: Callable[..., float], values: FloatArray) -> FloatArray:
-    """Return the entries from NUMBER on of a function (forward, left, up, values) and its values.
-
-    The number is the same in every process for the same name of the function and values.
-    """
+    """Return the entries from NUMBER on of a function and values; its number follows from both."""
     entries = _entries(function, np.asarray(values, dtype=float).tobytes())
     _known[entries[0]] = entries
     return entries

@@ -13,13 +13,7 @@ from maasi_filter.arrays import FloatArray
 
 
 def finite_vector(name: str, value: ArrayLike, length: int) -> FloatArray:
-    """Return `value` as a float array of `length` numbers.
-
-    Raises
-    ------
-    ValueError
-        If it has another shape or is not finite; the message names `name`.
-    """
+    """Return `value` as an array of `length` finite floats; ValueError names `name`."""
     array = np.array(value, dtype=float)
     if array.shape != (length,):
         raise ValueError(f'{name}: got shape {array.shape}, allowed is ({length},)')

@@ -95,11 +95,7 @@ class Sensor:
         return self.measurement.dimension
 
     def measurement_space(self, bounds: FloatArray) -> float:
-        """Return the volume of the measurements in an environment [m rad, in 3D m rad^2].
-
-        Ranges up to the sensor's largest, the diagonal of the environment, or the farthest corner
-        of its field of view; all angles.
-        """
+        """Return the volume of measurements up to the farthest range [m rad, in 3D m rad^2]."""
         size = bounds[:, 1] - bounds[:, 0]
         reach = min(self.maximum_range, math.sqrt(float((size * size).sum())))
         if isinstance(self.detection, BoxDetection):

@@ -1,7 +1,5 @@
 """Association by loopy belief propagation (Williams and Lau 2014)."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -24,11 +22,7 @@ class Marginals(NamedTuple):
 
 @njit(cache=True, error_model='numpy')
 def propagate(psi, missed, caused, new):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Pass messages until they stand still, and fill the marginals; `psi` is odds over `other`.
-
-    Returns the log of the sum of the weights of all associations, by the Bethe free energy
-    (Yedidia, Freeman and Weiss 2005).
-    """
+    """Fill the marginals; return the log of all weights (Yedidia, Freeman and Weiss 2005)."""
     n, m = psi.shape
     mu = np.zeros((n, m))
     nu = np.ones((n, m))

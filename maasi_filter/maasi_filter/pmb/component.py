@@ -268,11 +268,7 @@ def merge(components: list[Component]) -> list[Component]:
 
 
 def is_known(i: int, components: Sequence[Component], caused: FloatArray) -> bool:
-    """Return whether component i may be the same target as a found component.
-
-    A target causes at most one detection per scan, so two components that together caused more than
-    one are two targets.
-    """
+    """Return whether component i may be a found one: together, one detection in each scan."""
     item = components[i]
     return any(
         other.target is not None

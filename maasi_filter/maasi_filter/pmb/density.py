@@ -1,9 +1,4 @@
-"""Where a component's target is: weighted particles of a density known up to a constant.
-
-Iterated batch importance sampling (Chopin 2002): a new factor changes weights; when few particles
-carry them, they are resampled and moved by Metropolis steps that leave the product of all factors
-invariant, so that no number of measurements lets the particles collapse.
-"""
+"""A component's density: particles of iterated batch importance sampling (Chopin 2002)."""
 
 from __future__ import annotations
 
@@ -77,11 +72,7 @@ def _systematic(weights: FloatArray, number: int, start: float) -> IntArray:
 
 @njit(cache=True, error_model='numpy')
 def _sweep(heads, terms, grid, frame, exponent, particles, products, last, draws):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Propose a move for each particle, in place; return how many were accepted.
-
-    Differential moves: a share of the difference of two particles of the other half, which does
-    not move meanwhile, so that the target density is left invariant.
-    """
+    """Propose moves by differences of two particles of the other half; return how many succeed."""
     number, d = particles.shape
     half = number // 2
     accepted = 0

@@ -8,8 +8,6 @@ with marginal association probabilities):
 Factors are rows of numbers, so that one kernel evaluates the product of all of them.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,11 +1,4 @@
-"""Poisson multi-Bernoulli filter for static targets, or targets in a slow random walk.
-
-Undetected targets are a Poisson process of intensity (N0 / V) e(x); each detection that may
-originate from one of them creates a Bernoulli component (Williams 2015, TOMB/P). The equations are
-in `docs/filter.md`.
-"""
-
-from __future__ import annotations
+"""Poisson multi-Bernoulli filter (Williams 2015, TOMB/P); equations in `docs/filter.md`."""
 
 import math
 from collections.abc import Sequence
@@ -60,11 +53,7 @@ CERTAIN = 0.999
 
 
 class PmbFilter(SearchFilter):
-    """Poisson multi-Bernoulli filter for a set M_k of measuring robots.
-
-    Settings that are None are derived from the measuring sensor. `components` are the potential
-    targets, including found ones; everything else is as of `SearchFilter`.
-    """
+    """Poisson multi-Bernoulli filter; `components` are potential targets, found ones included."""
 
     method = 'pmb'
     saved: ClassVar[dict[str, Any]] = {
@@ -209,10 +198,7 @@ class PmbFilter(SearchFilter):
             self.components.append(item)
 
     def _review(self, item: Component, moved: bool) -> bool:
-        """Withdraw a found component that hardly exists; return whether another can be found.
-
-        That almost surely exists, at a precisely known position.
-        """
+        """Withdraw a found component that hardly exists; return whether a sure one can be found."""
         numbers, reflecting = self._numbers.pmb, reflects(item.answers, self._rates)
         if item.foreign:
             item.existence = CERTAIN

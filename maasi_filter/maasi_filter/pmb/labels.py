@@ -32,10 +32,7 @@ class LabelTally:
         return tally
 
     def add(self, label: Label, share: float) -> None:
-        """Count the class of a detection that this target caused with probability `share`.
-
-        A score that is not known counts as 1.
-        """
+        """Count a detection's class by its `share` of this target; an unknown score counts as 1."""
         if label.class_id:
             weight = share * (label.score or 1.0)
             self.classes[label.class_id] = self.classes.get(label.class_id, 0.0) + weight

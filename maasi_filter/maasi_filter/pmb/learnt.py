@@ -1,7 +1,5 @@
 """What the scans of a robot have told: clutter, noise, errors of its position, and misfits."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -46,11 +44,7 @@ BOUND = 4.0
 
 @njit(cache=True, error_model='numpy')
 def _log_sums(errors, jacobians, covariances, noise, variances, odds, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Fill the log of the sum of the weights of all associations for each variance [m^2].
-
-    `errors` (n, m, d), `jacobians` and `covariances` (n, d, d) are of n targets, `noise` (m, d, d)
-    is R, `odds` (n, m) are those of a detection of density 1.
-    """
+    """Fill the log of the sum of the weights of all associations for each variance [m^2]."""
     n, m, d = errors.shape
     psi = np.empty((n, m))
     missed, caused, new = np.empty(n), np.empty((n, m)), np.empty(m)
@@ -111,10 +105,7 @@ class Learnt:
     fit: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def clutter_per_scan(self, told: float) -> float:
-        """Return the mean number of false detections in a scan, of which the sensor says `told`.
-
-        It is the posterior mean of a gamma prior that is worth PRIOR_SCANS.
-        """
+        """Return the mean false detections in a scan, with a prior of `told` worth PRIOR_SCANS."""
         prior = max(told, LEAST_PER_SCAN)
         return (PRIOR_SCANS * prior + self.clutter) / (PRIOR_SCANS + self.scans)
 
@@ -139,10 +130,7 @@ class Learnt:
         caused: FloatArray,
         blurred: bool,
     ) -> None:
-        """Count the innovations of the detections that found targets `caused` (n, m).
-
-        If an error of the position explains the scan (`blurred`), it does not tell the noise.
-        """
+        """Count innovations of detections `caused` (n, m), unless a position error blurs them."""
         rows = np.flatnonzero((caused > 0.5).any(axis=1)).tolist()
         rows = [i for i in rows if components[i].target and not components[i].foreign]
         if rows:
@@ -225,9 +213,6 @@ def _log_likelihoods(
 
 
 def excess(ratio: float, freedom: float) -> float:
-    """Return chi-squared over its degrees of freedom in deviations from what is expected.
-
-    Its cube root is nearly normal (Wilson and Hilferty 1931).
-    """
+    """Return chi-squared in deviations from what is expected (Wilson and Hilferty 1931)."""
     variance = 2.0 / (9.0 * freedom)
     return (ratio ** (1.0 / 3.0) - (1.0 - variance)) / math.sqrt(variance)

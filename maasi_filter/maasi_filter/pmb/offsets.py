@@ -6,8 +6,6 @@ target is found; later b drifts with the robot's way. A detection of a found tar
 measures b - a, as in simultaneous localisation and mapping (Smith, Self and Cheeseman 1990).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -56,11 +54,7 @@ class Offsets:
         clutter: float,
         unseen: float,
     ) -> CheckedMeasurement:
-        """Return a robot's scan at its estimated pose, if errors last; the components are moved.
-
-        `clutter` is kappa, per unit of measurement space; `unseen` N0 / V, per m^d: the largest
-        intensity of undetected targets.
-        """
+        """Return a robot's scan at its estimated pose, with components moved, if errors last."""
         if not self.active:
             return member
         found = {item.target.id for item in components if item.target is not None}

@@ -1,7 +1,5 @@
 """One robot's scan: its detections as factors, and draws of where targets may be that they show."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -64,10 +62,7 @@ class Scan:
     def born(
         self, wanted: BoolArray, grid: FloatArray, frame: FloatArray
     ) -> list[tuple[int, Density]]:
-        """Return the density prior e pi g_j of each detection that is wanted, by its number.
-
-        A detection near or beyond the bounds has few draws inside, and none is made.
-        """
+        """Return the density prior e pi g_j of each wanted detection with enough draws inside."""
         total, squares = self.weights.sum(axis=1), np.square(self.weights).sum(axis=1)
         wanted = wanted & (np.square(total) > LEAST_SUPPORT * squares)
         head = self.head.copy()
@@ -178,10 +173,7 @@ def _derivatives(values: FloatArray) -> FloatArray:
 def _place(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     origins, cartesian, roots, scale, sensor_position, bounds, particles, jacobian
 ):
-    """Turn standard normal numbers (m, n, d) into positions, and fill |dx/dz| at each (m, n).
-
-    It is 0 outside the bounds, behind the sensor and beyond straight up: nothing points there.
-    """
+    """Turn normal numbers (m, n, d) into positions; |dx/dz| is 0 where no target can be."""
     d = origins.shape[1]
     z = np.zeros(3)
     for m in range(particles.shape[0]):

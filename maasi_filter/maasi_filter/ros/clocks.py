@@ -44,10 +44,7 @@ def batch_id_limit(last: int) -> int:
 
 
 class StampGate:
-    """Distinguishes a jump of a stream of stamps from a single wrong stamp.
-
-    A stamp that jumps (by more than `jump`) is refused, and accepted where the next one follows it.
-    """
+    """Distinguishes a jump of a stream, which the next stamp follows, from a single wrong stamp."""
 
     def __init__(self, jump: int = JUMP) -> None:
         self.jump = jump

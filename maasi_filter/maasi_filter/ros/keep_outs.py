@@ -1,7 +1,5 @@
 """Keep-outs that change while a search runs: the topic `keep_outs` of the team."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,19 +14,7 @@ from maasi_msgs.msg import KeepOuts
 
 
 class KeepOutTopic:
-    """The area with the keep-outs that hold now.
-
-    Filter and planner publish what they received again, so that it outlives either of them.
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        With `environment` in its settings.
-    on_change : callable
-        Called with the new area.
-    keep : bool
-        Whether to publish again what was received.
-    """
+    """The area with the keep-outs that hold now; `keep`: published again, to outlive a sender."""
 
     def __init__(
         self, node: LockstepLifecycleNode[Any], on_change: Callable[[Area], None], keep: bool

@@ -7,7 +7,7 @@ from typing_extensions import Self
 
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.plugins import add_folders
-from maasi_filter.settings import FilterSettings, SensorSettings, Settings
+from maasi_filter.settings import FilterSettings, NotNegative, Positive, SensorSettings, Settings
 
 # Time without asserted liveliness after which a guard considers its driver dead [s].
 LIVELINESS_LEASE = 0.5
@@ -64,22 +64,21 @@ class FilterNodeSettings(NodeSettings):
         description='Robots with filters of their own in their namespaces: what they find is taken '
         'over, and they take over what this one finds',
     )
-    batch_timeout: float = Field(
+    batch_timeout: Positive = Field(
         default=1.0,
-        gt=0.0,
         description='Time after which a batch goes on without who is missing; not in lockstep [s]',
     )
-    particles_rate: float = Field(
-        default=2.0, ge=0.0, description='Most publications of particles; 0: none [1/s]'
+    particles_rate: NotNegative = Field(
+        default=2.0, description='Most publications of particles; 0: none [1/s]'
     )
-    markers_rate: float = Field(
-        default=5.0, ge=0.0, description='Most publications of markers; 0: none [1/s]'
+    markers_rate: NotNegative = Field(
+        default=5.0, description='Most publications of markers; 0: none [1/s]'
     )
     save_file: str = Field(
         default='', description='File that the state is saved to, and loaded from at the start'
     )
-    save_period: float = Field(
-        default=0.0, ge=0.0, description='Wall time between saves; 0: only at the end [s]'
+    save_period: NotNegative = Field(
+        default=0.0, description='Wall time between saves; 0: only at the end [s]'
     )
     save_batches: bool = Field(
         default=False,

@@ -1,10 +1,4 @@
-"""The quadratic problem of one axis: rows, costs, and a dual active-set method.
-
-Once visits and faces of obstacles are fixed, P2 of 004 decomposes into one problem for each axis: T
-forces u such that positions, velocities, forces and the way to brake, all linear in u, stay in
-their bounds. Only bounds and free motion change from step to step: the method works on the rows'
-Gram matrix alone.
-"""
+"""The quadratic problem of one axis of 004, P2: rows, costs, and a dual active-set method."""
 
 import math
 from dataclasses import dataclass

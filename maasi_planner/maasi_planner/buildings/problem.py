@@ -180,10 +180,7 @@ class PlanSolver:
     def _visits(
         self, problem: Problem, first: FloatArray, wanted: BoolArray
     ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return possible visits from P_1: step, cuboid, and corners of its part that is in reach.
-
-        And the sums of the lowest and highest velocities before each step, (3, T + 1) [m].
-        """
+        """Return possible visits from P_1, and lowest and highest ways until each (3, T + 1)."""
         dynamics, sums = self.dynamics, np.zeros((2, 3, self.settings.horizon + 1))
         for side, sign in enumerate((-1.0, 1.0)):
             speed = np.array(problem.velocity, dtype=float)

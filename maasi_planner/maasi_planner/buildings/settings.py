@@ -11,9 +11,8 @@ from pydantic import Field, model_validator
 from maasi_filter.arrays import FloatArray
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.ros.node_settings import NodeSettings
-from maasi_filter.settings import Finite, Settings, Vector3
+from maasi_filter.settings import Finite, NotNegative, Positive, Settings, Vector3
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Face = Literal['west', 'east', 'south', 'north', 'bottom', 'top']
 
 FACES: tuple[Face, ...] = ('west', 'east', 'south', 'north', 'bottom', 'top')
@@ -56,8 +55,8 @@ class SearchCameraSettings(Settings):
     angle: float = Field(
         default=1.0471975511965976, gt=0.0, lt=3.0, description='Opening of the view [rad]'
     )
-    least_distance: float = Field(default=17.0, gt=0.0, description='d_min of (4) [m]')
-    largest_distance: float = Field(default=90.0, gt=0.0, description='d_max of (4) [m]')
+    least_distance: Positive = Field(default=17.0, description='d_min of (4) [m]')
+    largest_distance: Positive = Field(default=90.0, description='d_max of (4) [m]')
 
     @model_validator(mode='after')
     def _order(self) -> SearchCameraSettings:
@@ -72,11 +71,11 @@ class SearchCameraSettings(Settings):
 class DynamicsSettings(Settings):
     """Mass point with air resistance under bounded forces, 004, (1)."""
 
-    mass: float = Field(default=3.35, gt=0.0, description='m [kg]')
+    mass: Positive = Field(default=3.35, description='m [kg]')
     resistance: float = Field(default=0.2, ge=0.0, lt=1.0, description='eta, each step [1]')
-    force: float = Field(default=35.0, gt=0.0, description='Largest force on each axis [N]')
-    speed: float = Field(default=15.0, gt=0.0, description='Largest speed on each axis [m/s]')
-    gravity: float = Field(default=9.81, ge=0.0, description='g [m/s^2]')
+    force: Positive = Field(default=35.0, description='Largest force on each axis [N]')
+    speed: Positive = Field(default=15.0, description='Largest speed on each axis [m/s]')
+    gravity: NotNegative = Field(default=9.81, description='g [m/s^2]')
 
     @model_validator(mode='after')
     def _lifts(self) -> DynamicsSettings:
@@ -93,8 +92,8 @@ class DynamicsSettings(Settings):
 class HazardSettings(Settings):
     """Failure probability of a battery at each step, 004, (3)."""
 
-    alpha: float = Field(default=100.0, gt=0.0, description='alpha_1 [steps]')
-    beta: float = Field(default=0.3, gt=0.0, description='beta_1 [1/step]')
+    alpha: Positive = Field(default=100.0, description='alpha_1 [steps]')
+    beta: Positive = Field(default=0.3, description='beta_1 [1/step]')
     recharge_steps: list[Annotated[int, Field(ge=1)]] = Field(
         default=[5, 10],
         min_length=2,
@@ -141,15 +140,15 @@ class CuboidMethodSettings(Settings):
         description='Cells of a face: rounded as in the paper, which may leave strips of a few '
         'percent unseen, or so many that every point is seen',
     )
-    cuboid_size: float = Field(default=10.0, gt=0.0, description='Side of a cuboid [m]')
+    cuboid_size: Positive = Field(default=10.0, description='Side of a cuboid [m]')
     camera: SearchCameraSettings = Field(default_factory=SearchCameraSettings, description='Camera')
     horizon: int = Field(default=10, ge=2, le=25, description='T [steps]')
     guidance_step: int = Field(
         default=3, ge=1, description='tau*, at most T - 1: the step that is drawn to a cuboid [1]'
     )
-    guidance_weight: float = Field(default=1e-4, gt=0.0, description='w1 [1/m^2]')
-    smoothness_weight: float = Field(default=1e-4, gt=0.0, description='w2 [1/N^2]')
-    visit_weight: float = Field(default=0.3, ge=0.0, description='w3 [1]')
+    guidance_weight: Positive = Field(default=1e-4, description='w1 [1/m^2]')
+    smoothness_weight: Positive = Field(default=1e-4, description='w2 [1/N^2]')
+    visit_weight: NotNegative = Field(default=0.3, description='w3 [1]')
     discount: float = Field(
         default=0.95,
         gt=0.0,
@@ -175,7 +174,7 @@ class CuboidMethodSettings(Settings):
         description='Whether each plan leaves room to brake after its last step; without it, as '
         'printed, the next problem may have no solution',
     )
-    clearance: float = Field(default=0.01, ge=0.0, description='Kept from obstacles [m]')
+    clearance: NotNegative = Field(default=0.01, description='Kept from obstacles [m]')
     visit_depth: float = Field(
         default=1e-3,
         ge=0.0,
@@ -183,15 +182,15 @@ class CuboidMethodSettings(Settings):
         description='How far inside its cuboid a visit is planned; 0 is the paper: an optimum '
         'touches a face, and rounding decides whether it was a visit [m]',
     )
-    alpha: float = Field(default=2.0, gt=0.0, description='alpha_2 of (13) [1]')
-    beta: float = Field(default=0.5, gt=0.0, description='beta_2 of (13) [1]')
+    alpha: Positive = Field(default=2.0, description='alpha_2 of (13) [1]')
+    beta: Positive = Field(default=0.5, description='beta_2 of (13) [1]')
     condition: Literal['low_hazard', 'printed'] = Field(
         default='low_hazard',
         description='When (13) holds: where p_b(t + T) is at most 0.5, or above 0.5 as printed',
     )
-    communication_range: float = Field(default=100.0, gt=0.0, description='C_R [m]')
-    time_limit: float = Field(
-        default=0.5, gt=0.0, description='Wall time of a solve; then the best plan so far [s]'
+    communication_range: Positive = Field(default=100.0, description='C_R [m]')
+    time_limit: Positive = Field(
+        default=0.5, description='Wall time of a solve; then the best plan so far [s]'
     )
     node_limit: int = Field(
         default=20000,

@@ -1,7 +1,5 @@
 """Motion models: each has its controller, its prediction and its body."""
 
-from __future__ import annotations
-
 from maasi_filter.area import Area
 from maasi_planner.motion.base import Body, MotionModel, RobotState, Trajectories
 from maasi_planner.motion.models import ConstantSpeed, Mambo, Quadrotor, Unicycle
@@ -21,9 +19,7 @@ __all__ = [
 
 
 def make_motion(
-    settings: MotionSettings,
-    area: Area | None = None,
-    radius: float = 0.0,
+    settings: MotionSettings, area: Area | None = None, radius: float = 0.0
 ) -> MotionModel:
     """Return the motion model that `settings.model` names.
 

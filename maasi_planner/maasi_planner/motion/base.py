@@ -271,10 +271,7 @@ def check_step(step: float) -> float:
 
 @njit(cache=True)
 def _trim(positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: BoolArray) -> int:
-    """Fill what was reached, cut lengths, extend trajectories; return the longest length.
-
-    A length beyond the last column marks a waypoint that was not reached.
-    """
+    """Fill what was reached, cut lengths, extend trajectories; return the longest length."""
     limit = positions.shape[1] - 1
     for w in range(positions.shape[0]):
         reached[w] = lengths[w] <= limit

@@ -5,8 +5,6 @@ that could not stop before an obstacle are discarded; of the others the one is c
 nearest to the target point, facing it, with clearance from obstacles.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -66,10 +64,7 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray)
 def _arc(
     state: FloatArray, v: float, w: float, time: float, stopping: float, circles: FloatArray
 ) -> tuple[float, float, float, float]:
-    """Return x, y and heading at the end of an arc, and the least distance from circles on it.
-
-    Minus infinity if the robot could not stop within `stopping` before a circle.
-    """
+    """Return the end of an arc and its clearance, -inf if the robot could not stop in time."""
     px, py, heading = state[0], state[1], state[3]
     room = np.inf
     dt = time / ARC_STEPS

@@ -12,8 +12,6 @@ state (12,): position [m, map], yaw, roll, pitch [rad], velocity [m/s, map], ang
 [rad/s].
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -276,10 +274,7 @@ def mambo_step(
 def _step_at_once(
     state: FloatArray, wanted: Command, parameters: FloatArray, table: FloatArray, time: float
 ) -> float:
-    """Fly all periods without turning, in place; return the sum of u'u.
-
-    -1, with the state as it was, if a limit would act on the way.
-    """
+    """Fly all periods without turning, in place; return the sum of u'u, -1 if a limit would act."""
     cx, cy, cz, _ = wanted
     yaw, roll, pitch = state[3], state[4], state[5]
     # Deviations of the velocity along the heading, to its left, and upwards.

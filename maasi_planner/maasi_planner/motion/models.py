@@ -59,10 +59,7 @@ class Kernel(NamedTuple):
 
 @njit(cache=True, forceinline=True)
 def _point_step(state: FloatArray, command: Command, steering: Steering, dt: float) -> None:
-    """Move a point for `dt`, in place; state: position, heading, velocity and turn rate.
-
-    The velocity changes by at most the acceleration, and the position by its mean.
-    """
+    """Move a point for `dt`, in place, with a limited change of its velocity."""
     x, y = turned(command[0], command[1], state[3])
     wanted = (x, y, command[2])
     if dot(wanted, wanted) > steering.speed * steering.speed:
@@ -134,11 +131,7 @@ def _close_loop(
     positions: FloatArray,
     yaws: FloatArray,
 ) -> tuple[int, float]:
-    """Run controller and body against each other, `state` in place.
-
-    Return the steps to the waypoint, one too many where it is not reached, and the sum of squared
-    inputs.
-    """
+    """Run controller and body on `state`; return steps, one too many if not there, and u'u."""
     kind, steering, obstructed, _, _, parameters, table, tolerance, periods, h = kernel
     cost = 0.0
     for k in range(yaws.shape[0]):
@@ -227,10 +220,7 @@ class CompiledBody(Body):
 
 
 class CompiledMotion(MotionModel):
-    """Motion model of the suite: its controller and its body are compiled.
-
-    kind: which functions its steps use; steering: how it approaches its waypoint.
-    """
+    """Motion model of the suite: its controller and its body are compiled, by their `kind`."""
 
     kind: int
     steering: Steering
@@ -322,10 +312,7 @@ class CompiledMotion(MotionModel):
 
 
 class ConstantSpeed(CompiledMotion):
-    """A point with a largest speed and, if wanted, a largest acceleration.
-
-    Its input is the velocity command.
-    """
+    """A point with a largest speed and, if wanted, acceleration; its input is the command."""
 
     kind = POINT
 

@@ -6,8 +6,6 @@ robot's torques. As printed the term has no direction; `away` gives it the direc
 obstacle to the robot.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

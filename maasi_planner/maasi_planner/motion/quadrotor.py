@@ -15,8 +15,6 @@ state (14,): position [m, map], heading [rad], quaternion w x y z, velocity [m/s
 velocity [rad/s, body].
 """
 
-from __future__ import annotations
-
 import math
 
 from numba import njit

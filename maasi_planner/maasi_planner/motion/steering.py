@@ -1,7 +1,5 @@
 """Velocity commands of robots that can move in any direction, also around obstacles."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -89,10 +87,7 @@ def _towards(way: Vector, velocity: Vector, yaw: float, steering: Steering) -> C
 
 @njit(cache=True, forceinline=True)
 def fly_freely(position: Vector, yaw: float, goal: Vector, steering: Steering) -> Command:
-    """Return the command straight towards a waypoint.
-
-    The speed is `rate` times the distance left, at most `speed`.
-    """
+    """Return the command towards a waypoint: `rate` times the distance left, at most `speed`."""
     way = minus(goal, position)
     size, scale = norm(way), steering.rate
     if scale * size > steering.speed:

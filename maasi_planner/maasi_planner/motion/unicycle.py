@@ -11,8 +11,6 @@ the limits, and the robot turns on the spot while the waypoint is not ahead.
 state (6,): position [m, map], heading [rad], forward speed [m/s], turn rate [rad/s].
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -31,11 +29,7 @@ AHEAD = 0.6
 
 @njit(cache=True, forceinline=True)
 def unicycle_step(state: FloatArray, command: Command, steering: Steering, dt: float) -> None:
-    """Move for `dt`, in place.
-
-    Forward speed and turn rate change by at most their acceleration towards those of `command`,
-    and the robot follows the arc of the mean of old and new.
-    """
+    """Move for `dt`, in place, along the arc of the mean of old and new speeds."""
     yaw, forward, turn = state[3], state[4], state[5]
     acceleration, yaw_acceleration = steering.acceleration, steering.yaw_acceleration
     wanted = min(max(command[0], -steering.speed), steering.speed)
@@ -57,10 +51,7 @@ def unicycle_step(state: FloatArray, command: Command, steering: Steering, dt: f
 def _drive(
     dx: float, dy: float, left: float, yaw: float, steering: Steering, least: float
 ) -> tuple[float, float]:
-    """Return forward speed and turn rate towards a point at (dx, dy), with `left` m to go.
-
-    At a point on the way the robot keeps its speed, but for turning it counts at least `least`.
-    """
+    """Return speed and turn rate towards a point; turning counts `left`, or at least `least` m."""
     rho = math.sqrt(dx * dx + dy * dy)
     if rho < 1e-9:
         return 0.0, 0.0

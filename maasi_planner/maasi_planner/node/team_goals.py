@@ -68,10 +68,7 @@ class _Sent:
 
 
 class TeamGoals:
-    """Clients of the action `go_to` of all robots of a team, in lockstep by their states only.
-
-    `on_answer` is called with robot and number of an answered goal, and whether it was accepted.
-    """
+    """Clients of the action `go_to` of all robots of a team, in lockstep by their states only."""
 
     def __init__(
         self,

@@ -1,7 +1,5 @@
 """Refinement T as information about clusters, exploration E as expected new targets."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -30,10 +28,7 @@ def _add_information(
     cluster: IntArray,
     out: FloatArray,
 ) -> None:
-    """Add pi H' R^-1 H of measurements to out of their candidates and clusters.
-
-    rows (n, d, d): H; in place they become H in units of the noise, by forward substitution.
-    """
+    """Add pi H' R^-1 H to out; rows H (n, d, d) become H in units of the noise, in place."""
     d = lower.shape[0]
     for i in range(chance.shape[0]):
         for a in range(d):
@@ -105,10 +100,7 @@ def information_terms(
     first: int,
     centres: FloatArray,
 ) -> Terms:
-    """Return the terms of candidates: robots that plan, and their measurements from `first` on.
-
-    `settled`: robots whose measurements do not depend on the choice, and these.
-    """
+    """Return the terms of candidates by measurements from `first` on, beside `settled` ones."""
     d, clusters = team.dimension, team.clusters
     places, left = _unseen(team, settings, bool((planned[1].kind >= BOX).any()))
     for miss in _misses(settled[1], 0, places):

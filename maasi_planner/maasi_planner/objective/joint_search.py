@@ -1,7 +1,5 @@
 """The value J of candidates given the choices of others, and the joint choice: 000, (17), (26)."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -15,10 +13,7 @@ from maasi_planner.settings import PlannerSettings
 
 
 class CandidateTable(NamedTuple):
-    """G candidates of R planning robots, with the terms of the objective in use.
-
-    With `shared` what two see counts for the one with the shorter way only.
-    """
+    """G candidates of R planning robots; if `shared`, what two see counts for the shorter way."""
 
     allowed: BoolArray
     waypoints: FloatArray
@@ -113,12 +108,7 @@ class Ranking(NamedTuple):
 def _search_exactly(
     ranking: Ranking, chosen: IntArray, r: int, value: float, best: IntArray, best_value: float
 ) -> tuple[float, int]:
-    """Find the best joint choice (26), by depth-first search with bounds.
-
-    The robots before r have `chosen`, with that value together. `best` (R,) with its value is the
-    best choice known, and is replaced in place. Returns its value, and how many partial choices
-    were evaluated.
-    """
+    """Improve `best` (R,) to the optimum of (26) by bounds; return its value and evaluations."""
     table, order, start, alone = ranking
     if r == len(chosen):
         for other in range(r):
@@ -169,10 +159,7 @@ def _best_reply(ranking: Ranking, r: int, chosen: IntArray) -> tuple[int, float,
 def _search_in_turn(
     ranking: Ranking, rounds: int, backwards: bool, chosen: IntArray
 ) -> tuple[float, int]:
-    """Let robots choose in turn, each best for the team so far, then improve in rounds.
-
-    A robot that finds no admissible candidate keeps -1 in `chosen` (R,).
-    """
+    """Let robots choose in turn, each best for the team so far, then improve in rounds."""
     total, evaluated = -np.inf, 0
     for attempt in range(1 + rounds):
         changed = False
@@ -194,10 +181,7 @@ def _search_in_turn(
 def _improve_in_pairs(
     ranking: Ranking, total: float, budget: int, chosen: IntArray
 ) -> tuple[float, int]:
-    """Improve a choice by moves of two robots at once, while the budget of evaluations lasts.
-
-    One robot takes another candidate, the best alone first, and a second one its best reply.
-    """
+    """Improve a choice by moves of two robots at once, while the budget of evaluations lasts."""
     table, order, start, _ = ranking
     moving: IntArray = np.flatnonzero(chosen >= 0)
     evaluated, improved = 0, True

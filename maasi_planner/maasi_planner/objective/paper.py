@@ -1,7 +1,5 @@
 """Refinement T and exploration E as 000 prints them: (18) to (22), (31), (32)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

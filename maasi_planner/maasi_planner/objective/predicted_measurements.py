@@ -1,7 +1,5 @@
 """Predicted measurements along trajectories, and what they leave unseen."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The objective J of joint candidates: control cost, target refinement, exploration."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

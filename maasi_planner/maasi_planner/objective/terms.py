@@ -1,7 +1,5 @@
 """Refinement T and exploration E of a candidate, given the choices of other robots."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,8 +1,4 @@
-"""Makes the runs of experiments, keeps them, and what the commands that do so share.
-
-Seeds do not depend on the worker. Other processors or versions may change the last bits of numbers:
-runs of different machines are mixed only on request (docs/repeatability.md).
-"""
+"""Makes and keeps the runs of experiments; seeds do not depend on the worker."""
 
 import argparse
 import contextlib

@@ -71,10 +71,7 @@ def search_case(
     small: bool = False,
     runs: int | None = None,
 ) -> Case:
-    """Return a case that is a search; robots stop at each waypoint, as in the papers.
-
-    `most_measurements` is a cap on those of all robots; a small case has few, and few particles.
-    """
+    """Return a search with stops at waypoints, of few measurements, and few particles if small."""
     if small:
         most_measurements = min(most_measurements, _SMALL)
         values = merged(values, {'filter': {'particles': _SMALL_PARTICLES}})
@@ -129,10 +126,7 @@ def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: 
 
 
 def lane_share(places: FloatArray, side: float) -> float:
-    """Return which share of a way through places (n, 3) is lanes as of a lawnmower, from 0 to 1.
-
-    A lane is straight along an axis, without turning back, for at least half of `side` [m].
-    """
+    """Return the share of a way (n, 3) that is straight along an axis over half of `side` [m]."""
     steps = np.diff(places, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     steps, lengths = steps[lengths > 0.0], lengths[lengths > 0.0]

@@ -148,10 +148,7 @@ def _may_go(path: Path, domain: int | None) -> bool:
 
 
 def _is_unused(path: Path) -> bool:
-    """Return whether no process, of any container, has this user's file open or mapped.
-
-    Owners keep them so while they live; Linux grants a lease for writing only where none has.
-    """
+    """Return whether no process has a file open or mapped: Linux then grants a write lease."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:

@@ -1,7 +1,4 @@
-"""Nodes as processes: found, forked from a server, watched, and stopped in bounded time.
-
-The fork server of `multiprocessing` has loaded what nodes share: they start in a tenth of the time.
-"""
+"""Nodes as processes, forked from a server that has loaded what they share."""
 
 import contextlib
 import ctypes

@@ -1,7 +1,4 @@
-"""Search a recording of robots' cameras and poses, as `ros2 bag record` makes it of real robots.
-
-Sensors, start and filter are the scenario's; each robot measures once in each sensor period.
-"""
+"""Search a recording of robots' cameras and poses; each measures once a sensor period."""
 
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The common part of scenario files of all missions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -9,7 +7,7 @@ from pydantic import AfterValidator, Field
 
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.plugins import add_folders
-from maasi_filter.settings import Settings
+from maasi_filter.settings import NotNegative, Positive, Settings
 from maasi_sim.arguments import LARGEST
 from maasi_sim.scenario.layering import to_yaml
 
@@ -17,7 +15,7 @@ from maasi_sim.scenario.layering import to_yaml
 class EventSettings(Settings):
     """An event of a robot."""
 
-    at: float = Field(ge=0.0, description='When [s]')
+    at: NotNegative = Field(description='When [s]')
     robot: str = Field(description='Of which robot')
     do: Literal['leave', 'back'] = Field(description='It leaves and is silent, or returns')
 
@@ -25,16 +23,13 @@ class EventSettings(Settings):
 class LimitSettings(Settings):
     """When a run is given up."""
 
-    time: float = Field(default=600.0, gt=0.0, description='Simulated time [s]')
-    start: float = Field(
+    time: Positive = Field(default=600.0, description='Simulated time [s]')
+    start: Positive = Field(
         default=180.0,
-        gt=0.0,
         description='Wall time until all nodes are ready; they may have to compile [s]',
     )
-    silence: float = Field(
-        default=30.0,
-        gt=0.0,
-        description='Wall time without a step until a node counts as hung [s]',
+    silence: Positive = Field(
+        default=30.0, description='Wall time without a step until a node counts as hung [s]'
     )
     heartbeat: float = Field(
         default=4.5,
@@ -99,10 +94,7 @@ class BaseScenario(Settings):
         return sorted(self.robots)
 
     def check_pace(self, lockstep: bool, rate: float | None) -> None:
-        """Raise a ScenarioError if it cannot be run in lockstep, or at a rate.
-
-        The rate is simulated over wall time; links other than topics run in real time.
-        """
+        """Raise a ScenarioError if it cannot run in lockstep, or at a rate of simulated time."""
 
     def content(self) -> dict[str, Any]:
         """Return all settings as plain values, that are read back the same."""

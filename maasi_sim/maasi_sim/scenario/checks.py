@@ -1,7 +1,5 @@
 """Checks between the settings of a scenario."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator
@@ -27,10 +25,7 @@ _STEP_TOLERANCE = 1e-6
 # Drivers of robots that have no camera.
 _RANGING = ('ranging_driver', 'mavlink_driver')
 # Drivers by the link that they have.
-_DRIVERS = {
-    'mambo_wifi': ('mambo_driver',),
-    'mavlink': ('mavlink_driver', 'mavlink_camera_driver'),
-}
+_DRIVERS = {'mambo_wifi': ('mambo_driver',), 'mavlink': ('mavlink_driver', 'mavlink_camera_driver')}
 # URL of the driver of a simulated vehicle.
 _MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')
 
@@ -76,10 +71,7 @@ def _world_problems(scenario: Scenario) -> Problems:
 
 
 def _room_for_targets(scenario: Scenario) -> int:
-    """Return how many targets can be drawn one after the other at their separation, at most.
-
-    Balls that are placed at random, none moved again, fill 0.547 of a plane and 0.382 of space.
-    """
+    """Return how many targets fit: balls at random fill 0.547 of a plane and 0.382 of space."""
     targets = scenario.targets
     bounds = scenario.environment.array()
     sides = bounds[:, 1] - bounds[:, 0] - 2.0 * targets.margin

@@ -1,7 +1,5 @@
 """YAML files in layers: read, merged and checked, with errors that name file, line and key."""
 
-from __future__ import annotations
-
 import json
 import re
 import typing
@@ -69,11 +67,7 @@ class Layer:
 
 
 class _Loader(yaml.SafeLoader):
-    """A safe loader that also takes `1e-3` for a number, as YAML 1.2 and ROS do.
-
-    Refused are keys that are not text or stand twice, and aliases that hold themselves or stand
-    for more than anyone would write.
-    """
+    """A safe loader: `1e-3` is a number; keys that stand twice and endless aliases are refused."""
 
     def __init__(self, text: str, path: Path) -> None:
         super().__init__(text)

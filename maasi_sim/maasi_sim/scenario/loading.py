@@ -1,7 +1,5 @@
 """Scenario files: found by name, laid over robot types, and checked."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """The schema of scenario files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
@@ -17,6 +15,8 @@ from maasi_filter.settings import (
     FilterSettings,
     Finite,
     NoiseSettings,
+    NotNegative,
+    Positive,
     SensorSettings,
     Settings,
     Vector3,
@@ -83,14 +83,14 @@ class SimulatedSettings(Settings):
 class BatterySettings(Settings):
     """A robot's battery."""
 
-    capacity: float = Field(default=7200.0, gt=0.0, description='Energy of a full battery [J]')
+    capacity: Positive = Field(default=7200.0, description='Energy of a full battery [J]')
     charge: float = Field(default=1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
-    idle_power: float = Field(default=2.0, ge=0.0, description='Drain at rest or hovering [W]')
-    charging_power: float = Field(
-        default=0.0, ge=0.0, description='Power at a charger, where it stands; 0: never charged [W]'
+    idle_power: NotNegative = Field(default=2.0, description='Drain at rest or hovering [W]')
+    charging_power: NotNegative = Field(
+        default=0.0, description='Power at a charger, where it stands; 0: never charged [W]'
     )
-    motion_power: float = Field(
-        default=4.0, ge=0.0, description='Drain for each metre per second on top of it [W/(m/s)]'
+    motion_power: NotNegative = Field(
+        default=4.0, description='Drain for each metre per second on top of it [W/(m/s)]'
     )
 
 
@@ -129,7 +129,7 @@ class RobotSettings(Settings):
     )
     start: Vector3 = Field(description='Position at the start, x y z [m, map]')
     yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
-    radius: float = Field(default=0.1, gt=0.0, description='Of a circle around the robot [m]')
+    radius: Positive = Field(default=0.1, description='Of a circle around the robot [m]')
     candidates: CandidateSettings = Field(
         description='Waypoints to choose from; left out: a grid from which it sees everything'
     )
@@ -201,10 +201,7 @@ class Scenario(BaseScenario):
     scoring: ScoringSettings = Field(default_factory=ScoringSettings, description='Scores')
 
     def namespaces(self) -> dict[str, list[str]]:
-        """Return the robots that share filter and planner, by the namespace of those nodes.
-
-        The empty one stands for the root: all robots together.
-        """
+        """Return the robots that share filter and planner by namespace; all together have ''."""
         if self.planner.coordination == 'independent':
             return {name: [name] for name in self.names()}
         return {'': self.names()}

@@ -1,7 +1,5 @@
 """Which parts of the environment no candidate waypoint lets a robot see."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

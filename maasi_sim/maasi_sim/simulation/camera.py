@@ -1,8 +1,4 @@
-"""A simulated camera: images of the floor with its markers, geometry as in `vision.camera_model`.
-
-Arrays by pixel are (h, w). The floor's coordinates under each pixel are in the map frame [m], NaN
-above the horizon. The image is linear in the light.
-"""
+"""A simulated camera: images (h, w) of the floor [m, map] and its markers, linear in light."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
-from maasi_filter.settings import Settings, Vector3
+from maasi_filter.settings import NotNegative, Positive, Settings, Vector3
 from maasi_sim.simulation.world import World, noise_stream
 
 
@@ -30,7 +30,7 @@ class DistractorSettings(Settings):
 class RenderSettings(Settings):
     """Disturbances of the simulated camera: moderate by default, none with `ideal()`."""
 
-    marker_diameter: float = Field(default=0.03, gt=0, description='Diameter of the markers [m]')
+    marker_diameter: Positive = Field(default=0.03, gt=0, description='Diameter of the markers [m]')
     marker_colour: Vector3 = Field(
         default=[0.08, 0.17, 0.62], description='Reflectance of the markers in R, G, B, 0 to 1'
     )
@@ -43,7 +43,7 @@ class RenderSettings(Settings):
     light_variation: float = Field(
         default=0.15, ge=0, lt=1, description='Relative amplitude of the light over the floor [-]'
     )
-    light_wavelength: float = Field(
+    light_wavelength: Positive = Field(
         default=3.0, gt=0, description='Wavelength of the light over the floor [m]'
     )
     vignetting: float = Field(
@@ -61,19 +61,23 @@ class RenderSettings(Settings):
         lt=1,
         description="Relative amplitude of the drift of each channel's gain [-]",
     )
-    drift_period: float = Field(default=20.0, gt=0, description='Period of the drifts, about [s]')
-    shot_noise: float = Field(
+    drift_period: Positive = Field(
+        default=20.0, gt=0, description='Period of the drifts, about [s]'
+    )
+    shot_noise: NotNegative = Field(
         default=0.06,
         ge=0,
         description='Variance of the noise for each grey level of signal [grey level]',
     )
-    read_noise: float = Field(
+    read_noise: NotNegative = Field(
         default=1.5, ge=0, description='Deviation of the noise in the dark [grey level]'
     )
-    exposure_time: float = Field(
+    exposure_time: NotNegative = Field(
         default=0.006, ge=0, description='Time over which motion blurs the image [s]'
     )
-    blur: float = Field(default=0.5, ge=0, description='Deviation of the blur of the lens [px]')
+    blur: NotNegative = Field(
+        default=0.5, ge=0, description='Deviation of the blur of the lens [px]'
+    )
     jpeg_quality: int | None = Field(
         default=None, ge=1, le=100, description='Quality of JPEG compression; none: no JPEG [1]'
     )

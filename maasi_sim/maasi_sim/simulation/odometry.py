@@ -8,7 +8,7 @@ from pydantic import Field
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, inverse
-from maasi_filter.settings import Settings
+from maasi_filter.settings import NotNegative, Settings
 from maasi_planner.motion import RobotState
 from maasi_sim.simulation.world import noise_stream
 
@@ -18,29 +18,26 @@ _LEAST_VARIANCE = 1e-12  # reported variances stay positive: consumers invert th
 class OdometrySettings(Settings):
     """Errors of a robot's odometry; all zero: perfect."""
 
-    position_noise: float = Field(
-        default=0.002, ge=0.0, description='Deviation of each coordinate, independent each step [m]'
+    position_noise: NotNegative = Field(
+        default=0.002, description='Deviation of each coordinate, independent each step [m]'
     )
-    heading_noise: float = Field(
-        default=0.002, ge=0.0, description='Deviation of the heading, independent each step [rad]'
+    heading_noise: NotNegative = Field(
+        default=0.002, description='Deviation of the heading, independent each step [rad]'
     )
-    velocity_noise: float = Field(
-        default=0.005, ge=0.0, description='Deviation of each part of the velocity [m/s]'
+    velocity_noise: NotNegative = Field(
+        default=0.005, description='Deviation of each part of the velocity [m/s]'
     )
-    position_drift: float = Field(
+    position_drift: NotNegative = Field(
         default=0.0,
-        ge=0.0,
         description='Deviation of the drift of x and y after one metre; grows with its root [m]',
     )
-    heading_drift: float = Field(
+    heading_drift: NotNegative = Field(
         default=0.0,
-        ge=0.0,
         description='Deviation of the drift of the heading after one metre; grows with its root '
         '[rad]',
     )
-    position_offset: float = Field(
+    position_offset: NotNegative = Field(
         default=0.0,
-        ge=0.0,
         description='Length of a constant error of the position, in a direction drawn for each '
         'run; level where the robot is on the floor [m]',
     )

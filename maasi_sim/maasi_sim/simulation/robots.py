@@ -1,7 +1,5 @@
 """Simulated robots: a body under velocity commands, with battery, odometry and sensors."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np
@@ -62,12 +60,7 @@ class SimulatedRobot:
     """
 
     def __init__(
-        self,
-        name: str,
-        settings: RobotSettings,
-        world: World,
-        floor: RenderSettings,
-        seed: int,
+        self, name: str, settings: RobotSettings, world: World, floor: RenderSettings, seed: int
     ) -> None:
         self.name = name
         self.settings = settings

@@ -14,7 +14,7 @@ from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.measurement import wrap_angle
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
-from maasi_filter.settings import Settings
+from maasi_filter.settings import NotNegative, Positive, Settings
 from maasi_sim.simulation.world import noise_stream
 
 
@@ -78,12 +78,12 @@ class LaserSettings(Settings):
     """A planar laser scanner; the defaults are those of the TurtleBot3's."""
 
     beams: int = Field(default=360, ge=1, le=100_000, description='Beams of a full turn [1]')
-    minimum_range: float = Field(default=0.12, ge=0.0, description='Nearest return [m]')
-    maximum_range: float = Field(default=3.5, gt=0.0, description='Farthest return [m]')
-    noise: float = Field(default=0.01, ge=0.0, description='Deviation of a range [m]')
-    rate: float = Field(default=5.0, gt=0.0, description='Turns per second [Hz]')
-    wall_margin: float = Field(
-        default=0.3, ge=0.0, description='Distance of the walls outside the bounds [m]'
+    minimum_range: NotNegative = Field(default=0.12, description='Nearest return [m]')
+    maximum_range: Positive = Field(default=3.5, description='Farthest return [m]')
+    noise: NotNegative = Field(default=0.01, description='Deviation of a range [m]')
+    rate: Positive = Field(default=5.0, description='Turns per second [Hz]')
+    wall_margin: NotNegative = Field(
+        default=0.3, description='Distance of the walls outside the bounds [m]'
     )
 
     @model_validator(mode='after')

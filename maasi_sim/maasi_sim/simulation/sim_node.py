@@ -1,7 +1,5 @@
 """The simulation node: publishes the clock, and simulates every robot behind its topics."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable
@@ -20,6 +18,7 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, SENSOR, sensor_reader
 from maasi_filter.ros.run_node import run
+from maasi_filter.settings import NotNegative, Positive
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, ScenarioError
@@ -55,9 +54,8 @@ class SimNodeSettings(NodeSettings):
     scenario: str = Field(
         min_length=1, description='Scenario file, or the name of one in config/scenarios'
     )
-    rate: float = Field(
+    rate: NotNegative = Field(
         default=1.0,
-        ge=0.0,
         description='Simulated over wall time, at most; 0: as fast as possible, in lockstep only',
     )
     follow_clock: bool = Field(
@@ -66,9 +64,8 @@ class SimNodeSettings(NodeSettings):
         'and `rate` does not count',
     )
     recorder: bool = Field(default=False, description='Whether it waits for the recorder, too')
-    command_age: float = Field(
+    command_age: Positive = Field(
         default=1.0,
-        gt=0.0,
         description='Simulated time after which a command is too old; in lockstep each is for its '
         'step [s]',
     )
@@ -384,7 +381,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         for name in present:
             self._robots[name].publish_odometry(stamp)
         # In lockstep the step is the time of the nodes: a clock for each would cost a tenth more.
-        if self._clock_publisher is not None and self._is_time_due():
+        every = max(round(_CLOCK_PERIOD / self._length), 1) if self.settings.lockstep else 1
+        if self._clock_publisher is not None and self.step % every == 0:
             self._clock_publisher.publish(Clock(clock=stamp))
         again = [name for name in present if name in robots]
         imaging = [name for name in again if self.simulation.images_due(name)]
@@ -394,10 +392,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         # Last: robots and planners work while images are made.
         for name in again:
             self._robots[name].publish_sensors(stamp)
-
-    def _is_time_due(self) -> bool:
-        every = max(round(_CLOCK_PERIOD / self._length), 1) if self.settings.lockstep else 1
-        return self.step % every == 0
 
     def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
         """Pass every message: commands are compared with the step, and zeros always stop."""
@@ -428,8 +422,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self.simulation.robots[name].command(velocity)
         else:
             self.drop(
-                'bad command',
-                f'{name}/cmd_vel.twist: read {velocity}, allowed are finite numbers',
+                'bad command', f'{name}/cmd_vel.twist: read {velocity}, allowed are finite numbers'
             )
         if self.settings.lockstep:
             self._waiting.discard(f'{name}/cmd_vel')

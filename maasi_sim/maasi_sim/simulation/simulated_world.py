@@ -1,7 +1,5 @@
 """Simulated robots on one clock, with the events of the scenario."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

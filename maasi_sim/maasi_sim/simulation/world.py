@@ -13,7 +13,7 @@ from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.records import Label
-from maasi_filter.settings import Finite, Settings
+from maasi_filter.settings import Finite, NotNegative, Settings
 
 
 def noise_stream(
@@ -43,23 +43,21 @@ class TargetSettings(Settings):
     positions: list[list[Finite]] | None = Field(
         default=None, description='Given positions, instead of drawn ones [m, map]'
     )
-    separation: float = Field(
-        default=0.0, ge=0.0, description='Least distance between two targets [m]'
+    separation: NotNegative = Field(
+        default=0.0, description='Least distance between two targets [m]'
     )
-    margin: float = Field(default=0.0, ge=0.0, description='Least distance from the bounds [m]')
+    margin: NotNegative = Field(default=0.0, description='Least distance from the bounds [m]')
     clusters: int = Field(default=3, ge=1, description='Clustered: how many centres [1]')
     spread: float | None = Field(
         default=None,
         gt=0.0,
         description="Clustered: deviation around the centres; none: 1/15 of the space's size [m]",
     )
-    walk: float = Field(
+    walk: NotNegative = Field(
         default=0.0,
-        ge=0.0,
         description='Deviation of a random walk on each axis after one second; ranging sensors '
         'only [m/sqrt(s)]',
     )
-
     identified: bool = Field(
         default=False,
         description='Whether sensors read the identity of each target, as from a transponder; '

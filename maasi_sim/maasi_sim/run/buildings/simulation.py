@@ -15,10 +15,7 @@ from maasi_sim.simulation.simulated_world import SimulatedTeam
 
 
 class SearchingRobot:
-    """A simulated robot that searches buildings: a mass point under bounded forces, 004, (1).
-
-    The force of a command holds for one step; without one it brakes and hovers, as autopilots do.
-    """
+    """A mass point under a force for each step, 004, (1); without one it brakes and hovers."""
 
     camera = ranging = laser = None
 

@@ -1,7 +1,5 @@
 """A search on a map: found targets, ways and what was explored, as GeoJSON (RFC 7946)."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any

@@ -13,13 +13,7 @@ from maasi_drivers.settings.driver import DRIVERS, DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import unsuitable_lengths, unused_settings
-from maasi_sim.run.node_plan import (
-    SIMULATED,
-    NodePlan,
-    common_parameters,
-    guard_plan,
-    sim_plan,
-)
+from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.geojson import found_geojson, ways_geojson
 from maasi_sim.run.targets.observer import TargetObserver

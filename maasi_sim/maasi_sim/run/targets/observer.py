@@ -1,7 +1,5 @@
 """Gathers the data of the report of a search for targets from its messages."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from typing import Any
@@ -17,11 +15,7 @@ from maasi_sim.scenario.schema import Scenario
 
 
 class TargetObserver(Observer):
-    """Gathers the data of a report from serialised messages, in the order of arrival.
-
-    Decisions, filter updates and found targets are decoded at once, as the end of a run depends on
-    them; the rest is decoded by `record`.
-    """
+    """Gathers the data of a report; messages on which the end depends are decoded at once."""
 
     def __init__(self, name: str, scenario: Scenario, seed: int, types: Typestore) -> None:
         spaces = scenario.namespaces()

@@ -1,7 +1,5 @@
 """The report of a search for targets as plain values, and in words."""
 
-from __future__ import annotations
-
 from itertools import takewhile
 from typing import Any
 

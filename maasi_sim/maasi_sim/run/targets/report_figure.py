@@ -1,7 +1,5 @@
 """The figure of a search for targets: where, when, and what was found."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Scores of found targets against the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Found targets as rows of a table, for CSV, GeoJSON and data frames."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Sequence
@@ -22,11 +20,7 @@ def found_rows(
     pairs: Iterable[tuple[int, int]],
     origin: OriginSettings | None,
 ) -> list[Row]:
-    """Return a row for each found target, with the columns of `columns`.
-
-    `pairs` are indices of a found target and of the true one that it is. Without an origin of the
-    map rows have no geodetic coordinates.
-    """
+    """Return a row of `columns` for each found target; `pairs`: of it and the true one it is."""
     rows, true = [], dict(pairs)
     for index, item in enumerate(found):
         target = true.get(index)

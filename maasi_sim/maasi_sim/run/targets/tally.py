@@ -1,7 +1,5 @@
 """What the filters have found, update by update, and the record of a search for targets."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain

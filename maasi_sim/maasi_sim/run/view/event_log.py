@@ -1,37 +1,4 @@
-"""The event log of a run: JSON lines, the first of them the scene; thinned and packed for a page.
-
-Each event is a list: time since the first step [s], kind, whose it is, and what the kind holds.
-The last event of a kind and owner at or before a time is what holds at that time.
-
-==========  ======================================================================================
-kind        after time, kind and owner
-==========  ======================================================================================
-robot       [x, y, z, yaw], battery (negative: unknown), goal status, reason; beyond the statuses of
-            AgentState: 6 it left, 7 it is silent, 8 the run has ended
-seen        [x, y, z] of the robot, detections [range, bearing, elevation, and a deviation of each]
-picture     JPEG in base64 of what its camera saw as it measured, [width, height] of the image [px],
-            detections in it [column, row, radius], or null where they are not known
-filter      expected number, clusters [x, y, z, mass, covariance], measurements so far
-found       targets [id, x, y, z, covariance, robot, time]
-plan        planner, explored share, objective, reason, robots [name, index, chosen, waypoint,
-            candidates [x, y, z, C, T, E, J, K, M], reason]
-way         planned positions [x, y, z]
-map         corner [x, y, z], spacing, number of nodes by axis, e of each node as a digit 0 to 9,
-            explored share
-truth       true targets [x, y, z]
-score       true targets found, missed, false, RMSE or null [m], GOSPA [m]
-cuboid      activity, how, target, robots heard, cuboids planned, snapshots [cuboid, x, y, z, p_d],
-            whether it knows that all are visited
-log         level, source, text
-start       nodes that are ready, nodes that there are
-mode        the modes of the robots of a planner node, in words
-end         reason, text
-scene       a part of the scene that became known later
-==========  ======================================================================================
-
-Covariances are their upper triangle: xx, xy, xz, yy, yz, zz. Lengths are in metres, angles in
-radians, in the frame of the map.
-"""
+"""The event log of a run: JSON lines, the first of them the scene (docs/view.md, The event log)."""
 
 import base64
 import gzip

@@ -1,7 +1,4 @@
-"""Makes events from the messages of a run: of a recording, of a run, or of any ROS graph.
-
-Topics are known by types, or the last part of their names: any bag and namespace is read.
-"""
+"""Makes events from the messages of any bag or ROS graph, by types or ends of names."""
 
 import contextlib
 import math

@@ -1,7 +1,5 @@
 """The scene of a run: what does not change, from its scenario or from its messages."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

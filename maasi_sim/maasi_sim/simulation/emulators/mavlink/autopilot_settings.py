@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from maasi_filter.settings import Finite, Settings
+from maasi_filter.settings import Finite, NotNegative, Positive, Settings
 
 
 class AutopilotSettings(Settings):
@@ -19,16 +19,12 @@ class AutopilotSettings(Settings):
         default='arducopter', description='Whose behaviour it has'
     )
     system: int = Field(default=1, ge=1, le=255, description='Its system id')
-    depth: float = Field(
-        default=0.0, ge=0.0, description='Of a submarine when it is switched on [m]'
-    )
-    estimator_time: float = Field(
-        default=2.0, ge=0.0, description='Until its position estimate is ready [s]'
+    depth: NotNegative = Field(default=0.0, description='Of a submarine when it is switched on [m]')
+    estimator_time: NotNegative = Field(
+        default=2.0, description='Until its position estimate is ready [s]'
     )
     second_gnss: bool = Field(default=False, description='Whether it has a second GNSS receiver')
-    noise: float = Field(
-        default=0.005, ge=0.0, description='Deviation of its reported position [m]'
-    )
+    noise: NotNegative = Field(default=0.005, description='Deviation of its reported position [m]')
     barometer_drift: Finite = Field(
         default=0.0, description='Of its estimated height until it is armed [m/s]'
     )
@@ -36,12 +32,12 @@ class AutopilotSettings(Settings):
         default_factory=list,
         description='Charges of batteries beside the first, which do not change',
     )
-    endurance: float = Field(
-        default=1200.0, gt=0.0, description='Time for which a full battery lasts in the air [s]'
+    endurance: Positive = Field(
+        default=1200.0, description='Time for which a full battery lasts in the air [s]'
     )
     charge: float = Field(default=1.0, ge=0.0, le=1.0, description='At the start, 0 to 1')
-    speed: float = Field(default=2.0, gt=0.0, description='Largest speed, level [m/s]')
-    acceleration: float = Field(default=1.0, gt=0.0, description='Largest acceleration [m/s^2]')
+    speed: Positive = Field(default=2.0, description='Largest speed, level [m/s]')
+    acceleration: Positive = Field(default=1.0, description='Largest acceleration [m/s^2]')
     parameters: dict[str, float] = Field(
         default_factory=dict, description='Parameters of the autopilot that differ'
     )
