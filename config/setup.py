@@ -10,7 +10,7 @@ setup(
         ('share/ament_index/resource_index/packages', ['resource/maasi_config']),
         ('share/maasi_config', ['package.xml']),
         ('share/maasi_config/robots', glob('robots/*.yaml')),
-        ('share/maasi_config/scenarios', glob('scenarios/*.yaml')),
+        ('share/maasi_config/scenarios', glob('scenarios/*.*')),
         ('share/maasi_config/foxglove', glob('foxglove/*.json')),
         ('share/maasi_config/rviz', glob('rviz/*.rviz')),
     ],

@@ -52,7 +52,7 @@ def drive(goal, centres, radii, seconds=60.0, yaw=0.0, margin=0.0):
     model = ScanUnicycle(MOTION, Area([[-99.0, 99.0]] * 2), RADIUS, ScanSettings())
     centres, radii = np.reshape(centres, (-1, 2)), np.array(radii)
     body = model.body(RobotState.at_rest([0.0, 0.0, 0.0], yaw))
-    scanner = LaserScanner(LaserSettings(), BOUNDS, centres, radii, 3, 'rover')
+    scanner = LaserScanner(LaserSettings(), Area(BOUNDS), 3, 'rover')
     goal = np.array([*goal, 0.0])
     for step in range(round(seconds / STEP)):
         state = body.robot_state()
@@ -61,7 +61,8 @@ def drive(goal, centres, radii, seconds=60.0, yaw=0.0, margin=0.0):
         if step % 4 == 0:
             motion = {'velocity': state.velocity, 'angular_velocity': state.angular_velocity}
             placed = StampedPose(0, state.pose, **motion)
-            angles, ranges = (0.0, 2.0 * math.pi / 360), scanner.scan(state.pose, step)
+            ranges = scanner.scan(state.pose, step, centres, radii)
+            angles = 0.0, 2.0 * math.pi / 360
             model.see(scan_points(ranges, angles, (0.12, 3.5), 0.0, placed, [0.0, 0.0, 0.0]))
         if model.arrived(state.pose.position, goal):
             return True

@@ -18,6 +18,7 @@ from robot_team import NANOSECONDS, STEP, TURTLEBOT, parameters_of, stamped
 from sensor_msgs.msg import LaserScan
 
 from maasi_drivers.drivers import TurtlebotDriver
+from maasi_filter.area import Area
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState
@@ -34,14 +35,16 @@ class Scanned:
     def __init__(self, team, centres=(), radii=()):
         self.team = team
         self.centres, self.radii = np.reshape(centres, (-1, 2)), np.array(radii, dtype=float)
-        bounds = np.array(team.settings.environment.bounds)
-        self.scanner = LaserScanner(LaserSettings(), bounds, self.centres, self.radii, 1, 'rover')
+        area = Area(team.settings.environment)
+        self.scanner = LaserScanner(LaserSettings(), area, 1, 'rover')
         self.publisher = team.create_publisher(LaserScan, 'scan', RELIABLE)
         team.until(self.publisher.get_subscription_count)
 
     def message(self):
         step = max(self.team.step, 0)
-        ranges = self.scanner.scan(self.team.body.robot_state().pose, step)
+        ranges = self.scanner.scan(
+            self.team.body.robot_state().pose, step, self.centres, self.radii
+        )
         message = scan_message(self.scanner.settings, 'rover/base_scan')
         message.ranges = ranges.tolist()
         return stamped(message, step * NANOSECONDS)

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from planner_helpers import random_team
 
+from maasi_filter.area import Area
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
@@ -13,7 +15,6 @@ from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
     MotionSettings,
-    Obstacles,
     RobotState,
     RobotView,
     TeamView,
@@ -97,7 +98,9 @@ def test_others_keep_their_tours_until_a_cluster_appears():
 
 
 def test_a_tour_ends_where_an_obstacle_hides_a_part():
-    around = Obstacles(np.array([[6.0, 6.0, 0.0]]), np.array([3.0]), np.array([False]))
+    zone = {'centre': [6.0, 6.0], 'radius': 3.0}
+    values = {'bounds': [[-99.0, 99.0]] * 2, 'obstacles': [zone]}
+    around = Area(EnvironmentSettings.model_validate(values))
     team, planner = field(obstacles=around), make_planner('tour')
     legs = 0
     while planner.finished(team) is None:

@@ -119,7 +119,7 @@ def test_independent_robots_share_what_they_find_and_nothing_else(tmp_path):
         scenario['robots'][robot]['start'] = place
         scenario['robots'][robot]['candidates'] = {'ring': 6, 'distance': 12.0}
     scenario['targets'] = {'positions': [[100.0, 95.0, 70.0], [60.0, 70.0, 60.0], [250.0] * 3]}
-    scenario['limits']['time'] = 14.0
+    scenario['limits']['time'] = 13.5
     run = run_scenario(scenario, tmp_path / 'run', '--seed', 1, '--lockstep')
     assert run.code == 1, run.output
     result = search(load_scenario(tmp_path / 'search.yaml'), 1)
