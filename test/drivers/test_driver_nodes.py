@@ -239,6 +239,20 @@ def test_a_batch_is_answered_with_what_the_image_shows(play):
     assert 'outside the field of view' in str(driver.status())
 
 
+def test_in_lockstep_an_image_answers_its_own_batch_after_an_older_one(play):
+    """A driver that was restarted gets the batch before again, and one image only."""
+    _, team = play(lockstep=True)
+    team.move(2)
+    stamp = team.step * NANOSECONDS
+    team.ask(stamp - NANOSECONDS)
+    pose = team.body.robot_state().pose
+    team.images.publish(stamped(rendered(team, [], pose), stamp))
+    assert team.answer(1).batch_id == 1
+    team.ask(stamp)
+    answer = team.answer(2)
+    assert (answer.batch_id, answer.step) == (2, team.step)
+
+
 def test_images_that_cannot_be_used_are_counted_and_the_next_good_one_answers(play, capfd):
     driver, team = play()
     team.move()

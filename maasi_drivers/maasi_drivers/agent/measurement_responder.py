@@ -105,6 +105,8 @@ class MeasurementResponder:
         #: Batches without an answer yet.
         self.queue = MeasurementQueue(driver.history, sensor.offset)
         self._answer: DetectionArray | None = None
+        # The last image with its stamp [ns].
+        self._frame: tuple[int, Any] | None = None
         self.left_out: Counter[str] = Counter()
         self._publisher = driver.create_publisher(DetectionArray, 'detections', RELIABLE)
         driver.create_subscription(
@@ -115,7 +117,7 @@ class MeasurementResponder:
     def reset(self) -> None:
         """Discard what belongs to another time."""
         self.queue.clear()
-        self._answer = None
+        self._answer = self._frame = None
 
     def take_frame(self, topic: str, stamp: int, data: Any, repeated: bool) -> None:
         """Take an image or sweep; see `RobotNode.take_frame`."""
@@ -135,6 +137,7 @@ class MeasurementResponder:
             )
             self.queue.clear()
         self._watchdog.note_frame(topic, repeated)
+        self._frame = stamp, data
         self.queue.add_frame(stamp, data)
         self.serve()
 
@@ -176,6 +179,12 @@ class MeasurementResponder:
                 if (old := self.queue.add_request(request)) is not None:
                     driver.drop('batch', f'batch {old.batch}: no image for it, too many newer ones')
                 self.serve()
+                # In lockstep no other image comes. After a restart it may have answered the batch
+                # before, which is published again.
+                frame = self._frame if driver.settings.lockstep and len(self.queue) else None
+                if frame is not None and frame[0] == stamp:
+                    self.queue.add_frame(*frame)
+                    self.serve()
                 return
 
     def _is_ahead(self, reason: str, what: str, stamp: int) -> bool:
