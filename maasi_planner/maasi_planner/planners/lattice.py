@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 
 import numpy as np
 from numba import njit
+from scipy.sparse import csr_array
 
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.pose import Pose
@@ -19,12 +22,19 @@ OVERLAP = 0.3
 LEAST = 0.01
 # Squares of half the best detection in an area from which on lanes of them are regular enough.
 MANY = 30
+# Parts of a cell of the map along each axis, of which each lies in one square.
+PARTS = 5
+# A square of which less than this share is in the area is visited in the middle of that part.
+CUT = 0.95
+SMALL = 0.3
 
 
-def passing(view: RobotView, step_time: float, reach: float) -> tuple[FloatArray, FloatArray]:
+def passing(
+    view: RobotView, step_time: float, reach: float, heading: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Return distances beside a way, (n,) [m], and the probability of detection on passing them.
 
-    reach: the largest distance of interest [m].
+    reach: the largest distance of interest [m]; heading: of the way [rad].
     """
     half = min(half_view(view.sensor), reach)
     spacing = view.motion.settings.speed * step_time * view.period_steps
@@ -34,13 +44,23 @@ def passing(view: RobotView, step_time: float, reach: float) -> tuple[FloatArray
     places = np.zeros((4, len(beside), 2))
     places[..., 0] = spacing * np.arange(4)[:, None] / 4.0
     places[..., 1] = beside
+    places = places @ turned(heading, 2).T
     missed = np.ones(places.shape[:2])
     for number in range(-math.ceil(far / spacing), math.ceil(far / spacing) + 2):
-        pose = Pose.from_yaw([number * spacing, 0.0, 0.0], 0.0)
+        along = number * spacing
+        pose = Pose.from_yaw([along * math.cos(heading), along * math.sin(heading), 0.0], heading)
         found = view.sensor.detection.probability(places.reshape(-1, 2), pose)
         missed *= 1.0 - found.reshape(missed.shape)
     detected = 1.0 - missed.mean(axis=0)
     return beside[320:], 0.5 * (detected[320:] + detected[320::-1])
+
+
+def turned(heading: float, dimension: int) -> FloatArray:
+    """Return a rotation about the vertical (d, d)."""
+    turn = np.eye(dimension)
+    cos, sin = math.cos(heading), math.sin(heading)
+    turn[:2, :2] = [[cos, -sin], [sin, cos]]
+    return turn
 
 
 class Lattice:
@@ -48,36 +68,71 @@ class Lattice:
 
     Where that gives few squares, as wide as with 0.9 of it, so that places can be chosen finely.
 
-    points (n, d): their centres [m]; kernel: probability of detection on passing, by offset in
-    squares from the place that is passed; trust (n,): in what a visit gains, for
-    its user to reduce.
+    points (n, d): their centres, or those of their parts in the area [m]; turn (d, d): axes of
+    the squares, in columns; kernel: probability of detection on passing, by offset in squares
+    from the place that is passed; trust (n,): in what a visit gains, for its user to reduce.
     """
 
-    def __init__(self, exploration: UnexploredMap, beside: FloatArray, detected: FloatArray):
+    def __init__(
+        self,
+        exploration: UnexploredMap,
+        beside: FloatArray,
+        detected: FloatArray,
+        heading: float = 0.0,
+    ):
+        d = exploration.dimension
+        self.turn = turned(heading, d)
         sure, half = (
             2.0 * float(beside[detected >= share * detected.max()].max()) for share in (0.9, 0.5)
         )
-        self.pitch = half if exploration.volume >= MANY * half**exploration.dimension else sure
-        centres, self._parts, widths = [], [], []
+        self.pitch = half if exploration.volume >= MANY * half**d else sure
+        # Parts of the cells of the map, of each axis.
+        parts, sizes = [], []
         for (low, high), nodes, step in zip(
             exploration.bounds, exploration.axes(), exploration.step
         ):
-            number = max(1, math.ceil((high - low) / max(self.pitch, step) - 0.1))
-            edges = np.linspace(low, high, number + 1)
-            centres.append(0.5 * (edges[1:] + edges[:-1]))
-            widths.append(edges[1] - edges[0])
-            # Share of the cell of each node of the map that lies in each square.
             first, last = np.maximum(nodes - 0.5 * step, low), np.minimum(nodes + 0.5 * step, high)
-            begin, end = np.maximum(edges[:-1, None], first), np.minimum(edges[1:, None], last)
-            self._parts.append(np.maximum(end - begin, 0.0) / (last - first))
-        points = np.stack(np.meshgrid(*centres, indexing='ij'), axis=-1)
-        self.points = points.reshape(-1, exploration.dimension)
-        self.trust = np.ones(len(self.points))
-        self.shape = (*points.shape[:-1], 1)[:3]
+            shares = (np.arange(PARTS) + 0.5) / PARTS
+            sizes.append(np.repeat(last - first, PARTS))
+            parts.append((first[:, None] + shares * (last - first)[:, None]).ravel())
+        places = np.stack(np.meshgrid(*parts, indexing='ij'), axis=-1)
+        within = places.reshape(-1, d) @ self.turn
+        corners = np.array(list(itertools.product(*exploration.bounds))) @ self.turn
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        size = np.maximum(self.pitch, exploration.step)
+        counts = np.maximum(1, np.ceil((high - low) / size - 0.1)).astype(int)
+        widths = (high - low) / counts
+        rows = np.clip(((within - low) / widths).astype(int), 0, counts - 1)
+        squares = np.ravel_multi_index(tuple(rows.T), tuple(counts))
+        nodes = np.indices(places.shape[:-1]).reshape(d, -1) // PARTS
+        cells = np.ravel_multi_index(tuple(nodes), exploration.values.shape[:d])
+        number = int(counts.prod())
+        inside = (exploration.cell_volumes() > 0.0).ravel()[cells]
+        inside = inside * functools.reduce(np.multiply.outer, sizes).ravel()
+        self.points = (low + (np.indices(tuple(counts)).reshape(d, -1).T + 0.5) * widths) @ self.turn.T
+        held = np.bincount(squares, inside, number)
+        # What is small belongs to the nearest square that is not.
+        small = (held > 0.0) & (held < SMALL * held.max())
+        large = np.flatnonzero(held >= SMALL * held.max())
+        gaps = np.linalg.norm(self.points[small, None] - self.points[large], axis=2)
+        owner = np.arange(number)
+        owner[small] = large[gaps.argmin(axis=1)]
+        squares = owner[squares]
+        whole = held > CUT * held.max()
+        held = np.bincount(squares, inside, number)
+        moved = (held > 0.0) & ~(whole & (held < (2.0 - CUT) * held.max()))
+        for axis in range(d):
+            middle = np.bincount(squares, inside * places.reshape(-1, d)[:, axis], number)
+            self.points[moved, axis] = middle[moved] / held[moved]
+        shares = np.full(len(squares), float(PARTS) ** -d)
+        # Share of each cell of the map that lies in each square.
+        self._parts = csr_array((shares, (squares, cells)), (number, exploration.values.size))
+        self.trust = np.ones(number)
+        self.shape = (*counts.tolist(), 1)[:3]
         far = float(beside[detected >= 0.05].max(initial=0.0))
-        counts = [min(int(far / width), size) for width, size in zip(widths, self.shape)]
-        counts += [0] * (3 - len(counts))
-        offsets = np.meshgrid(*(np.arange(-count, count + 1) for count in counts), indexing='ij')
+        reach = [min(int(far / width), size) for width, size in zip(widths, self.shape)]
+        reach += [0] * (3 - d)
+        offsets = np.meshgrid(*(np.arange(-count, count + 1) for count in reach), indexing='ij')
         square = sum((offset * width) ** 2 for offset, width in zip(offsets, widths))
         self.kernel = np.interp(np.sqrt(square), beside, detected, right=0.0)
 
@@ -85,9 +140,7 @@ class Lattice:
         """Return the share of all targets that is unseen in each square, (nx, ny, nz)."""
         volumes = exploration.cell_volumes()
         share = exploration.values * volumes / volumes.sum()
-        for axis, part in enumerate(self._parts):
-            share = np.moveaxis(np.tensordot(part, share, (1, axis)), 0, axis)
-        return np.ascontiguousarray(share.reshape(self.shape))
+        return np.ascontiguousarray((self._parts @ share.ravel()).reshape(self.shape))
 
     def choose(self, exploration: UnexploredMap, enough: int = 1) -> tuple[IntArray, FloatArray]:
         """Return places from which what is unseen is seen, and the share each adds (m,).

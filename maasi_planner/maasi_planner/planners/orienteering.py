@@ -61,6 +61,7 @@ def plan_ways(
     budgets: FloatArray,
     ends: FloatArray | None = None,
     speeds: FloatArray | None = None,
+    known: list[IntArray] | None = None,
 ) -> list[IntArray]:
     """Return the nodes that each robot visits, in order.
 
@@ -81,6 +82,8 @@ def plan_ways(
         Where the way of each robot has to end, metres.
     speeds : (r,) array, optional
         Of the robots, on any common scale; none: all alike.
+    known : list of (m,) arrays, optional
+        Ways to improve, beside new ones; nodes that are not on them are added.
     """
     used, robots = np.flatnonzero(np.asarray(prizes) > 0.0), len(budgets)
     n, d = len(used), np.shape(nodes)[1]
@@ -97,9 +100,15 @@ def plan_ways(
     rates = np.ones(robots) if speeds is None else 1.0 / np.asarray(speeds, dtype=float)
     limits = np.asarray(budgets, dtype=float)
     early = _terms(limits, rate=rates)
+    begun = [
+        _shared(places, _lanes(points[:n][:, axes]), robots)
+        for axes in (np.arange(d), np.array([1, 0, *range(2, d)]))
+    ]
+    if known is not None:
+        begun.append(_completed(places, [np.searchsorted(used, way[np.isin(way, used)]) for way in known]))
     found = []
-    for axes in (np.arange(d), np.array([1, 0, *range(2, d)])):
-        routes = _routes(places, _shared(places, _lanes(points[:n][:, axes]), robots))
+    for rows in begun:
+        routes = _routes(places, rows)
         _improve(places, routes, early)
         found.append((sum(_now(routes, early, k) for k in range(robots)), routes))
     routes = min(found, key=lambda item: item[0])[1]
@@ -153,6 +162,18 @@ def _shared(places: _Places, order: IntArray, robots: int) -> list[IntArray]:
         part, gap = parts.pop(nearest), gaps[nearest]
         rows.append(part[::-1] if gap[1] < gap[0] else part)
     return rows
+
+
+def _completed(places: _Places, rows: list[IntArray]) -> list[IntArray]:
+    """Return rows with the nodes that are on none, each behind its nearest one that is on one."""
+    ways = [row.tolist() for row in rows]
+    on = {node: way for way in ways for node in way}
+    for node in range(len(places.near) - len(rows) - 1):
+        if node not in on:
+            near = next((other for other in places.near[node].tolist() if other in on), None)
+            on[node] = on[near] if near is not None else min(ways, key=len)
+            on[node].insert(on[node].index(near) + 1 if near is not None else 0, node)
+    return [np.array(way, np.int64) for way in ways]
 
 
 def _routes(places: _Places, rows: list[IntArray]) -> _Routes:

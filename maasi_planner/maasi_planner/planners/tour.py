@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
@@ -21,6 +23,8 @@ SAME = 0.1
 ENOUGH = 3
 # A leg has at most one square, or so many times the distance at which the robot turns.
 LEG = 5.0
+# Lanes lie askew if they are so many times as wide then.
+ASKEW = 1.1
 
 
 class Tour(Planner):
@@ -79,12 +83,23 @@ class Tour(Planner):
         )
 
     def _squares(self, team: TeamView) -> Lattice:
-        """Return the lattice: of the robot that sees least to its sides."""
+        """Return the lattice: of the robot that sees least to its sides.
+
+        In the plane its lanes lie askew where that shows more, as with a box that does not turn.
+        """
         if self._lattice is None:
             reach = float(np.linalg.norm(team.bounds[:, 1] - team.bounds[:, 0]))
-            seen = [passing(view, team.step_time, reach) for view in team.robots.values()]
-            lattices = [Lattice(team.exploration, *one) for one in seen]
-            self._lattice = min(lattices, key=lambda lattice: lattice.pitch)
+            found = []
+            for heading in (0.0, 0.25 * math.pi)[: 4 - team.dimension]:
+                seen = [
+                    passing(view, team.step_time, reach, heading) for view in team.robots.values()
+                ]
+                lattices = [Lattice(team.exploration, *one, heading) for one in seen]
+                found.append(min(lattices, key=lambda lattice: lattice.pitch))
+            level, *askew = found
+            self._lattice = level
+            if askew and askew[0].pitch > ASKEW * level.pitch:
+                self._lattice = askew[0]
         return self._lattice
 
     def _prizes(self, team: TeamView) -> FloatArray | None:
@@ -110,6 +125,11 @@ class Tour(Planner):
     def _plan(self, team: TeamView) -> FloatArray:
         """Plan the tours of all robots from where they are, or will be; return the prizes."""
         lattice, names, heavy = self._squares(team), team.names(), self.heavy(team)
+        number = len(self._chosen)
+        before = {
+            name: self._chosen[[i for i in way if i < number]].tolist()
+            for name, way in self._ways.items()
+        }
         self._chosen, gains = lattice.choose(team.exploration, ENOUGH * len(names))
         centres = np.array([item.position for item in heavy]).reshape(-1, team.dimension)
         self._points = np.vstack([lattice.points[self._chosen], centres])
@@ -133,7 +153,15 @@ class Tour(Planner):
                 prizes[gaps < SAME * lattice.pitch] = 0.0
         speeds = np.array([team.robots[name].motion.settings.speed for name in names])
         homes = np.array(ends) if np.isfinite(budgets).all() else None
-        ways = plan_ways(self._points, prizes, np.array(starts), np.array(budgets), homes, speeds)
+        # Lanes are those of the lattice.
+        points, places = self._points @ lattice.turn, np.array(starts) @ lattice.turn
+        homes = None if homes is None else homes @ lattice.turn
+        rows = {square: row for row, square in enumerate(self._chosen.tolist())}
+        known = [
+            np.array([rows[i] for i in before.get(name, []) if i in rows], np.int64)
+            for name in names
+        ]
+        ways = plan_ways(points, prizes, places, np.array(budgets), homes, speeds, known)
         self._ways = {name: way.tolist() for name, way in zip(names, ways)}
         return self._planned
 
