@@ -97,7 +97,11 @@ def large(squares, detection, number):
         60.0 + 24.0 * squares / number,
         {'ring': 8, 'distance': 20.0},
         [
-            {'environment': {'bounds': [[0.0, side]] * 2}, 'targets': {'separation': 5.0}},
+            {
+                'step': 0.2,
+                'environment': {'bounds': [[0.0, side]] * 2},
+                'targets': {'separation': 5.0},
+            },
             drones(*starts),
             robots(
                 candidates=grid,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import functools
 import itertools
 import math
@@ -85,6 +86,7 @@ class Lattice:
         sure, half = (
             2.0 * float(beside[detected >= share * detected.max()].max()) for share in (0.9, 0.5)
         )
+        half *= float(os.environ.get('HALF','1'))
         self.pitch = half if exploration.volume >= MANY * half**d else sure
         # Parts of the cells of the map, of each axis.
         parts, sizes = [], []
@@ -109,24 +111,21 @@ class Lattice:
         number = int(counts.prod())
         inside = (exploration.cell_volumes() > 0.0).ravel()[cells]
         inside = inside * functools.reduce(np.multiply.outer, sizes).ravel()
-        self.points = (low + (np.indices(tuple(counts)).reshape(d, -1).T + 0.5) * widths) @ self.turn.T
+        self._centres = (low + (np.indices(tuple(counts)).reshape(d, -1).T + 0.5) * widths) @ self.turn.T
         held = np.bincount(squares, inside, number)
         # What is small belongs to the nearest square that is not.
         small = (held > 0.0) & (held < SMALL * held.max())
         large = np.flatnonzero(held >= SMALL * held.max())
-        gaps = np.linalg.norm(self.points[small, None] - self.points[large], axis=2)
+        gaps = np.linalg.norm(self._centres[small, None] - self._centres[large], axis=2)
         owner = np.arange(number)
         owner[small] = large[gaps.argmin(axis=1)]
         squares = owner[squares]
-        whole = held > CUT * held.max()
-        held = np.bincount(squares, inside, number)
-        moved = (held > 0.0) & ~(whole & (held < (2.0 - CUT) * held.max()))
-        for axis in range(d):
-            middle = np.bincount(squares, inside * places.reshape(-1, d)[:, axis], number)
-            self.points[moved, axis] = middle[moved] / held[moved]
         shares = np.full(len(squares), float(PARTS) ** -d)
         # Share of each cell of the map that lies in each square.
         self._parts = csr_array((shares, (squares, cells)), (number, exploration.values.size))
+        self._whole = float(widths.prod())
+        self._cells = functools.reduce(np.multiply.outer, sizes)[(slice(None, None, PARTS),) * d].ravel()
+        self._nodes = np.stack(np.meshgrid(*exploration.axes(), indexing='ij'), axis=-1).reshape(-1, d)
         self.trust = np.ones(number)
         self.shape = (*counts.tolist(), 1)[:3]
         far = float(beside[detected >= 0.05].max(initial=0.0))
@@ -141,6 +140,15 @@ class Lattice:
         volumes = exploration.cell_volumes()
         share = exploration.values * volumes / volumes.sum()
         return np.ascontiguousarray((self._parts @ share.ravel()).reshape(self.shape))
+
+    def points(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
+        """Return where to pass squares, (m, d) [m]: in the middle of what is unseen of them."""
+        weights = exploration.values.ravel() * self._cells * (exploration.cell_volumes() > 0.0).ravel()
+        parts = self._parts[chosen]
+        held = parts @ weights
+        middle = parts @ (weights[:, None] * self._nodes) / np.maximum(held, 1e-12)[:, None]
+        whole = np.abs(held - self._whole) < (1.0 - CUT) * self._whole
+        return np.where(whole[:, None] | (held <= 0.0)[:, None], self._centres[chosen], middle)
 
     def choose(self, exploration: UnexploredMap, enough: int = 1) -> tuple[IntArray, FloatArray]:
         """Return places from which what is unseen is seen, and the share each adds (m,).

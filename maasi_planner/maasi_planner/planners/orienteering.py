@@ -105,7 +105,8 @@ def plan_ways(
         for axes in (np.arange(d), np.array([1, 0, *range(2, d)]))
     ]
     if known is not None:
-        begun.append(_completed(places, [np.searchsorted(used, way[np.isin(way, used)]) for way in known]))
+        rows = [np.searchsorted(used, way[np.isin(way, used)]) for way in known]
+        begun.append(_completed(places, rows))
     found = []
     for rows in begun:
         routes = _routes(places, rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 
 import numpy as np
 
@@ -24,7 +25,7 @@ ENOUGH = 3
 # A leg has at most one square, or so many times the distance at which the robot turns.
 LEG = 5.0
 # Lanes lie askew if they are so many times as wide then.
-ASKEW = 1.1
+ASKEW = float(os.environ.get('ASKEW','1.1'))
 
 
 class Tour(Planner):
@@ -132,7 +133,7 @@ class Tour(Planner):
         }
         self._chosen, gains = lattice.choose(team.exploration, ENOUGH * len(names))
         centres = np.array([item.position for item in heavy]).reshape(-1, team.dimension)
-        self._points = np.vstack([lattice.points[self._chosen], centres])
+        self._points = np.vstack([lattice.points(team.exploration, self._chosen), centres])
         masses = [item.mass for item in heavy]
         self._planned = np.concatenate([team.area.expected_targets * gains, masses])
         prizes = self._planned.copy()
@@ -217,14 +218,15 @@ class Tour(Planner):
     def _leg(self, team: TeamView, view: RobotView, place: FloatArray) -> tuple[FloatArray, bool]:
         """Return the waypoint of a leg towards a place, and whether it leads all the way.
 
-        The robot turns half the arrival radius behind what it would without: it cuts corners less.
+        The robot turns a quarter of the arrival radius behind what it would without: it cuts corners less.
         """
         here, turning = view.state.pose.position, view.arrival_radius
         gap = max(float(np.linalg.norm(place - here)), 1e-9)
         longest = max(self._squares(team).pitch, LEG * turning)
-        if turning > 0.0 and gap > 1.5 * longest:
-            return here + (place - here) * longest / gap, False
-        ahead = place + (place - here) * 0.5 * turning / gap
+        whole = turning == 0.0 or gap <= 1.5 * longest
+        end = place + (place - here) * 0.25 * turning / gap
+        if not whole:
+            end = here + (place - here) * longest / gap
         low, high = team.bounds.T
-        ahead[: team.dimension] = np.clip(ahead[: team.dimension], low, high)
-        return ahead, True
+        end[: team.dimension] = np.clip(end[: team.dimension], low, high)
+        return end, whole
