@@ -6,6 +6,7 @@ on.
 """
 
 import argparse
+import dataclasses
 import itertools
 import math
 import os
@@ -18,8 +19,10 @@ from quality_conditions import RADIANS, changed, copies, robots, wanted
 
 from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
 from maasi_sim.experiments.experiment import Case
-from maasi_sim.experiments.searches import comparison_of, search_settings
+from maasi_sim.experiments.searches import comparison_of, run_compared, search_settings
 from maasi_sim.experiments.tables import SearchTable
+from maasi_sim.scenario.loading import scenario_from_values
+from maasi_sim.simulation.world import World
 
 BEGIN, END = '<!-- table: begin -->', '<!-- table: end -->'
 PAPER = {'objective': 'paper', 'alpha': 0.75, 'beta': 0.75, 'control_weight': 0.0}
@@ -35,6 +38,8 @@ class Regime(NamedTuple):
     # Candidates of planners that measure at waypoints only.
     neighbours: dict[str, Any]
     changes: Sequence[Any] = ()
+    # Further ones of the world from which the targets are drawn, where the prior is wrong.
+    truth: Sequence[Any] = ()
 
 
 class Kind(NamedTuple):
@@ -86,39 +91,58 @@ REGIMES = {
 }
 
 
-def large(squares, detection, number):
+def likely(side, turned=False, shifted=0.0):
+    """Return a prior: 58 % of the targets in three squares, 12 % of the area."""
+    parts = []
+    for x, y, width in ((0.25, 0.3, 0.2), (0.7, 0.2, 0.16), (0.55, 0.8, 0.24)):
+        x, y = (1.0 - x, 1.0 - y) if turned else ((x + shifted) % 1.0, y)
+        ring = [(x + i * width / 2, y + j * width / 2) for i, j in CORNERS]
+        text = ', '.join(f'{side * u:.3f} {side * v:.3f}' for u, v in ring)
+        parts.append({'polygon': f'POLYGON (({text}))', 'weight': 10.0})
+    return {'environment': {'prior': {'polygons': parts}}}
+
+
+def large(squares, detection, number, prior='', **wrong):
     """Return the regime of an area of so many squares of a swath (20 m), and drones at its edge."""
     side = 20.0 * math.sqrt(squares)
     most = round(side / 20.0)
     starts = [(side * (i + 0.5) / number, 1.0, 30.0) for i in range(number)]
     grid = {'grid': [most, most], 'spacing': side / most, 'corner': [0.5 * side / most] * 2}
+    shape = {
+        'step': 0.2,
+        'environment': {'bounds': [[0.0, side]] * 2},
+        'targets': {'separation': 5.0, 'distribution': 'prior' if prior else 'uniform'},
+    }
+    drone = robots(
+        candidates=grid,
+        motion={'speed': 5.0, 'acceleration': 5.0},
+        sensor={'detection': DETECTIONS[detection]},
+    )
+    priors = [likely(side, **wrong)] if prior else []
     return Regime(
         PAIR,
         60.0 + 24.0 * squares / number,
         {'ring': 8, 'distance': 20.0},
-        [
-            {
-                'step': 0.2,
-                'environment': {'bounds': [[0.0, side]] * 2},
-                'targets': {'separation': 5.0},
-            },
-            drones(*starts),
-            robots(
-                candidates=grid,
-                motion={'speed': 5.0, 'acceleration': 5.0},
-                sensor={'detection': DETECTIONS[detection]},
-            ),
-        ],
+        [shape, drones(*starts), drone, *priors],
+        [likely(side)] if wrong else [],
     )
 
 
+CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 # Both see 20 m beside a way of 5 m/s, with a measurement each second: the box all, the other half.
 DETECTIONS = {
     'box': {'kind': 'box', 'lower': [-10.0] * 2, 'upper': [10.0] * 2, 'frame': 'world'},
     'exponential': {'size': [3.0, 3.0]},
 }
-for squares, detection, number in itertools.product((30, 100, 300, 1000), DETECTIONS, (1, 3, 10)):
-    REGIMES[f'{squares} squares, {detection}, {number}'] = large(squares, detection, number)
+for squares, detection, prior, number in itertools.product(
+    (30, 100, 300, 1000), DETECTIONS, ('', ', prior'), (1, 3, 10)
+):
+    name = f'{squares} squares, {detection}, {number}{prior}'
+    REGIMES[name] = large(squares, detection, number, prior)
+for squares in (100, 300):
+    for wrong in ({'turned': True}, {'shifted': 0.25}):
+        name = f'{squares} squares, box, 3, prior {[*wrong][0]}'
+        REGIMES[name] = large(squares, 'box', 3, 'prior', **wrong)
 STOPS = [robots(motion={'arrival_radius': 0.0})]
 # What is compared; differences are to the first one.
 KINDS = {
@@ -149,12 +173,25 @@ def prepared(regime, kind):
 
 def comparison(regime, kinds):
     """Return the comparison of a regime."""
-    cases = []
+    what, cases = REGIMES[regime], []
     for kind, how in KINDS.items():
         if kind in kinds:
             settings = search_settings(prepared(regime, kind), how.maker)
+            if what.truth:
+                truth = changed(what.scenario, [*what.changes, *what.truth])
+                settings['truth'] = truth.content()
             cases.append(Case(kind, settings, runs=how.runs))
-    return comparison_of(regime, cases)
+    return dataclasses.replace(comparison_of(regime, cases), run=run_drawn)
+
+
+def run_drawn(settings, seed):
+    """Run a search of a case, with targets that are drawn elsewhere than it believes."""
+    if 'truth' in settings:
+        truth = scenario_from_values(settings['truth'], 'settings')
+        world = World.from_settings(truth.environment, truth.targets, seed)
+        told = {**settings['scenario'], 'targets': {'positions': world.targets.tolist()}}
+        settings = {**settings, 'scenario': told}
+    return run_compared(settings, seed)
 
 
 def main():
