@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from scipy.spatial import cKDTree
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 
@@ -19,6 +20,8 @@ from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 NEIGHBOURS = 8
 LONGEST = 3
 ROUNDS = 6
+# Within budgets the best nodes are looked at, so many times those that can be visited.
+CHOICE = 1.2
 _NONE = (0, 1, 0, 0)
 
 
@@ -86,6 +89,13 @@ def plan_ways(
         Ways to improve, beside new ones; nodes that are not on them are added.
     """
     used, robots = np.flatnonzero(np.asarray(prizes) > 0.0), len(budgets)
+    if len(used) > 1 and np.isfinite(budgets).all():
+        gaps = cKDTree(nodes[used]).query(nodes[used], 2)[0][:, 1]
+        number = int(CHOICE * np.sum(budgets) / max(float(np.median(gaps)), 1e-9)) + 1
+        if number < len(used):
+            far = 0.0 if starts is None else cKDTree(starts).query(nodes[used])[0]
+            best = np.argsort(-prizes[used] / (np.mean(budgets) + far), kind='stable')[:number]
+            used = np.sort(used[best])
     n, d = len(used), np.shape(nodes)[1]
     if n == 0:
         return [used] * robots

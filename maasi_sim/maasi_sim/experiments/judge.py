@@ -45,8 +45,6 @@ PUBLISHED = {
 GOALS = {100.0: 10.0, 300.0: 5.0}
 # Share of the victims that may be anywhere, as in the planner's prior.
 FLOOR = 0.02
-# Among how many squares ways are planned, in squares that the budget reaches: the best ones.
-CHOICE = 1.2
 _FEATURES, _HEATMAP = 'features.geojson', 'heatmap.npy'
 _KEYS = ('center_point', 'meter_per_bin', 'bounds', 'climate', 'environment_type', 'features')
 
@@ -97,8 +95,6 @@ def our_ways(swath: float, free: bool, **task: Any) -> list[Any]:
     apart = np.pi * task['max_radius'] ** 2 / budget
     side = float(np.clip(apart, swath / np.sqrt(2.0), swath))
     nodes, prizes = squares(task['probability_map'], task['bounds'], side)
-    best = np.sort(np.argsort(-prizes)[: int(CHOICE * budget / side)])
-    nodes, prizes = nodes[best], prizes[best]
     if free:
         [order] = plan_ways(nodes, prizes, None, np.array([budget]))
         return list(toolkit().paths.split_path_for_drones(line(nodes[order]), drones))
