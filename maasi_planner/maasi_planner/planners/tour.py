@@ -8,7 +8,14 @@ import os
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.planners.base import Planner, explain, free_of_robots, held_back, waiting_places
+from maasi_planner.planners.base import (
+    Planner,
+    affordable,
+    explain,
+    free_of_robots,
+    held_back,
+    waiting_places,
+)
 from maasi_planner.planners.lattice import Lattice, passing
 from maasi_planner.planners.orienteering import plan_ways
 from maasi_planner.settings import PlannerSettings
@@ -62,7 +69,11 @@ class Tour(Planner):
                 chosen = self._next(team, name, prizes, places, decision)
             if chosen is None:
                 self._target.pop(name, None)
-                chosen = stay(team.robots[name], 'stays: nothing is left for it')
+                view = team.robots[name]
+                chosen = stay(view, 'stays: nothing is left for it')
+                if view.endurance is not None:
+                    # More may be in its reach with a full battery.
+                    view.endurance.spent = True
             decision.robots[name] = chosen
             places.append((chosen.waypoint, team.robots[name].radius))
         return explain(decision)
@@ -195,6 +206,8 @@ class Tour(Planner):
             prediction = view.motion.predict(view.state, point, team.step_time)
             usable = prediction.reached[0] and prediction.lengths[0] > 0
             usable = usable and free_of_robots(point, view.radius, places)[0]
+            if usable and not affordable(team, name, prediction, prediction.reached)[0]:
+                continue
             if usable and (held := held_back(team, name, prediction, decision)):
                 way.insert(0, index)
                 return stay(view, held)
