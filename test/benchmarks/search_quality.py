@@ -141,7 +141,7 @@ for squares, detection, prior, number in itertools.product(
     REGIMES[name] = large(squares, detection, number, prior)
 for squares in (100, 300):
     for wrong in ({'turned': True}, {'shifted': 0.25}):
-        name = f'{squares} squares, box, 3, prior {[*wrong][0]}'
+        name = f'{squares} squares, box, 3, prior {next(iter(wrong))}'
         REGIMES[name] = large(squares, 'box', 3, 'prior', **wrong)
 STOPS = [robots(motion={'arrival_radius': 0.0})]
 # What is compared; differences are to the first one.

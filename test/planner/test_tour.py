@@ -72,11 +72,24 @@ def test_a_box_gives_lanes_that_cover_the_area_once():
     assert team.exploration.explored_fraction() > 0.998
 
 
+def test_lanes_lie_askew_in_a_large_area_where_the_box_is_wider_so():
+    team, planner = field(size=40.0), make_planner('tour')
+    way = [np.array([1.0, 1.0, 0.0])]
+    while team.exploration.explored_fraction() < 0.8:
+        way.append(fly(planner, team))
+    steps = np.diff(way, axis=0)[:, :2]
+    lengths = np.linalg.norm(steps, axis=1)
+    # Along its sides, a box of 2 m sees at most 2 m2 on each metre.
+    assert lengths.sum() < 0.9 * 0.8 * 40.0**2 / 2.0
+    askew = np.abs(np.abs(steps[:, 0]) - np.abs(steps[:, 1])) < 0.1 * lengths
+    assert lengths[askew].sum() > 0.6 * lengths.sum()
+
+
 def test_a_wide_view_visits_few_places_and_then_those_between():
     team, planner = field(ExponentialDetection(0.98, [0.4, 0.4])), make_planner('tour')
     lattice = Lattice(team.exploration, *passing(team.robots['robot0'], 0.1, 17.0))
     chosen, gains = lattice.choose(team.exploration)
-    assert 4 < len(chosen) < 0.5 * len(lattice.points)
+    assert 4 < len(chosen) < 0.5 * lattice.trust.size
     assert gains.sum() <= 1.0 and (np.diff(gains) < 1e-9).all()
     assert gains == pytest.approx(lattice.gains(team.exploration, chosen))
     for _ in range(60):

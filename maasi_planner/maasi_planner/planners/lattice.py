@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import functools
 import itertools
 import math
@@ -10,6 +9,7 @@ import math
 import numpy as np
 from numba import njit
 from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.pose import Pose
@@ -23,11 +23,12 @@ OVERLAP = 0.3
 LEAST = 0.01
 # Squares of half the best detection in an area from which on lanes of them are regular enough.
 MANY = 30
-# Parts of a cell of the map along each axis, of which each lies in one square.
-PARTS = 5
-# A square of which less than this share is in the area is visited in the middle of that part.
-CUT = 0.95
+# Parts of a cell of the map along each axis: each lies in one square. Even: none on a border.
+PARTS = 4
+# A square that holds less than this share of a whole one belongs to its neighbour.
 SMALL = 0.3
+# A square of which less than this share is unseen is passed in the middle of that.
+WHOLE = 0.95
 
 
 def passing(
@@ -69,9 +70,9 @@ class Lattice:
 
     Where that gives few squares, as wide as with 0.9 of it, so that places can be chosen finely.
 
-    points (n, d): their centres, or those of their parts in the area [m]; turn (d, d): axes of
-    the squares, in columns; kernel: probability of detection on passing, by offset in squares
-    from the place that is passed; trust (n,): in what a visit gains, for its user to reduce.
+    turn (d, d): axes of the squares, in columns; kernel: probability of detection on passing, by
+    offset in squares from the place that is passed; trust (n,): in what a visit gains, for its
+    user to reduce. Beside and detected are those of `passing`, for ways of the heading [rad].
     """
 
     def __init__(
@@ -80,54 +81,32 @@ class Lattice:
         beside: FloatArray,
         detected: FloatArray,
         heading: float = 0.0,
-    ):
+    ) -> None:
         d = exploration.dimension
         self.turn = turned(heading, d)
         sure, half = (
             2.0 * float(beside[detected >= share * detected.max()].max()) for share in (0.9, 0.5)
         )
-        half *= float(os.environ.get('HALF','1'))
         self.pitch = half if exploration.volume >= MANY * half**d else sure
-        # Parts of the cells of the map, of each axis.
-        parts, sizes = [], []
-        for (low, high), nodes, step in zip(
-            exploration.bounds, exploration.axes(), exploration.step
-        ):
-            first, last = np.maximum(nodes - 0.5 * step, low), np.minimum(nodes + 0.5 * step, high)
-            shares = (np.arange(PARTS) + 0.5) / PARTS
-            sizes.append(np.repeat(last - first, PARTS))
-            parts.append((first[:, None] + shares * (last - first)[:, None]).ravel())
-        places = np.stack(np.meshgrid(*parts, indexing='ij'), axis=-1)
-        within = places.reshape(-1, d) @ self.turn
+        places, sizes, cells = _samples(exploration)
         corners = np.array(list(itertools.product(*exploration.bounds))) @ self.turn
         low, high = corners.min(axis=0), corners.max(axis=0)
         size = np.maximum(self.pitch, exploration.step)
         counts = np.maximum(1, np.ceil((high - low) / size - 0.1)).astype(int)
         widths = (high - low) / counts
-        rows = np.clip(((within - low) / widths).astype(int), 0, counts - 1)
-        squares = np.ravel_multi_index(tuple(rows.T), tuple(counts))
-        nodes = np.indices(places.shape[:-1]).reshape(d, -1) // PARTS
-        cells = np.ravel_multi_index(tuple(nodes), exploration.values.shape[:d])
+        rows = np.clip(((places @ self.turn - low) / widths).astype(int), 0, counts - 1)
+        squares = _joined(np.ravel_multi_index(tuple(rows.T), tuple(counts)), places, sizes)
         number = int(counts.prod())
-        inside = (exploration.cell_volumes() > 0.0).ravel()[cells]
-        inside = inside * functools.reduce(np.multiply.outer, sizes).ravel()
-        self._centres = (low + (np.indices(tuple(counts)).reshape(d, -1).T + 0.5) * widths) @ self.turn.T
-        held = np.bincount(squares, inside, number)
-        # What is small belongs to the nearest square that is not.
-        small = (held > 0.0) & (held < SMALL * held.max())
-        large = np.flatnonzero(held >= SMALL * held.max())
-        gaps = np.linalg.norm(self._centres[small, None] - self._centres[large], axis=2)
-        owner = np.arange(number)
-        owner[small] = large[gaps.argmin(axis=1)]
-        squares = owner[squares]
-        shares = np.full(len(squares), float(PARTS) ** -d)
-        # Share of each cell of the map that lies in each square.
-        self._parts = csr_array((shares, (squares, cells)), (number, exploration.values.size))
-        self._whole = float(widths.prod())
-        self._cells = functools.reduce(np.multiply.outer, sizes)[(slice(None, None, PARTS),) * d].ravel()
-        self._nodes = np.stack(np.meshgrid(*exploration.axes(), indexing='ij'), axis=-1).reshape(-1, d)
-        self.trust = np.ones(number)
         self.shape = (*counts.tolist(), 1)[:3]
+        self.trust = np.ones(number)
+        # Share of each cell of the map that lies in each square.
+        shares = np.full(len(squares), float(PARTS) ** -d)
+        self._parts = csr_array((shares, (squares, cells)), (number, exploration.values.size))
+        self._cells = np.bincount(cells, sizes)
+        self._held, self._centres = _middles(squares, places, sizes, number)
+        centres = (low + (np.indices(tuple(counts)).reshape(d, -1).T + 0.5) * widths) @ self.turn.T
+        whole = np.abs(self._held / widths.prod() - 1.0) < 1.0 - WHOLE
+        self._centres[whole] = centres[whole]
         far = float(beside[detected >= 0.05].max(initial=0.0))
         reach = [min(int(far / width), size) for width, size in zip(widths, self.shape)]
         reach += [0] * (3 - d)
@@ -142,13 +121,13 @@ class Lattice:
         return np.ascontiguousarray((self._parts @ share.ravel()).reshape(self.shape))
 
     def points(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
-        """Return where to pass squares, (m, d) [m]: in the middle of what is unseen of them."""
-        weights = exploration.values.ravel() * self._cells * (exploration.cell_volumes() > 0.0).ravel()
-        parts = self._parts[chosen]
-        held = parts @ weights
-        middle = parts @ (weights[:, None] * self._nodes) / np.maximum(held, 1e-12)[:, None]
-        whole = np.abs(held - self._whole) < (1.0 - CUT) * self._whole
-        return np.where(whole[:, None] | (held <= 0.0)[:, None], self._centres[chosen], middle)
+        """Return where to pass squares, (m, d) [m]: in the middle, or that of what is unseen."""
+        unseen = exploration.values.ravel() * self._cells
+        parts, nodes = self._parts[chosen], np.meshgrid(*exploration.axes(), indexing='ij')
+        held = np.maximum(parts @ unseen, 1e-12)
+        middles = np.stack([parts @ (unseen * axis.ravel()) / held for axis in nodes], axis=1)
+        whole = held > WHOLE * self._held[chosen]
+        return np.where(whole[:, None], self._centres[chosen], middles)
 
     def choose(self, exploration: UnexploredMap, enough: int = 1) -> tuple[IntArray, FloatArray]:
         """Return places from which what is unseen is seen, and the share each adds (m,).
@@ -161,6 +140,42 @@ class Lattice:
     def gains(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
         """Return the share that each of some places adds to those before it, (m,)."""
         return self.trust[chosen] * _gains(self.unseen(exploration), self.kernel, chosen)
+
+
+def _samples(exploration: UnexploredMap) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return parts of the map's cells: places (n, d) [m], sizes in the area, and cells (n,)."""
+    parts, sizes = [], []
+    for (low, high), nodes, step in zip(exploration.bounds, exploration.axes(), exploration.step):
+        first, last = np.maximum(nodes - 0.5 * step, low), np.minimum(nodes + 0.5 * step, high)
+        shares = (np.arange(PARTS) + 0.5) / PARTS
+        parts.append((first[:, None] + shares * (last - first)[:, None]).ravel())
+        sizes.append(np.repeat((last - first) / PARTS, PARTS))
+    places = np.stack(np.meshgrid(*parts, indexing='ij'), axis=-1)
+    size = functools.reduce(np.multiply.outer, sizes).ravel()
+    rows = np.indices(places.shape[:-1]).reshape(len(parts), -1) // PARTS
+    cells = np.ravel_multi_index(tuple(rows), exploration.values.shape[: len(parts)])
+    inside = (exploration.cell_volumes() > 0.0).ravel()[cells]
+    return places.reshape(-1, len(parts)), size * inside, np.asarray(cells, np.int64)
+
+
+def _middles(
+    squares: IntArray, places: FloatArray, sizes: FloatArray, number: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return how much of the area squares hold, (n,), and the middle of that, (n, d)."""
+    held = np.asarray(np.bincount(squares, sizes, number), dtype=float)
+    sums = [np.bincount(squares, sizes * axis, number) for axis in places.T]
+    return held, np.stack(sums, axis=1) / np.maximum(held, 1e-12)[:, None]
+
+
+def _joined(squares: IntArray, places: FloatArray, sizes: FloatArray) -> IntArray:
+    """Return the squares of samples (n,), those that hold little joined with the nearest others."""
+    number = int(squares.max()) + 1
+    held, middles = _middles(squares, places, sizes, number)
+    small = (held > 0.0) & (held < SMALL * held.max())
+    large = np.flatnonzero(held >= SMALL * held.max())
+    owner = np.arange(number)
+    owner[small] = large[cKDTree(middles[large]).query(middles[small])[1]]
+    return owner[squares]
 
 
 @njit(cache=True)

@@ -110,19 +110,20 @@ def plan_ways(
     rates = np.ones(robots) if speeds is None else 1.0 / np.asarray(speeds, dtype=float)
     limits = np.asarray(budgets, dtype=float)
     early = _terms(limits, rate=rates)
-    begun = [
-        _shared(places, _lanes(points[:n][:, axes]), robots)
-        for axes in (np.arange(d), np.array([1, 0, *range(2, d)]))
-    ]
-    if known is not None:
+    begun = []
+    if known is not None and any(map(len, known)):
         rows = [np.searchsorted(used, way[np.isin(way, used)]) for way in known]
         begun.append(_completed(places, rows))
-    found = []
+    for axes in (np.arange(d), np.array([1, 0, *range(2, d)])):
+        begun.append(_shared(places, _lanes(points[:n][:, axes]), robots))
+    routes, least = _routes(places, begun[0]), math.inf
     for rows in begun:
-        routes = _routes(places, rows)
-        _improve(places, routes, early)
-        found.append((sum(_now(routes, early, k) for k in range(robots)), routes))
-    routes = min(found, key=lambda item: item[0])[1]
+        found = _routes(places, rows)
+        _improve(places, found, early)
+        cost = sum(_now(found, early, k) for k in range(robots))
+        # Of equal ones the first: known ways, or straight ones.
+        if cost < (1.0 - 1e-6) * least:
+            routes, least = found, cost
     if (routes.lengths() > limits).any():
         routes = _within(places, routes, limits, rates)
     return [used[row] for row in routes.visited()]

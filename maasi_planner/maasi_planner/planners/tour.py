@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 
 import numpy as np
 
@@ -31,8 +30,9 @@ SAME = 0.1
 ENOUGH = 3
 # A leg has at most one square, or so many times the distance at which the robot turns.
 LEG = 5.0
-# Lanes lie askew if they are so many times as wide then.
-ASKEW = float(os.environ.get('ASKEW','1.1'))
+# Lanes lie askew if they are so many times as wide then, in areas of so many squares.
+ASKEW = 1.1
+LARGE = 200
 
 
 class Tour(Planner):
@@ -108,9 +108,10 @@ class Tour(Planner):
                 ]
                 lattices = [Lattice(team.exploration, *one, heading) for one in seen]
                 found.append(min(lattices, key=lambda lattice: lattice.pitch))
-            level, *askew = found
-            self._lattice = level
-            if askew and askew[0].pitch > ASKEW * level.pitch:
+            self._lattice, *askew = found
+            # In small areas the corners that are left of turned squares take the gain again.
+            large = team.exploration.volume > LARGE * found[0].pitch ** 2
+            if askew and large and askew[0].pitch > ASKEW * found[0].pitch:
                 self._lattice = askew[0]
         return self._lattice
 
@@ -231,7 +232,7 @@ class Tour(Planner):
     def _leg(self, team: TeamView, view: RobotView, place: FloatArray) -> tuple[FloatArray, bool]:
         """Return the waypoint of a leg towards a place, and whether it leads all the way.
 
-        The robot turns a quarter of the arrival radius behind what it would without: it cuts corners less.
+        It leads a quarter of the arrival radius too far: the robot cuts corners less.
         """
         here, turning = view.state.pose.position, view.arrival_radius
         gap = max(float(np.linalg.norm(place - here)), 1e-9)
