@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +13,12 @@ from shapely.geometry import box
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.environment import (
-    EnvironmentSettings,
-    PriorSettings,
-    Zone,
-    read_image,
-    read_shape,
-)
+from maasi_filter.environment import EnvironmentSettings, Zone, read_image, read_shape
 
 # Of coordinates, also of those that are large [m].
 _ROUNDING = 1e-6
-# Cells of the raster along the longer side.
-_CELLS = 512
+# Cells of the density along the longer side, and every how many are looked at to check it.
+_CELLS, _CHECKED = 512, 16
 
 
 class Area:
@@ -40,8 +35,6 @@ class Area:
         Around the area, metres.
     region : shapely geometry or None
         Level shape of what may hold targets: the area without keep-outs; None: all of `bounds`.
-    volume : float
-        Of the region, m^d.
     circles : (n, 5) array
         Of all round zones: x, y, z, radius [m, map], 1 for a sphere, 0 for a cylinder.
 
@@ -75,23 +68,24 @@ class Area:
             if self.region.area <= 0.0:
                 raise ValueError('environment: nothing of the area is left outside of keep_outs')
             shapely.prepare(self.region)
-        size = self.bounds[:, 1] - self.bounds[:, 0]
-        self.volume = float(np.prod(size))
-        self._density: FloatArray | None = None
         prior = environment.prior
-        if self.region is not None or prior.polygons or prior.raster:
-            self._density, share = self._rasterised(prior)
-            self.volume *= share
+        self._raster = None if prior.raster is None else read_raster(prior.raster)
+        #: Whether targets are equally likely in all of the bounds.
+        self.uniform = self.region is None and not prior.polygons and self._raster is None
+        # All cells, which take long and not all users need, only where a few promise nothing.
+        if not self.uniform and not np.prod(self._cells(_CHECKED), axis=0).any():
+            _ = self._rasterised  # for its errors
 
     @classmethod
     def of(cls, area: Area | EnvironmentSettings | ArrayLike) -> Area:
         """Return an area as it is, or of settings or bounds."""
         return area if isinstance(area, Area) else cls(area)
 
-    @property
-    def uniform(self) -> bool:
-        """Whether targets are equally likely in all of the bounds."""
-        return self._density is None
+    @cached_property
+    def volume(self) -> float:
+        """Of the region, m^d."""
+        whole = float(np.prod(self.bounds[:, 1] - self.bounds[:, 0]))
+        return whole if self.uniform else whole * self._rasterised[1]
 
     def inside(self, points: ArrayLike) -> BoolArray:
         """Return which points (n, d or more) are finite and in the area, up to rounding."""
@@ -122,13 +116,14 @@ class Area:
 
         Relative to evenly over the region: its mean there is 1.
         """
-        if self._density is None:
+        if self.uniform:
             return np.ones(len(points))
         low, high = self.bounds[:2].T
-        shape_of = np.array(self._density.shape)
+        values = self._rasterised[0]
+        shape_of = np.array(values.shape)
         cell = np.floor((points[:, :2] - low) / (high - low) * shape_of).astype(int)
         cell = np.clip(cell, 0, shape_of - 1)
-        return np.asarray(self._density[cell[:, 0], cell[:, 1]])
+        return np.asarray(values[cell[:, 0], cell[:, 1]])
 
     def draw(
         self,
@@ -142,10 +137,10 @@ class Area:
         It is drawn evenly or, `by_prior`, as likely as targets are.
         """
         place = generator.uniform(low, high)
-        if self._density is None:
+        if self.uniform:
             return np.asarray(place)
         density = float(self.density(place[None, :])[0])
-        if by_prior and generator.uniform(0.0, float(self._density.max())) > density:
+        if by_prior and generator.uniform(0.0, float(self._rasterised[0].max())) > density:
             return None
         return np.asarray(place) if density > 0.0 and self.inside(place[None, :])[0] else None
 
@@ -176,31 +171,36 @@ class Area:
             whole = box(*self.bounds[:2].T.ravel()).buffer(reach, join_style='mitre')
         return whole.difference(shapely.union_all(polygons))
 
-    def _rasterised(self, prior: PriorSettings) -> tuple[FloatArray, float]:
-        """Return the density in cells (nx, ny), and the share of the bounds that is inside."""
+    @cached_property
+    def _rasterised(self) -> tuple[FloatArray, float]:
+        """The density in cells (nx, ny), and the share of the bounds that is inside."""
+        likely, inside = self._cells()
+        if not inside.any():
+            raise ValueError('environment: the area is too narrow for its bounds')
+        promised = float((likely * inside).sum() / inside.sum())
+        if not promised > 0.0:
+            raise ValueError('environment.prior: promises nothing inside the area')
+        floor = self.settings.prior.floor
+        return (floor + (1.0 - floor) * likely / promised) * inside, float(inside.mean())
+
+    def _cells(self, every: int = 1) -> tuple[FloatArray, FloatArray]:
+        """Return prior, and 1 for inside, at the middle of every n-th cell, (nx, ny)."""
+        prior = self.settings.prior
         low, high = self.bounds[:2].T
         size = high - low
         number = np.maximum(np.ceil(_CELLS * size / size.max()), 8).astype(int)
-        axes = [a + (np.arange(n) + 0.5) * s / n for a, n, s in zip(low, number, size)]
+        axes = [a + (np.arange(0, n, every) + 0.5) * s / n for a, n, s in zip(low, number, size)]
         x, y = np.meshgrid(*axes, indexing='ij')
-        inside = np.ones(x.shape)
+        inside, likely = np.ones(x.shape), np.ones(x.shape)
         if self.region is not None:
             inside = shapely.contains_xy(self.region, x, y).astype(float)
-        if not inside.any():
-            raise ValueError('environment: the area is too narrow for its bounds')
-        likely = np.ones(x.shape)
         for part in prior.polygons:
             shape_of = read_shape(part.polygon)
             shapely.prepare(shape_of)
             likely[shapely.contains_xy(shape_of, x, y)] = part.weight
-        if prior.raster is not None:
-            extent = np.array(prior.extent or self.bounds[:2])
-            likely *= _sampled(read_raster(prior.raster), extent, x, y)
-        promised = float((likely * inside).sum() / inside.sum())
-        if not promised > 0.0:
-            raise ValueError('environment.prior: promises nothing inside the area')
-        density = (prior.floor + (1.0 - prior.floor) * likely / promised) * inside
-        return density, float(inside.mean())
+        if self._raster is not None:
+            likely *= _sampled(self._raster, np.array(prior.extent or self.bounds[:2]), x, y)
+        return likely, inside
 
 
 def level_shape(zone: Zone) -> BaseGeometry:
