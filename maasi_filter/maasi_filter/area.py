@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 
@@ -87,23 +87,21 @@ class Area:
         whole = float(np.prod(self.bounds[:, 1] - self.bounds[:, 0]))
         return whole if self.uniform else whole * self._rasterised[1]
 
-    def inside(self, points: ArrayLike) -> BoolArray:
-        """Return which points (n, d or more) are finite and in the area, up to rounding."""
+    def inside(self, points: ArrayLike, bounded: bool = True) -> BoolArray:
+        """Return which points (n, d or more) are finite and in the area, up to rounding.
+
+        Not `bounded`: in the region only, or anywhere if there is none.
+        """
         array = np.asarray(points, dtype=float)
-        places = array[:, : self.dimension]
-        within = (places >= self.bounds[:, 0] - _ROUNDING).all(axis=1)
-        within &= (places <= self.bounds[:, 1] + _ROUNDING).all(axis=1)
-        within &= np.isfinite(array).all(axis=1)
+        within = np.isfinite(array).all(axis=1)
+        if bounded:
+            places = array[:, : self.dimension]
+            within &= (places >= self.bounds[:, 0] - _ROUNDING).all(axis=1)
+            within &= (places <= self.bounds[:, 1] + _ROUNDING).all(axis=1)
         if self.region is not None and within.any():
-            near = shapely.points(places[within, :2])
+            near = shapely.points(array[within, :2])
             within[within] = shapely.dwithin(self.region, near, _ROUNDING)
         return np.asarray(within)
-
-    def admits(self, position: Sequence[float]) -> bool:
-        """Return whether a place (3,) is outside of keep-outs and inside the area's border."""
-        if self.region is None:
-            return True
-        return bool(shapely.dwithin(self.region, shapely.Point(position[:2]), _ROUNDING))
 
     def outside_by(self, position: ArrayLike) -> float:
         """Return how far a place (3,) is outside of the area's border [m]; 0: inside, or none."""

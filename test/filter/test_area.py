@@ -100,11 +100,31 @@ def test_wrong_environments_are_refused_by_their_key(values, words):
         ({'keep_outs': [[[-1, -1], [50, -1], [50, 50], [-1, 50]]]}, 'nothing of the area is left'),
         ({'prior': {'raster': 'none.npy'}}, 'prior.raster: none.npy'),
         ({'prior': {'polygons': [{'polygon': RING, 'weight': 0.0}]}}, 'promises nothing'),
+        ({'area': [[[0, 0], [40, 40], [39.99, 40]]]}, 'too narrow'),
     ],
 )
 def test_areas_that_cannot_be_used_are_refused(values, words):
     with pytest.raises(ValueError, match=words):
-        Area(environment(area=RING, **values))
+        Area(environment(**{'area': RING, **values}))
+
+
+def test_the_density_is_made_at_its_first_use():
+    """Not by drivers; and a prior that promises only a spot is no error."""
+    spot = [[5.0, 2.0], [5.2, 2.0], [5.2, 2.2], [5.0, 2.2]]
+    polygons = [{'polygon': RING, 'weight': 0.0}, {'polygon': spot, 'weight': 1.0}]
+    field, promised = (environment(area=RING, prior=p) for p in ({}, {'polygons': polygons}))
+    area = Area(field)
+    places = np.array([[20.0, 10.0], [1.0, 29.0], [50.0, 10.0]])
+    assert area.inside(places).tolist() == [True, False, False]
+    assert '_rasterised' not in vars(area)
+    assert area.volume == pytest.approx(1050.0, rel=0.01)
+    assert '_rasterised' in vars(area)
+    assert Area(promised).density(np.array([[5.1, 2.1], [20.0, 10.0]])).tolist()[1] == 0.02
+    around = Area(environment(bounds=[[0.0, 40.0], [0.0, 30.0]], keep_outs=[SQUARE]))
+    places = np.array([[33.0, 23.0, 5.0], [20.0, np.nan, 5.0], [1.0, 1.0, 5.0]])
+    assert around.inside(places, bounded=False).tolist() == [False, False, True]
+    box = Area(environment(bounds=[[0.0, 40.0], [0.0, 30.0]]))
+    assert box.inside([[-0.1, 5.0]], bounded=False)[0] and not box.inside([[-0.1, 5.0]])[0]
 
 
 def test_a_map_of_nav2_is_obstacles(tmp_path):

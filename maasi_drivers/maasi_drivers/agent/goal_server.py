@@ -93,7 +93,7 @@ class GoalServer:
                     f'waypoint.pose.position.{"xyz"[axis]}: read {position[axis]}, '
                     f'allowed is {low - margin:g} to {high + margin:g} [m]'
                 )
-        if not driver.area.admits(position):
+        if not driver.area.inside([position], bounded=False)[0]:
             return (
                 f'waypoint.pose.position: read {list(position)}, allowed is what lies inside the '
                 'area and outside of its keep-outs'
