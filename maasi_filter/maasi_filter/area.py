@@ -66,7 +66,7 @@ class Area:
             whole = self._fence or box(*self.bounds[:2].T.ravel())
             self.region = whole.difference(shapely.union_all(closed))
             if self.region.area <= 0.0:
-                raise ValueError('environment: nothing of the area is left outside of keep_outs')
+                raise ValueError('environment.keep_outs: leave nothing of the area')
             shapely.prepare(self.region)
         prior = environment.prior
         self._raster = None if prior.raster is None else read_raster(prior.raster)
@@ -174,7 +174,7 @@ class Area:
         """The density in cells (nx, ny), and the share of the bounds that is inside."""
         likely, inside = self._cells()
         if not inside.any():
-            raise ValueError('environment: the area is too narrow for its bounds')
+            raise ValueError('environment.area: is too narrow for its bounds')
         promised = float((likely * inside).sum() / inside.sum())
         if not promised > 0.0:
             raise ValueError('environment.prior: promises nothing inside the area')
@@ -249,15 +249,15 @@ def read_raster(path: str) -> FloatArray:
 
     ValueError if it cannot be read, or is not of finite numbers from 0.
     """
+    key = f'environment.prior.raster: {path}'
     try:
         found = np.load(path) if Path(path).suffix.lower() == '.npy' else read_image(path)
     except (OSError, ValueError) as error:
-        raise ValueError(f'prior.raster: {path}: {error}') from None
+        raise ValueError(f'{key}: {error}') from None
     raster = np.asarray(found, dtype=float)
     if raster.ndim != 2 or not np.isfinite(raster).all() or (raster < 0.0).any():
         raise ValueError(
-            f'prior.raster: {path}: got shape {raster.shape}, allowed are two axes of finite '
-            'numbers from 0'
+            f'{key}: got shape {raster.shape}, allowed are two axes of finite numbers from 0'
         )
     return raster
 

@@ -12,6 +12,7 @@ from maasi_filter import BoxDetection, Pose, UnexploredMap
 from maasi_filter.area import Area
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.ros.node_parameters import check
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten, unflatten
 
@@ -74,33 +75,66 @@ def test_an_environment_survives_the_parameters_of_a_node():
     assert flat['environment.keep_outs'][1] == '5.0 6.0 1.5'
 
 
-@pytest.mark.parametrize(
-    ('values', 'words'),
-    [
-        ({'area': [[0, 0], [1, 1], [1, 0], [0, 1]]}, 'area: .*Self-intersection'),
-        ({'area': [[0, 0], [1, 1]]}, 'area: '),
-        ({'area': 'nowhere.geojson'}, 'area: .*nowhere.geojson'),
-        ({'area': RING, 'keep_outs': [feature(SQUARE)]}, r'keep_outs\[0\]: .*origin'),
-        ({'area': RING, 'keep_outs': ['circle']}, r'keep_outs\[0\]: got circle, allowed'),
-        ({'area': RING, 'keep_outs': [{'centre': [1, 2]}]}, 'centre and radius, or polygon'),
-        ({'area': RING, 'keep_outs': [{'centre': [1, 2, 3], 'radius': 1}]}, 'allowed are 2 coord'),
-        ({'area': feature(RING, role='garden')}, 'got role garden, allowed are area'),
-        ({'bounds': [[0, 1], [0, 1]], 'altitude': [0, 1]}, 'altitude: allowed with area'),
-        ({'bounds': [[0, 1], [1, 1]]}, r'axis 1: got \[1.0, 1.0\]'),
-    ],
-)
-def test_wrong_environments_are_refused_by_their_key(values, words):
-    with pytest.raises(ValidationError, match=words):
+BOW = [[0, 0], [9, 9], [9, 0], [0, 9]]
+PARTS = [feature(RING), feature(BOW, role='keep_out')]
+WRONG = [
+    # What is given, the key of the error, and words that it has.
+    ({'area': [[0, 0], [1, 1], [1, 0], [0, 1]]}, 'area', 'Self-intersection'),
+    ({'area': [[0, 0], [1, 1]]}, 'area', 'at least 4'),
+    ({'area': 'nowhere.geojson'}, 'area', 'nowhere.geojson: No such file'),
+    ({'area': feature(RING, role='garden')}, 'area', 'got role garden, allowed are area'),
+    ({'area': {'type': 'FeatureCollection', 'features': PARTS}}, 'area', 'Self-intersection'),
+    ({'area': {'type': 'FeatureCollection', 'features': [3]}}, 'area', 'allowed is a list of'),
+    ({'keep_outs': [SQUARE, feature(SQUARE)]}, 'keep_outs.1', 'origin'),
+    ({'keep_outs': ['circle']}, 'keep_outs.0', 'got circle, allowed'),
+    ({'keep_outs': [{'centre': [1, 2]}]}, 'keep_outs.0', 'centre and radius, or polygon'),
+    ({'keep_outs': [{'centre': [1, 2, 3], 'radius': 1}]}, 'keep_outs.0.centre', 'allowed are 2'),
+    ({'obstacles': [SQUARE, 'none.yaml']}, 'obstacles.1', 'no map of Nav2'),
+    ({'prior': 'none.geojson'}, 'prior', 'none.geojson: No such file'),
+    ({'prior': [3]}, 'prior', 'allowed is GeoJSON'),
+    (
+        {'prior': {'polygons': [{'polygon': 'x', 'weight': 1}]}},
+        'prior.polygons.0.polygon',
+        'got x, allowed is GeoJSON',
+    ),
+    ({'origin': {'latitude': 91, 'longitude': 9}}, 'origin.latitude', 'less than or equal to 90'),
+    ({'area': None, 'altitude': [0, 1]}, 'altitude', 'allowed with area'),
+    ({'area': None, 'bounds': [[0, 1], [1, 1]]}, 'bounds', r'axis 1: got \[1.0, 1.0\]'),
+]
+
+
+@pytest.mark.parametrize('values, key, words', WRONG)
+def test_wrong_environments_are_refused_by_their_key(values, key, words):
+    values = {'area': RING, 'bounds': [[0, 1], [0, 1]], **values}
+    with pytest.raises(ValidationError, match=words) as caught:
         environment(**values)
+    assert ['.'.join(map(str, item['loc'])) for item in caught.value.errors()] == [key]
+
+
+def test_a_node_names_the_parameter_of_a_wrong_shape():
+    """Shapes are texts there."""
+    flat = {'robots': [], 'environment.area': 'POLYGON ((0 0, 9 0, 9 9, 0 0))'}
+    for key, value in (('keep_outs', ['circle']), ('area', 'POLYGON ((0 0, 9 9, 9 0, 0 9, 0 0))')):
+        _, problems = check(FilterNodeSettings, {**flat, f'environment.{key}': value})
+        text = problems[f'environment.{key}']
+        assert (
+            text.startswith(f'parameter environment.{key}: got ') and 'environment' not in problems
+        )
 
 
 @pytest.mark.parametrize(
     ('values', 'words'),
     [
-        ({'keep_outs': [[[-1, -1], [50, -1], [50, 50], [-1, 50]]]}, 'nothing of the area is left'),
-        ({'prior': {'raster': 'none.npy'}}, 'prior.raster: none.npy'),
-        ({'prior': {'polygons': [{'polygon': RING, 'weight': 0.0}]}}, 'promises nothing'),
-        ({'area': [[[0, 0], [40, 40], [39.99, 40]]]}, 'too narrow'),
+        (
+            {'keep_outs': [[[-1, -1], [50, -1], [50, 50], [-1, 50]]]},
+            'environment.keep_outs: leave nothing',
+        ),
+        ({'prior': {'raster': 'none.npy'}}, 'environment.prior.raster: none.npy'),
+        (
+            {'prior': {'polygons': [{'polygon': RING, 'weight': 0.0}]}},
+            'environment.prior: promises nothing',
+        ),
+        ({'area': [[[0, 0], [40, 40], [39.99, 40]]]}, 'environment.area: is too narrow'),
     ],
 )
 def test_areas_that_cannot_be_used_are_refused(values, words):
@@ -145,8 +179,6 @@ def test_a_map_of_nav2_is_obstacles(tmp_path):
     # A pillar of 0.2 m around (0.1, 0.9), and half a cell more.
     assert area.distances([0.5, 0.9, 0.0]).min() == pytest.approx(0.3 - 0.025, abs=1e-6)
     assert area.distances([1.3, 0.0, 0.0]).min() > 0.3
-    with pytest.raises(ValidationError, match=r'obstacles\[0\]: .*no map of Nav2'):
-        environment(bounds=[[-1.0, 2.0], [-0.5, 1.5]], obstacles=['none.yaml'])
 
 
 def test_the_density_is_prior_times_inside_with_mean_one(tmp_path):

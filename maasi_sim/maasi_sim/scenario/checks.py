@@ -32,6 +32,11 @@ _MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')
 
 def problems_of(scenario: Scenario) -> Problems:
     """Yield problems between keys."""
+    try:
+        area = Area(scenario.environment)
+    except ValueError as error:
+        yield str(error)
+        return
     yield from _world_problems(scenario)
     yield from name_problems(scenario)
     yield from event_problems(scenario)
@@ -39,7 +44,7 @@ def problems_of(scenario: Scenario) -> Problems:
     for name in scenario.names():
         robot = scenario.robots[name]
         for problems in (
-            _place_problems(robot, scenario),
+            _place_problems(robot, scenario, area),
             _sensor_problems(robot, scenario),
             _simulated_problems(robot, scenario),
             _link_problems(robot),
@@ -82,9 +87,8 @@ def _room_for_targets(scenario: Scenario) -> int:
     return max(1, round(1.1 * filled * space / (ball * targets.separation**scenario.dimension)))
 
 
-def _place_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
+def _place_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> Problems:
     """Yield problems of where it starts and may be sent."""
-    area = Area(scenario.environment)
     if not area.inside([robot.start])[0]:
         yield (
             f'start: read {robot.start}, allowed is what lies inside environment.bounds, or the '
