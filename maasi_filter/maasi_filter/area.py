@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.environment import EnvironmentSettings, Zone, read_image, read_shape
+from maasi_filter.geodesy import OriginSettings, geodetic
 
 # Of coordinates, also of those that are large [m].
 _ROUNDING = 1e-6
@@ -69,7 +71,7 @@ class Area:
                 raise ValueError('environment.keep_outs: leave nothing of the area')
             shapely.prepare(self.region)
         prior = environment.prior
-        self._raster = None if prior.raster is None else read_raster(prior.raster)
+        self._raster = read_raster(environment) if prior.raster else None
         #: Whether targets are equally likely in all of the bounds.
         self.uniform = self.region is None and not prior.polygons and self._raster is None
         # All cells, which take long and not all users need, only where a few promise nothing.
@@ -197,7 +199,7 @@ class Area:
             shapely.prepare(shape_of)
             likely[shapely.contains_xy(shape_of, x, y)] = part.weight
         if self._raster is not None:
-            likely *= _sampled(self._raster, np.array(prior.extent or self.bounds[:2]), x, y)
+            likely *= self._raster.at(x, y)
         return likely, inside
 
 
@@ -244,30 +246,79 @@ def _polygons(zones: Iterable[Zone]) -> list[BaseGeometry]:
     return [read_shape(zone.polygon) for zone in zones if zone.polygon is not None]
 
 
-def read_raster(path: str) -> FloatArray:
-    """Return the densities of a raster (rows from north, columns from west).
+@dataclass(frozen=True)
+class _Raster:
+    """Densities: values (rows, columns), and how x, y [m, map] become columns and rows."""
+
+    values: FloatArray
+    cells: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+    def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the values at places, 0 outside."""
+        rows, columns = self.values.shape
+        column, row = self.cells(x, y)
+        known = (column >= 0.0) & (column < columns) & (row >= 0.0) & (row < rows)
+        found = np.zeros(x.shape)
+        found[known] = self.values[row[known].astype(int), column[known].astype(int)]
+        return found
+
+
+def read_raster(environment: EnvironmentSettings) -> _Raster:
+    """Return the raster of an environment's prior: .npy or an image, first row north; or GeoTIFF.
 
     ValueError if it cannot be read, or is not of finite numbers from 0.
     """
+    path = str(environment.prior.raster)
     key = f'environment.prior.raster: {path}'
     try:
-        found = np.load(path) if Path(path).suffix.lower() == '.npy' else read_image(path)
+        suffix = Path(path).suffix.lower()
+        if suffix in ('.tif', '.tiff'):
+            raster = _of_geotiff(path, environment.origin)
+        else:
+            values = np.load(path) if suffix == '.npy' else read_image(path)
+            extent = environment.prior.extent or environment.bounds[:2]
+            raster = _over(np.asarray(values, dtype=float), extent)
     except (OSError, ValueError) as error:
         raise ValueError(f'{key}: {error}') from None
-    raster = np.asarray(found, dtype=float)
-    if raster.ndim != 2 or not np.isfinite(raster).all() or (raster < 0.0).any():
+    values = raster.values
+    if values.ndim != 2 or not np.isfinite(values).all() or (values < 0.0).any():
         raise ValueError(
-            f'{key}: got shape {raster.shape}, allowed are two axes of finite numbers from 0'
+            f'{key}: got shape {values.shape}, allowed are two axes of finite numbers from 0'
         )
     return raster
 
 
-def _sampled(raster: FloatArray, extent: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the values of a raster at places, 0 outside of it."""
-    rows, columns = raster.shape
+def _over(values: FloatArray, extent: list[list[float]]) -> _Raster:
+    """Return a raster over bounds on x and y [m, map]."""
     (west, east), (south, north) = extent
-    column = np.floor((x - west) / (east - west) * columns).astype(int)
-    row = np.floor((north - y) / (north - south) * rows).astype(int)
-    known = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    row, column = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
-    return np.asarray(np.where(known, raster[row, column], 0.0))
+
+    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        rows, columns = values.shape
+        return (x - west) / (east - west) * columns, (north - y) / (north - south) * rows
+
+    return _Raster(values, cells)
+
+
+def _of_geotiff(path: str, origin: OriginSettings | None) -> _Raster:
+    """Return the first band of a GeoTIFF in its own coordinates; what has no data is 0."""
+    try:
+        import rasterio
+        from rasterio.warp import transform
+    except ImportError:
+        raise ValueError('needs rasterio, the extra geo: pip install "rasterio>=1.4"') from None
+    if origin is None:
+        raise ValueError('a GeoTIFF needs environment.origin')
+    with rasterio.open(path) as file:
+        if file.crs is None:
+            raise ValueError('has no coordinate system')
+        crs, grid = file.crs, list(~file.transform)
+        values = file.read(1, masked=True).astype(float).filled(0.0)
+
+    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)
+        places = transform('EPSG:4326', crs, degrees[:, 1], degrees[:, 0])
+        east, north = (np.reshape(axis, x.shape) for axis in places)
+        a, b, c, d, e, f = grid[:6]
+        return a * east + b * north + c, d * east + e * north + f
+
+    return _Raster(values, cells)

@@ -23,7 +23,7 @@ from maasi_filter.settings import Finite, Positive, Settings, Vector2
 # With which a number begins.
 _NUMBER = '-+.0123456789'
 # Of files that an environment names.
-FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.yaml')
+FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.yaml', '.tif', '.tiff')
 
 
 class Zone(Settings):
@@ -88,13 +88,14 @@ class PriorSettings(Settings):
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
         default=None,
-        description='File of densities, first row north: .npy or an image',
+        description='File of densities: .npy or an image, first row north; or GeoTIFF',
     )
     extent: list[Vector2] | None = Field(
         default=None,
         min_length=2,
         max_length=2,
-        description='Lower and upper bound of the raster on x and y; none: of the area [m, map]',
+        description='Lower and upper bound of the raster on x and y; none: of the area; GeoTIFF '
+        'has its own [m, map]',
     )
     floor: float = Field(
         default=0.02,

@@ -1,17 +1,20 @@
 """Areas, keep-outs and priors: how they are given, and where targets are expected."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
+import rasterio
 import shapely
 from PIL import Image
 from pydantic import ValidationError
+from rasterio.warp import transform
 
 from maasi_filter import BoxDetection, Pose, UnexploredMap
 from maasi_filter.area import Area
 from maasi_filter.environment import EnvironmentSettings
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.geodesy import OriginSettings, geodetic, to_map
 from maasi_filter.ros.node_parameters import check
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten, unflatten
@@ -205,6 +208,42 @@ def test_the_density_is_prior_times_inside_with_mean_one(tmp_path):
     expected = 0.98 + 0.02 * promised.sum() / inside.sum()
     # Four deviations of a share.
     assert east.mean() == pytest.approx(expected, abs=4.0 * 0.14 / np.sqrt(len(drawn)))
+
+
+@pytest.mark.parametrize('crs', ['EPSG:4326', 'EPSG:32632'])
+def test_a_geotiff_is_the_same_prior_as_its_values_in_the_map(crs, tmp_path, monkeypatch):
+    """10 km by 8 km; UTM's grid is turned by 0.6 degrees here, and 0.02 % short."""
+    rows, columns = 80, 100
+    x, y = np.meshgrid((np.arange(columns) + 0.5) * 100.0, (rows - 0.5 - np.arange(rows)) * 100.0)
+
+    def likely(x, y):
+        return np.maximum(0.0, np.sin(x / 1500.0) + np.cos(y / 1100.0) + 1.0)
+
+    np.save(tmp_path / 'heat.npy', likely(x, y))
+    corners = geodetic(np.array([[-500.0, -500.0], [10500.0, 8500.0]]), ORIGIN)
+    (west, east), (south, north) = transform('EPSG:4326', crs, corners[:, 1], corners[:, 0])
+    grid = rasterio.transform.from_bounds(west, south, east, north, 440, 360)
+    easts = west + (np.arange(440) + 0.5) * (east - west) / 440
+    norths = north - (np.arange(360) + 0.5) * (north - south) / 360
+    cells = [axis.ravel() for axis in np.meshgrid(easts, norths)]
+    values = likely(*to_map(np.transpose(transform(crs, 'EPSG:4326', *cells)), ORIGIN).T)
+    values = np.where(values == 0.0, -9999.0, values).reshape(360, 440)
+    facts = {'driver': 'GTiff', 'width': 440, 'height': 360, 'count': 1, 'dtype': 'float64'}
+    path = str(tmp_path / 'heat.tif')
+    with rasterio.open(path, 'w', crs=crs, transform=grid, nodata=-9999.0, **facts) as file:
+        file.write(values, 1)
+    bounds = [[0.0, 10000.0], [0.0, 8000.0]]
+    plain = Area(environment(bounds=bounds, prior=str(tmp_path / 'heat.npy')))
+    area = Area(environment(bounds=bounds, prior=path, origin=ORIGIN))
+    places = np.random.default_rng(902).uniform(*plain.bounds.T, (20000, 2))
+    gaps = np.abs(area.density(places) - plain.density(places))
+    # Within a cell of 100 m, of a density of up to 3, it changes by 0.15.
+    assert gaps.max() < 0.1 and gaps.mean() < 0.02
+    with pytest.raises(ValueError, match=r'heat\.tif: a GeoTIFF needs environment\.origin'):
+        Area(environment(bounds=bounds, prior=path))
+    monkeypatch.setitem(sys.modules, 'rasterio', None)
+    with pytest.raises(ValueError, match=r'prior\.raster: .*heat\.tif: needs rasterio, .*geo'):
+        Area(environment(bounds=bounds, prior=path, origin=ORIGIN))
 
 
 def test_the_map_counts_what_is_expected_only():
