@@ -17,8 +17,7 @@ from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.environment import EnvironmentSettings, Zone, read_image, read_shape
 from maasi_filter.geodesy import OriginSettings, geodetic
 
-# Of coordinates, also of those that are large [m].
-_ROUNDING = 1e-6
+_ROUNDING = 1e-6  # of coordinates, also of those that are large [m]
 # Cells of the density along the longer side, and every how many are looked at to check it.
 _CELLS, _CHECKED = 512, 16
 

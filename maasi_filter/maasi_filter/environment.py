@@ -20,8 +20,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geodesy import OriginSettings, to_map
 from maasi_filter.settings import Finite, Positive, Settings, Vector2
 
-# With which a number begins.
-_NUMBER = '-+.0123456789'
+_NUMBER = '-+.0123456789'  # with which a number begins
 # Of files that an environment names.
 FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.yaml', '.tif', '.tiff')
 
@@ -87,8 +86,7 @@ class PriorSettings(Settings):
 
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
-        default=None,
-        description='File of densities: .npy or an image, first row north; or GeoTIFF',
+        default=None, description='File of densities: .npy or an image, first row north; or GeoTIFF'
     )
     extent: list[Vector2] | None = Field(
         default=None,

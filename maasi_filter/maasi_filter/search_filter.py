@@ -49,8 +49,7 @@ class SearchFilter(ABC):
     """
 
     method: ClassVar[str]
-    #: Types of what is saved of one method only, by attribute.
-    saved: ClassVar[dict[str, Any]]
+    saved: ClassVar[dict[str, Any]]  #: types of what is saved of one method only, by attribute
 
     def __init__(
         self, settings: FilterSettings, area: Area | ArrayLike, generator: np.random.Generator

@@ -1,7 +1,5 @@
 """How far a robot can go and still come home, by its battery."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -13,8 +11,7 @@ from maasi_filter.settings import NotNegative, Settings, Vector3
 from maasi_planner.motion import MotionModel, Trajectories
 from maasi_planner.obstacles import next_point
 
-# Share of the reserve that is left when a robot on its way turns home at once.
-_LAST = 0.5
+_LAST = 0.5  # share of the reserve that is left when a robot on its way turns home at once
 
 
 class EnduranceSettings(Settings):
@@ -46,12 +43,9 @@ class Endurance:
         self.settings, self.motion = settings, motion
         chargers: list[ArrayLike] = [*settings.chargers]
         self.chargers = np.array(chargers or [start], dtype=float)
-        #: Charge as it was last heard, 0 to 1; not a number: unknown.
-        self.charge = math.nan
-        #: Whether it is on its way to a charger, or charges.
-        self.charging = False
-        #: Whether nothing else was affordable at the last decision.
-        self.spent = False
+        self.charge = math.nan  #: charge as it was last heard, 0 to 1; not a number: unknown
+        self.charging = False  #: whether it is on its way to a charger, or charges
+        self.spent = False  #: whether nothing else was affordable at the last decision
 
     def way_home(self, position: ArrayLike) -> tuple[float, FloatArray]:
         """Return the shortest way to a charger [m], and that charger (3,)."""

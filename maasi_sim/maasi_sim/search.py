@@ -120,8 +120,7 @@ class _Search:
         self._radius = scoring_radius(scenario, truth)
         counts, ways = dict.fromkeys(self._robots, 0), dict.fromkeys(self._robots, 0.0)
         self._result = SearchResult(scenario, self.trace, counts, ways)
-        # Whether the last score of a step was complete.
-        self._complete = False
+        self._complete = False  # whether the last score of a step was complete
 
     def run(self, most_measurements: int | None) -> SearchResult:
         reason = None

@@ -1,7 +1,5 @@
 """A camera as a robot's sensor: image source, decoding, detection."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

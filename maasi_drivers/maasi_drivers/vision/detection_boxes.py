@@ -1,7 +1,5 @@
 """Boxes in images, as detectors of other packages publish them, to points on the floor."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -36,10 +36,8 @@ from maasi_filter.records import UNLABELLED, AgentMeasurement, FilterResult, Fou
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
 
-# Particle sets below this size are faster on one thread.
-PARALLEL_PARTICLES = 65_536
-# Fewest particles of a birth, when many detections share the particle budget.
-LEAST_BIRTHS = 20
+PARALLEL_PARTICLES = 65_536  # particle sets below this size are faster on one thread
+LEAST_BIRTHS = 20  # fewest particles of a birth, when many detections share the particle budget
 
 
 class IcPhdFilter(SearchFilter):

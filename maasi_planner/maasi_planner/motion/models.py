@@ -349,8 +349,7 @@ class Unicycle(CompiledMotion):
         return settings.speed, min(braking, 0.5 * slowing), settings.acceleration
 
     def _push(self, gain: float) -> Command:
-        # Its inputs are forward speed and turn rate.
-        return gain, 0.0, 0.0, gain
+        return gain, 0.0, 0.0, gain  # its inputs are forward speed and turn rate
 
     def _to_array(self, state: RobotState) -> FloatArray:
         yaw = state.pose.yaw

@@ -23,8 +23,7 @@ from maasi_planner.obstacles import Surroundings, Vector, next_point
 
 K_RHO = 1.5
 K_ALPHA = 3.0
-# Beyond this bearing error the robot turns on the spot.
-AHEAD = 0.6
+AHEAD = 0.6  # beyond this bearing error the robot turns on the spot
 
 
 @njit(cache=True, forceinline=True)

@@ -9,8 +9,7 @@ from numba import njit
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.objective.predicted_measurements import Measurements, apply_misses
 
-# Rows kept of what one candidate leaves of another.
-CACHE_ROWS = 8000
+CACHE_ROWS = 8000  # rows kept of what one candidate leaves of another
 
 
 class Terms(NamedTuple):

@@ -15,19 +15,15 @@ from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.schema import RobotSettings, Scenario, SimulatedSettings
 from maasi_sim.scenario.visibility import robot_candidates
 
-# Each is `key: text`.
-Problems = Iterator[str]
+Problems = Iterator[str]  # each is `key: text`
 
 _ROBOT_NAME = re.compile(r'^[a-z][a-z0-9]*(_[a-z0-9]+)*$')
 _RESERVED = ('exploration', 'ground_truth', 'lockstep', 'scenario')
-# Largest deviation of a time from a whole number of steps.
-_STEP_TOLERANCE = 1e-6
-# Drivers of robots that have no camera.
-_RANGING = ('ranging_driver', 'mavlink_driver')
+_STEP_TOLERANCE = 1e-6  # largest deviation of a time from a whole number of steps
+_RANGING = ('ranging_driver', 'mavlink_driver')  # drivers of robots that have no camera
 # Drivers by the link that they have.
 _DRIVERS = {'mambo_wifi': ('mambo_driver',), 'mavlink': ('mavlink_driver', 'mavlink_camera_driver')}
-# URL of the driver of a simulated vehicle.
-_MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')
+_MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')  # URL of the driver of a simulated vehicle
 
 
 def problems_of(scenario: Scenario) -> Problems:

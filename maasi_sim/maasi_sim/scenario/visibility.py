@@ -10,10 +10,8 @@ from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_par
 from maasi_planner.settings import CandidateSettings
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
-# Farther than any way between two waypoints [m].
-_FAR = 1e9
-# Of a grid that is chosen for a robot without candidates.
-_MOST_CANDIDATES = 400
+_FAR = 1e9  # farther than any way between two waypoints [m]
+_MOST_CANDIDATES = 400  # of a grid that is chosen for a robot without candidates
 
 
 def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> CandidateSet:
@@ -24,8 +22,7 @@ def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> 
 def never_seen(scenario: Scenario) -> str:
     """Return a warning about parts that can never be seen from the candidates, or ''."""
     if any(robot.candidates.ring is not None for robot in scenario.robots.values()):
-        # Candidates that move with the robot can reach every place.
-        return ''
+        return ''  # candidates that move with the robot can reach every place
     area = Area(scenario.environment)
     margin = scenario.targets.margin if scenario.targets.positions is None else 0.0
     # What is seen from the waypoints need not be checked on the paths between them.

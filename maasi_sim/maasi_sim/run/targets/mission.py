@@ -29,8 +29,7 @@ from maasi_sim.simulation.emulators.linked_robots import with_addresses
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Of the robots' frames in lockstep, where each message counts [Hz].
-_LOCKSTEP_TF_RATE = 4.0
+_LOCKSTEP_TF_RATE = 4.0  # of the robots' frames in lockstep, where each message counts [Hz]
 # Settings of a robot that its driver has as well.
 _OF_THE_DRIVER = ['start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'battery_unit', 'link']
 

@@ -21,8 +21,7 @@ from maasi_sim.simulation.world import World
 class FoundCount:
     """Measurements and found targets of all robots so far, after a filter update."""
 
-    #: [s].
-    time: float
+    time: float  #: [s]
     #: k.
     step: int
     measurements: int
@@ -129,8 +128,7 @@ class Tally:
 class TargetRecord(RunRecord):
     """The record of a search for targets."""
 
-    #: At the end.
-    tally: Tally
+    tally: Tally  #: at the end
     #: By robot, in order: chosen ones, (n, 3) [m], and poses at which it measured.
     waypoints: dict[str, FloatArray] = field(default_factory=dict)
     measured_from: dict[str, list[Pose]] = field(default_factory=dict)
