@@ -9,9 +9,8 @@ from cuboid_instances import problems_of_missions, random_problem, solver_for
 from mixed_cuboid import MixedProblem, solve_with_scip
 
 from maasi_planner.buildings import problem as problem_module
-from maasi_planner.buildings.centralized import solve_jointly
 from maasi_planner.buildings.preplanning import segment_cuts
-from maasi_planner.buildings.problem import Problem
+from maasi_planner.buildings.problem import Problem, solve_jointly
 
 
 def same_optimum(solver, problem):

@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_planner.buildings.dynamics import Dynamics
-from maasi_planner.buildings.preplanning import CoveragePlan, detection_probability
+from maasi_planner.buildings.preplanning import CoveragePlan, WayFinder, detection_probability
 from maasi_planner.buildings.problem import Plan, PlanSolver, Problem
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
 from maasi_planner.buildings.sharing import Broadcast, assigned, rewards
-from maasi_planner.buildings.way_finder import WayFinder
 
 _ARRIVED, _ARRIVED_SPEED = 2.0, 2.0  # tolerances of arrival at the station [m, m/s]
 # Largest deviation from the last plan for which that plan may be continued [m, m/s].
