@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
 from maasi_filter.ic_phd.births import (
     gaussian_births,
     jittered,
@@ -33,7 +32,7 @@ from maasi_filter.measurement_check import (
 )
 from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.records import UNLABELLED, AgentMeasurement, FilterResult, FoundTarget, Label
-from maasi_filter.search_filter import SearchFilter
+from maasi_filter.search_filter import SAME_TARGET, FoundTargets, SearchFilter, distance
 from maasi_filter.settings import FilterSettings
 
 PARALLEL_PARTICLES = 65_536  # particle sets below this size are faster on one thread

@@ -10,12 +10,12 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_filter.found_targets import SAME_TARGET
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
 from maasi_filter.pmb.labels import LabelTally
 from maasi_filter.pmb.scan import LEAST_SUPPORT, Scan
 from maasi_filter.records import FoundTarget
+from maasi_filter.search_filter import SAME_TARGET
 from maasi_filter.vector_math import squared_distance
 
 # Shares of the believed pi with which a place may answer.

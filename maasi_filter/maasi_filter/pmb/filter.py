@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
-from maasi_filter.found_targets import FoundTargets, nearest
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
     check_measurements,
@@ -36,7 +35,7 @@ from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.scan import Scan, make_scan
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
-from maasi_filter.search_filter import SearchFilter
+from maasi_filter.search_filter import FoundTargets, SearchFilter, nearest
 from maasi_filter.settings import FilterSettings
 
 LEAST_EXISTENCE = 1e-4
