@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from maasi_sim.run.missions import load_mission
+from maasi_sim.scenario.checks import never_seen, robot_candidates
 from maasi_sim.scenario.layering import ScenarioWarning
 from maasi_sim.scenario.loading import (
     config_folder,
@@ -17,7 +18,6 @@ from maasi_sim.scenario.loading import (
     scenario_from_values,
 )
 from maasi_sim.scenario.schema import ScenarioError
-from maasi_sim.scenario.visibility import never_seen, robot_candidates
 
 # Those of buildings are of another kind: test_cuboid_scenario.py.
 SCENARIOS = sorted(

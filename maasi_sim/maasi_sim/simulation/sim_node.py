@@ -23,8 +23,8 @@ from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, ScenarioError
 from maasi_sim.simulation.emulators.linked_robots import LinkedRobot, linked_robot
+from maasi_sim.simulation.robots import Simulation
 from maasi_sim.simulation.sim_topics import Connections, ExternalRobot, RobotTopics, publish_truth
-from maasi_sim.simulation.simulated_world import Simulation
 
 RECORDER = 'recorder'
 

@@ -33,9 +33,8 @@ from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import AgentState, RangeArray, RangeMeasurement
 from maasi_planner.motion import RobotState
 from maasi_sim.scenario.schema import steps_of
-from maasi_sim.simulation.robots import SimulatedRobot
+from maasi_sim.simulation.robots import SimulatedRobot, Simulation
 from maasi_sim.simulation.sensors import LaserSettings
-from maasi_sim.simulation.simulated_world import Simulation
 from maasi_sim.simulation.world import World
 
 # Period of battery messages [s of simulated time].

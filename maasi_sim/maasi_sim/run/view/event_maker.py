@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import Cluster, FoundTarget
 from maasi_planner.team import Decision
-from maasi_sim.run.targets.scoring import score
+from maasi_sim.run.targets.tally import score
 from maasi_sim.run.topics import point
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning
 
