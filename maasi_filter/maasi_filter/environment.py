@@ -29,11 +29,11 @@ class Zone(Settings):
     """A zone: a polygon, a cylinder (2D: a disc) or, with three coordinates, a sphere."""
 
     centre: list[Finite] | None = Field(
-        default=None, min_length=2, max_length=3, description='Centre of a round one [m, map]'
+        None, min_length=2, max_length=3, description='Centre of a round one [m, map]'
     )
-    radius: Positive | None = Field(default=None, description='Radius of a round one [m]')
+    radius: Positive | None = Field(None, description='Radius of a round one [m]')
     polygon: str | None = Field(
-        default=None,
+        None,
         description='Corners [m, map], GeoJSON or the name of its file; kept as well-known text',
     )
 
@@ -86,17 +86,17 @@ class PriorSettings(Settings):
 
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
-        default=None, description='File of densities: .npy or an image, first row north; or GeoTIFF'
+        None, description='File of densities: .npy or an image, first row north; or GeoTIFF'
     )
     extent: list[Vector2] | None = Field(
-        default=None,
+        None,
         min_length=2,
         max_length=2,
         description='Lower and upper bound of the raster on x and y; none: of the area; GeoTIFF '
         'has its own [m, map]',
     )
     floor: float = Field(
-        default=0.02,
+        0.02,
         ge=0.0,
         le=1.0,
         description='Share of the targets that may be anywhere, whatever the prior promises [1]',
@@ -110,12 +110,12 @@ class EnvironmentSettings(Settings):
         min_length=2, max_length=3, description='Lower and upper bound on each map axis [m]'
     )
     area: str | None = Field(
-        default=None,
+        None,
         description='Polygons in place of bounds: corners or rings [m, map], GeoJSON or its file; '
         'kept as well-known text',
     )
     altitude: Vector2 | None = Field(
-        default=None, description='With area: lowest and highest z of targets; none: 2D [m]'
+        None, description='With area: lowest and highest z of targets; none: 2D [m]'
     )
     keep_outs: list[Zone] = Field(
         default_factory=list, description='No target is expected there, and no robot goes there'
@@ -128,10 +128,10 @@ class EnvironmentSettings(Settings):
         default_factory=PriorSettings, description='Where targets are likely'
     )
     expected_targets: float = Field(
-        default=12.0, gt=0.0, description='N0, targets expected in all before the search [1]'
+        12.0, gt=0.0, description='N0, targets expected in all before the search [1]'
     )
     origin: OriginSettings | None = Field(
-        default=None, description='Of the map on the earth; with GeoJSON, none: amid its area'
+        None, description='Of the map on the earth; with GeoJSON, none: amid its area'
     )
 
     @model_validator(mode='before')

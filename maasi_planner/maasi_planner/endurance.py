@@ -18,15 +18,13 @@ class EnduranceSettings(Settings):
     """What the battery is used for, as shares of a full one, and where it is charged."""
 
     per_second: NotNegative = Field(
-        default=0.0, description='Use at rest or hovering; of a flight of 20 minutes: 0.00083 [1/s]'
+        0.0, description='Use at rest or hovering; of a flight of 20 minutes: 0.00083 [1/s]'
     )
-    per_metre: NotNegative = Field(default=0.0, description='Use of a metre on top of it [1/m]')
+    per_metre: NotNegative = Field(0.0, description='Use of a metre on top of it [1/m]')
     reserve: float = Field(
-        default=0.25, ge=0.0, lt=1.0, description='Charge that is left when it is home [1]'
+        0.25, ge=0.0, lt=1.0, description='Charge that is left when it is home [1]'
     )
-    full: float = Field(
-        default=0.95, gt=0.0, le=1.0, description='Charge at which it goes out again [1]'
-    )
+    full: float = Field(0.95, gt=0.0, le=1.0, description='Charge at which it goes out again [1]')
     chargers: list[Vector3] = Field(
         default_factory=list, description='Where it is charged; none: at its start [m, map]'
     )

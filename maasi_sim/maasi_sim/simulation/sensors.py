@@ -77,13 +77,13 @@ class RangingSensor:
 class LaserSettings(Settings):
     """A planar laser scanner; the defaults are those of the TurtleBot3's."""
 
-    beams: int = Field(default=360, ge=1, le=100_000, description='Beams of a full turn [1]')
-    minimum_range: NotNegative = Field(default=0.12, description='Nearest return [m]')
-    maximum_range: Positive = Field(default=3.5, description='Farthest return [m]')
-    noise: NotNegative = Field(default=0.01, description='Deviation of a range [m]')
-    rate: Positive = Field(default=5.0, description='Turns per second [Hz]')
+    beams: int = Field(360, ge=1, le=100_000, description='Beams of a full turn [1]')
+    minimum_range: NotNegative = Field(0.12, description='Nearest return [m]')
+    maximum_range: Positive = Field(3.5, description='Farthest return [m]')
+    noise: NotNegative = Field(0.01, description='Deviation of a range [m]')
+    rate: Positive = Field(5.0, description='Turns per second [Hz]')
     wall_margin: NotNegative = Field(
-        default=0.3, description='Distance of the walls outside the bounds [m]'
+        0.3, description='Distance of the walls outside the bounds [m]'
     )
 
     @model_validator(mode='after')

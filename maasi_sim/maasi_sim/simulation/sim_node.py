@@ -45,23 +45,23 @@ class SimNodeSettings(NodeSettings):
     live: ClassVar[frozenset[str]] = frozenset({'command_age'})
 
     step: float = Field(
-        default=0.0, ge=0.0, le=10.0, description="Duration of a step; 0: the scenario's [s]"
+        0.0, ge=0.0, le=10.0, description="Duration of a step; 0: the scenario's [s]"
     )
     scenario: str = Field(
         min_length=1, description='Scenario file, or the name of one in config/scenarios'
     )
     rate: NotNegative = Field(
-        default=1.0,
+        1.0,
         description='Simulated over wall time, at most; 0: as fast as possible, in lockstep only',
     )
     follow_clock: bool = Field(
-        default=False,
+        False,
         description='Whether its time is a /clock that somebody else publishes; not in lockstep, '
         'and `rate` does not count',
     )
-    recorder: bool = Field(default=False, description='Whether it waits for the recorder, too')
+    recorder: bool = Field(False, description='Whether it waits for the recorder, too')
     command_age: Positive = Field(
-        default=1.0,
+        1.0,
         description='Simulated time after which a command is too old; in lockstep each is for its '
         'step [s]',
     )
