@@ -28,8 +28,7 @@ from maasi_sim.simulation.robots import Simulation
 TARGET = [0.8, 0.9]
 AT_TARGET = ['--target', *map(str, TARGET)]
 NOISE, HEADING_NOISE = 0.008, 0.02
-# Stamps of the recorded images are late by so much [s].
-LATE = 0.05
+LATE = 0.05  # stamps of the recorded images are late by so much [s]
 
 
 # ---- from observations to R ------------------------------------------------------------------

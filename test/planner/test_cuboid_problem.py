@@ -76,8 +76,7 @@ def cuts(plan, problem):
 
 
 CUBE = [[40.0, 60.0], [40.0, 60.0], [0.0, 100.0]]
-# Positions alone jump through it.
-THIN_WALL = [[48.0, 50.0], [0.0, 90.0], [0.0, 100.0]]
+THIN_WALL = [[48.0, 50.0], [0.0, 90.0], [0.0, 100.0]]  # positions alone jump through it
 
 
 @pytest.mark.parametrize('between', [True, False])
