@@ -20,8 +20,7 @@ class GoalServer:
     """Takes goals of `go_to`, each in place of the one before; a bad one is aborted, with why."""
 
     def __init__(self, driver: RobotNode, link: RobotLink) -> None:
-        self._driver = driver
-        self._link = link
+        self._driver, self._link = driver, link
         self.away = False
         # Goals that have ended, until their results are sent.
         self._ended: dict[bytes, Goal] = {}

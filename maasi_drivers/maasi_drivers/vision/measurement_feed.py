@@ -201,8 +201,7 @@ class FeedReceiver:
         sender: str | None = None,
         on_drop: Callable[[str, str, int], None] = lambda *_: None,
     ) -> None:
-        self.sender = sender
-        self._on_drop = on_drop
+        self.sender, self._on_drop = sender, on_drop
         self._last: int | None = None
         self._heard_at = -1e9
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

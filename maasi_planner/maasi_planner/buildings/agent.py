@@ -63,9 +63,7 @@ class SearchAgent:
         robot: SearcherSettings,
         step: float = 1.0,
     ) -> None:
-        self.name = name
-        self.settings = settings
-        self.mission = mission
+        self.name, self.settings, self.mission = name, settings, mission
         self.dynamics = Dynamics(robot.dynamics, step)
         self.hazard = robot.hazard
         self.home = np.array(robot.start, dtype=float)

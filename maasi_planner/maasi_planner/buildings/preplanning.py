@@ -238,8 +238,7 @@ class WayFinder:
     """Paths around boxes (n, 3, 2) [m]: a visibility graph over their corners, by travel time."""
 
     def __init__(self, solids: FloatArray, area: FloatArray, speed: float, climb: float) -> None:
-        self.solids = solids
-        self.area = area
+        self.solids, self.area = solids, area
         self._speeds = np.array([speed, speed, max(climb, 1e-3)])
         self._down = speed
 

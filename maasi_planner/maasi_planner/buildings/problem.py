@@ -63,8 +63,7 @@ class PlanSolver:
     """Solves the problems of one kind of robot, with at most so many nodes or seconds."""
 
     def __init__(self, dynamics: Dynamics, settings: CuboidMethodSettings) -> None:
-        self.dynamics = dynamics
-        self.settings = settings
+        self.dynamics, self.settings = dynamics, settings
         horizon, smoothness = settings.horizon, settings.smoothness_weight
         pull = np.zeros(horizon + 1)
         pull[settings.guided] = settings.guidance_weight

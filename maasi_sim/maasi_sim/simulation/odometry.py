@@ -70,8 +70,7 @@ class OdometryModel:
     ) -> None:
         self.settings = settings
         self.reported = reported or settings
-        self.seed = seed
-        self.robot = robot
+        self.seed, self.robot = seed, robot
         # Plain numbers: arrays of this size take several times as long.
         to_start = inverse(Pose.from_yaw(start.position, start.yaw))
         self._shift = to_start.position.tolist()

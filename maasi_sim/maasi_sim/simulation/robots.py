@@ -67,9 +67,7 @@ class SimulatedRobot:
     def __init__(
         self, name: str, settings: RobotSettings, world: World, floor: RenderSettings, seed: int
     ) -> None:
-        self.name = name
-        self.settings = settings
-        self.world = world
+        self.name, self.settings, self.world = name, settings, world
         self.collisions = 0
         start = Pose.from_yaw(settings.start, settings.yaw)
         self._motion = make_motion(settings.motion)

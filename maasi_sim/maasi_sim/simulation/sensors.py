@@ -29,8 +29,7 @@ class RangingSensor:
     ) -> None:
         self.sensor = sensor
         self.targets = np.asarray(targets, dtype=float)
-        self.seed = seed
-        self.robot = robot
+        self.seed, self.robot = seed, robot
         self.reach = min(reach, sensor.maximum_range)
         self._spread = np.linalg.cholesky(sensor.covariance)
 
@@ -140,9 +139,7 @@ class LaserScanner:
     """
 
     def __init__(self, settings: LaserSettings, area: Area, seed: int, robot: str) -> None:
-        self.settings = settings
-        self.seed = seed
-        self.robot = robot
+        self.settings, self.seed, self.robot = settings, seed, robot
         margin = settings.wall_margin
         low, high = area.bounds[:2, 0] - margin, area.bounds[:2, 1] + margin
         self._walls = np.array([low[0], high[0], low[1], high[1]])

@@ -30,8 +30,7 @@ class BuildingMission(Mission[CuboidRecord]):
     found_word = 'visited'
 
     def __init__(self, name: str, scenario: CuboidScenario) -> None:
-        self.name = name
-        self.scenario = scenario
+        self.name, self.scenario = name, scenario
 
     def plan_nodes(self, options: Options, file: Path) -> list[NodePlan]:
         """Return the simulation, and for each robot a planner and a guard: not in lockstep."""

@@ -70,9 +70,7 @@ class CuboidMission:
         seed: int = 1,
         scheme: Scheme = 'distributed',
     ) -> None:
-        self.settings = settings
-        self.seed = seed
-        self.scheme = scheme
+        self.settings, self.seed, self.scheme = settings, seed, scheme
         self.mission = plan_mission(settings, area)
         self.agents = {
             name: SearchAgent(name, settings, self.mission, robots[name], step)

@@ -39,8 +39,7 @@ class TargetMission:
     found_word = 'found'
 
     def __init__(self, name: str, scenario: Scenario) -> None:
-        self.name = name
-        self.scenario = scenario
+        self.name, self.scenario = name, scenario
 
     def prepare(self) -> None:
         """See `Mission.prepare`."""

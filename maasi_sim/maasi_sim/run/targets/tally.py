@@ -109,8 +109,7 @@ class Tally:
     """Counts what the filters have found, update by update."""
 
     def __init__(self, scenario: Scenario, world: World, run: Observer) -> None:
-        self.scenario = scenario
-        self.world = world
+        self.scenario, self.world = scenario, world
         self.truth = np.asarray(world.targets, dtype=float)
         self.measurements = dict.fromkeys(scenario.names(), 0)
         self.progress: list[FoundCount] = []

@@ -56,8 +56,7 @@ class EventMaker:
     """Makes the events of a run with a scene, see `scene_of`, and hands each to a listener."""
 
     def __init__(self, scene: Scene, listener: Listener) -> None:
-        self.scene = scene
-        self._listener = listener
+        self.scene, self._listener = scene, listener
         bounds = np.asarray(scene.get('bounds') or [[0.0, 1.0]], dtype=float)
         extent = float((bounds[:, 1] - bounds[:, 0]).max())
         # A ten-thousandth of the environment is not seen.

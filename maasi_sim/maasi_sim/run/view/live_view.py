@@ -166,8 +166,7 @@ class SearchTrace:
     """Gathers calls that make the events of a search, cheaply: they are made when it is shown."""
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
-        self.scenario = scenario
-        self.seed = seed
+        self.scenario, self.seed = scenario, seed
         self._live: LiveView | None = None
         self._calls: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
         self._last_states = -np.inf

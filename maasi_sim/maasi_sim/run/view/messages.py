@@ -84,9 +84,7 @@ class MessageEvents:
         waits: bool = False,
         on_restart: Callable[[], EventMaker] | None = None,
     ) -> None:
-        self.maker = maker
-        self._waits = waits
-        self._on_restart = on_restart
+        self.maker, self._waits, self._on_restart = maker, waits, on_restart
         self._early: list[tuple[str, str, Any]] = []
         self._begin: float | None = None
         self._team: set[str] | None = None
