@@ -10,7 +10,7 @@ from std_msgs.msg import Header
 
 from maasi_filter.colours import ROBOTS
 from maasi_filter.ros.conversions import colour_of
-from maasi_planner.buildings.agent import Activity, SearchAgent
+from maasi_planner.buildings.agent import Activity, Broadcast, SearchAgent, assigned, rewards
 from maasi_planner.buildings.conversions import (
     agent_markers,
     broadcast_from_ros,
@@ -20,7 +20,6 @@ from maasi_planner.buildings.conversions import (
 )
 from maasi_planner.buildings.preplanning import plan_mission
 from maasi_planner.buildings.settings import CuboidMethodSettings, HazardSettings
-from maasi_planner.buildings.sharing import Broadcast, assigned, rewards
 
 HOME = [166.0, 235.0, 5.0]
 

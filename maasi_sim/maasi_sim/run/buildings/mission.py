@@ -9,11 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_planner.buildings.agent import Activity, SearchAgent, Snapshot, decision_stream
+from maasi_planner.buildings.agent import (
+    Activity,
+    Broadcast,
+    SearchAgent,
+    Snapshot,
+    decision_stream,
+)
 from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
 from maasi_planner.buildings.problem import Plan, solve_jointly
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
-from maasi_planner.buildings.sharing import Broadcast
 
 Scheme = Literal['distributed', 'sequential', 'centralized']
 

@@ -162,7 +162,7 @@ class EventMaker:
         self._put(time, 'seen', robot, self._place(position), rows)
 
     def picture(self, time: float, robot: str, content: Sequence[Any]) -> None:
-        """Add what a camera saw as its robot measured, see `maasi_sim.run.view.pictures`."""
+        """Add what a camera saw as its robot measured, see `maasi_sim.run.view.messages`."""
         self._put(time, 'picture', robot, *content)
 
     def filter(
