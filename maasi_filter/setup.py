@@ -23,7 +23,7 @@ setup(
         'shapely>=2.0',
         'typing_extensions>=4.10',
     ],
-    extras_require={'test': ['hypothesis>=6.98', 'pytest>=7.4']},
+    extras_require={'geo': ['rasterio>=1.4'], 'test': ['hypothesis>=6.98', 'pytest>=7.4']},
     zip_safe=True,
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',
@@ -32,9 +32,5 @@ setup(
         'the filter node'
     ),
     license='Apache-2.0',
-    entry_points={
-        'console_scripts': [
-            'filter_node = maasi_entry:filter_node',
-        ],
-    },
+    entry_points={'console_scripts': ['filter_node = maasi_entry:filter_node']},
 )

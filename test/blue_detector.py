@@ -29,8 +29,7 @@ class BlueDetector:
             Detection2DArray, f'{space}camera/detections', RELIABLE
         )
         node.create_subscription(Image, f'{space}camera/image_raw', self.on_image, RELIABLE)
-        # In place of that of the image.
-        self.frame = None
+        self.frame = None  # in place of that of the image
 
     def on_image(self, message):
         red, green, blue = np.moveaxis(image_to_array(message).astype(int), 2, 0)

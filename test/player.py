@@ -39,8 +39,7 @@ class Player:
         self.tested.destroy_node()
         self.own.shutdown()
         self.tested = self.own = None
-        # See `own_context`.
-        gc.collect()
+        gc.collect()  # see `own_context`
 
     def close(self):
         if self.tested is not None:

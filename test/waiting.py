@@ -2,8 +2,7 @@
 
 import time
 
-# Of a test [s]; the machine may be busy.
-PATIENCE = 120.0
+PATIENCE = 120.0  # of a test [s]; the machine may be busy
 
 
 def wait_until(condition, turn=lambda: time.sleep(0.01), what='nothing came of it', limit=PATIENCE):

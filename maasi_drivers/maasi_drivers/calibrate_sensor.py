@@ -30,44 +30,43 @@ def build_parser() -> argparse.ArgumentParser:
         'of the sensor, for sensor.noise, and the probability of detection inside its field of '
         'view. The images go through the same steps as in the driver.',
     )
-    parser.add_argument('bag', type=Path, help='folder of the recording')
-    parser.add_argument(
+    add = parser.add_argument
+    add('bag', type=Path, help='folder of the recording')
+    add(
         '--parameters',
         type=Path,
         required=True,
         metavar='FILE',
         help="the driver's parameter file, for its camera, sensor and start",
     )
-    parser.add_argument(
-        '--robot', metavar='NAMESPACE', help='of the robot (default: the only one recorded)'
-    )
-    parser.add_argument(
+    add('--robot', metavar='NAMESPACE', help='of the robot (default: the only one recorded)')
+    add(
         '--target',
         type=float,
         nargs='+',
         metavar='X',
         help='where the target is in the map [m] (default: the mean of where it was seen)',
     )
-    parser.add_argument(
+    add(
         '--use',
         choices=('images', 'detections'),
         help='segment the recorded images, or take the detections that a driver published '
         '(default: images, if there are any)',
     )
-    parser.add_argument(
+    add(
         '--poses',
         metavar='TOPIC',
         help='where the robot was: AgentState or PoseStamped in the map, or Odometry (default: '
         'state, else pose, else odom)',
     )
-    parser.add_argument(
+    add(
         '--least-range',
         type=float,
         default=0.05,
         metavar='M',
         help='nearer observations are left out: the bearing means nothing there (default: 0.05)',
     )
-    parser.add_argument('--json', type=Path, metavar='FILE', help='write the result to a file too')
+    add('--json', type=Path, metavar='FILE', help='write the result to a file too')
     return parser
 
 

@@ -58,8 +58,7 @@ class MeasuringFlight:
     """Flies the legs, each at most `way` [m] long."""
 
     def __init__(self, link: MamboLink, way: float, legs: int, clock: Callable[[], float]) -> None:
-        self.link = link
-        self.way = way
+        self.link, self.way = link, way
         self.number = legs
         self.clock = clock
         self.legs: list[Leg] = []

@@ -24,14 +24,11 @@ def build_parser() -> argparse.ArgumentParser:
         description='Segment the images of a camera, and send the blobs to a driver with '
         'image_source: feed. Ends with the video, or with Ctrl-C.',
     )
-    parser.add_argument(
-        'video', help='address (rtsp://...), device (/dev/video0) or file, as OpenCV opens it'
-    )
-    parser.add_argument('to', metavar='HOST:PORT', help='of the driver')
-    parser.add_argument(
-        '--rule', default='robust', help='segmentation rule: robust or paper (default: robust)'
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add('video', help='address (rtsp://...), device (/dev/video0) or file, as OpenCV opens it')
+    add('to', metavar='HOST:PORT', help='of the driver')
+    add('--rule', default='robust', help='segmentation rule: robust or paper (default: robust)')
+    add(
         '--exposure-age',
         type=float,
         default=0.0,

@@ -61,8 +61,7 @@ def _metres(text: str) -> float:
 
 class _User:
     def __init__(self, node: Node, options: argparse.Namespace) -> None:
-        self._node = node
-        self._options = options
+        self._node, self._options = node, options
         self._top = '/' + options.robot.strip('/')
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)

@@ -16,8 +16,7 @@ NOISE = {'range': 0.05, 'bearing': 0.02, 'elevation': 0.03, 'as': 'deviation', '
 POSE = Pose([4.0, -3.0, 12.0], [0.9, 0.05, -0.1, 0.42])
 TARGETS = np.array([[9.0, 1.0, 5.0], [-3.0, -9.0, 2.0], [4.5, -2.5, 30.0]])
 
-# Of the deviations of the attitude, along the axes of the map.
-AXES = np.array([1.5, 0.5, 1.0])
+AXES = np.array([1.5, 0.5, 1.0])  # of the deviations of the attitude, along the axes of the map
 
 
 def stamped(attitude=0.0):

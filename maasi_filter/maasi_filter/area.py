@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +14,12 @@ from shapely.geometry import box
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.environment import (
-    EnvironmentSettings,
-    PriorSettings,
-    Zone,
-    read_image,
-    read_shape,
-)
+from maasi_filter.environment import EnvironmentSettings, Zone, read_image, read_shape
+from maasi_filter.geodesy import OriginSettings, geodetic
 
-# Of coordinates, also of those that are large [m].
-_ROUNDING = 1e-6
-# Cells of the raster along the longer side.
-_CELLS = 512
+_ROUNDING = 1e-6  # of coordinates, also of those that are large [m]
+# Cells of the density along the longer side, and every how many are looked at to check it.
+_CELLS, _CHECKED = 512, 16
 
 
 class Area:
@@ -40,8 +36,6 @@ class Area:
         Around the area, metres.
     region : shapely geometry or None
         Level shape of what may hold targets: the area without keep-outs; None: all of `bounds`.
-    volume : float
-        Of the region, m^d.
     circles : (n, 5) array
         Of all round zones: x, y, z, radius [m, map], 1 for a sphere, 0 for a cylinder.
 
@@ -73,43 +67,42 @@ class Area:
             whole = self._fence or box(*self.bounds[:2].T.ravel())
             self.region = whole.difference(shapely.union_all(closed))
             if self.region.area <= 0.0:
-                raise ValueError('environment: nothing of the area is left outside of keep_outs')
+                raise ValueError('environment.keep_outs: leave nothing of the area')
             shapely.prepare(self.region)
-        size = self.bounds[:, 1] - self.bounds[:, 0]
-        self.volume = float(np.prod(size))
-        self._density: FloatArray | None = None
         prior = environment.prior
-        if self.region is not None or prior.polygons or prior.raster:
-            self._density, share = self._rasterised(prior)
-            self.volume *= share
+        self._raster = read_raster(environment) if prior.raster else None
+        #: Whether targets are equally likely in all of the bounds.
+        self.uniform = self.region is None and not prior.polygons and self._raster is None
+        # All cells, which take long and not all users need, only where a few promise nothing.
+        if not self.uniform and not np.prod(self._cells(_CHECKED), axis=0).any():
+            _ = self._rasterised  # for its errors
 
     @classmethod
     def of(cls, area: Area | EnvironmentSettings | ArrayLike) -> Area:
         """Return an area as it is, or of settings or bounds."""
         return area if isinstance(area, Area) else cls(area)
 
-    @property
-    def uniform(self) -> bool:
-        """Whether targets are equally likely in all of the bounds."""
-        return self._density is None
+    @cached_property
+    def volume(self) -> float:
+        """Of the region, m^d."""
+        whole = float(np.prod(self.bounds[:, 1] - self.bounds[:, 0]))
+        return whole if self.uniform else whole * self._rasterised[1]
 
-    def inside(self, points: ArrayLike) -> BoolArray:
-        """Return which points (n, d or more) are finite and in the area, up to rounding."""
+    def inside(self, points: ArrayLike, bounded: bool = True) -> BoolArray:
+        """Return which points (n, d or more) are finite and in the area, up to rounding.
+
+        Not `bounded`: in the region only, or anywhere if there is none.
+        """
         array = np.asarray(points, dtype=float)
-        places = array[:, : self.dimension]
-        within = (places >= self.bounds[:, 0] - _ROUNDING).all(axis=1)
-        within &= (places <= self.bounds[:, 1] + _ROUNDING).all(axis=1)
-        within &= np.isfinite(array).all(axis=1)
+        within = np.isfinite(array).all(axis=1)
+        if bounded:
+            places = array[:, : self.dimension]
+            within &= (places >= self.bounds[:, 0] - _ROUNDING).all(axis=1)
+            within &= (places <= self.bounds[:, 1] + _ROUNDING).all(axis=1)
         if self.region is not None and within.any():
-            near = shapely.points(places[within, :2])
+            near = shapely.points(array[within, :2])
             within[within] = shapely.dwithin(self.region, near, _ROUNDING)
         return np.asarray(within)
-
-    def admits(self, position: Sequence[float]) -> bool:
-        """Return whether a place (3,) is outside of keep-outs and inside the area's border."""
-        if self.region is None:
-            return True
-        return bool(shapely.dwithin(self.region, shapely.Point(position[:2]), _ROUNDING))
 
     def outside_by(self, position: ArrayLike) -> float:
         """Return how far a place (3,) is outside of the area's border [m]; 0: inside, or none."""
@@ -122,13 +115,14 @@ class Area:
 
         Relative to evenly over the region: its mean there is 1.
         """
-        if self._density is None:
+        if self.uniform:
             return np.ones(len(points))
         low, high = self.bounds[:2].T
-        shape_of = np.array(self._density.shape)
+        values = self._rasterised[0]
+        shape_of = np.array(values.shape)
         cell = np.floor((points[:, :2] - low) / (high - low) * shape_of).astype(int)
         cell = np.clip(cell, 0, shape_of - 1)
-        return np.asarray(self._density[cell[:, 0], cell[:, 1]])
+        return np.asarray(values[cell[:, 0], cell[:, 1]])
 
     def draw(
         self,
@@ -142,10 +136,10 @@ class Area:
         It is drawn evenly or, `by_prior`, as likely as targets are.
         """
         place = generator.uniform(low, high)
-        if self._density is None:
+        if self.uniform:
             return np.asarray(place)
         density = float(self.density(place[None, :])[0])
-        if by_prior and generator.uniform(0.0, float(self._density.max())) > density:
+        if by_prior and generator.uniform(0.0, float(self._rasterised[0].max())) > density:
             return None
         return np.asarray(place) if density > 0.0 and self.inside(place[None, :])[0] else None
 
@@ -176,31 +170,36 @@ class Area:
             whole = box(*self.bounds[:2].T.ravel()).buffer(reach, join_style='mitre')
         return whole.difference(shapely.union_all(polygons))
 
-    def _rasterised(self, prior: PriorSettings) -> tuple[FloatArray, float]:
-        """Return the density in cells (nx, ny), and the share of the bounds that is inside."""
+    @cached_property
+    def _rasterised(self) -> tuple[FloatArray, float]:
+        """The density in cells (nx, ny), and the share of the bounds that is inside."""
+        likely, inside = self._cells()
+        if not inside.any():
+            raise ValueError('environment.area: is too narrow for its bounds')
+        promised = float((likely * inside).sum() / inside.sum())
+        if not promised > 0.0:
+            raise ValueError('environment.prior: promises nothing inside the area')
+        floor = self.settings.prior.floor
+        return (floor + (1.0 - floor) * likely / promised) * inside, float(inside.mean())
+
+    def _cells(self, every: int = 1) -> tuple[FloatArray, FloatArray]:
+        """Return prior, and 1 for inside, at the middle of every n-th cell, (nx, ny)."""
+        prior = self.settings.prior
         low, high = self.bounds[:2].T
         size = high - low
         number = np.maximum(np.ceil(_CELLS * size / size.max()), 8).astype(int)
-        axes = [a + (np.arange(n) + 0.5) * s / n for a, n, s in zip(low, number, size)]
+        axes = [a + (np.arange(0, n, every) + 0.5) * s / n for a, n, s in zip(low, number, size)]
         x, y = np.meshgrid(*axes, indexing='ij')
-        inside = np.ones(x.shape)
+        inside, likely = np.ones(x.shape), np.ones(x.shape)
         if self.region is not None:
             inside = shapely.contains_xy(self.region, x, y).astype(float)
-        if not inside.any():
-            raise ValueError('environment: the area is too narrow for its bounds')
-        likely = np.ones(x.shape)
         for part in prior.polygons:
             shape_of = read_shape(part.polygon)
             shapely.prepare(shape_of)
             likely[shapely.contains_xy(shape_of, x, y)] = part.weight
-        if prior.raster is not None:
-            extent = np.array(prior.extent or self.bounds[:2])
-            likely *= _sampled(read_raster(prior.raster), extent, x, y)
-        promised = float((likely * inside).sum() / inside.sum())
-        if not promised > 0.0:
-            raise ValueError('environment.prior: promises nothing inside the area')
-        density = (prior.floor + (1.0 - prior.floor) * likely / promised) * inside
-        return density, float(inside.mean())
+        if self._raster is not None:
+            likely *= self._raster.at(x, y)
+        return likely, inside
 
 
 def level_shape(zone: Zone) -> BaseGeometry:
@@ -246,30 +245,79 @@ def _polygons(zones: Iterable[Zone]) -> list[BaseGeometry]:
     return [read_shape(zone.polygon) for zone in zones if zone.polygon is not None]
 
 
-def read_raster(path: str) -> FloatArray:
-    """Return the densities of a raster (rows from north, columns from west).
+@dataclass(frozen=True)
+class _Raster:
+    """Densities: values (rows, columns), and how x, y [m, map] become columns and rows."""
+
+    values: FloatArray
+    cells: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+    def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the values at places, 0 outside."""
+        rows, columns = self.values.shape
+        column, row = self.cells(x, y)
+        known = (column >= 0.0) & (column < columns) & (row >= 0.0) & (row < rows)
+        found = np.zeros(x.shape)
+        found[known] = self.values[row[known].astype(int), column[known].astype(int)]
+        return found
+
+
+def read_raster(environment: EnvironmentSettings) -> _Raster:
+    """Return the raster of an environment's prior: .npy or an image, first row north; or GeoTIFF.
 
     ValueError if it cannot be read, or is not of finite numbers from 0.
     """
+    path = str(environment.prior.raster)
+    key = f'environment.prior.raster: {path}'
     try:
-        found = np.load(path) if Path(path).suffix.lower() == '.npy' else read_image(path)
+        suffix = Path(path).suffix.lower()
+        if suffix in ('.tif', '.tiff'):
+            raster = _of_geotiff(path, environment.origin)
+        else:
+            values = np.load(path) if suffix == '.npy' else read_image(path)
+            extent = environment.prior.extent or environment.bounds[:2]
+            raster = _over(np.asarray(values, dtype=float), extent)
     except (OSError, ValueError) as error:
-        raise ValueError(f'prior.raster: {path}: {error}') from None
-    raster = np.asarray(found, dtype=float)
-    if raster.ndim != 2 or not np.isfinite(raster).all() or (raster < 0.0).any():
+        raise ValueError(f'{key}: {error}') from None
+    values = raster.values
+    if values.ndim != 2 or not np.isfinite(values).all() or (values < 0.0).any():
         raise ValueError(
-            f'prior.raster: {path}: got shape {raster.shape}, allowed are two axes of finite '
-            'numbers from 0'
+            f'{key}: got shape {values.shape}, allowed are two axes of finite numbers from 0'
         )
     return raster
 
 
-def _sampled(raster: FloatArray, extent: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the values of a raster at places, 0 outside of it."""
-    rows, columns = raster.shape
+def _over(values: FloatArray, extent: list[list[float]]) -> _Raster:
+    """Return a raster over bounds on x and y [m, map]."""
     (west, east), (south, north) = extent
-    column = np.floor((x - west) / (east - west) * columns).astype(int)
-    row = np.floor((north - y) / (north - south) * rows).astype(int)
-    known = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    row, column = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
-    return np.asarray(np.where(known, raster[row, column], 0.0))
+
+    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        rows, columns = values.shape
+        return (x - west) / (east - west) * columns, (north - y) / (north - south) * rows
+
+    return _Raster(values, cells)
+
+
+def _of_geotiff(path: str, origin: OriginSettings | None) -> _Raster:
+    """Return the first band of a GeoTIFF in its own coordinates; what has no data is 0."""
+    try:
+        import rasterio
+        from rasterio.warp import transform
+    except ImportError:
+        raise ValueError('needs rasterio, the extra geo: pip install "rasterio>=1.4"') from None
+    if origin is None:
+        raise ValueError('a GeoTIFF needs environment.origin')
+    with rasterio.open(path) as file:
+        if file.crs is None:
+            raise ValueError('has no coordinate system')
+        crs, grid = file.crs, list(~file.transform)
+        values = file.read(1, masked=True).astype(float).filled(0.0)
+
+    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)
+        places = transform('EPSG:4326', crs, degrees[:, 1], degrees[:, 0])
+        east, north = (np.reshape(axis, x.shape) for axis in places)
+        a, b, c, d, e, f = grid[:6]
+        return a * east + b * north + c, d * east + e * north + f
+
+    return _Raster(values, cells)

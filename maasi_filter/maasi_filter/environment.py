@@ -6,34 +6,34 @@ Shapes are given in metres of the map, as GeoJSON (degrees, RFC 7946), or as wel
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 from shapely.geometry import MultiPolygon, Polygon, shape
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geodesy import OriginSettings, to_map
 from maasi_filter.settings import Finite, Positive, Settings, Vector2
 
-# With which a number begins.
-_NUMBER = '-+.0123456789'
+_NUMBER = '-+.0123456789'  # with which a number begins
 # Of files that an environment names.
-FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.yaml')
+FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.yaml', '.tif', '.tiff')
 
 
 class Zone(Settings):
     """A zone: a polygon, a cylinder (2D: a disc) or, with three coordinates, a sphere."""
 
     centre: list[Finite] | None = Field(
-        default=None, min_length=2, max_length=3, description='Centre of a round one [m, map]'
+        None, min_length=2, max_length=3, description='Centre of a round one [m, map]'
     )
-    radius: Positive | None = Field(default=None, description='Radius of a round one [m]')
+    radius: Positive | None = Field(None, description='Radius of a round one [m]')
     polygon: str | None = Field(
-        default=None,
+        None,
         description='Corners [m, map], GeoJSON or the name of its file; kept as well-known text',
     )
 
@@ -86,17 +86,17 @@ class PriorSettings(Settings):
 
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
-        default=None,
-        description='File of densities, first row north: .npy or an image',
+        None, description='File of densities: .npy or an image, first row north; or GeoTIFF'
     )
     extent: list[Vector2] | None = Field(
-        default=None,
+        None,
         min_length=2,
         max_length=2,
-        description='Lower and upper bound of the raster on x and y; none: of the area [m, map]',
+        description='Lower and upper bound of the raster on x and y; none: of the area; GeoTIFF '
+        'has its own [m, map]',
     )
     floor: float = Field(
-        default=0.02,
+        0.02,
         ge=0.0,
         le=1.0,
         description='Share of the targets that may be anywhere, whatever the prior promises [1]',
@@ -110,12 +110,12 @@ class EnvironmentSettings(Settings):
         min_length=2, max_length=3, description='Lower and upper bound on each map axis [m]'
     )
     area: str | None = Field(
-        default=None,
+        None,
         description='Polygons in place of bounds: corners or rings [m, map], GeoJSON or its file; '
         'kept as well-known text',
     )
     altitude: Vector2 | None = Field(
-        default=None, description='With area: lowest and highest z of targets; none: 2D [m]'
+        None, description='With area: lowest and highest z of targets; none: 2D [m]'
     )
     keep_outs: list[Zone] = Field(
         default_factory=list, description='No target is expected there, and no robot goes there'
@@ -128,10 +128,10 @@ class EnvironmentSettings(Settings):
         default_factory=PriorSettings, description='Where targets are likely'
     )
     expected_targets: float = Field(
-        default=12.0, gt=0.0, description='N0, targets expected in all before the search [1]'
+        12.0, gt=0.0, description='N0, targets expected in all before the search [1]'
     )
     origin: OriginSettings | None = Field(
-        default=None, description='Of the map on the earth; with GeoJSON, none: amid its area'
+        None, description='Of the map on the earth; with GeoJSON, none: amid its area'
     )
 
     @model_validator(mode='before')
@@ -155,10 +155,9 @@ class EnvironmentSettings(Settings):
         for key in ('keep_outs', 'obstacles'):
             most = 2 if key == 'keep_outs' else self.dimension
             for index, zone in enumerate(getattr(self, key)):
-                if len(zone.centre or ()) > most:
-                    raise ValueError(
-                        f'{key}[{index}].centre: got {zone.centre}, allowed are {most} coordinates'
-                    )
+                with _at(zone.centre, key, index, 'centre'):
+                    if len(zone.centre or ()) > most:
+                        raise ValueError(f'got {zone.centre}, allowed are {most} coordinates')
         return self
 
     def without_keep_outs(self) -> EnvironmentSettings:
@@ -213,9 +212,11 @@ def features_of(value: Any) -> list[dict[str, Any]]:
         raise ValueError(f'{value[:60]}: is not JSON: {error}') from None
     if not isinstance(value, Mapping):
         raise ValueError(f'got {str(value)[:60]}, allowed is GeoJSON')
-    if value.get('type') == 'FeatureCollection':
-        return list(value['features'])
-    return [dict(value) if value.get('type') == 'Feature' else {'geometry': dict(value)}]
+    one = value if value.get('type') == 'Feature' else {'type': 'Feature', 'geometry': value}
+    features = value.get('features') if value.get('type') == 'FeatureCollection' else [one]
+    if not isinstance(features, list) or not all(isinstance(one, Mapping) for one in features):
+        raise ValueError(f'features: got {str(features)[:60]}, allowed is a list of features')
+    return features
 
 
 def _geometry(feature: Mapping[str, Any]) -> Any:
@@ -254,81 +255,93 @@ def read_map(path: str) -> Any:
     return cells.buffer(0.5 * cell, join_style='mitre').simplify(0.5 * cell)
 
 
+@contextmanager
+def _at(value: Any, *key: str | int) -> Iterator[None]:
+    """Make what is wrong with a value an error at its key."""
+    problems: list[Any]
+    try:
+        yield
+    except ValidationError as error:
+        problems = [{**item, 'loc': (*key, *item['loc'])} for item in error.errors()]
+    except (ValueError, TypeError, OSError, shapely.errors.ShapelyError) as error:
+        wrong = ValueError(str(error))
+        problems = [{'type': 'value_error', 'loc': key, 'input': value, 'ctx': {'error': wrong}}]
+    else:
+        return
+    raise ValidationError.from_exception_data('environment', problems) from None
+
+
 def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of an environment with all shapes as well-known text in the map."""
     values = dict(given)
     roles: dict[str, list[dict[str, Any]]] = {'area': [], 'keep_out': [], 'prior': []}
-    if _is_geojson(values.get('area')):
-        try:
-            features = features_of(values['area'])
-        except ValueError as error:
-            raise ValueError(f'area: {error}') from None
-        for feature in features:
-            role = (feature.get('properties') or {}).get('role', 'area')
-            roles.setdefault(role, []).append(feature)
-        if unknown := roles.keys() - {'area', 'keep_out', 'prior'}:
-            raise ValueError(f'area: got role {min(unknown)}, allowed are area, keep_out, prior')
-        values['area'] = {'type': 'FeatureCollection', 'features': roles['area']}
-        if not values.get('origin'):
-            whole = shapely.union_all([_geometry(item) for item in roles['area']])
-            west, south, east, north = whole.bounds
-            values['origin'] = OriginSettings(
-                latitude=0.5 * (south + north), longitude=0.5 * (west + east)
-            )
-    origin = values.get('origin')
+    area, origin, prior = values.get('area'), values.get('origin'), values.get('prior')
+    if _is_geojson(area):
+        with _at(area, 'area'):
+            for feature in features_of(area):
+                role = (feature.get('properties') or {}).get('role', 'area')
+                if role not in roles:
+                    raise ValueError(f'got role {role}, allowed are area, keep_out, prior')
+                roles[role].append(feature)
+            if not origin:
+                whole = shapely.union_all([_geometry(item) for item in roles['area']])
+                west, south, east, north = whole.bounds
+                origin = {'latitude': 0.5 * (south + north), 'longitude': 0.5 * (west + east)}
+        area = {'type': 'FeatureCollection', 'features': roles['area']}
+    if origin:
+        with _at(origin, 'origin'):
+            values['origin'] = OriginSettings.model_validate(origin)
 
     def project(degrees: FloatArray) -> FloatArray:
-        return to_map(degrees, OriginSettings.model_validate(origin))
+        return to_map(degrees, values['origin'])
 
-    def text(value: Any, key: str) -> str:
-        try:
+    def text(value: Any, *key: str | int) -> str:
+        with _at(value, *key):
             found = read_shape(value, project if origin else None)
-        except (ValueError, TypeError, KeyError, OSError, shapely.errors.ShapelyError) as error:
-            raise ValueError(f'{key}: {error}') from None
         return str(shapely.to_wkt(found, rounding_precision=4))
 
-    def zones(key: str, more: Iterable[Any] = ()) -> list[Any]:
-        out: list[Any] = []
-        for index, item in enumerate([*(values.get(key) or []), *more]):
-            round_one = isinstance(item, Zone) or (isinstance(item, Mapping) and 'centre' in item)
-            row = isinstance(item, str) and Path(item).suffix not in FILES and item[:1] in _NUMBER
-            if not (round_one or row):
-                inner = item['polygon'] if isinstance(item, Mapping) and 'polygon' in item else item
-                item = {'polygon': text(inner, f'{key}[{index}]')}
-            out.append(item)
-        return out
+    def zone(item: Any, *key: str | int) -> Any:
+        round_one = isinstance(item, Zone) or (isinstance(item, Mapping) and 'centre' in item)
+        row = isinstance(item, str) and Path(item).suffix not in FILES and item[:1] in _NUMBER
+        if round_one or row:
+            return item
+        inner = item['polygon'] if isinstance(item, Mapping) and 'polygon' in item else item
+        return {'polygon': text(inner, *key)}
 
-    if values.get('area'):
-        values['area'] = text(values['area'], 'area')
+    if area:
+        values['area'] = text(area, 'area')
         west, south, east, north = shapely.from_wkt(values['area']).bounds
         values['bounds'] = [[west, east], [south, north]]
         if values.get('altitude') is not None:
             values['bounds'].append(values['altitude'])
     elif values.get('altitude') is not None:
-        raise ValueError('altitude: allowed with area; bounds have the heights themselves')
-    for key, more in (('keep_outs', roles['keep_out']), ('obstacles', [])):
-        if values.get(key) or more:
-            values[key] = zones(key, more)
-    prior = values.get('prior')
-    if isinstance(prior, str):
-        suffix = Path(prior).suffix
-        prior = features_of(prior) if suffix in ('.json', '.geojson') else {'raster': prior}
-    if isinstance(prior, list):
-        roles['prior'] += prior
+        with _at(values['altitude'], 'altitude'):
+            raise ValueError('allowed with area; bounds have the heights themselves')
+    for key, role in (('keep_outs', 'keep_out'), ('obstacles', 'obstacle')):
+        items, more = values.get(key) or [], roles.get(role, [])
+        if isinstance(items, (list, tuple)):
+            values[key] = [zone(item, key, index) for index, item in enumerate(items)]
+            values[key] += [zone(item, 'area') for item in more]
+    parts = [('area', item) for item in roles['prior']]
+    if isinstance(prior, list) or _is_geojson(prior):
+        with _at(prior, 'prior'):
+            items = prior if isinstance(prior, list) else [prior]
+            parts += [('prior', part) for item in items for part in features_of(item)]
         prior = {}
-    if isinstance(prior, Mapping) or roles['prior']:
+    elif isinstance(prior, str):
+        prior = {'raster': prior}
+    if isinstance(prior, Mapping) or parts:
         prior = dict(prior or {})
-        parts = list(prior.get('polygons') or [])
-        for item in roles['prior']:
-            weight = (item.get('properties') or {}).get('weight', 1.0)
-            parts.append({'polygon': item, 'weight': weight})
-        prior['polygons'] = [
-            {**item, 'polygon': text(item['polygon'], f'prior.polygons[{index}]')}
-            if isinstance(item, Mapping)
+        polygons = [
+            {**item, 'polygon': text(item['polygon'], 'prior', 'polygons', index, 'polygon')}
+            if isinstance(item, Mapping) and 'polygon' in item
             else item
-            for index, item in enumerate(parts)
+            for index, item in enumerate(prior.get('polygons') or [])
         ]
-        values['prior'] = prior
+        for key, item in parts:
+            weight = (item.get('properties') or {}).get('weight', 1.0)
+            polygons.append({'polygon': text(item, key), 'weight': weight})
+        values['prior'] = {**prior, 'polygons': polygons}
     return values
 
 

@@ -45,12 +45,9 @@ from maasi_msgs.msg import (
 )
 
 _TIMEOUT_PERIOD = 0.05
-# Upper bound on predicted steps: a day at 10 steps per second.
-_MOST_STEPS = 864_000
-# Longest wait for the latched message with kept targets [s].
-_KEPT_PATIENCE = 5.0
-# Longest wait for other filters to acknowledge found targets [s].
-_SHARING_PATIENCE = 0.5
+_MOST_STEPS = 864_000  # upper bound on predicted steps: a day at 10 steps per second
+_KEPT_PATIENCE = 5.0  # longest wait for the latched message with kept targets [s]
+_SHARING_PATIENCE = 0.5  # longest wait for other filters to acknowledge found targets [s]
 
 
 class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):

@@ -12,7 +12,7 @@ class OriginSettings(Settings):
 
     latitude: float = Field(ge=-90.0, le=90.0, description='North of the equator [degrees]')
     longitude: float = Field(ge=-180.0, le=180.0, description='East of Greenwich [degrees]')
-    altitude: Finite = Field(default=0.0, description='Over the ellipsoid [m]')
+    altitude: Finite = Field(0.0, description='Over the ellipsoid [m]')
 
 
 def geodetic(positions: FloatArray, origin: OriginSettings) -> FloatArray:

@@ -37,8 +37,7 @@ class Label:
             raise ValueError(f'score: got {self.score}, allowed is 0 to 1')
 
 
-#: Of a detection about which nothing is known but its position.
-UNLABELLED = Label()
+UNLABELLED = Label()  #: of a detection about which nothing is known but its position
 
 
 @dataclass

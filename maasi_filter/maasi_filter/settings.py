@@ -50,44 +50,43 @@ class DetectionSettings(Settings):
     """Probability of detection pi(x, q)."""
 
     kind: Annotated[str, DETECTIONS, AfterValidator(DETECTIONS.check)] = Field(
-        default='exponential',
+        'exponential',
         description='Form of pi: G exp(-|zeta|/2), G exp(-|zeta|^2/2), G inside a box, or '
         'module:Class of your own',
     )
     settings: Annotated[Any, _DETECTION, AfterValidator(_DETECTION.check)] = Field(
-        default=None, validate_default=True, description='Settings of a form of your own'
+        None, validate_default=True, description='Settings of a form of your own'
     )
     probability: float = Field(
-        default=0.98,
+        0.98,
         ge=0.0,
         le=1.0,
         description='G, the largest probability of detection; a form of your own is multiplied '
         'with it [1]',
     )
     size: list[Positive] = Field(
-        default=[25.0, 25.0, 25.0],
+        [25.0, 25.0, 25.0],
         min_length=2,
         max_length=3,
         description='F, size of the field of view on each map axis, exponential or gaussian [m]',
     )
     lower: list[Finite] = Field(
-        default=[-0.2, -0.2],
+        [-0.2, -0.2],
         min_length=2,
         max_length=3,
         description='Lower corner of a box as offset from the robot [m]',
     )
     upper: list[Finite] = Field(
-        default=[0.2, 0.2],
+        [0.2, 0.2],
         min_length=2,
         max_length=3,
         description='Upper corner of a box as offset from the robot [m]',
     )
     frame: Literal['robot', 'world'] = Field(
-        default='robot',
-        description='Whether a box turns with the robot or stays aligned with the map',
+        'robot', description='Whether a box turns with the robot or stays aligned with the map'
     )
     edge: NotNegative = Field(
-        default=0.0, description='Half width of a ramp across the faces of a box; 0 is hard [m]'
+        0.0, description='Half width of a ramp across the faces of a box; 0 is hard [m]'
     )
 
     @model_validator(mode='after')
@@ -110,21 +109,19 @@ class DetectionSettings(Settings):
 class NoiseSettings(Settings):
     """Noise of a measurement; the meaning of each number is explicit."""
 
-    range: Positive = Field(default=1.5, description='Noise of the range [m, or m^2 as variance]')
+    range: Positive = Field(1.5, description='Noise of the range [m, or m^2 as variance]')
     bearing: Positive = Field(
-        default=0.175, description='Noise of the bearing [unit of `angles`, squared as variance]'
+        0.175, description='Noise of the bearing [unit of `angles`, squared as variance]'
     )
     elevation: NotNegative = Field(
-        default=0.295, description='Noise of the elevation, 3D only [unit of `angles`, or squared]'
+        0.295, description='Noise of the elevation, 3D only [unit of `angles`, or squared]'
     )
     as_: Literal['deviation', 'variance'] = Field(
-        default='deviation',
+        'deviation',
         alias='as',
         description='Whether the numbers are standard deviations or variances',
     )
-    angles: Literal['radians', 'degrees'] = Field(
-        default='radians', description='Unit of the angles'
-    )
+    angles: Literal['radians', 'degrees'] = Field('radians', description='Unit of the angles')
 
     def deviations(self, dimension: int) -> FloatArray:
         """Return the standard deviations, (d,), in metres and radians."""
@@ -152,12 +149,11 @@ class SensorSettings(Settings):
         default_factory=NoiseSettings, description='Noise of a measurement'
     )
     clutter: NotNegative = Field(
-        default=0.0,
-        description='Intensity of false detections [1/(m rad) in 2D, 1/(m rad^2) in 3D]',
+        0.0, description='Intensity of false detections [1/(m rad) in 2D, 1/(m rad^2) in 3D]'
     )
-    period: NotNegative = Field(default=0.0, description='Time between possible measurements [s]')
+    period: NotNegative = Field(0.0, description='Time between possible measurements [s]')
     resolution: NotNegative = Field(
-        default=1.0,
+        1.0,
         description='pmb: detections of one scan that are closer are of one target; 0: none are '
         '[deviations of the noise]',
     )
@@ -176,10 +172,10 @@ class OffsetSettings(Settings):
     """Errors of the robots' positions that last; both 0: their errors are independent."""
 
     deviation: NotNegative = Field(
-        default=0.0, description='Deviation of a constant offset on each axis [m]'
+        0.0, description='Deviation of a constant offset on each axis [m]'
     )
     drift: NotNegative = Field(
-        default=0.0,
+        0.0,
         description='Deviation of the drift of x and y after one metre; grows with its root [m]',
     )
 
@@ -188,22 +184,22 @@ class PmbSettings(Settings):
     """Settings of the Poisson multi-Bernoulli filter."""
 
     particles: int = Field(
-        default=300, ge=50, le=100_000, description='Particles of each potential target [1]'
+        300, ge=50, le=100_000, description='Particles of each potential target [1]'
     )
     found_probability: float = Field(
-        default=0.99,
+        0.99,
         gt=0.5,
         lt=1.0,
         description='Existence probability above which a target can be found [1]',
     )
     withdrawn_probability: float = Field(
-        default=0.5,
+        0.5,
         ge=0.0,
         le=0.5,
         description='Existence probability below which a found target is withdrawn [1]',
     )
     walk: NotNegative = Field(
-        default=0.0,
+        0.0,
         description='Standard deviation of a random walk of the targets on each axis after one '
         'second; 0: they stand still [m/sqrt(s)]',
     )
@@ -258,92 +254,79 @@ class FilterSettings(Settings):
     """
 
     method: Literal['ic_phd', 'pmb'] = Field(
-        default='ic_phd', description="The papers' PHD, or a Poisson multi-Bernoulli filter"
+        'ic_phd', description="The papers' PHD, or a Poisson multi-Bernoulli filter"
     )
-    preset: Preset = Field(
-        default='paper_000', description='ic_phd: where values left None come from'
-    )
+    preset: Preset = Field('paper_000', description='ic_phd: where values left None come from')
     found_radius: float | None = Field(
-        default=None,
-        gt=0.0,
-        description='T_r, largest root mean square radius of what is found [m]',
+        None, gt=0.0, description='T_r, largest root mean square radius of what is found [m]'
     )
     exploration_spacing: float | None = Field(
-        default=None, gt=0.0, description='Spacing of the exploration grid [m]'
+        None, gt=0.0, description='Spacing of the exploration grid [m]'
     )
     threads: int | None = Field(
-        default=None,
-        ge=1,
-        le=256,
-        description='Threads for large particle sets; results do not depend [1]',
+        None, ge=1, le=256, description='Threads for large particle sets; results do not depend [1]'
     )
     particles: int | None = Field(
-        default=None,
+        None,
         ge=1,
         le=5_000_000,
         description='ic_phd: largest number of particles after resampling [1]',
     )
     particles_minimum: int | None = Field(
-        default=None,
+        None,
         ge=0,
         description='ic_phd: smallest number of particles after resampling, if any mass [1]',
     )
     particles_per_target: int | None = Field(
-        default=None,
+        None,
         ge=1,
         description='ic_phd: l, particles for each expected target, within the bounds [1]',
     )
     survival_probability: float | None = Field(
-        default=None,
+        None,
         ge=0.0,
         le=1.0,
         description='ic_phd: p_s, that a target still exists after one step [1]',
     )
     births: Literal['measurement', 'uniform', 'gaussian'] | None = Field(
-        default=None, description='ic_phd: births at each measurement, anywhere (001), or as in 003'
+        None, description='ic_phd: births at each measurement, anywhere (001), or as in 003'
     )
     birth_particles: int | None = Field(
-        default=None,
+        None,
         ge=1,
         le=1_000_000,
         description='ic_phd: J, particles of a birth (measurement: for each) [1]',
     )
     birth_targets: float | None = Field(
-        default=None,
+        None,
         ge=0.0,
         description='ic_phd: Y V, targets expected to appear at a batch (not at z) [1]',
     )
     jitter_deviation: float | None = Field(
-        default=None,
+        None,
         ge=0.0,
         description='ic_phd: deviation of the noise that moves copies of a particle apart [m]',
     )
     found_mass: float | None = Field(
-        default=None,
-        ge=0.0,
-        description='ic_phd: T_m, smallest mass of a cluster that is found [1]',
+        None, ge=0.0, description='ic_phd: T_m, smallest mass of a cluster that is found [1]'
     )
     removal: Literal['closest', 'every'] | None = Field(
-        default=None,
-        description='ic_phd: which measurements near a found target are removed (000, or 003)',
+        None, description='ic_phd: which measurements near a found target are removed (000, or 003)'
     )
     removal_distance: float | None = Field(
-        default=None,
-        gt=0.0,
-        description='ic_phd: T_z, largest distance of a removed measurement [m]',
+        None, gt=0.0, description='ic_phd: T_z, largest distance of a removed measurement [m]'
     )
     kmeans_iterations: int | None = Field(
-        default=None, ge=1, le=1000, description='ic_phd: largest number of K-means iterations [1]'
+        None, ge=1, le=1000, description='ic_phd: largest number of K-means iterations [1]'
     )
     pose_error: float | None = Field(
-        default=None,
+        None,
         ge=0.0,
         description='pmb: deviation of the error of a robot position, per axis; none: as it says '
         '[m]',
     )
     use_detection_covariances: bool | None = Field(
-        default=None,
-        description='pmb: whether covariances of detections replace that of the sensor',
+        None, description='pmb: whether covariances of detections replace that of the sensor'
     )
     pmb: PmbSettings = Field(default_factory=PmbSettings, description='pmb: what only it has')
 

@@ -13,8 +13,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 
-# Places along each axis at which the density of a cell is sampled.
-_PARTS = 5
+_PARTS = 5  # places along each axis at which the density of a cell is sampled
 # Cells along the mean side of the environment, in 2D and 3D.
 CELLS = {2: 54, 3: 13}
 MAXIMUM_NODES = 20_000_000

@@ -34,8 +34,7 @@ def generate_test_description():
     from launch_testing.actions import ReadyToTest
 
     with tempfile.NamedTemporaryFile('w', suffix='.yaml', delete=False) as file:
-        # JSON is YAML too.
-        json.dump({'/**': {'ros__parameters': flatten(SETTINGS)}}, file)
+        json.dump({'/**': {'ros__parameters': flatten(SETTINGS)}}, file)  # JSON is YAML too
     included = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(FILE)),
         launch_arguments={'params_file': file.name, 'namespace': TEAM}.items(),

@@ -3,8 +3,6 @@
 Used by the planner node and the in-process search (000, algorithms 1 and 2).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -69,8 +67,7 @@ class RobotPlan:
     decision: int = -1
     decided_at: int | None = None
     waypoint: FloatArray = field(default_factory=lambda: np.zeros(3))
-    # The same for the present waypoint.
-    turning_distance: float = 0.0
+    turning_distance: float = 0.0  # the same for the present waypoint
     # Waypoint that was left for the next one, until its closest point, and its distance squared.
     passed: FloatArray | None = None
     nearest: float = 0.0
@@ -100,8 +97,7 @@ class RobotPlan:
         """Note that it follows a goal of another client: it measures without a plan."""
         began = self.decided_at
         if began is not None and self.staying and not len(self.positions):
-            # It does so already.
-            return
+            return  # it does so already
         self.leave()
         if began is None:
             began = self.measured_from = step

@@ -1,7 +1,5 @@
 """How far a robot can go and still come home, by its battery."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -13,23 +11,20 @@ from maasi_filter.settings import NotNegative, Settings, Vector3
 from maasi_planner.motion import MotionModel, Trajectories
 from maasi_planner.obstacles import next_point
 
-# Share of the reserve that is left when a robot on its way turns home at once.
-_LAST = 0.5
+_LAST = 0.5  # share of the reserve that is left when a robot on its way turns home at once
 
 
 class EnduranceSettings(Settings):
     """What the battery is used for, as shares of a full one, and where it is charged."""
 
     per_second: NotNegative = Field(
-        default=0.0, description='Use at rest or hovering; of a flight of 20 minutes: 0.00083 [1/s]'
+        0.0, description='Use at rest or hovering; of a flight of 20 minutes: 0.00083 [1/s]'
     )
-    per_metre: NotNegative = Field(default=0.0, description='Use of a metre on top of it [1/m]')
+    per_metre: NotNegative = Field(0.0, description='Use of a metre on top of it [1/m]')
     reserve: float = Field(
-        default=0.25, ge=0.0, lt=1.0, description='Charge that is left when it is home [1]'
+        0.25, ge=0.0, lt=1.0, description='Charge that is left when it is home [1]'
     )
-    full: float = Field(
-        default=0.95, gt=0.0, le=1.0, description='Charge at which it goes out again [1]'
-    )
+    full: float = Field(0.95, gt=0.0, le=1.0, description='Charge at which it goes out again [1]')
     chargers: list[Vector3] = Field(
         default_factory=list, description='Where it is charged; none: at its start [m, map]'
     )
@@ -46,12 +41,9 @@ class Endurance:
         self.settings, self.motion = settings, motion
         chargers: list[ArrayLike] = [*settings.chargers]
         self.chargers = np.array(chargers or [start], dtype=float)
-        #: Charge as it was last heard, 0 to 1; not a number: unknown.
-        self.charge = math.nan
-        #: Whether it is on its way to a charger, or charges.
-        self.charging = False
-        #: Whether nothing else was affordable at the last decision.
-        self.spent = False
+        self.charge = math.nan  #: charge as it was last heard, 0 to 1; not a number: unknown
+        self.charging = False  #: whether it is on its way to a charger, or charges
+        self.spent = False  #: whether nothing else was affordable at the last decision
 
     def way_home(self, position: ArrayLike) -> tuple[float, FloatArray]:
         """Return the shortest way to a charger [m], and that charger (3,)."""

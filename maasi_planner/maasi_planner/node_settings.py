@@ -22,20 +22,20 @@ class PlannedRobotSettings(Settings):
     sensor: SensorSettings = Field(
         default_factory=SensorSettings, description='Its sensor, as the planner believes'
     )
-    radius: NotNegative = Field(default=0.1, description='Of a circle around the robot [m]')
+    radius: NotNegative = Field(0.1, description='Of a circle around the robot [m]')
     start: Vector3 = Field(
-        default=[0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0],
         description='Position at the start; its height is that of the waypoints in 2D [m, map]',
     )
     endurance: EnduranceSettings | None = Field(
-        default=None, description='So that it is home before its battery is empty; none: no matter'
+        None, description='So that it is home before its battery is empty; none: no matter'
     )
 
 
 class OtherRobotSettings(Settings):
     """Settings of a robot with its own planner."""
 
-    radius: NotNegative = Field(default=0.1, description='Of a circle around the robot [m]')
+    radius: NotNegative = Field(0.1, description='Of a circle around the robot [m]')
     start: Vector3 = Field(description='Position at the start [m, map]')
 
 
@@ -58,31 +58,28 @@ class PlannerNodeSettings(NodeSettings):
     planner: PlannerSettings = Field(default_factory=PlannerSettings, description='The planner')
     robots: dict[str, PlannedRobotSettings] = Field(min_length=1, description='Robots, by name')
     others: dict[str, OtherRobotSettings] = Field(
-        default={},
-        description='Robots that plan for themselves, by name; where they go is kept clear',
+        {}, description='Robots that plan for themselves, by name; where they go is kept clear'
     )
     exploration_spacing: float | None = Field(
-        default=None,
-        gt=0.0,
-        description='Spacing of the exploration grid; none: as the filter has it [m]',
+        None, gt=0.0, description='Spacing of the exploration grid; none: as the filter has it [m]'
     )
     search_on_start: bool = Field(
-        default=False,
+        False,
         description='Whether the search starts as soon as the planner is active; otherwise with '
         'the service search/start or a goal of the action search',
     )
     state_timeout: Positive = Field(
-        default=1.0,
+        1.0,
         description='Time without a state after which a robot is planned without; not in '
         'lockstep [s]',
     )
     filter_timeout: NotNegative = Field(
-        default=4.0,
+        4.0,
         description='Wall time without a heartbeat of the filter, or without the update of a '
         'batch, after which all robots are held; 0: never; not in lockstep [s]',
     )
     views_rate: NotNegative = Field(
-        default=1.0, description='Most publications of exploration and markers [1/s]'
+        1.0, description='Most publications of exploration and markers [1/s]'
     )
 
     def resolved(self) -> Self:

@@ -5,8 +5,6 @@ They are cylinders of any height (in 2D discs), spheres, and walls: the edges of
 visibility graph, so that several of them close together are no trap.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

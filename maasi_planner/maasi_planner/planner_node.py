@@ -35,10 +35,8 @@ _CHECK_PERIOD = 0.1
 # At shutdown: longest wait for answers to goals, which are then cancelled [s], and executor rounds
 # for sending results.
 _ANSWERS, _LAST_TASKS = 0.5, 5
-# Period of republishing a batch without an update [s].
-_ANSWER_PATIENCE = 1.0
-# Simulated time in which every goal is refused, until it is an error [s].
-_REFUSAL_PATIENCE = 10.0
+_ANSWER_PATIENCE = 1.0  # period of republishing a batch without an update [s]
+_REFUSAL_PATIENCE = 10.0  # simulated time in which every goal is refused, until it is an error [s]
 
 
 class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):

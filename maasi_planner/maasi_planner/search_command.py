@@ -29,12 +29,11 @@ def build_parser() -> argparse.ArgumentParser:
         epilog='Exit codes: 0 all followed, 1 one refused or did not answer, 2 wrong arguments '
         'or no such service, 130 interrupted.',
     )
-    parser.add_argument('command', choices=[*COMMANDS, *_OF_DRIVERS])
-    parser.add_argument('--robot', metavar='NAME', help='one robot instead of the team')
-    parser.add_argument('--namespace', default='', metavar='NS', help='of the team')
-    parser.add_argument(
-        '--timeout', type=float, default=10.0, metavar='S', help='longest wait for answers [s]'
-    )
+    add = parser.add_argument
+    add('command', choices=[*COMMANDS, *_OF_DRIVERS])
+    add('--robot', metavar='NAME', help='one robot instead of the team')
+    add('--namespace', default='', metavar='NS', help='of the team')
+    add('--timeout', type=float, default=10.0, metavar='S', help='longest wait for answers [s]')
     return parser
 
 

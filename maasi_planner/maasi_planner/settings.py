@@ -49,26 +49,24 @@ class CandidateSettings(Settings):
     """Candidate waypoints of a robot: exactly one of `grid`, `ring` and `points`."""
 
     grid: list[PositiveInt] | None = Field(
-        default=None, min_length=2, max_length=3, description='Waypoints on each map axis [1]'
+        None, min_length=2, max_length=3, description='Waypoints on each map axis [1]'
     )
     spacing: Positive | list[Positive] | None = Field(
-        default=None, description='Distance of neighbours in the grid, one or one per axis [m]'
+        None, description='Distance of neighbours in the grid, one or one per axis [m]'
     )
     corner: list[Finite] | None = Field(
-        default=None,
+        None,
         min_length=2,
         max_length=3,
         description='First waypoint of the grid; left out, the grid is centred [m, map]',
     )
     ring: Literal[4, 6, 8] | None = Field(
-        default=None,
+        None,
         description='Waypoints around the robot: 4 or 8 level directions, or 6 with up and down',
     )
-    distance: Positive | None = Field(
-        default=None, description='Distance of the ring from the robot [m]'
-    )
+    distance: Positive | None = Field(None, description='Distance of the ring from the robot [m]')
     points: list[Annotated[list[Finite], Field(min_length=2, max_length=3)]] | None = Field(
-        default=None, min_length=1, description='Waypoints, one by one [m, map]'
+        None, min_length=1, description='Waypoints, one by one [m, map]'
     )
 
     @model_validator(mode='after')
@@ -97,76 +95,73 @@ class MotionSettings(Settings):
     """How a robot moves to a waypoint: model, limits and controller."""
 
     model: Annotated[str, MOTIONS, AfterValidator(MOTIONS.check)] = Field(
-        default='constant_speed',
-        description='Motion model and controller, or module:Class of your own',
+        'constant_speed', description='Motion model and controller, or module:Class of your own'
     )
     settings: Annotated[Any, _MOTION, AfterValidator(_MOTION.check)] = Field(
-        default=None, validate_default=True, description='Settings of a model of your own'
+        None, validate_default=True, description='Settings of a model of your own'
     )
-    speed: float = Field(default=0.4, gt=0.0, le=100.0, description='Largest speed [m/s]')
+    speed: float = Field(0.4, gt=0.0, le=100.0, description='Largest speed [m/s]')
     acceleration: float | None = Field(
-        default=None, gt=0.0, le=100.0, description='Largest acceleration; none: no limit [m/s^2]'
+        None, gt=0.0, le=100.0, description='Largest acceleration; none: no limit [m/s^2]'
     )
     tolerance: Positive = Field(
-        default=0.05, description='Distance at which a waypoint counts as reached [m]'
+        0.05, description='Distance at which a waypoint counts as reached [m]'
     )
     arrival_radius: float | None = Field(
-        default=None,
+        None,
         ge=0.0,
         description='Distance from the waypoint at which the next one is decided, so that the '
         'robot passes without slowing down; 0: it stops at each waypoint, as in the papers; none: '
         'where it begins to brake, at most what the sensor sees to each side [m]',
     )
     approach_rate: float | None = Field(
-        default=None,
+        None,
         gt=0.0,
         le=20.0,
         description='Speed per metre left near the waypoint; none: of the controller [1/s]',
     )
     heading: Literal['keep', 'travel'] = Field(
-        default='keep',
+        'keep',
         description='Whether a robot that can move sideways keeps its heading or faces its travel',
     )
-    yaw_rate: float = Field(default=1.5, gt=0.0, le=20.0, description='Largest turn rate [rad/s]')
+    yaw_rate: float = Field(1.5, gt=0.0, le=20.0, description='Largest turn rate [rad/s]')
     yaw_acceleration: float | None = Field(
-        default=None,
-        gt=0.0,
-        description='Largest change of the turn rate; none: no limit [rad/s^2]',
+        None, gt=0.0, description='Largest change of the turn rate; none: no limit [rad/s^2]'
     )
     tilt: float = Field(
-        default=0.5, gt=0.0, lt=1.5, description='Largest tilt of a flying robot, each axis [rad]'
+        0.5, gt=0.0, lt=1.5, description='Largest tilt of a flying robot, each axis [rad]'
     )
     state_weights: list[NotNegative] = Field(
-        default=[1.0] * 12,
+        [1.0] * 12,
         min_length=12,
         max_length=12,
         description='LQR weights of position, roll pitch yaw, velocity, angular velocity [1]',
     )
     input_weights: list[Positive] = Field(
-        default=[1000.0, 1000.0, 1000.0, 100.0],
+        [1000.0, 1000.0, 1000.0, 100.0],
         min_length=4,
         max_length=4,
         description='LQR weights of roll, pitch and yaw torque and of the collective force [1]',
     )
     control_inputs: Literal['all', 'torques'] = Field(
-        default='all', description='Inputs of a flying robot that the control cost C counts'
+        'all', description='Inputs of a flying robot that the control cost C counts'
     )
     clearance: Positive = Field(
-        default=0.05, description='Kept from obstacles beyond the radius of the robot [m]'
+        0.05, description='Kept from obstacles beyond the radius of the robot [m]'
     )
     obstacle_term: Literal['none', 'printed', 'away'] = Field(
-        default='none',
+        'none',
         description='001, eq. (14), (15), in place of ways around obstacles: none, as printed, or '
         'pushing away from the obstacle',
     )
     obstacle_distance: Positive = Field(
-        default=0.12, description='d_l, distance to an obstacle below which the term acts [m]'
+        0.12, description='d_l, distance to an obstacle below which the term acts [m]'
     )
     obstacle_gain: NotNegative = Field(
-        default=0.002, description='k_obs, gain of the term [unit of the input]'
+        0.002, description='k_obs, gain of the term [unit of the input]'
     )
     avoidance: Literal['steer', 'dynamic_window'] = Field(
-        default='steer', description='How a ground robot gets around obstacles'
+        'steer', description='How a ground robot gets around obstacles'
     )
 
     @model_validator(mode='after')
@@ -197,116 +192,109 @@ class PlannerSettings(Settings):
     """Choice of planner, and its parameters. None means the default of the objective."""
 
     name: Annotated[str, PLANNERS, AfterValidator(PLANNERS.check)] = Field(
-        default='maasi', description='Planner, or module:Class of your own'
+        'maasi', description='Planner, or module:Class of your own'
     )
     settings: Annotated[Any, _PLANNER, AfterValidator(_PLANNER.check)] = Field(
-        default=None, validate_default=True, description='Settings of a planner of your own'
+        None, validate_default=True, description='Settings of a planner of your own'
     )
     objective: Literal['paper', 'information'] = Field(
-        default='information',
+        'information',
         description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
         'expected new targets of all measurements of the team together',
     )
     alpha: NotNegative = Field(
-        default=0.5, description='Weight of target refinement T (001: of exploration) [1]'
+        0.5, description='Weight of target refinement T (001: of exploration) [1]'
     )
     beta: float | None = Field(
-        default=None,
-        ge=0.0,
-        description='Weight of exploration E; none: 0.5 paper, 1 information [1]',
+        None, ge=0.0, description='Weight of exploration E; none: 0.5 paper, 1 information [1]'
     )
     control_weight: float | None = Field(
-        default=None,
+        None,
         ge=0.0,
         description='Weight of the control cost C; none: 1 paper, 1e-6 information [1]',
     )
     normalisation: Literal['steps', 'distance'] = Field(
-        default='steps', description='What J is divided by: steps K, or metres of the trajectory'
+        'steps', description='What J is divided by: steps K, or metres of the trajectory'
     )
     measure_at_arrival: bool | None = Field(
-        default=None,
+        None,
         description='Whether T and E count the measurement at the waypoint itself; none: only '
         'information does',
     )
     count_present: bool | None = Field(
-        default=None,
+        None,
         description='Whether T and E count the measurement at the present place, the same for all '
         'candidates; none: only paper does',
     )
     own_measurement: bool | None = Field(
-        default=None,
+        None,
         description='Whether e in E at a measurement includes that measurement itself, as (21), '
         '(22) do; none: true. With pi = 1 around the robot that makes E vanish',
     )
     extension: Literal['measuring', 'silent'] = Field(
-        default='measuring',
+        'measuring',
         description='Whether robots that wait at the end of a predicted trajectory go on measuring',
     )
     cluster_candidates: bool | None = Field(
-        default=None,
-        description='Whether cluster centres are candidates too; none: only information',
+        None, description='Whether cluster centres are candidates too; none: only information'
     )
     exploration_nodes: int = Field(
-        default=1000, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
+        1000, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
     )
     enumeration_limit: int = Field(
-        default=50_000,
+        50_000,
         ge=1,
         description='Most joint candidates searched exactly; above, robots choose in turn [1]',
     )
     improvement_rounds: int = Field(
-        default=3,
-        ge=0,
-        le=100,
-        description='Most rounds of improvement when robots choose in turn [1]',
+        3, ge=0, le=100, description='Most rounds of improvement when robots choose in turn [1]'
     )
     pair_budget: int = Field(
-        default=1000,
+        1000,
         ge=0,
         description='Most evaluations of moves of two robots when up to 5 choose in turn [1]',
     )
     measurement: Literal['periodic', 'event'] = Field(
-        default='periodic', description='Measure at every period, or only when worth it (24), (33)'
+        'periodic', description='Measure at every period, or only when worth it (24), (33)'
     )
     trigger: Literal['absolute', 'relative'] = Field(
-        default='absolute',
+        'absolute',
         description='Compare (24) with the threshold, or with the threshold times its mean along '
         'the trajectory',
     )
-    gamma: NotNegative = Field(default=1.0, description='Weight of e in the trigger [1]')
-    threshold: NotNegative = Field(default=4.0, description='T_delta, threshold of the trigger [1]')
+    gamma: NotNegative = Field(1.0, description='Weight of e in the trigger [1]')
+    threshold: NotNegative = Field(4.0, description='T_delta, threshold of the trigger [1]')
     explored_threshold: float = Field(
-        default=0.999, gt=0.0, le=1.0, description='Explored share at which the search may end [1]'
+        0.999, gt=0.0, le=1.0, description='Explored share at which the search may end [1]'
     )
     mass_threshold: Positive = Field(
-        default=0.1, description='Mass of a cluster that is still worth a visit [1]'
+        0.1, description='Mass of a cluster that is still worth a visit [1]'
     )
     gain_threshold: NotNegative = Field(
-        default=1e-3,
-        description='Gain of all candidates below which nothing is left, information only [1]',
+        1e-3, description='Gain of all candidates below which nothing is left, information only [1]'
     )
-    horizon: int = Field(default=1, ge=1, le=3, description='maas: waypoints planned ahead [1]')
+    horizon: int = Field(1, ge=1, le=3, description='maas: waypoints planned ahead [1]')
     agent_exploration: Literal['own', 'shared'] = Field(
-        default='own',
+        'own',
         description='maas: whether e of a robot has its own measurements only (002, eq. 12, 16) or '
         'those of the whole team',
     )
     refinement: Literal['centres', 'mutual_information'] = Field(
-        default='centres', description='maas: T by centre probabilities or by mutual information'
+        'centres', description='maas: T by centre probabilities or by mutual information'
     )
     coordination: Literal['centralized', 'independent'] = Field(
-        default='centralized',
+        'centralized',
         description='All robots with one filter and joint choices, or each for itself with a '
         'filter of its own, sharing only what is found',
     )
     lane_spacing: float | None = Field(
-        default=None, gt=0.0, description='lawnmower: distance of lanes; none: size of the view [m]'
+        None, gt=0.0, description='lawnmower: distance of lanes; none: size of the view [m]'
     )
     layer_spacing: float | None = Field(
-        default=None, gt=0.0, description='lawnmower: distance of layers in 3D; none: as lanes [m]'
+        None, gt=0.0, description='lawnmower: distance of layers in 3D; none: as lanes [m]'
     )
     margin: float | None = Field(
-        default=None,
+        None,
         ge=0.0,
         description='lawnmower: distance of the outer lanes from the bounds; none: half a lane [m]',
     )

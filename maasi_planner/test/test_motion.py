@@ -9,14 +9,7 @@ import scipy.linalg
 from maasi_filter.area import Area
 from maasi_filter.environment import EnvironmentSettings
 from maasi_planner import MotionSettings, RobotState, make_motion
-from maasi_planner.motion.mambo import (
-    GRAVITY,
-    INERTIA,
-    MASS,
-    PERIOD,
-    lqr_gains,
-    mambo_parameters,
-)
+from maasi_planner.motion.mambo import GRAVITY, INERTIA, MASS, PERIOD, lqr_gains, mambo_parameters
 
 MODELS = {
     'constant_speed': MotionSettings(model='constant_speed', speed=0.5, acceleration=0.8),

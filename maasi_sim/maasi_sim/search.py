@@ -23,14 +23,12 @@ from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planners import Planner
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.compiling import compiling_said
-from maasi_sim.run.targets.scoring import Scores, score, scoring_radius
-from maasi_sim.run.targets.tally import numbered
+from maasi_sim.run.targets.tally import Scores, numbered, score, scoring_radius
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.live_view import SearchTrace
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
 from maasi_sim.search_result import SearchResult, SearchState
-from maasi_sim.simulation.robots import SimulatedRobot
-from maasi_sim.simulation.simulated_world import Simulation
+from maasi_sim.simulation.robots import SimulatedRobot, Simulation
 
 # From the settings, and a function that returns the true targets that are not found yet.
 MakePlanner = Callable[[PlannerSettings, Callable[[], FloatArray]], Planner]
@@ -120,8 +118,7 @@ class _Search:
         self._radius = scoring_radius(scenario, truth)
         counts, ways = dict.fromkeys(self._robots, 0), dict.fromkeys(self._robots, 0.0)
         self._result = SearchResult(scenario, self.trace, counts, ways)
-        # Whether the last score of a step was complete.
-        self._complete = False
+        self._complete = False  # whether the last score of a step was complete
 
     def run(self, most_measurements: int | None) -> SearchResult:
         reason = None

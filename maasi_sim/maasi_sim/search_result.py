@@ -10,9 +10,8 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
 from maasi_planner.team import Decision
-from maasi_sim.run.targets.scoring import Scores
 from maasi_sim.run.targets.tables import columns, found_rows
-from maasi_sim.run.targets.tally import FoundCount
+from maasi_sim.run.targets.tally import FoundCount, Scores
 from maasi_sim.run.view.live_view import SearchTrace
 from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.scenario.schema import Scenario

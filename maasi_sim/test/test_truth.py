@@ -12,8 +12,8 @@ from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import SimulatedSettings
 from maasi_sim.search import search
 from maasi_sim.simulation.odometry import OdometryModel, OdometrySettings
+from maasi_sim.simulation.robots import Simulation
 from maasi_sim.simulation.sensors import RangingSensor
-from maasi_sim.simulation.simulated_world import Simulation
 from maasi_sim.simulation.world import World
 
 CUBE = np.array([[0.0, 260.0]] * 3)

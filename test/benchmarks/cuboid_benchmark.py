@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 from timing import entry, few, times_of
 
-from maasi_planner.buildings.centralized import solve_jointly
+from maasi_planner.buildings.problem import solve_jointly
 
 # Of SCIP: absolute gap, and time of an instance [s].
 GAP, LIMIT = 1e-4, 20.0

@@ -22,8 +22,7 @@ _PAIRS = (
     ('/mambo/driver', '/turtlebot/driver'),
 )
 SIM = '/sim_node'
-# Length of a pause [s].
-PAUSE = 3.0
+PAUSE = 3.0  # length of a pause [s]
 
 _GRID = {'grid': [6, 6], 'spacing': 0.45, 'corner': [-0.1, -0.1]}
 # One target is in view at the start, so that a result can be lost; the last one is far.
@@ -69,11 +68,7 @@ _BUILDINGS = {
     'environment': {'bounds': [[0.0, 300.0], [0.0, 300.0], [0.0, 80.0]]},
     'step': 1.0,
     'robots': {
-        'red': {
-            'type': 'search_drone',
-            'start': [160.0, 175.0, 5.0],
-            'hazard': {'failures': False},
-        }
+        'red': {'type': 'search_drone', 'start': [160.0, 175.0, 5.0], 'hazard': {'failures': False}}
     },
     'planner': {
         'name': 'cuboid_mpc',

@@ -8,16 +8,13 @@ from chaos_cases import SIM
 
 from maasi_sim.run.bag import Bag, BagError
 
-# From a driver's last state until its robot stands [s].
-DRIVER_STOP = 2.5
-# Without the guard the run itself stops the robot, after 5 s [s].
-UNGUARDED_STOP = 7.0
+DRIVER_STOP = 2.5  # from a driver's last state until its robot stands [s]
+UNGUARDED_STOP = 7.0  # without the guard the run itself stops the robot, after 5 s [s]
 # An autopilot without its driver flies to the last set-point, a second's way ahead at 3 m/s, here
 # with what was flown since the last state that arrived [m]. It slows down by 1 m/s for each metre
 # left: from 3 m/s it is at rest after ln(3 / 0.06) = 3.9 s [s].
 AUTOPILOT_WAY, AUTOPILOT_STOP = 3.5, 5.0
-# Below this speed, noise of odometry, a robot is at rest [m/s].
-STANDING = 0.06
+STANDING = 0.06  # below this speed, noise of odometry, a robot is at rest [m/s]
 # From the first batch without an update of the filter on, how fast a robot may be, and after what
 # time: held after 5 s, and then braking. A drone that flies at 3 m/s overshoots, and comes back to
 # where it was held [s, m/s].

@@ -18,13 +18,7 @@ from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_msgs.msg import (
-    AgentState,
-    FilterUpdate,
-    FoundTarget,
-    FoundTargetArray,
-    MeasurementBatch,
-)
+from maasi_msgs.msg import AgentState, FilterUpdate, FoundTarget, FoundTargetArray, MeasurementBatch
 from maasi_sim.run.bag import BagWriter, load_types
 
 pytestmark = pytest.mark.system

@@ -1,7 +1,5 @@
 """What the tests of the drivers share: drivers at work."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

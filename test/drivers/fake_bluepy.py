@@ -67,8 +67,7 @@ class BluetoothMambo(FakeMambo):
         return True
 
     def _send_sensors(self, elapsed):
-        # They are "wifi only" or late (pyparrot, docs/minidronecommands.rst).
-        pass
+        pass  # they are "wifi only" or late (pyparrot, docs/minidronecommands.rst)
 
     def _transmit(self, frame):
         if not self.cut_down:

@@ -1,7 +1,5 @@
 """Sequences of images that are hard to segment, and how well markers are seen in them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

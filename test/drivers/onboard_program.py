@@ -24,8 +24,7 @@ class OnboardProgram:
         # How long it flies without an order [s].
         self.place, self.patience = place, 3.0
         self.charge = 1.0
-        # Of the next images, as the feed has them.
-        self.blobs, self.count = b'', 0
+        self.blobs, self.count = b'', 0  # of the next images, as the feed has them
         # Orders that it has heard.
         self.kinds, self.take_offs = [], 0
         self.doing = GROUND

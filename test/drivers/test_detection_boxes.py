@@ -19,7 +19,7 @@ from vision_msgs.msg import Detection2DArray
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.settings.driver import DriverSettings
-from maasi_drivers.vision.detection_boxes import boxes_to_blobs
+from maasi_drivers.vision.camera_input import boxes_to_blobs
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.measurement import RangeBearing
 from maasi_filter.models.pose import Pose

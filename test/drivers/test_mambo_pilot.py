@@ -15,8 +15,7 @@ from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_sim.simulation.emulators.mambo.firmware import FlyingState
 
-# What a fault may take until the robot hovers or lands [s].
-AT_MOST = 1.5
+AT_MOST = 1.5  # what a fault may take until the robot hovers or lands [s]
 
 
 @pytest.mark.parametrize('share', [0.6, 1.0, 1.6])
@@ -94,8 +93,7 @@ def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
     distances = []
     while flight.time < 35.0:
         if flight.where[2] > 0.05:
-            # Wind.
-            flight.firmware.body.velocity[0] += 0.2 * STEP
+            flight.firmware.body.velocity[0] += 0.2 * STEP  # wind
         if pose == 'pose':
             flight.pilot.take_pose(flight.time, flight.firmware.state)
         flight.step()

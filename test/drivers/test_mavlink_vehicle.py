@@ -343,8 +343,7 @@ def test_a_pilot_who_takes_the_mode_while_it_is_told_to_land_has_it(firmware, an
         play.autopilot._sender.command_ack_send = lambda *_: None
     play.until(lambda: play.autopilot.mode == land)
     if answered:
-        # Before a heartbeat has shown that it lands.
-        play.turn()
+        play.turn()  # before a heartbeat has shown that it lands
     else:
         play.until(lambda: play.vehicle.at_rest)
     asked = len(play.commands(MODE))

@@ -23,13 +23,12 @@ from maasi_filter.settings import SensorSettings
 from maasi_msgs.msg import AgentState, DetectionArray
 from maasi_sim.run.bag import BagWriter, load_types
 from maasi_sim.scenario.loading import scenario_from_values
-from maasi_sim.simulation.simulated_world import Simulation
+from maasi_sim.simulation.robots import Simulation
 
 TARGET = [0.8, 0.9]
 AT_TARGET = ['--target', *map(str, TARGET)]
 NOISE, HEADING_NOISE = 0.008, 0.02
-# Stamps of the recorded images are late by so much [s].
-LATE = 0.05
+LATE = 0.05  # stamps of the recorded images are late by so much [s]
 
 
 # ---- from observations to R ------------------------------------------------------------------

@@ -100,10 +100,7 @@ def plane_filter(seed=0, particles=1000, expected_targets=3.0, **settings):
     """Return a filter on the plane, e on nodes 2 m apart."""
     return PmbFilter(
         FilterSettings(
-            method='pmb',
-            exploration_spacing=2.0,
-            pmb={'particles': particles},
-            **settings,
+            method='pmb', exploration_spacing=2.0, pmb={'particles': particles}, **settings
         ),
         Area(EnvironmentSettings(bounds=PLANE.tolist(), expected_targets=expected_targets)),
         np.random.default_rng(seed),

@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from searches import (
-    CUBE,
-    FLOOR,
-    FLOOR_LENGTHS,
-    cube_sensor,
-    floor_sensor,
-    observe,
-)
+from searches import CUBE, FLOOR, FLOOR_LENGTHS, cube_sensor, floor_sensor, observe
 
 from maasi_filter import (
     AgentMeasurement,

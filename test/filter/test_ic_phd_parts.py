@@ -6,17 +6,12 @@ from searches import log_density
 
 from maasi_filter import AgentMeasurement, ExponentialDetection, Pose, Sensor
 from maasi_filter.area import Area
-from maasi_filter.found_targets import FoundTargets
-from maasi_filter.ic_phd.births import (
-    gaussian_births,
-    measurement_births,
-    noise_in_space,
-    resample,
-)
+from maasi_filter.ic_phd.births import gaussian_births, measurement_births, noise_in_space, resample
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.corrector import phd_correct, phd_scan
 from maasi_filter.ic_phd.filter import kept_measurements
 from maasi_filter.records import FoundTarget
+from maasi_filter.search_filter import FoundTargets
 
 POSE = Pose.from_yaw([40.0, 50.0, 45.0], 0.3)
 NOISE = {2: np.diag([2.0, 0.02]), 3: np.diag([2.0, 0.02, 0.03])}

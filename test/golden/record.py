@@ -20,10 +20,8 @@ TOLERANCE = 1e-6
 # On another processor or with other versions than those of the stored runs: a sum that is rounded
 # otherwise draws another particle here and there. See docs/repeatability.md.
 TOLERANCE_ELSEWHERE = 2e-2
-# Columns of lengths [m].
-LENGTHS = ('waypoint', 'mean', 'position')
-# Only in recordings to the bit.
-BITS = 'bits'
+LENGTHS = ('waypoint', 'mean', 'position')  # columns of lengths [m]
+BITS = 'bits'  # only in recordings to the bit
 
 
 def path_of(name: str) -> Path:

@@ -29,8 +29,7 @@ def shots_of(team, name, options, choice, weights, horizon):
         if yaws is None:
             yaws = np.full(len(positions), view.state.pose.yaw)
         last = len(positions) - 1
-        # It plans there, and measures then.
-        arrives = last > 0
+        arrives = last > 0  # it plans there, and measures then
     out = []
     for step in range(horizon + 1):
         k = min(step, last)

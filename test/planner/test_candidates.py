@@ -14,8 +14,7 @@ ORIGIN = np.zeros(3)
 
 PAPER_GRID = {'grid': [3, 3, 3], 'spacing': 80.0, 'corner': [10.0, 10.0, 10.0]}
 CENTRED = {'grid': [2, 3], 'spacing': [1.0, 0.5]}
-# Up to rounding.
-ON_BOUNDS = {'points': [[-0.3, 1.0], [2.4 + 1e-12, 0.5]]}
+ON_BOUNDS = {'points': [[-0.3, 1.0], [2.4 + 1e-12, 0.5]]}  # up to rounding
 
 
 @pytest.mark.parametrize(

@@ -143,8 +143,7 @@ SERVICES = {
 # Neither another type nor a stop without a release is a robot's.
 SERVICES |= {'/c/stop': TRIGGER, '/d/search/stop': ['std_srvs/srv/Empty']}
 SERVICES |= {'/a/arm': TRIGGER, '/c/arm': TRIGGER}
-# A planner for each robot.
-SERVICES |= {'/a/search/pause': TRIGGER, '/b/search/pause': TRIGGER}
+SERVICES |= {'/a/search/pause': TRIGGER, '/b/search/pause': TRIGGER}  # a planner for each robot
 
 
 @pytest.mark.parametrize(
@@ -187,8 +186,7 @@ def test_robot_command_shows_sends_and_stops_a_robot(world):
     assert code == FAILED and 'not reached: cancelled' in said, said
     world.until(lambda: not a.moves, 'it still moves')
 
-    # One that flies keeps its height unless another is given.
-    goals = []
+    goals = []  # one that flies keeps its height unless another is given
 
     def take(handle):
         goals.append(handle.request.waypoint.pose.position)

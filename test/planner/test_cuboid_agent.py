@@ -10,7 +10,7 @@ from std_msgs.msg import Header
 
 from maasi_filter.colours import ROBOTS
 from maasi_filter.ros.conversions import colour_of
-from maasi_planner.buildings.agent import Activity, SearchAgent
+from maasi_planner.buildings.agent import Activity, Broadcast, SearchAgent, assigned, rewards
 from maasi_planner.buildings.conversions import (
     agent_markers,
     broadcast_from_ros,
@@ -20,7 +20,6 @@ from maasi_planner.buildings.conversions import (
 )
 from maasi_planner.buildings.preplanning import plan_mission
 from maasi_planner.buildings.settings import CuboidMethodSettings, HazardSettings
-from maasi_planner.buildings.sharing import Broadcast, assigned, rewards
 
 HOME = [166.0, 235.0, 5.0]
 
@@ -206,10 +205,7 @@ CAGE = [
     [
         (lambda: make_agent(home=[300.0, 0.0, 0.0]), r'purple: start: read .*inside the area'),
         (lambda: make_agent(obstacles=CAGE), r'no cuboid can be reached: obstacles close it in'),
-        (
-            lambda: make_agent().observe(0, [np.nan, 0.0, 0.0], np.zeros(3)),
-            r'purple: state: got',
-        ),
+        (lambda: make_agent().observe(0, [np.nan, 0.0, 0.0], np.zeros(3)), r'purple: state: got'),
         (lambda: HazardSettings(recharge_steps=[5, 2]), 'recharge_steps: got'),
     ],
 )

@@ -9,9 +9,8 @@ from cuboid_instances import problems_of_missions, random_problem, solver_for
 from mixed_cuboid import MixedProblem, solve_with_scip
 
 from maasi_planner.buildings import problem as problem_module
-from maasi_planner.buildings.centralized import solve_jointly
 from maasi_planner.buildings.preplanning import segment_cuts
-from maasi_planner.buildings.problem import Problem
+from maasi_planner.buildings.problem import Problem, solve_jointly
 
 
 def same_optimum(solver, problem):
@@ -77,8 +76,7 @@ def cuts(plan, problem):
 
 
 CUBE = [[40.0, 60.0], [40.0, 60.0], [0.0, 100.0]]
-# Positions alone jump through it.
-THIN_WALL = [[48.0, 50.0], [0.0, 90.0], [0.0, 100.0]]
+THIN_WALL = [[48.0, 50.0], [0.0, 90.0], [0.0, 100.0]]  # positions alone jump through it
 
 
 @pytest.mark.parametrize('between', [True, False])

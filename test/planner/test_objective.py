@@ -100,7 +100,7 @@ def test_search_is_enumeration(case, kind):
                 for choice, chosen in choices(options)
                 if all(options[name].allowed[w] for name, w in choice.items())
                 and all_apart(team, {name: options[name].points[w] for name, w in choice.items()})
-            ),
+            )
         )
         chosen, value, exact, _ = best_of(team, settings)
         assert exact

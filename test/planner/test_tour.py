@@ -13,14 +13,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_planner import (
-    MotionSettings,
-    RobotState,
-    RobotView,
-    TeamView,
-    make_motion,
-    make_planner,
-)
+from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
 from maasi_planner.planners.base import check_decision
 from maasi_planner.planners.lattice import Lattice, passing
 from maasi_sim.scenario.loading import load_scenario

@@ -155,8 +155,7 @@ class Rover:
             self.step = self.now
             self.position += step
         else:
-            # It is waited for.
-            self.now += 1000
+            self.now += 1000  # it is waited for
         message = Odometry()
         message.header.stamp = stamp_to_ros(self.now)
         message.header.frame_id = 'odom'

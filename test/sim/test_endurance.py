@@ -96,3 +96,5 @@ def test_a_way_is_afforded_if_the_way_home_is_left_with_the_reserve():
     assert endurance.charging
     endurance.hear(0.96)
     assert not endurance.charging
+    # The way table of each charger is made once.
+    assert motion.table.cache_info().misses == 2

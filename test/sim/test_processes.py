@@ -184,11 +184,7 @@ def test_unknown_packages_and_executables_are_named(tmp_path, monkeypatch):
 
 
 # What a process has mapped at a moment of its start.
-MOMENTS = {
-    'imports': 'numpy',
-    'ROS imports': '_rclpy_pybind11',
-    'node is made': 'librmw_fastrtps',
-}
+MOMENTS = {'imports': 'numpy', 'ROS imports': '_rclpy_pybind11', 'node is made': 'librmw_fastrtps'}
 
 
 def wait_for(pid, library):
@@ -205,11 +201,7 @@ def command_of(kind, folder):
 
 @pytest.mark.parametrize(
     ('kind', 'moment'),
-    [
-        ('filter', 'imports'),
-        ('filter', 'node is made'),
-        ('run_scenario', 'imports'),
-    ],
+    [('filter', 'imports'), ('filter', 'node is made'), ('run_scenario', 'imports')],
 )
 def test_an_interrupt_while_a_script_starts_leaves_no_traceback(tmp_path, domain, kind, moment):
     with subprocess.Popen(

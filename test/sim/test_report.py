@@ -25,7 +25,7 @@ from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.targets.observer import TargetObserver
 from maasi_sim.run.targets.report import build_report, target_summary
 from maasi_sim.run.targets.report_figure import plot_report
-from maasi_sim.run.targets.scoring import score, scoring_radius
+from maasi_sim.run.targets.tally import score, scoring_radius
 from maasi_sim.run.topics import within
 from maasi_sim.scenario.loading import load_scenario
 

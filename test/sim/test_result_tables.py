@@ -16,9 +16,8 @@ from small_field import SMALL_FIELD
 from maasi_filter.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget, Label
 from maasi_sim.run.run_options import Options
-from maasi_sim.run.targets.geojson import found_geojson
 from maasi_sim.run.targets.mission import TargetMission
-from maasi_sim.run.targets.tables import csv_text, found_rows
+from maasi_sim.run.targets.tables import csv_text, found_geojson, found_rows
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from maasi_sim.run.missions import load_mission
+from maasi_sim.scenario.checks import never_seen, robot_candidates
 from maasi_sim.scenario.layering import ScenarioWarning
 from maasi_sim.scenario.loading import (
     config_folder,
@@ -17,7 +18,6 @@ from maasi_sim.scenario.loading import (
     scenario_from_values,
 )
 from maasi_sim.scenario.schema import ScenarioError
-from maasi_sim.scenario.visibility import never_seen, robot_candidates
 
 # Those of buildings are of another kind: test_cuboid_scenario.py.
 SCENARIOS = sorted(
@@ -100,6 +100,7 @@ def test_types_beside_the_scenario_win_and_are_named_with_their_line(tmp_path, l
 LEAVES = {'at': 5.0, 'robot': 'mambo', 'do': 'leave'}
 GRID, DISCS = 'robots.mambo.candidates', 'environment.obstacles'
 TRUE = 'robots.mambo.simulated'
+ROUND = [[-9, -9], [9, -9], [9, 9], [-9, 9]]
 WRONG = [
     # What is changed, the key in the message, and words that it must hold.
     ([('plannr', {'name': 'asi'})], 'plannr', ["did you mean 'planner'", 'known are']),
@@ -125,7 +126,22 @@ WRONG = [
     ([(GRID, {'ring': 6, 'distance': 0.2})], f'{GRID}.ring', ['allowed in 2D']),
     ([('environment.bounds.0', [2.0, 0.0])], 'environment.bounds', ['lower < upper']),
     ([(DISCS, [{'centre': [0.5, 0.6], 'radius': 0.1}])], 'robots.mambo.start', [DISCS]),
-    ([(DISCS, [{'centre': [1, 1, 0], 'radius': 0.1}])], 'environment', ['[0].centre: got']),
+    ([(DISCS, [{'centre': [1, 1, 0], 'radius': 0.1}])], f'{DISCS}[0].centre', ['allowed are 2']),
+    *(
+        ([(f'environment.{key}', value)], f'environment.{key}{inner}', [words])
+        for key, value, inner, words in (
+            ('area', [[0, 0], [1, 1]], '', 'at least 4'),
+            ('altitude', [0.0, 1.0], '', 'allowed with area'),
+            ('keep_outs', ['circle'], '[0]', 'allowed is GeoJSON'),
+            ('keep_outs', [ROUND], '', 'leave nothing'),
+            ('obstacles', ['none.yaml'], '[0]', 'no map of Nav2'),
+            ('prior', 'none.geojson', '', 'No such file'),
+            ('prior', {'raster': 'none.npy'}, '.raster', 'No such file'),
+            ('prior', {'polygons': [{'weight': 1.0, 'polygon': 'x'}]}, '.polygons[0].polygon', 'x'),
+            ('prior', {'polygons': [{'weight': 0.0, 'polygon': ROUND}]}, '', 'promises nothing'),
+            ('origin', {'latitude': 91.0, 'longitude': 9.0}, '.latitude', 'equal to 90'),
+        )
+    ),
     ([('targets.margin', 1.5)], 'targets.margin', ['at most half']),
     ([('targets.count', 500)], 'targets.separation', ['not 500']),
     ([('targets', {'positions': [[0.5, 3.0]]})], 'targets.positions[0]', ['the bounds']),

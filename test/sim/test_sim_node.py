@@ -59,7 +59,7 @@ LINKED = {
             'link': 'mavlink',
             'mavlink': {'arm': True},
             'autopilot': {'estimator_time': 0.2, 'parameters': {'FS_GCS_TIMEOUT': 60.0}},
-        },
+        }
     },
     'events': [
         {'at': 2.0, 'robot': 'drone', 'do': 'leave'},

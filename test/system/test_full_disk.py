@@ -16,8 +16,7 @@ from maasi_sim.run.bag import Bag
 from maasi_sim.run.report_files import store_report
 
 pytestmark = pytest.mark.system
-# Little enough that the report is larger.
-LITTLE = 16
+LITTLE = 16  # little enough that the report is larger
 
 
 @pytest.fixture

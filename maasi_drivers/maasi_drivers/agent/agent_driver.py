@@ -78,8 +78,7 @@ class AgentDriver(RobotNode):
         self, links: Mapping[str, MakeLink], make_sensor: MakeSensor, **options: Any
     ) -> None:
         super().__init__(**options)
-        self._links = links
-        self._make_sensor = make_sensor
+        self._links, self._make_sensor = links, make_sensor
         self._opened: list[RobotLink | SensorInput] = []  # what has to be closed
         self._stop_latched = False  # outlives *cleanup* and *configure*, but not the process
 

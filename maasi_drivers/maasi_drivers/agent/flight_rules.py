@@ -1,7 +1,5 @@
 """What a flying robot may do: take off when permitted, and fly inside a geofence. Without ROS."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -9,8 +7,7 @@ import numpy as np
 from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.arrays import FloatArray
 
-# Reason in `state` while a vehicle waits for it.
-UNTIL_ARM = 'until the service arm is called'
+UNTIL_ARM = 'until the service arm is called'  # reason in `state` while a vehicle waits for it
 
 
 class ArmPermission:
@@ -44,10 +41,8 @@ class ArmPermission:
         return over
 
 
-# Between the heights of start and ground and the geofence, where none is given [m].
-_HEIGHT = 1.0
-# How far outside it may drift before it lands [m].
-MARGIN = 0.5
+_HEIGHT = 1.0  # between the heights of start and ground and the geofence, where none is given [m]
+MARGIN = 0.5  # how far outside it may drift before it lands [m]
 
 
 def make_fence(

@@ -20,8 +20,7 @@ class GoalServer:
     """Takes goals of `go_to`, each in place of the one before; a bad one is aborted, with why."""
 
     def __init__(self, driver: RobotNode, link: RobotLink) -> None:
-        self._driver = driver
-        self._link = link
+        self._driver, self._link = driver, link
         self.away = False
         # Goals that have ended, until their results are sent.
         self._ended: dict[bytes, Goal] = {}
@@ -93,7 +92,7 @@ class GoalServer:
                     f'waypoint.pose.position.{"xyz"[axis]}: read {position[axis]}, '
                     f'allowed is {low - margin:g} to {high + margin:g} [m]'
                 )
-        if not driver.area.admits(position):
+        if not driver.area.inside([position], bounded=False)[0]:
             return (
                 f'waypoint.pose.position: read {list(position)}, allowed is what lies inside the '
                 'area and outside of its keep-outs'

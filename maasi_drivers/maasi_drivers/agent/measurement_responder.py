@@ -38,8 +38,7 @@ class MeasurementQueue:
     def __init__(
         self, history: PoseHistory, offset: int = 0, frames: int = 8, requests: int = 16
     ) -> None:
-        self.history = history
-        self.offset = offset
+        self.history, self.offset = history, offset
         # Stamp [ns] and data of images.
         self._frames: deque[tuple[int, Any]] = deque(maxlen=frames)
         self._requests: list[MeasurementRequest] = []
@@ -99,9 +98,7 @@ class MeasurementResponder:
     """Answers each batch that the robot is in by the detections of one image or sweep."""
 
     def __init__(self, driver: RobotNode, sensor: SensorInput, watchdog: Watchdog) -> None:
-        self._driver = driver
-        self._sensor = sensor
-        self._watchdog = watchdog
+        self._driver, self._sensor, self._watchdog = driver, sensor, watchdog
         #: Batches without an answer yet.
         self.queue = MeasurementQueue(driver.history, sensor.offset)
         self._answer: DetectionArray | None = None

@@ -86,8 +86,7 @@ class RobotFrames:
     ) -> None:
         self._node = node
         self._settings = node.settings
-        self._robot = robot
-        self._on_pose = on_pose
+        self._robot, self._on_pose = robot, on_pose
         self._base = base_frame(robot, self._settings)
         self._odom = f'{robot}/odom'
         self._buffer = TransformBuffer()

@@ -58,8 +58,7 @@ class Health:
     """The present faults of a robot; without any it can follow goals."""
 
     def __init__(self, logger: RcutilsLogger, on_fault: Callable[[str], None]) -> None:
-        self._logger = logger
-        self._on_fault = on_fault
+        self._logger, self._on_fault = logger, on_fault
         self._faults: dict[str, str] = {}
 
     def __contains__(self, kind: str) -> bool:

@@ -79,8 +79,7 @@ class PoseTopic:
     def __init__(
         self, node: LockstepLifecycleNode[DriverSettings], on_pose: Callable[[int, Pose], None]
     ) -> None:
-        self._node = node
-        self._on_pose = on_pose
+        self._node, self._on_pose = node, on_pose
         node.create_subscription(PoseStamped, 'pose', self._take, sensor_reader(False))
 
     def _take(self, message: PoseStamped) -> None:

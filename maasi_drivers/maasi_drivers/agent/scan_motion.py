@@ -12,7 +12,7 @@ from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import RobotState, Unicycle
 from maasi_planner.motion.base import check_waypoint
-from maasi_planner.motion.dynamic_window import window_command
+from maasi_planner.motion.unicycle import window_command
 from maasi_planner.obstacles import is_clear, next_point
 from maasi_planner.settings import MotionSettings
 

@@ -68,10 +68,7 @@ class Watchdog:
     def __init__(
         self, driver: RobotNode, link: RobotLink, sensor: SensorInput, state: StatePublisher
     ) -> None:
-        self._driver = driver
-        self._link = link
-        self._sensor = sensor
-        self._state = state
+        self._driver, self._link, self._sensor, self._state = driver, link, sensor, state
         self.moving = False
         # Stamps of the last change of the pose, and of the pose at the last image [ns].
         self._changed_at = 0

@@ -33,62 +33,51 @@ class SegmentationSettings(Settings):
     """How marker pixels are separated from the floor; see `maasi_drivers.vision.segmentation`."""
 
     rule: Annotated[str, DETECTORS, AfterValidator(DETECTORS.check)] = Field(
-        default='robust',
+        'robust',
         description="'paper': fixed blue excess (001, eq. (16)), blobs of any size from "
         "minimum_area on; 'robust': adapts to light, and gates on size and shape; 'aruco': "
         'fiducial markers, whose ids are the identities of targets; or module:Class of your own',
     )
     settings: Annotated[Any, _DETECTOR, AfterValidator(_DETECTOR.check)] = Field(
-        default=None, validate_default=True, description='Settings of a detector of your own'
+        None, validate_default=True, description='Settings of a detector of your own'
     )
     dictionary: Literal[
         '4X4_50', '4X4_250', '5X5_50', '5X5_250', '6X6_50', '6X6_250', 'APRILTAG_36h11'
-    ] = Field(default='4X4_50', description='Aruco rule: dictionary of the markers')
+    ] = Field('4X4_50', description='Aruco rule: dictionary of the markers')
     threshold: float = Field(
-        default=35.0,
-        ge=0,
-        le=255,
-        description='Paper rule: blue excess over this is marker [grey levels]',
+        35.0, ge=0, le=255, description='Paper rule: blue excess over this is marker [grey levels]'
     )
     minimum_area: float = Field(
-        default=2e-4,
+        2e-4,
         ge=0,
         lt=1,
         description="Paper rule: smallest blob kept, as a share of the image's pixels; 4 px of "
         '160 x 120; 0 keeps single pixels [-]',
     )
     saturation: float = Field(
-        default=0.40,
+        0.40,
         gt=0,
         le=3,
         description='Robust rule: least blueness (B - max(R, G)) / mean of a marker pixel, after '
         'white balance [-]',
     )
     peak_saturation: float = Field(
-        default=0.70, gt=0, le=3, description='Robust rule: blueness reached inside a marker [-]'
+        0.70, gt=0, le=3, description='Robust rule: blueness reached inside a marker [-]'
     )
     noise_factor: float = Field(
-        default=7.0,
-        gt=0,
-        description="Robust rule: threshold in deviations (MAD) of the floor's blueness",
+        7.0, gt=0, description="Robust rule: threshold in deviations (MAD) of the floor's blueness"
     )
     maximum_aspect: float = Field(
-        default=2.5,
-        ge=1,
-        description='Robust rule: longest allowed length over width of a blob [-]',
+        2.5, ge=1, description='Robust rule: longest allowed length over width of a blob [-]'
     )
     minimum_solidity: float = Field(
-        default=0.80, gt=0, le=1, description='Robust rule: least area over that of its ellipse [-]'
+        0.80, gt=0, le=1, description='Robust rule: least area over that of its ellipse [-]'
     )
     minimum_diameter: float = Field(
-        default=0.55,
-        gt=0,
-        description='Robust rule: least diameter on the floor, in marker diameters [-]',
+        0.55, gt=0, description='Robust rule: least diameter on the floor, in marker diameters [-]'
     )
     maximum_diameter: float = Field(
-        default=1.6,
-        gt=0,
-        description='Robust rule: largest diameter on the floor, in marker diameters [-]',
+        1.6, gt=0, description='Robust rule: largest diameter on the floor, in marker diameters [-]'
     )
 
     @model_validator(mode='after')
@@ -110,10 +99,10 @@ class MountSettings(Settings):
     """Where the camera sits on the robot (REP-103); without rpy it looks forward, image top up."""
 
     position: Vector3 = Field(
-        default=[0.0, 0.0, 0.0], description="Optical centre in the robot's frame [m]"
+        [0.0, 0.0, 0.0], description="Optical centre in the robot's frame [m]"
     )
     rpy: Vector3 = Field(
-        default=[0.0, 1.5707963267948966, 0.0],
+        [0.0, 1.5707963267948966, 0.0],
         description='Roll, pitch, yaw of the camera about fixed axes of the robot [rad]',
     )
 
@@ -125,16 +114,14 @@ class BoxSettings(Settings):
     their size apart: the default of `error`.
     """
 
-    classes: list[str] = Field(
-        default=[], description='Classes (class_id) of which targets are; none: all'
-    )
+    classes: list[str] = Field([], description='Classes (class_id) of which targets are; none: all')
     point: Literal['foot', 'centre'] = Field(
-        default='foot',
+        'foot',
         description="What of a box is on the floor: 'foot', the middle of its lower side, of "
         "things that stand, seen from the side; 'centre', of what lies flat, or from above",
     )
     error: float = Field(
-        default=0.1,
+        0.1,
         gt=0.0,
         le=0.5,
         description='Deviation of that point, as a share of the width and height of its box; of a '
@@ -151,16 +138,16 @@ class CameraSettings(Settings):
     0.40 m at 1 m, and markers at its edge are cut.)
     """
 
-    width: int = Field(default=160, ge=8, le=16384, description='Image width [px]')
-    height: int = Field(default=120, ge=8, le=16384, description='Image height [px]')
+    width: int = Field(160, ge=8, le=16384, description='Image width [px]')
+    height: int = Field(120, ge=8, le=16384, description='Image height [px]')
     focal_length: list[Focal] = Field(
-        default=[260.0, 260.0],
+        [260.0, 260.0],
         min_length=2,
         max_length=2,
         description='Focal length along image x and y (beta_x, beta_y of 001, eq. (18)) [px]',
     )
     principal_point: list[Pixel] | None = Field(
-        default=None,
+        None,
         min_length=2,
         max_length=2,
         description="Optical centre, pixel centres at whole numbers; none: the image's centre [px]",
@@ -172,37 +159,32 @@ class CameraSettings(Settings):
     mount: MountSettings = Field(
         default_factory=MountSettings, description='Where the camera sits on the robot'
     )
-    rate: float = Field(default=10.0, gt=0, description='Images per second [Hz]')
+    rate: float = Field(10.0, gt=0, description='Images per second [Hz]')
     stamp_offset: float = Field(
-        default=0.0,
-        description='Added to an image stamp: minus the latency where stamps are late [s]',
+        0.0, description='Added to an image stamp: minus the latency where stamps are late [s]'
     )
-    marker_diameter: float = Field(default=0.03, gt=0, description='Diameter of the markers [m]')
+    marker_diameter: float = Field(0.03, gt=0, description='Diameter of the markers [m]')
     pixel_noise: float = Field(
-        default=0.1,
+        0.1,
         gt=0,
         description='Deviation of a centroid beyond what image noise explains; about 0.03 for raw '
         'images and the robust rule, 0.1 for JPEG or the paper rule [px]',
     )
     position_noise: float = Field(
-        default=0.0,
-        ge=0,
-        description="Deviation of each of the pose's coordinates if it carries none [m]",
+        0.0, ge=0, description="Deviation of each of the pose's coordinates if it carries none [m]"
     )
     orientation_noise: float = Field(
-        default=0.0,
-        ge=0,
-        description="Deviation of each of the pose's angles if it carries none [rad]",
+        0.0, ge=0, description="Deviation of each of the pose's angles if it carries none [rad]"
     )
     cut_blobs: Literal['keep', 'drop'] = Field(
-        default='keep',
+        'keep',
         description='Blobs that the image border cuts: kept with more covariance, or dropped',
     )
     segmentation: SegmentationSettings = Field(
         default_factory=SegmentationSettings, description='How markers are segmented'
     )
     detections: BoxSettings | None = Field(
-        default=None,
+        None,
         description='What is taken of camera/detections (vision_msgs/Detection2DArray), in place '
         'of images; none: the driver finds markers in images',
     )

@@ -44,17 +44,16 @@ class RangingSettings(Settings):
     """What the angles of `ranges` are relative to, and where the sensor sits."""
 
     frame: Literal['map', 'body'] = Field(
-        default='map',
+        'map',
         description="'map': bearings from the map's x axis, elevations from the horizontal plane; "
         "'body': both in the frame of the sensor on the robot, as real ones give them, with slant "
         'ranges',
     )
     position: Vector3 = Field(
-        default=[0.0, 0.0, 0.0],
-        description="Of the sensor in the robot's frame, with frame body [m]",
+        [0.0, 0.0, 0.0], description="Of the sensor in the robot's frame, with frame body [m]"
     )
     rpy: Vector3 = Field(
-        default=[0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0],
         description='Roll, pitch, yaw of the sensor about fixed axes of the robot, with frame body '
         '[rad]',
     )
@@ -64,19 +63,19 @@ class ScanSettings(Settings):
     """How a ground robot keeps clear of what its laser scanner sees."""
 
     position: Vector2 = Field(
-        default=[0.0, 0.0], description="Of the scanner in the robot's frame, x and y [m]"
+        [0.0, 0.0], description="Of the scanner in the robot's frame, x and y [m]"
     )
-    yaw: Finite = Field(default=0.0, description="Of the scanner in the robot's frame [rad]")
+    yaw: Finite = Field(0.0, description="Of the scanner in the robot's frame [rad]")
     reach: float = Field(
-        default=0.7, gt=0.0, le=10.0, description='How far ahead the way has to be free [m]'
+        0.7, gt=0.0, le=10.0, description='How far ahead the way has to be free [m]'
     )
     timeout: float = Field(
-        default=1.0,
+        1.0,
         gt=0.0,
         description='Time by the odometry without a scan after which the robot is stopped [s]',
     )
     blocked_timeout: float = Field(
-        default=15.0,
+        15.0,
         gt=0.0,
         description='Time by the odometry without getting nearer to a waypoint after which it is '
         'given up [s]',
@@ -99,122 +98,117 @@ class DriverSettings(NodeSettings):
 
     environment: EnvironmentSettings = Field(description='Where the robot may go')
     link: Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink'] = Field(
-        default='topics',
+        'topics',
         description='How it is reached: ROS topics; pyparrot over WiFi or Bluetooth '
         '(mambo_driver); a program of its own by UDP (mambo_onboard_driver); MAVLink '
         '(mavlink_driver)',
     )
     mambo: MamboSettings | None = Field(
-        default=None, description='With a link mambo_...: how, and what it may be made to do'
+        None, description='With a link mambo_...: how, and what it may be made to do'
     )
     mavlink: MavlinkSettings | None = Field(
-        default=None, description='With link mavlink: how, and what it may be made to do'
+        None, description='With link mavlink: how, and what it may be made to do'
     )
     start: Vector3 = Field(
-        default=[0.0, 0.0, 0.0], description='Position in the map where its odometry is zero [m]'
+        [0.0, 0.0, 0.0], description='Position in the map where its odometry is zero [m]'
     )
-    yaw: Finite = Field(default=0.0, description='Heading there, from the x axis of the map [rad]')
-    radius: float = Field(default=0.1, gt=0.0, description='Of the robot [m]')
+    yaw: Finite = Field(0.0, description='Heading there, from the x axis of the map [rad]')
+    radius: float = Field(0.1, gt=0.0, description='Of the robot [m]')
     motion: MotionSettings = Field(
         default_factory=MotionSettings, description='Motion model and controller'
     )
     sensor: SensorSettings = Field(
         default_factory=SensorSettings, description='What it measures targets with'
     )
-    camera: CameraSettings | None = Field(default=None, description='Its camera; none: it has none')
+    camera: CameraSettings | None = Field(None, description='Its camera; none: it has none')
     ranging: RangingSettings = Field(
         default_factory=RangingSettings,
         description='What the angles of `ranges` are relative to; of drivers with a ranging sensor',
     )
     scan: ScanSettings | None = Field(
-        default=None,
+        None,
         description='How a ground robot uses its laser scan; none: it drives by the known '
         'obstacles alone; not in lockstep',
     )
     navigation: Literal['own', 'nav2'] = Field(
-        default='own',
+        'own',
         description="What drives a ground robot to its waypoints: the driver, or Nav2's "
         'NavigateToPose; not in lockstep',
     )
     nav2_timeout: float = Field(
-        default=2.0,
+        2.0,
         gt=0.0,
         description='Longest silence of Nav2 while it has a goal, answer or feedback: then the '
         'goal is aborted and the robot stopped [s]',
     )
     image_source: Literal['topic', 'video', 'feed'] = Field(
-        default='topic',
+        'topic',
         description='Where images come from: a topic, what `video` names, or blobs that the robot '
         'finds on board and sends to `feed_port` (docs/measurement_feed.md)',
     )
     video: str = Field(
-        default='',
-        description='Address (rtsp://...), device (/dev/video0) or file, as OpenCV opens it',
+        '', description='Address (rtsp://...), device (/dev/video0) or file, as OpenCV opens it'
     )
-    feed_port: int = Field(
-        default=14700, ge=1, le=65535, description='UDP port of the measurement feed'
-    )
+    feed_port: int = Field(14700, ge=1, le=65535, description='UDP port of the measurement feed')
     feed_address: str = Field(
-        default='127.0.0.1',
+        '127.0.0.1',
         min_length=1,
         description='Address of this host on which the measurement feed is received; 0.0.0.0: all, '
         'from a robot on the network',
     )
     image_transport: Literal['raw', 'compressed'] = Field(
-        default='raw', description='Images as camera/image_raw, or as camera/image_raw/compressed'
+        'raw', description='Images as camera/image_raw, or as camera/image_raw/compressed'
     )
     image_reliability: Literal['best_effort', 'reliable'] = Field(
-        default='best_effort',
+        'best_effort',
         description='Quality of service with which images are read; best_effort matches every '
         'camera',
     )
     calibration_file: str = Field(
-        default='',
+        '',
         description="Calibration of the camera as ROS's camera_calibration writes it (YAML); "
         'none: the parameters of the camera',
     )
     odometry_frame: str = Field(
-        default='',
+        '',
         description='What odom.header.frame_id has to be; none: odom, with this namespace or '
         'without one',
     )
     odometry_origin: Literal['zero', 'first', 'map'] = Field(
-        default='zero',
+        'zero',
         description='What the odometry shows at the start: zero, or its first message; '
         'map: it is in the map already, and so is its header.frame_id',
     )
     pose_source: Literal['odometry', 'tf', 'pose'] | None = Field(
-        default=None,
+        None,
         description='Where poses come from: `odom` (with link mavlink the autopilot), the '
         'transform from the frame map to `base_frame` on /tf, or the topic `pose` '
         '(geometry_msgs/PoseStamped, in the map); none: tf with navigation nav2, so that targets '
         'are placed where the robot drives, else odometry; the others not in lockstep, and with '
         'link topics or mavlink',
     )
-    base_frame: str = Field(
-        default='', description="The robot's own frame on /tf; none: <robot>/base_link"
-    )
+    base_frame: str = Field('', description="The robot's own frame on /tf; none: <robot>/base_link")
     tf_rate: float = Field(
-        default=20.0,
+        20.0,
         ge=0.0,
         le=1000.0,
         description="How often the robot's pose is published on /tf, at most; 0: neither its "
         'frames nor robot_description are published [Hz]',
     )
     odometry_timeout: float = Field(
-        default=0.5,
+        0.5,
         ge=0.1,
         description='Time without odometry, or without a pose on /tf, after which the robot is '
         'stopped; not in lockstep [s]',
     )
     frozen_pose_timeout: float = Field(
-        default=1.0,
+        1.0,
         ge=0.0,
         description='Time by the odometry for which its pose may be the same to the bit under a '
         'command to move, before the robot is stopped; 0: disabled; not in lockstep [s]',
     )
     sensor_timeout: float | None = Field(
-        default=None,
+        None,
         ge=0.0,
         description='Time by the odometry without a new image or sweep after which the robot is '
         'stopped; none: three periods of the sensor, at least 1 s; 0: disabled; not in '
@@ -222,12 +216,12 @@ class DriverSettings(NodeSettings):
     )
     command_type: CommandType = 'auto'
     battery_unit: BatteryUnit = Field(
-        default='fraction',
+        'fraction',
         description='Unit of battery_state.percentage: fraction, 0 to 1 as its definition says, or '
         'percent, 0 to 100 as a TurtleBot3 has it',
     )
     battery_minimum: float = Field(
-        default=0.0,
+        0.0,
         ge=0.0,
         lt=1.0,
         description='Charge below which the robot takes no goals; 0: disabled [1]',
@@ -287,7 +281,7 @@ class GuardSettings(NodeSettings):
     """What the guard of a robot needs to know."""
 
     lease: float = Field(
-        default=LIVELINESS_LEASE,
+        LIVELINESS_LEASE,
         ge=LIVELINESS_LEASE,
         le=60.0,
         description='Time without an assertion of liveliness after which the driver is dead '

@@ -31,24 +31,22 @@ class FlightSettings(Settings):
     """What a driver may have any vehicle do that takes off."""
 
     arm: bool = Field(
-        default=False,
+        False,
         description='Whether the driver may let it take off: each time the service arm is called, '
         'and never without',
     )
     arm_timeout: float = Field(
-        default=60.0,
+        60.0,
         gt=0.0,
         description='Time after the service arm in which it has to take off, or to be armed; then '
         'it is to be called again [s]',
     )
     ground: Finite = Field(
-        default=0.0, description='Height in the map of the ground, or the surface, at its start [m]'
+        0.0, description='Height in the map of the ground, or the surface, at its start [m]'
     )
-    latency: float = Field(
-        default=0.0, ge=0.0, le=1.0, description='Age of a position when it arrives [s]'
-    )
+    latency: float = Field(0.0, ge=0.0, le=1.0, description='Age of a position when it arrives [s]')
     geofence: Fence | None = Field(
-        default=None,
+        None,
         description='Lowest and highest x, y and z that it is sent to; none: the environment with '
         'the radius around it, in the plane 1 m above and below its heights at the start; for what '
         'starts above the ground, not below that [m, map]',
@@ -59,78 +57,76 @@ class MamboSettings(FlightSettings):
     """How the driver reaches a Mambo, and what it may have it do."""
 
     address: str = Field(
-        default='192.168.99.3',
+        '192.168.99.3',
         min_length=1,
         description='IP address over WiFi, or Bluetooth address, as pyparrot takes them',
     )
     port: int = Field(
-        default=43210,
+        43210,
         ge=1024,
         le=65535,
         description='UDP port on which the drone is heard, on the address of this host that '
         'faces it',
     )
     order_port: int = Field(
-        default=14701,
+        14701,
         ge=1,
         le=65535,
         description='UDP port on which the program on board hears orders, with link mambo_feed',
     )
     pose: Literal['events', 'odometry', 'pose'] = Field(
-        default='events',
+        'events',
         description='Where its pose comes from: its own position events, or a topic of another '
         'system, odom (nav_msgs/Odometry) or pose (geometry_msgs/PoseStamped, in the map)',
     )
     position_noise: float = Field(
-        default=0.01, ge=0.0, description="Deviation of a position event's numbers [m]"
+        0.01, ge=0.0, description="Deviation of a position event's numbers [m]"
     )
     position_growth: float = Field(
-        default=0.04,
+        0.04,
         ge=0.0,
         description='Deviation of the position after each second of dead reckoning [m/s]',
     )
     attitude_noise: float = Field(
-        default=0.02, ge=0.0, description='Deviation of roll, pitch and heading [rad]'
+        0.02, ge=0.0, description='Deviation of roll, pitch and heading [rad]'
     )
     full_speed: float | None = Field(
-        default=None,
+        None,
         gt=0.0,
         le=10.0,
         description='Steady speed at the largest tilt, motion.tilt, as measure_mambo measures it; '
         'none: it does not take off [m/s]',
     )
     delay: float = Field(
-        default=0.2,
+        0.2,
         ge=0.0,
         le=1.0,
         description='From a piloting command to the acceleration that it makes [s]',
     )
-    full_turn: float = Field(
-        default=2.6, gt=0.0, le=7.0, description='Turn rate at full yaw [rad/s]'
-    )
+    full_turn: float = Field(2.6, gt=0.0, le=7.0, description='Turn rate at full yaw [rad/s]')
     climb: float = Field(
-        default=0.5, ge=0.5, le=2.0, description='Climb at full throttle, set in the drone [m/s]'
+        0.5, ge=0.5, le=2.0, description='Climb at full throttle, set in the drone [m/s]'
     )
     link_timeout: float = Field(
-        default=1.0,
+        1.0,
         ge=0.6,
         le=10.0,
         description='Silence after which link or pose are lost: it hovers; events come every 0.5 s '
         '[s]',
     )
     land_after: float = Field(
-        default=3.0, ge=0.0, description='Time without link or pose after which it lands [s]'
+        3.0, ge=0.0, description='Time without link or pose after which it lands [s]'
     )
     cancel_landing: float = Field(
-        default=5.0,
+        5.0,
         ge=0.0,
         description='Time after a cancelled goal, without another one, after which it lands [s]',
     )
     take_off_timeout: float = Field(
-        default=10.0, gt=0.0, description='Time in which it has to take off [s]'
+        10.0, gt=0.0, description='Time in which it has to take off [s]'
     )
     battery_minimum: float = Field(
-        default=0.1, ge=0.0, lt=1.0, description='Charge below which it lands [1]'
+        0.1, ge=0.0, lt=1.0, description='Charge below which it lands [1]'
     )
 
     def pose_covariance(self) -> FloatArray:
@@ -145,70 +141,70 @@ class MavlinkSettings(FlightSettings):
     """How the driver reaches an autopilot, and what it may have it do."""
 
     url: str = Field(
-        default='udpin:127.0.0.1:14550',
+        'udpin:127.0.0.1:14550',
         min_length=1,
         description='As pymavlink has it: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or the '
         'name of a serial device; udpin:0.0.0.0:PORT is heard from the whole network',
     )
-    baud: int = Field(default=57600, ge=1200, description='Of a serial device [1/s]')
-    system: int = Field(default=1, ge=1, le=255, description='System id of the vehicle')
+    baud: int = Field(57600, ge=1200, description='Of a serial device [1/s]')
+    system: int = Field(1, ge=1, le=255, description='System id of the vehicle')
     own_system: int = Field(
-        default=240,
+        240,
         ge=1,
         le=255,
         description='System id of the driver, of nobody else (ground stations have 255); the '
         'autopilot must have it as its ground station (SYSID_MYGCS, MAV_GCS_SYSID)',
     )
     vehicle: Literal['copter', 'submarine'] = Field(
-        default='copter', description='What it is; another one is left alone'
+        'copter', description='What it is; another one is left alone'
     )
     require_failsafe: bool = Field(
-        default=True,
+        True,
         description='Whether it is armed only if the autopilot acts by itself when the link is cut',
     )
     origin: Literal['local', 'here'] = Field(
-        default='local',
+        'local',
         description='What stands at the start in the map: the origin of the local frame of the '
         'autopilot, or the vehicle when the driver first hears its position, which is kept until '
         'the autopilot is restarted',
     )
     map_yaw: Finite = Field(
-        default=0.0, description='Direction of the x axis of the map, from east to the left [rad]'
+        0.0, description='Direction of the x axis of the map, from east to the left [rad]'
     )
     lead: float = Field(
-        default=1.0,
+        1.0,
         gt=0.0,
         le=5.0,
         description='Setpoints are as far ahead as it flies in this time, so that it stops by '
         'itself where none follows [s]',
     )
     setpoint_rate: float = Field(
-        default=20.0, ge=4.0, le=100.0, description='Setpoints; PX4 needs more than 2 [1/s]'
+        20.0, ge=4.0, le=100.0, description='Setpoints; PX4 needs more than 2 [1/s]'
     )
     position_rate: float = Field(
-        default=20.0, ge=5.0, le=100.0, description='Positions asked of the autopilot [1/s]'
+        20.0, ge=5.0, le=100.0, description='Positions asked of the autopilot [1/s]'
     )
     link_timeout: float = Field(
-        default=0.6, ge=0.3, le=10.0, description='Silence after which the link is lost [s]'
+        0.6, ge=0.3, le=10.0, description='Silence after which the link is lost [s]'
     )
     rise_timeout: float = Field(
-        default=15.0,
+        15.0,
         gt=0.0,
         description='Time without coming nearer to its height at the start after which it lands '
         '[s]',
     )
     battery: int = Field(
-        default=-1,
+        -1,
         ge=-1,
         le=255,
         description='Id of the battery that counts (BATTERY_STATUS.id); -1: the emptiest of all',
     )
     at_end: Ending = Field(
-        default='land',
+        'land',
         description='What it does when the driver ends: hold its position, or land; a submarine '
         'surfaces',
     )
-    on_low_battery: Ending = Field(default='land', description='The same with a low battery')
+    on_low_battery: Ending = Field('land', description='The same with a low battery')
 
     @model_validator(mode='after')
     def _consistent(self) -> MavlinkSettings:

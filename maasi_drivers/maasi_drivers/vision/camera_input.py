@@ -1,6 +1,4 @@
-"""A camera as a robot's sensor: image source, decoding, detection."""
-
-from __future__ import annotations
+"""A camera as a robot's sensor: image source, decoding, detection; or boxes of another detector."""
 
 import time
 from collections.abc import Callable
@@ -17,17 +15,75 @@ from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.sensor_reading import SensorReading
 from maasi_drivers.settings.camera import CameraSettings, load_calibration
 from maasi_drivers.vision.camera_model import Camera, box_view_margin
-from maasi_drivers.vision.detection_boxes import boxes_to_blobs
 from maasi_drivers.vision.detector import Blobs
 from maasi_drivers.vision.images import ImageSourceError, VideoSource, decode_image, image_to_array
 from maasi_drivers.vision.marker_detector import MarkerDetector, read_markers
 from maasi_drivers.vision.measurement_feed import FeedReceiver
-from maasi_filter.arrays import ImageArray
+from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.pose import Pose
-from maasi_filter.ros.conversions import stamp_from_ros
+from maasi_filter.records import UNLABELLED, Label
+from maasi_filter.ros.conversions import label_problem, stamp_from_ros
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.qos import RELIABLE, SENSOR, sensor_reader
+
+
+def boxes_to_blobs(message: Any, camera: CameraSettings) -> tuple[Blobs, list[str]]:
+    """Return the boxes of a `vision_msgs/Detection2DArray` that are used, and errors of others.
+
+    A box is labelled by its hypothesis with the largest score. The id of a tracker is no identity:
+    it is another one when a target is seen again.
+    """
+    settings, size = camera.detections, np.array([camera.width, camera.height], dtype=float)
+    assert settings is not None
+    corners, labels, problems = [], [], []
+    for item in message.detections:
+        hypotheses = [result.hypothesis for result in item.results] or [UNLABELLED]
+        best = max(hypotheses, key=lambda hypothesis: float(hypothesis.score))
+        try:
+            label = Label(best.class_id, best.score)
+            if (problem := label_problem(label)) is not None:
+                raise ValueError(problem)
+            if not settings.classes or label.class_id in settings.classes:
+                corners.append(_corners(item.bbox, size))
+                labels.append(label)
+        except ValueError as error:
+            problems.append(str(error))
+    low, high = np.reshape(np.array(corners, dtype=float), (-1, 2, 2)).transpose(1, 0, 2)
+    points, extents = 0.5 * (low + high), high - low
+    if settings.point == 'foot':
+        points[:, 1] = high[:, 1]
+    # Of a cut box the point may be outside of the image.
+    cut = ((low < 1.0) | (high > size - 1.0)).any(axis=1)
+    deviations = np.where(cut, 0.5, settings.error)[:, None] * extents
+    blobs = Blobs(
+        # A box that is 1 px wide reaches from 0 to 1, while pixel centres are at whole numbers.
+        points - 0.5,
+        extents.prod(axis=1),
+        extents,
+        cut,
+        deviations[:, :, None] ** 2 * np.eye(2),
+        tuple(labels),
+        message.header.frame_id.strip('/'),
+    )
+    return blobs, problems
+
+
+def _corners(box: Any, size: FloatArray) -> FloatArray:
+    """Return the least and largest x and y of a box, which may be turned, in the image (2, 2)."""
+    place, turn = box.center.position, box.center.theta
+    numbers = np.array([place.x, place.y, box.size_x, box.size_y, turn])
+    centre, extent = numbers[:2], numbers[2:4]
+    inside = (centre >= 0.0).all() and (centre <= size).all()
+    if not (inside and np.isfinite(numbers).all() and (extent > 0.0).all()):
+        raise ValueError(
+            f'bbox: read centre, size and theta {numbers.tolist()}, allowed are a centre inside '
+            f'{size[0]:g} x {size[1]:g} px, sizes above 0 and a finite theta'
+        )
+    cosine, sine = abs(np.cos(turn)), abs(np.sin(turn))
+    half = 0.5 * np.array([[cosine, sine], [sine, cosine]]) @ extent
+    return np.clip([centre - half, centre + half], 0.0, size)
+
 
 # Decodes an image, or returns the blobs found on board; called only for images that answer a batch.
 Picture = Callable[[], ImageArray | Blobs]

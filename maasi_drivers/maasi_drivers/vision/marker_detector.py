@@ -1,7 +1,5 @@
 """From a camera image and the robot's pose to detections: segmentation and projection."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maasi_drivers.agent.odometry import StampedPose

@@ -4,8 +4,6 @@ One datagram is what was seen in one image. The layout is in docs/measurement_fe
 is little-endian.
 """
 
-from __future__ import annotations
-
 import socket
 import struct
 import time
@@ -24,21 +22,17 @@ VERSION = 1
 #: Most blobs of one image.
 MOST = 256
 BORDER_CUT = 1
-#: Of the flags: the robot's pose follows the header.
-HAS_POSE = 1
+HAS_POSE = 1  #: of the flags: the robot's pose follows the header
 
 _HEADER = struct.Struct('<4sBBHHHII')
 _POSE = struct.Struct('<7fI')
 _BLOB = np.dtype([('numbers', '<f4', 8), ('mark', '<u4')])
 _CHECKSUM = struct.Struct('<I')
-# Images older than this are dropped [s].
-_OLDEST = 10.0
+_OLDEST = 10.0  # images older than this are dropped [s]
 # A pose farther from the take-off point, or with more tilt, is invalid [m, rad].
 _FARTHEST, _MOST_TILT = 1000.0, 1.5
-# A sequence number that is farther behind belongs to a restarted sender.
-_FAR_BEHIND = 1000
-# So does any, after a silence of this length [s].
-_SILENCE = 2.0
+_FAR_BEHIND = 1000  # a sequence number that is farther behind belongs to a restarted sender
+_SILENCE = 2.0  # so does any, after a silence of this length [s]
 
 
 class FeedError(ValueError):
@@ -207,8 +201,7 @@ class FeedReceiver:
         sender: str | None = None,
         on_drop: Callable[[str, str, int], None] = lambda *_: None,
     ) -> None:
-        self.sender = sender
-        self._on_drop = on_drop
+        self.sender, self._on_drop = sender, on_drop
         self._last: int | None = None
         self._heard_at = -1e9
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

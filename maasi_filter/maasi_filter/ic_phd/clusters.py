@@ -6,8 +6,7 @@ from numba import njit
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.records import Cluster
 
-# Particles of a part: resampling keeps copies together, so that most lie in a small box.
-PART = 128
+PART = 128  # particles of a part: resampling keeps copies together, so that most lie in a small box
 # Columns of a covariance's entries in sums of products.
 SQUARES = np.array([[1, 2, 4], [2, 3, 5], [4, 5, 6]])
 

@@ -16,10 +16,8 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.vector_math import arctan2, exponential, use_wide_vectors
 
 CHUNK = 2048
-# Sums may be added in vector lanes; all numbers are finite.
-SUMS = {'reassoc', 'nsz', 'nnan'}
-# Rows of a chunk's working array.
-X, Y, Z, RANGE, BEARING, ELEVATION, ROWS = range(7)
+SUMS = {'reassoc', 'nsz', 'nnan'}  # sums may be added in vector lanes; all numbers are finite
+X, Y, Z, RANGE, BEARING, ELEVATION, ROWS = range(7)  # rows of a chunk's working array
 
 
 class PhdScan(NamedTuple):

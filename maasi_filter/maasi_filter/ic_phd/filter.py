@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
 from maasi_filter.ic_phd.births import (
     gaussian_births,
     jittered,
@@ -33,13 +32,11 @@ from maasi_filter.measurement_check import (
 )
 from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.records import UNLABELLED, AgentMeasurement, FilterResult, FoundTarget, Label
-from maasi_filter.search_filter import SearchFilter
+from maasi_filter.search_filter import SAME_TARGET, FoundTargets, SearchFilter, distance
 from maasi_filter.settings import FilterSettings
 
-# Particle sets below this size are faster on one thread.
-PARALLEL_PARTICLES = 65_536
-# Fewest particles of a birth, when many detections share the particle budget.
-LEAST_BIRTHS = 20
+PARALLEL_PARTICLES = 65_536  # particle sets below this size are faster on one thread
+LEAST_BIRTHS = 20  # fewest particles of a birth, when many detections share the particle budget
 
 
 class IcPhdFilter(SearchFilter):

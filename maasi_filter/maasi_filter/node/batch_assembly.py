@@ -44,9 +44,7 @@ class BatchAssembly:
         sensors: Mapping[str, Sensor],
         progress: Progress,
     ) -> None:
-        self._node = node
-        self._sensors = sensors
-        self._progress = progress
+        self._node, self._sensors, self._progress = node, sensors, progress
         #: Batches that have not been taken, by id.
         self.pending: dict[int, PendingBatch] = {}
         self._early: dict[tuple[int, str], DetectionArray] = {}

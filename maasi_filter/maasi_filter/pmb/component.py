@@ -10,12 +10,12 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_filter.found_targets import SAME_TARGET
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
 from maasi_filter.pmb.labels import LabelTally
 from maasi_filter.pmb.scan import LEAST_SUPPORT, Scan
 from maasi_filter.records import FoundTarget
+from maasi_filter.search_filter import SAME_TARGET
 from maasi_filter.vector_math import squared_distance
 
 # Shares of the believed pi with which a place may answer.
@@ -23,10 +23,8 @@ RATES = np.array([1.0, 0.7, 0.5, 0.35, 0.2])
 # Those with which all targets may, if pi is not as believed, and their probabilities beforehand.
 COMMON = RATES[:3]
 PRIOR = np.array([0.9, 0.05, 0.05])
-# A reflection answers at most this often, compared with a target.
-MOST_OF_REFLECTION = 0.5
-# Probability beforehand that a place that answers is one.
-REFLECTIONS = 0.1
+MOST_OF_REFLECTION = 0.5  # a reflection answers at most this often, compared with a target
+REFLECTIONS = 0.1  # probability beforehand that a place that answers is one
 
 # By the rate of targets and that of a place: weights of what a place is.
 _TARGET = (1.0 - REFLECTIONS) * np.eye(len(COMMON), len(RATES))
@@ -71,13 +69,11 @@ def reflects(answers, rates):  # type: ignore[no-untyped-def]  # pragma: no cove
     return reflection / (target + reflection)
 
 
-# Gate of a detection, in standard deviations and root mean square radii.
-GATE = 6.0
+GATE = 6.0  # gate of a detection, in standard deviations and root mean square radii
 # Largest squared normalised distance for draws from a detection with too few particles.
 SUPPORT_DISTANCE = 36.0
 SUPPORT_DRAWS = 100
-# Association probability above which such draws replace particles.
-LEAST_DRAWN_SHARE = 0.05
+LEAST_DRAWN_SHARE = 0.05  # association probability above which such draws replace particles
 # Association probabilities and changes of the log density below these are neglected.
 LEAST_SHARE = 1e-4
 LEAST_CHANGE = 1e-3
@@ -89,8 +85,7 @@ MOST_FACTORS = 150
 LEAST_HITS = 1.5
 # Expected joint detections in a scan from which two components are different targets.
 SEEN_BOTH = 1.5
-# Gate on the squared normalised distance for merging components.
-SAME_PLACE = 6.0
+SAME_PLACE = 6.0  # gate on the squared normalised distance for merging components
 
 
 @dataclass

@@ -22,12 +22,9 @@ from maasi_filter.pmb.factors import (
     log_products,
 )
 
-# Below this share of effective particles they are resampled and moved.
-LEAST_EFFECTIVE = 0.4
-# Smallest part of a factor that is taken in at a time.
-LEAST_STEP = 1.0 / 64.0
-# Of the mean variance, what each axis has at least.
-LEAST_EIGENVALUE = 1e-9
+LEAST_EFFECTIVE = 0.4  # below this share of effective particles they are resampled and moved
+LEAST_STEP = 1.0 / 64.0  # smallest part of a factor that is taken in at a time
+LEAST_EIGENVALUE = 1e-9  # of the mean variance, what each axis has at least
 # Moves end when as many are accepted as there are particles, or after so many sweeps.
 MOST_SWEEPS = 8
 

@@ -19,14 +19,11 @@ from maasi_filter.models.measurement import TWO_PI
 from maasi_filter.unexplored_map import interpolate_at
 from maasi_filter.vector_math import arctan2, exponential, use_wide_vectors
 
-# Kind of pi of a factor that is no scan's: 1 everywhere.
-ALWAYS = -1
-# With 1, a single miss would end a component that certainly exists.
-MOST_PROBABLE = 0.98
+ALWAYS = -1  # kind of pi of a factor that is no scan's: 1 everywhere
+MOST_PROBABLE = 0.98  # with 1, a single miss would end a component that certainly exists
 # An environment is never seen beyond doubt: the model of the sensor is not that good.
 LEAST_UNEXPLORED = 1e-3
-# What a factor is at least.
-LEAST_FACTOR = 1e-60
+LEAST_FACTOR = 1e-60  # what a factor is at least
 
 # A head: sensor position, cos and sin of its yaw, kind of pi, c_0, first term, terms, parameters.
 SENSOR, COS, SIN, KIND, MISS, FIRST, TERMS, MODEL = 0, 3, 4, 5, 6, 7, 8, 9

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
-from maasi_filter.found_targets import FoundTargets, nearest
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
     check_measurements,
@@ -36,20 +35,17 @@ from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.scan import Scan, make_scan
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
-from maasi_filter.search_filter import SearchFilter
+from maasi_filter.search_filter import FoundTargets, SearchFilter, nearest
 from maasi_filter.settings import FilterSettings
 
 LEAST_EXISTENCE = 1e-4
-# Least existence probability of a cluster that is published.
-LEAST_CLUSTER_MASS = 0.1
-# Default of T_r, in standard deviations of the range.
-FOUND_RADIUS_DEVIATIONS = 2.0
+LEAST_CLUSTER_MASS = 0.1  # least existence probability of a cluster that is published
+FOUND_RADIUS_DEVIATIONS = 2.0  # default of T_r, in standard deviations of the range
 # Probability of being a reflection below which a target can be found, and above which a found one
 # is withdrawn.
 MOST_REFLECTING = 0.3
 SURELY_REFLECTING = 0.5
-# Existence probability of targets that other filters found.
-CERTAIN = 0.999
+CERTAIN = 0.999  # existence probability of targets that other filters found
 
 
 class PmbFilter(SearchFilter):
@@ -150,8 +146,7 @@ class PmbFilter(SearchFilter):
             blurred, learnt.noise_factor(), self.exploration, self._numbers, self.generator
         )
         self._scans += 1
-        # p_D = int f pi dx, L_j = int f pi g_j dx.
-        seen = views(components, scan)
+        seen = views(components, scan)  # p_D = int f pi dx, L_j = int f pi g_j dx
         # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
         odds = np.zeros((len(seen), len(scan.terms)))
         for i, (item, view) in enumerate(zip(components, seen)):
@@ -178,8 +173,7 @@ class PmbFilter(SearchFilter):
         real = np.where(named, 0.0, scan.intensity / (kappa + scan.intensity))
         self._add_born(blurred, scan, new * real, radius)
         learnt.count_clutter(float((new * (1.0 - real)).sum()))
-        # e <- e (1 - pi).
-        self.exploration.update(scan.detection, member.pose)
+        self.exploration.update(scan.detection, member.pose)  # e <- e (1 - pi)
 
     def _add_born(
         self, member: CheckedMeasurement, scan: Scan, existence: FloatArray, radius: float

@@ -10,10 +10,8 @@ import numpy as np
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.records import UNLABELLED, Label
 
-# Odds of clutter against the target that a detection names.
-MISREAD = 1e-6
-# Association probability from which a component gets the identity of a detection.
-LEAST_SHARE = 0.5
+MISREAD = 1e-6  # odds of clutter against the target that a detection names
+LEAST_SHARE = 0.5  # association probability from which a component gets the identity of a detection
 
 
 @dataclass

@@ -15,31 +15,24 @@ from maasi_filter.pmb.component import Component, moments
 from maasi_filter.pmb.factors import MOST_PROBABLE
 from maasi_filter.vector_math import normalised
 
-# Weight of the prior of the clutter, in scans.
-PRIOR_SCANS = 10.0
-# Detections that the belief in the noise is worth.
-PRIOR_DETECTIONS = 6.0
+PRIOR_SCANS = 10.0  # weight of the prior of the clutter, in scans
+PRIOR_DETECTIONS = 6.0  # detections that the belief in the noise is worth
 # The factor of the variance stays within these.
 LEAST_FACTOR = 0.2
 MOST_FACTOR = 10.0
 # Deviations of the error of positions that are compared, in deviations of the range.
 LEVELS = np.array([0.0, 0.5, 1.0, 2.0, 4.0])
-# Their probabilities beforehand.
-PRIOR = np.array([0.96, 0.01, 0.01, 0.01, 0.01])
-# Probability that the error is another one from one scan to the next.
-CHANGE = 0.005
-# Components below this r are not considered.
-LEAST_EXISTENCE = 0.1
-# Gate on the range, in deviations of the largest error and root mean square radii.
-GATE = 4.0
+PRIOR = np.array([0.96, 0.01, 0.01, 0.01, 0.01])  # their probabilities beforehand
+CHANGE = 0.005  # probability that the error is another one from one scan to the next
+LEAST_EXISTENCE = 0.1  # components below this r are not considered
+GATE = 4.0  # gate on the range, in deviations of the largest error and root mean square radii
 # Share of the weight of earlier detections that each new one leaves.
 MEMORY = 1.0 - 1.0 / 50.0
 FADING = np.array([MEMORY, MEMORY, MEMORY**2])
 # A single outlier, such as a detection of another target, is no misfit: squares count up to this
 # for each dimension.
 MOST_SQUARE = 6.0
-# Deviations of a standard normal number above which detections do not fit.
-BOUND = 4.0
+BOUND = 4.0  # deviations of a standard normal number above which detections do not fit
 
 
 @njit(cache=True, error_model='numpy')

@@ -20,12 +20,9 @@ from maasi_filter.pmb.component import Component, moments
 from maasi_filter.pmb.learnt import innovations, likely, odds_of_detection
 from maasi_filter.settings import OffsetSettings
 
-# Associations below this probability are not considered.
-LEAST_PROBABILITY = 0.5
-# Gate on the squared normalised innovation.
-GATE = 25.0
-# Differences of two errors below this deviation are not estimated, metres.
-LEAST_DIFFERENCE = 1e-3
+LEAST_PROBABILITY = 0.5  # associations below this probability are not considered
+GATE = 25.0  # gate on the squared normalised innovation
+LEAST_DIFFERENCE = 1e-3  # differences of two errors below this deviation are not estimated, metres
 
 
 @dataclass(eq=False)

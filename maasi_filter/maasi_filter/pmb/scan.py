@@ -29,8 +29,7 @@ from maasi_filter.pmb.factors import (
 from maasi_filter.settings import FilterSettings
 from maasi_filter.unexplored_map import UnexploredMap
 
-# Fewest effective draws that stand for a density.
-LEAST_SUPPORT = 10.0
+LEAST_SUPPORT = 10.0  # fewest effective draws that stand for a density
 # Closer than this many deviations of the range, bearings say nothing and noise is Cartesian.
 POLE_DEVIATIONS = 3.0
 # Variances of range and angles are at most these: an unknown angle is uniform.

@@ -109,9 +109,7 @@ class ClockWatch:
     def __init__(
         self, node: Node, warn: Callable[[str, str], None], on_restart: Callable[[float], None]
     ) -> None:
-        self._node = node
-        self._warn = warn
-        self._on_restart = on_restart
+        self._node, self._warn, self._on_restart = node, warn, on_restart
         # Unconfirmed jump: time before it [ns], and steady time at which it happened [s].
         self._pending: tuple[int, float] | None = None
         # rclpy only borrows the pointer: without this reference a jump segfaults.

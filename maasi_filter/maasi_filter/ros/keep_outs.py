@@ -58,5 +58,8 @@ def with_keep_outs(environment: EnvironmentSettings, zones: Sequence[str]) -> Ar
         # One line, without the type of error and the address that pydantic adds.
         if not isinstance(error, ValidationError):
             raise
-        parts = [(*map(str, item['loc']), item['msg']) for item in error.errors()]
+        parts = [
+            (*map(str, item['loc']), item['msg'].removeprefix('Value error, '))
+            for item in error.errors()
+        ]
         raise ValueError('; '.join(map(': '.join, parts))) from None

@@ -41,8 +41,7 @@ class NodeParameters(Generic[SettingsT]):
     """
 
     def __init__(self, node: Node, model: type[SettingsT]) -> None:
-        self._node = node
-        self._model = model
+        self._node, self._model = node, model
         # Settings in use, until `release`.
         self._settings: SettingsT | None = None
         self._own_change = False

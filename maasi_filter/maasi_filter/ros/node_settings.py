@@ -20,23 +20,21 @@ class NodeSettings(Settings):
 
     # First: what names a class of a plugin is checked after it.
     plugin_path: Annotated[list[str], AfterValidator(add_folders)] = Field(
-        default=[], description='Folders in which the modules of plugins (module:Class) are'
+        [], description='Folders in which the modules of plugins (module:Class) are'
     )
-    step: float = Field(default=0.05, gt=0.0, le=10.0, description='Duration of a step [s]')
-    seed: int = Field(default=1, ge=0, description='Of all random numbers')
+    step: float = Field(0.05, gt=0.0, le=10.0, description='Duration of a step [s]')
+    seed: int = Field(1, ge=0, description='Of all random numbers')
     lockstep: bool = Field(
-        default=False, description='Whether each step of lockstep/step waits for its nodes'
+        False, description='Whether each step of lockstep/step waits for its nodes'
     )
-    frame: str = Field(default='map', min_length=1, description='Name of the common frame')
+    frame: str = Field('map', min_length=1, description='Name of the common frame')
     largest_message: int = Field(
-        default=200_000,
+        200_000,
         gt=0,
         description='Largest message with a list (detections, clusters, found targets) that is '
         'read; larger ones are dropped [bytes]',
     )
-    autostart: bool = Field(
-        default=True, description='Whether the node configures and activates itself'
-    )
+    autostart: bool = Field(True, description='Whether the node configures and activates itself')
 
     def resolved(self) -> Self:
         """Return a copy with derived settings filled in."""
@@ -60,28 +58,28 @@ class FilterNodeSettings(NodeSettings):
     filter: FilterSettings = Field(default_factory=FilterSettings, description='The filter')
     robots: dict[str, SensorOfRobot] = Field(min_length=1, description='Robots, by name')
     share_with: list[str] = Field(
-        default=[],
+        [],
         description='Robots with filters of their own in their namespaces: what they find is taken '
         'over, and they take over what this one finds',
     )
     batch_timeout: Positive = Field(
-        default=1.0,
+        1.0,
         description='Time after which a batch goes on without who is missing; not in lockstep [s]',
     )
     particles_rate: NotNegative = Field(
-        default=2.0, description='Most publications of particles; 0: none [1/s]'
+        2.0, description='Most publications of particles; 0: none [1/s]'
     )
     markers_rate: NotNegative = Field(
-        default=5.0, description='Most publications of markers; 0: none [1/s]'
+        5.0, description='Most publications of markers; 0: none [1/s]'
     )
     save_file: str = Field(
-        default='', description='File that the state is saved to, and loaded from at the start'
+        '', description='File that the state is saved to, and loaded from at the start'
     )
     save_period: NotNegative = Field(
-        default=0.0, description='Wall time between saves; 0: only at the end [s]'
+        0.0, description='Wall time between saves; 0: only at the end [s]'
     )
     save_batches: bool = Field(
-        default=False,
+        False,
         description='Whether the state is saved after each batch, with the place in the run, where '
         'a restarted node goes on; the file belongs to one run then',
     )

@@ -20,11 +20,10 @@ from maasi_filter.ros.conversions import (
 )
 from maasi_msgs.msg import CuboidDecision, SearchLink
 from maasi_msgs.msg import Snapshot as SnapshotMessage
-from maasi_planner.buildings.agent import SearchAgent, Snapshot
+from maasi_planner.buildings.agent import Broadcast, SearchAgent, Snapshot
 from maasi_planner.buildings.preplanning import CoveragePlan
 from maasi_planner.buildings.problem import Plan
 from maasi_planner.buildings.settings import HazardSettings
-from maasi_planner.buildings.sharing import Broadcast
 
 _LARGEST_HAZARD = 1e9  # upper bound of the parameters of a battery
 

@@ -28,7 +28,7 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LATCHED, LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
 from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState, CuboidDecision, SearchLink, SearchLinkArray
-from maasi_planner.buildings.agent import Activity, SearchAgent, decision_stream
+from maasi_planner.buildings.agent import Activity, Broadcast, SearchAgent, decision_stream
 from maasi_planner.buildings.conversions import (
     agent_markers,
     broadcast_from_ros,
@@ -40,7 +40,6 @@ from maasi_planner.buildings.conversions import (
 )
 from maasi_planner.buildings.preplanning import plan_mission
 from maasi_planner.buildings.settings import CuboidPlannerSettings
-from maasi_planner.buildings.sharing import Broadcast
 from maasi_planner.conversions import path_to_ros
 from maasi_planner.node.search_action import offer_services
 from maasi_planner.node.search_modes import Mode, SearchModes

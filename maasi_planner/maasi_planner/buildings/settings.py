@@ -53,10 +53,10 @@ class SearchCameraSettings(Settings):
     """The camera of a searching robot, and how well it detects people (004, III-C)."""
 
     angle: float = Field(
-        default=1.0471975511965976, gt=0.0, lt=3.0, description='Opening of the view [rad]'
+        1.0471975511965976, gt=0.0, lt=3.0, description='Opening of the view [rad]'
     )
-    least_distance: Positive = Field(default=17.0, description='d_min of (4) [m]')
-    largest_distance: Positive = Field(default=90.0, description='d_max of (4) [m]')
+    least_distance: Positive = Field(17.0, description='d_min of (4) [m]')
+    largest_distance: Positive = Field(90.0, description='d_max of (4) [m]')
 
     @model_validator(mode='after')
     def _order(self) -> SearchCameraSettings:
@@ -71,11 +71,11 @@ class SearchCameraSettings(Settings):
 class DynamicsSettings(Settings):
     """Mass point with air resistance under bounded forces, 004, (1)."""
 
-    mass: Positive = Field(default=3.35, description='m [kg]')
-    resistance: float = Field(default=0.2, ge=0.0, lt=1.0, description='eta, each step [1]')
-    force: Positive = Field(default=35.0, description='Largest force on each axis [N]')
-    speed: Positive = Field(default=15.0, description='Largest speed on each axis [m/s]')
-    gravity: NotNegative = Field(default=9.81, description='g [m/s^2]')
+    mass: Positive = Field(3.35, description='m [kg]')
+    resistance: float = Field(0.2, ge=0.0, lt=1.0, description='eta, each step [1]')
+    force: Positive = Field(35.0, description='Largest force on each axis [N]')
+    speed: Positive = Field(15.0, description='Largest speed on each axis [m/s]')
+    gravity: NotNegative = Field(9.81, description='g [m/s^2]')
 
     @model_validator(mode='after')
     def _lifts(self) -> DynamicsSettings:
@@ -92,15 +92,15 @@ class DynamicsSettings(Settings):
 class HazardSettings(Settings):
     """Failure probability of a battery at each step, 004, (3)."""
 
-    alpha: Positive = Field(default=100.0, description='alpha_1 [steps]')
-    beta: Positive = Field(default=0.3, description='beta_1 [1/step]')
+    alpha: Positive = Field(100.0, description='alpha_1 [steps]')
+    beta: Positive = Field(0.3, description='beta_1 [1/step]')
     recharge_steps: list[Annotated[int, Field(ge=1)]] = Field(
-        default=[5, 10],
+        [5, 10],
         min_length=2,
         max_length=2,
         description='T_R, least and most steps of a recharge [steps]',
     )
-    failures: bool = Field(default=True, description='Whether batteries fail at all')
+    failures: bool = Field(True, description='Whether batteries fail at all')
 
     @model_validator(mode='after')
     def _order(self) -> HazardSettings:
@@ -122,7 +122,7 @@ class SearcherSettings(Settings):
     """A robot that searches buildings."""
 
     start: Vector3 = Field(description='Where it starts, and recharges, x y z [m, map]')
-    yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
+    yaw: Finite = Field(0.0, description='Heading at the start [rad]')
     dynamics: DynamicsSettings = Field(default_factory=DynamicsSettings, description='Its body')
     hazard: HazardSettings = Field(
         default_factory=HazardSettings, description='How its battery fails'
@@ -133,67 +133,67 @@ class CuboidMethodSettings(Settings):
     """The distributed model predictive control of 004, without its mission."""
 
     detection_probability: float = Field(
-        default=0.88, gt=0.0, le=1.0, description='p_d that each snapshot must have, (4) [1]'
+        0.88, gt=0.0, le=1.0, description='p_d that each snapshot must have, (4) [1]'
     )
     coverage: Literal['paper', 'strict'] = Field(
-        default='paper',
+        'paper',
         description='Cells of a face: rounded as in the paper, which may leave strips of a few '
         'percent unseen, or so many that every point is seen',
     )
-    cuboid_size: Positive = Field(default=10.0, description='Side of a cuboid [m]')
+    cuboid_size: Positive = Field(10.0, description='Side of a cuboid [m]')
     camera: SearchCameraSettings = Field(default_factory=SearchCameraSettings, description='Camera')
-    horizon: int = Field(default=10, ge=2, le=25, description='T [steps]')
+    horizon: int = Field(10, ge=2, le=25, description='T [steps]')
     guidance_step: int = Field(
-        default=3, ge=1, description='tau*, at most T - 1: the step that is drawn to a cuboid [1]'
+        3, ge=1, description='tau*, at most T - 1: the step that is drawn to a cuboid [1]'
     )
-    guidance_weight: Positive = Field(default=1e-4, description='w1 [1/m^2]')
-    smoothness_weight: Positive = Field(default=1e-4, description='w2 [1/N^2]')
-    visit_weight: NotNegative = Field(default=0.3, description='w3 [1]')
+    guidance_weight: Positive = Field(1e-4, description='w1 [1/m^2]')
+    smoothness_weight: Positive = Field(1e-4, description='w2 [1/N^2]')
+    visit_weight: NotNegative = Field(0.3, description='w3 [1]')
     discount: float = Field(
-        default=0.95,
+        0.95,
         gt=0.0,
         le=1.0,
         description='Of the reward, for each step that a visit comes later, the more the more '
         'often it was put off; 1 is the paper, in which robots may hover for ever [1]',
     )
     assignment: Literal['predicted', 'printed'] = Field(
-        default='predicted',
+        'predicted',
         description='Distances of the assignment (10): from where the plans have the robots at '
         'tau* + 1, as (10) has it for a robot alone, or from where they are, as printed',
     )
     around_corners: bool = Field(
-        default=True,
+        True,
         description='Whether a robot aims at the first corner of its way around obstacles '
         'instead of at the cuboid behind them',
     )
     between_samples: bool = Field(
-        default=True, description='Whether obstacles are kept away from between samples, too'
+        True, description='Whether obstacles are kept away from between samples, too'
     )
     brake_at_end: bool = Field(
-        default=True,
+        True,
         description='Whether each plan leaves room to brake after its last step; without it, as '
         'printed, the next problem may have no solution',
     )
-    clearance: NotNegative = Field(default=0.01, description='Kept from obstacles [m]')
+    clearance: NotNegative = Field(0.01, description='Kept from obstacles [m]')
     visit_depth: float = Field(
-        default=1e-3,
+        1e-3,
         ge=0.0,
         lt=0.5,
         description='How far inside its cuboid a visit is planned; 0 is the paper: an optimum '
         'touches a face, and rounding decides whether it was a visit [m]',
     )
-    alpha: Positive = Field(default=2.0, description='alpha_2 of (13) [1]')
-    beta: Positive = Field(default=0.5, description='beta_2 of (13) [1]')
+    alpha: Positive = Field(2.0, description='alpha_2 of (13) [1]')
+    beta: Positive = Field(0.5, description='beta_2 of (13) [1]')
     condition: Literal['low_hazard', 'printed'] = Field(
-        default='low_hazard',
+        'low_hazard',
         description='When (13) holds: where p_b(t + T) is at most 0.5, or above 0.5 as printed',
     )
-    communication_range: Positive = Field(default=100.0, description='C_R [m]')
+    communication_range: Positive = Field(100.0, description='C_R [m]')
     time_limit: Positive = Field(
-        default=0.5, description='Wall time of a solve; then the best plan so far [s]'
+        0.5, description='Wall time of a solve; then the best plan so far [s]'
     )
     node_limit: int = Field(
-        default=20000,
+        20000,
         ge=1,
         description='Nodes of a solve; then the best plan so far, the same on every machine [1]',
     )
@@ -225,12 +225,12 @@ class CuboidPlannerSettings(NodeSettings, SearcherSettings):
     live: ClassVar[frozenset[str]] = frozenset({'link_patience'})
 
     search_on_start: bool = Field(
-        default=False,
+        False,
         description='Whether the search starts as soon as the planner is active; otherwise with '
         'the service search/start',
     )
-    step: float = Field(default=1.0, gt=0.0, le=10.0, description='dT, duration of a step [s]')
-    team: list[str] = Field(default=[], description='Names of all robots, for their colours')
+    step: float = Field(1.0, gt=0.0, le=10.0, description='dT, duration of a step [s]')
+    team: list[str] = Field([], description='Names of all robots, for their colours')
     environment: EnvironmentSettings = Field(description='Where robots may be')
     planner: CuboidMethodSettings = Field(
         default_factory=CuboidMethodSettings, description='The method'
@@ -239,13 +239,13 @@ class CuboidPlannerSettings(NodeSettings, SearcherSettings):
         min_length=1, description='To be searched: centre x y z and size x y z of each [m]'
     )
     faces: list[str] = Field(
-        default=[], description='Faces of each object, with spaces between; none: the lateral ones'
+        [], description='Faces of each object, with spaces between; none: the lateral ones'
     )
     obstacles: list[Box] = Field(
-        default=[], description='To be kept away from: centre x y z and size x y z of each [m]'
+        [], description='To be kept away from: centre x y z and size x y z of each [m]'
     )
     link_patience: float = Field(
-        default=0.3,
+        0.3,
         gt=0.0,
         le=1.0,
         description='Share of a step after which it decides without having heard of anyone; '

@@ -145,8 +145,8 @@ class MotionModel(ABC):
     def take_area(self, area: Area | None, radius: float) -> None:
         """Take where it may go, also another area while it moves."""
         self.keep_out = KeepOut(area, radius, self.settings.clearance)
-        # Way table of a waypoint, remembered until the waypoint changes.
-        self.table = lru_cache(maxsize=1)(self.keep_out.to_goal)
+        # Way tables of the latest waypoint and of chargers, which are asked for again and again.
+        self.table = lru_cache(maxsize=32)(self.keep_out.to_goal)
 
     def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
         """Return the trajectory to each waypoint under this controller.

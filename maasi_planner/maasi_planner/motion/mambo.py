@@ -129,8 +129,7 @@ def _response_size(a: FloatArray, b: FloatArray, gain: FloatArray) -> tuple[Floa
 # Entries of the parameter array of `mambo_step`.
 K_VX, K_PITCH, K_Q, K_VY, K_ROLL, K_P, K_VZ, K_R = range(8)
 TILT, LIFT, SPEED, YAW_RATE, COUNT_FORCE = range(8, 13)
-# Speed per distance left of the position loop [1/s].
-RATE = 13
+RATE = 13  # speed per distance left of the position loop [1/s]
 
 
 _PARAMETERS: dict[str, FloatArray] = {}

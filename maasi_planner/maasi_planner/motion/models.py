@@ -25,9 +25,17 @@ from maasi_planner.motion.base import (
     check_waypoint,
 )
 from maasi_planner.motion.mambo import mambo_step
-from maasi_planner.motion.obstacle_term import TERMS, ObstacleTerm, with_obstacle_term
 from maasi_planner.motion.quadrotor import quadrotor_step
-from maasi_planner.motion.steering import Command, Steering, fly_among, fly_freely, turned
+from maasi_planner.motion.steering import (
+    TERMS,
+    Command,
+    ObstacleTerm,
+    Steering,
+    fly_among,
+    fly_freely,
+    turned,
+    with_obstacle_term,
+)
 from maasi_planner.motion.unicycle import K_RHO, drive_among, drive_freely, unicycle_step
 from maasi_planner.obstacles import Surroundings, Vector, dot, norm
 from maasi_planner.settings import MotionSettings
@@ -349,8 +357,7 @@ class Unicycle(CompiledMotion):
         return settings.speed, min(braking, 0.5 * slowing), settings.acceleration
 
     def _push(self, gain: float) -> Command:
-        # Its inputs are forward speed and turn rate.
-        return gain, 0.0, 0.0, gain
+        return gain, 0.0, 0.0, gain  # its inputs are forward speed and turn rate
 
     def _to_array(self, state: RobotState) -> FloatArray:
         yaw = state.pose.yaw

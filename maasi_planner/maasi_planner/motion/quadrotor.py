@@ -27,8 +27,7 @@ from maasi_planner.obstacles import Vector, dot, norm
 MASS = 1.2
 INERTIA = (0.0123, 0.0123, 0.0224)
 C1, C2, C3, C4 = 0.8, 2.5, 10.0, 45.0
-# Entries of the array of limits.
-SPEED, LEVEL, VERTICAL, SLOPE, YAW_RATE, COUNT_FORCE = range(6)
+SPEED, LEVEL, VERTICAL, SLOPE, YAW_RATE, COUNT_FORCE = range(6)  # entries of the array of limits
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""Unicycle (TurtleBot3) with a feedback controller on distance and heading.
+"""Unicycle (TurtleBot3) with a feedback controller on distance and heading, or a dynamic window.
 
 000, section 7.1.3, after Khoukhi and Shahab (2013): in polar coordinates about the waypoint, with
 distance rho and bearing error alpha,
@@ -9,6 +9,10 @@ so that rho' = -v cos(alpha) <= 0 and alpha' = -k_alpha alpha from any heading. 
 the limits, and the robot turns on the spot while the waypoint is not ahead.
 
 state (6,): position [m, map], heading [rad], forward speed [m/s], turn rate [rad/s].
+
+Dynamic window (section 7.2): pairs of forward speed and turn rate within the acceleration limits
+are simulated as arcs. Those that could not stop before an obstacle are discarded; of the others the
+one is chosen that ends nearest to the target point, facing it, with clearance from obstacles.
 """
 
 import math
@@ -17,14 +21,126 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.motion.dynamic_window import way_ahead, window_command
 from maasi_planner.motion.steering import Command, Steering, wrapped
-from maasi_planner.obstacles import Surroundings, Vector, next_point
+from maasi_planner.obstacles import Surroundings, Vector, from_centre, is_far, next_point
+
+# Seconds until the next command at which the window is taken, and for which arcs are followed.
+WINDOW = 0.2
+LOOK_AHEAD = 1.2
+ARC_STEPS = 8
+FORWARD_SAMPLES = 6
+TURN_SAMPLES = 13
+
+
+@njit(cache=True, forceinline=True)
+def _before_disc(along: float, across: float, radius: float) -> float:
+    """Return how far straight ahead a disc is; infinite: not there."""
+    if along > 0.0 and abs(across) < radius:
+        return max(along - math.sqrt(radius * radius - across * across), 0.0)
+    return np.inf
+
+
+@njit(cache=True)
+def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray) -> float:
+    """Return how far straight ahead is free of circles, at most `reach` metres."""
+    cos_yaw = math.cos(yaw)
+    sin_yaw = math.sin(yaw)
+    free, here = reach, (x, y, 0.0)
+    for i in range(circles.shape[0]):
+        ox = circles[i, 0] - x
+        oy = circles[i, 1] - y
+        along = ox * cos_yaw + oy * sin_yaw
+        across = ox * sin_yaw - oy * cos_yaw
+        radius = circles[i, 3]
+        free = min(free, _before_disc(along, across, radius))
+        if (circles[i, 5] != 0.0 or circles[i, 6] != 0.0) and not is_far(
+            here, here, circles, i, reach + circles[i, 3]
+        ):
+            ahead = circles[i, 5] * cos_yaw + circles[i, 6] * sin_yaw
+            aside = circles[i, 5] * sin_yaw - circles[i, 6] * cos_yaw
+            free = min(free, _before_disc(along + ahead, across + aside, radius))
+            # Both long sides of the wall, where it lies across the way.
+            length = math.hypot(ahead, aside)
+            for side in (-radius / length, radius / length):
+                start, start_across = along - side * aside, across + side * ahead
+                if aside != 0.0 and 0.0 <= -start_across / aside <= 1.0:
+                    hit = start - start_across / aside * ahead
+                    if hit > 0.0:
+                        free = min(free, hit)
+    return free
+
+
+@njit(cache=True)
+def _arc(
+    state: FloatArray, v: float, w: float, time: float, stopping: float, circles: FloatArray
+) -> tuple[float, float, float, float]:
+    """Return the end of an arc and its clearance, -inf if the robot could not stop in time."""
+    px, py, heading = state[0], state[1], state[3]
+    room = np.inf
+    dt = time / ARC_STEPS
+    for k in range(ARC_STEPS):
+        heading += 0.5 * w * dt
+        px += v * dt * math.cos(heading)
+        py += v * dt * math.sin(heading)
+        heading += 0.5 * w * dt
+        travelled = v * dt * (k + 1)
+        for c in range(circles.shape[0]):
+            ox, oy, _ = from_centre((px, py, 0.0), circles, c)
+            gap = math.hypot(ox, oy) - circles[c, 3]
+            room = min(room, gap)
+            if gap < 0.0 and v > 0.0 and travelled <= stopping + v * dt:
+                return px, py, heading, -np.inf
+        if room < 0.0 and v > 0.0:
+            break
+    return px, py, heading, room
+
+
+@njit(cache=True)
+def window_command(
+    state: FloatArray,
+    target: Vector,
+    left: float,
+    steering: Steering,
+    circles: FloatArray,
+    clearance: float,
+) -> tuple[float, float]:
+    """Return forward speed and turn rate of a unicycle with `left` metres to go by `target`."""
+    x, y, _, yaw, forward, turn = state
+    speed, change = steering.speed, steering.acceleration * WINDOW
+    deceleration = min(steering.acceleration, 2.0 * speed)
+    low = max(0.0, forward - change)
+    high = max(low, min(speed, steering.rate * left, forward + change))
+    turn_low = max(-steering.yaw_rate, turn - steering.yaw_acceleration * WINDOW)
+    turn_high = min(steering.yaw_rate, turn + steering.yaw_acceleration * WINDOW)
+    away = math.hypot(target[0] - x, target[1] - y)
+    time = min(LOOK_AHEAD, max(0.3, away / max(speed, 1e-9)))
+    best = -np.inf
+    best_forward = best_turn = 0.0
+    for i in range(FORWARD_SAMPLES + 1):
+        # Zero forward speed is always a choice: turning on the spot is safe.
+        v = low + (high - low) * (i - 1) / (FORWARD_SAMPLES - 1) if i > 0 else 0.0
+        stopping = 0.5 * v * v / deceleration + v * WINDOW
+        for j in range(TURN_SAMPLES):
+            w = turn_low + (turn_high - turn_low) * j / (TURN_SAMPLES - 1)
+            px, py, heading, room = _arc(state, v, w, time, stopping, circles)
+            if room == -np.inf:
+                continue
+            gap = math.hypot(target[0] - px, target[1] - py)
+            off = wrapped(math.atan2(target[1] - py, target[0] - px) - heading)
+            score = (away - gap) / (speed * time)
+            score -= 0.3 * abs(off) / math.pi * min(1.0, gap / clearance)
+            score += 0.2 * min(max(room, -clearance), clearance) / clearance
+            score -= 0.01 * abs(w) / steering.yaw_rate
+            if score > best:
+                best, best_forward, best_turn = score, v, w
+    # Limit the speed by the free distance straight ahead.
+    ahead = way_ahead(x, y, yaw, 4.0 * clearance + speed, circles)
+    return min(best_forward, steering.barrier * ahead), best_turn
+
 
 K_RHO = 1.5
 K_ALPHA = 3.0
-# Beyond this bearing error the robot turns on the spot.
-AHEAD = 0.6
+AHEAD = 0.6  # beyond this bearing error the robot turns on the spot
 
 
 @njit(cache=True, forceinline=True)

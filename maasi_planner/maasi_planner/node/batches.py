@@ -26,9 +26,7 @@ class Batches:
         guard: FilterGuard,
         on_answer: Callable[[], None],
     ) -> None:
-        self._node = node
-        self._guard = guard
-        self._on_answer = on_answer
+        self._node, self._guard, self._on_answer = node, guard, on_answer
 
     def reset(self, coordinator: Coordinator) -> None:
         """Reset for a new search."""

@@ -24,8 +24,7 @@ class Orders:
         coordinator: Coordinator,
         modes: SearchModes,
     ) -> None:
-        self._node = node
-        self._modes = modes
+        self._node, self._modes = node, modes
         self.reset(coordinator)
 
     def reset(self, coordinator: Coordinator) -> None:

@@ -28,9 +28,7 @@ class SearchAction:
         on_begin: Callable[[], object],
         on_end: Callable[[], None],
     ) -> None:
-        self._node = node
-        self._on_begin = on_begin
-        self._on_end = on_end
+        self._node, self._on_begin, self._on_end = node, on_begin, on_end
         self._goal: Any = None
         self._outcome: Future | None = None
         self._feedback = SearchTargets.Feedback()

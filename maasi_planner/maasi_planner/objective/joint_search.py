@@ -87,8 +87,7 @@ def values_given(table: CandidateTable, first: int, last: int, chosen: IntArray)
     return out
 
 
-# Moves of two robots at once are tried in teams up to this size.
-PAIRS_LIMIT = 5
+PAIRS_LIMIT = 5  # moves of two robots at once are tried in teams up to this size
 
 
 class Ranking(NamedTuple):

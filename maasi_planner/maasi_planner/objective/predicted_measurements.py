@@ -19,8 +19,7 @@ from maasi_filter.models.detection import (
 )
 from maasi_planner.team import RobotView
 
-# After every measurement [steps].
-NEVER = 1 << 60
+NEVER = 1 << 60  # after every measurement [steps]
 # x, y and z (n,) [m]: each on its own, so that loops over them become vector instructions.
 Places = tuple[FloatArray, FloatArray, FloatArray]
 

@@ -5,10 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_planner.objective.information import information_terms
 from maasi_planner.objective.joint_search import CandidateTable, values_given
-from maasi_planner.objective.paper import paper_terms
 from maasi_planner.objective.predicted_measurements import Ways, predicted, remaining_way
+from maasi_planner.objective.terms import information_terms, paper_terms
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import TeamView, UsableCandidates
 

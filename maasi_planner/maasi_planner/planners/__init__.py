@@ -1,7 +1,5 @@
 """Planners by name."""
 
-from __future__ import annotations
-
 from maasi_planner.planners.active_search import ActiveSearch
 from maasi_planner.planners.base import Planner
 from maasi_planner.planners.intermittent import Intermittent

@@ -8,21 +8,13 @@ with one instance of planner and filter for each robot. e and the clusters are k
 prediction.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.planners.base import (
-    Planner,
-    all_apart,
-    explain,
-    search_jointly,
-    usable_options,
-)
+from maasi_planner.planners.base import Planner, all_apart, explain, search_jointly, usable_options
 from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
 from maasi_planner.team import (
     Decision,

@@ -1,7 +1,5 @@
 """Active search with intermittent measurements, ASI and MAASI (000, sections 4 and 6)."""
 
-from __future__ import annotations
-
 from maasi_filter.arrays import FloatArray
 from maasi_planner.objective.joint_search import search
 from maasi_planner.objective.team_objective import TeamObjective

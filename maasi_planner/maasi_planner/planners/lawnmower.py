@@ -4,8 +4,6 @@ Two robots start from the two ends and meet between them; more robots divide the
 two to a block.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

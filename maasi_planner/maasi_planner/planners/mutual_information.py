@@ -11,8 +11,6 @@ E p log p = E p * int (1 - pi) log(1 - pi) D, while E (1 - p) log(1 - p) is the 
 -sum_n (E p^n - E p^(n + 1)) / n.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

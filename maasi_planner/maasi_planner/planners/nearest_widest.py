@@ -3,8 +3,6 @@
 Without clusters a robot goes to the candidate with the largest e (ties: the nearest).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maasi_filter.arrays import FloatArray

@@ -245,13 +245,10 @@ def one_machine(workers: Workers, campaigns: Sequence[Campaign]) -> dict[str, st
 
 def add_worker_options(parser: argparse.ArgumentParser, cluster: str) -> None:
     """Add the options of `carry_out_all`; `cluster` is the name of that of a Dask cluster."""
-    parser.add_argument(
-        '--workers', type=count, metavar='N', help='processes (default: one for each core)'
-    )
-    parser.add_argument(
-        cluster, dest='cluster', metavar='ADDRESS', help='scheduler of a Dask cluster'
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add('--workers', type=count, metavar='N', help='processes (default: one for each core)')
+    add(cluster, dest='cluster', metavar='ADDRESS', help='scheduler of a Dask cluster')
+    add(
         '--mixed-workers',
         action='store_true',
         help='mix runs of different processors or versions, which may differ in the last bits',

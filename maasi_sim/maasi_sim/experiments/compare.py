@@ -37,43 +37,38 @@ def build_parser() -> argparse.ArgumentParser:
         'search in one process; the same command resumes an interrupted comparison.',
         epilog=EXIT_CODES,
     )
-    parser.add_argument(
-        'scenarios', nargs='+', metavar='SCENARIO', help='file, or name of one in config/scenarios'
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add('scenarios', nargs='+', metavar='SCENARIO', help='file, or name of one in config/scenarios')
+    add(
         '--planners',
         type=_names,
         default=(),
         metavar='NAME,...',
         help="planners; differences are to the first one (default: the scenario's)",
     )
-    parser.add_argument(
+    add(
         '--filters',
         type=_names,
         default=(),
         metavar='NAME,...',
         help="filters, each with each planner (default: the scenario's)",
     )
-    parser.add_argument(
-        '--seeds', type=count, default=30, metavar='N', help='how many (default: %(default)s)'
-    )
-    parser.add_argument(
+    add('--seeds', type=count, default=30, metavar='N', help='how many (default: %(default)s)')
+    add(
         '--first-seed',
         type=partial(whole, most=2**32),
         default=1,
         metavar='N',
         help='the first (default: %(default)s)',
     )
-    parser.add_argument(
-        '--time-limit', type=positive, metavar='S', help="of a search [s], not the scenario's"
-    )
+    add('--time-limit', type=positive, metavar='S', help="of a search [s], not the scenario's")
     add_worker_options(parser, '--dask')
-    parser.add_argument(
+    add(
         '--again',
         action='store_true',
         help='repeat searches in DIR that are of other settings, or of another version of the code',
     )
-    parser.add_argument(
+    add(
         '--out',
         type=Path,
         metavar='DIR',

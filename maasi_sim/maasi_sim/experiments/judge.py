@@ -1,7 +1,5 @@
 """An outside judge: SAREnv's evaluator, terrains and victims, its planners beside our ways."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging
@@ -41,10 +39,8 @@ PUBLISHED = {
     'mountainous, temperate': {100.0: (22.3, 19.7, 19.5, 22.9), 300.0: (47.7, 64.7, 62.7, 64.2)},
     'mountainous, dry': {100.0: (18.5, 19.0, 19.9, 16.9), 300.0: (42.2, 56.5, 56.6, 56.5)},
 }
-# Points of a free start above the best baseline, by budget [km].
-GOALS = {100.0: 10.0, 300.0: 5.0}
-# Share of the victims that may be anywhere, as in the planner's prior.
-FLOOR = 0.02
+GOALS = {100.0: 10.0, 300.0: 5.0}  # points of a free start above the best baseline, by budget [km]
+FLOOR = 0.02  # share of the victims that may be anywhere, as in the planner's prior
 _FEATURES, _HEATMAP = 'features.geojson', 'heatmap.npy'
 _KEYS = ('center_point', 'meter_per_bin', 'bounds', 'climate', 'environment_type', 'features')
 

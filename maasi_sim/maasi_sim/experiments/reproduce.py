@@ -28,34 +28,31 @@ def build_parser() -> argparse.ArgumentParser:
         description="Run the papers' experiments; the same command resumes an interrupted run.",
         epilog=EXIT_CODES,
     )
-    parser.add_argument('names', nargs='*', metavar='NAME', help='experiments, or "all"')
-    parser.add_argument('--list', action='store_true', help='list all experiments')
-    parser.add_argument(
-        '--runs', type=count, metavar='N', help="maps of each (default: the paper's number)"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add('names', nargs='*', metavar='NAME', help='experiments, or "all"')
+    add('--list', action='store_true', help='list all experiments')
+    add('--runs', type=count, metavar='N', help="maps of each (default: the paper's number)")
+    add(
         '--case',
         action='append',
         metavar='NAME',
         help='only this case of each experiment; may be given several times',
     )
     add_worker_options(parser, '--cluster')
-    parser.add_argument(
+    add(
         '--out',
         type=Path,
         default=Path('runs/reproduction'),
         metavar='DIR',
         help='folder of the results (default: %(default)s)',
     )
-    parser.add_argument(
-        '--seed', type=whole, default=1, metavar='N', help='of the maps (default: %(default)s)'
-    )
-    parser.add_argument(
+    add('--seed', type=whole, default=1, metavar='N', help='of the maps (default: %(default)s)')
+    add(
         '--small',
         action='store_true',
         help='short runs for a first look; their numbers mean nothing',
     )
-    parser.add_argument(
+    add(
         '--document',
         type=Path,
         metavar='FILE',

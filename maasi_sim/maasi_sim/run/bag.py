@@ -114,8 +114,7 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
         self, path: Path, types: Typestore, images: ImageFormat = 'jpeg', backlog: int = 8 * 2**20
     ) -> None:
         self.path = Path(path)
-        self._types = types
-        self._images = images
+        self._types, self._images = types, images
         self._limit = backlog
         if self.path.exists():
             raise BagError(f'{path}: exists already')

@@ -67,10 +67,7 @@ class Observer(ABC):
     def __init__(
         self, name: str, scenario: Any, seed: int, types: Typestore, topics: Sequence[str]
     ) -> None:
-        self.name = name
-        self.scenario = scenario
-        self.seed = seed
-        self._types = types
+        self.name, self.scenario, self.seed, self._types = name, scenario, seed, types
         self._events: list[dict[str, Any]] = []
         self._states: dict[str, list[bytes]] = {f'/{name}/state': [] for name in scenario.names()}
         self.topics = [STEP, *topics, *self._states]

@@ -145,8 +145,7 @@ class NodeProcess(ForkServerProcess):
 
     def __init__(self, name: str, command: list[str], log: Path) -> None:
         super().__init__(name=name)
-        self.command = command
-        self.log = log
+        self.command, self.log = command, log
         self.restarts = 0
         self.started = 0.0
         #: Time of its last heartbeat, and how long it had waited for a processor by then.

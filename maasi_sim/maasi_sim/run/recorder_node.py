@@ -94,12 +94,9 @@ class Recorder:
             enable_rosout=False,
             use_global_arguments=False,
         )
-        self.observer = observer
-        self._step_length = step_length
-        self._lockstep = lockstep
+        self.observer, self._step_length, self._lockstep = observer, step_length, lockstep
         self._lead = round(1e9 * max(_LARGEST_LEAD, _MOST_STEPS * step_length))
-        self.bag = bag
-        self._team = team
+        self.bag, self._team = bag, team
         self.name = within(team, f'/{NAME}')
         self.time = 0
         # Of the first step [ns].

@@ -72,48 +72,39 @@ def build_parser() -> argparse.ArgumentParser:
         description='Run a scenario as separate ROS 2 processes, or replay a recording of one.',
         epilog=f'Exit codes: {", ".join(f"{code} {what}" for code, what in EXIT_CODES.items())}.',
     )
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         'scenario',
         nargs='?',
         default='',
         metavar='FILE',
         help='scenario file, or name of one in config',
     )
-    parser.add_argument(
-        '--out', type=Path, metavar='DIR', help='folder of the run (default: runs/<time>)'
-    )
-    parser.add_argument('--seed', type=whole, metavar='N', help="instead of the scenario's")
-    parser.add_argument(
+    add('--out', type=Path, metavar='DIR', help='folder of the run (default: runs/<time>)')
+    add('--seed', type=whole, metavar='N', help="instead of the scenario's")
+    add(
         '--lockstep',
         action='store_true',
         help='step by step, as fast as it goes: the same seed gives the same run',
     )
-    parser.add_argument(
-        '--rate', type=positive, metavar='X', help='simulated over wall time (default: 1)'
-    )
-    parser.add_argument(
-        '--no-record', dest='record', action='store_false', help='write no recording'
-    )
-    parser.add_argument('--planner', metavar='NAME', help="instead of the scenario's")
-    parser.add_argument(
-        '--time-limit', type=positive, metavar='S', help='simulated time [s], instead of its own'
-    )
-    parser.add_argument(
-        '--domain-id', type=whole, metavar='N', help='ROS domain (default: one of its own)'
-    )
-    parser.add_argument(
+    add('--rate', type=positive, metavar='X', help='simulated over wall time (default: 1)')
+    add('--no-record', dest='record', action='store_false', help='write no recording')
+    add('--planner', metavar='NAME', help="instead of the scenario's")
+    add('--time-limit', type=positive, metavar='S', help='simulated time [s], instead of its own')
+    add('--domain-id', type=whole, metavar='N', help='ROS domain (default: one of its own)')
+    add(
         '--namespace',
         type=_namespace,
         metavar='NS',
         help='of all nodes and topics of the run; /clock and /diagnostics are shared',
     )
-    parser.add_argument(
+    add(
         '--follow-clock',
         action='store_true',
         help='its time is the /clock of another run in the domain --domain-id',
     )
-    parser.add_argument('--log-level', choices=LOG_LEVELS, help='of the nodes (default: info)')
-    parser.add_argument(
+    add('--log-level', choices=LOG_LEVELS, help='of the nodes (default: info)')
+    add(
         '--replay',
         type=Path,
         metavar='BAG',
@@ -121,33 +112,32 @@ def build_parser() -> argparse.ArgumentParser:
         'scenario: search a recording of cameras and poses, which needs nothing else of this suite',
     )
     add_view_options(parser)
-    parser.add_argument('--view', action='store_true', help='show the run in a browser')
+    add('--view', action='store_true', help='show the run in a browser')
     return parser
 
 
 def add_view_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a server of the page."""
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         '--port',
         type=lambda text: whole(text, most=65535),
         metavar='N',
         help='of the page; the next free one (default: 8420)',
     )
-    parser.add_argument(
+    add(
         '--host',
         default='127.0.0.1',
         metavar='ADDRESS',
         help='that the page is served on (default: 127.0.0.1, this machine only); others need the '
         'whole link, which has a token',
     )
-    parser.add_argument(
+    add(
         '--control',
         action='store_true',
         help='let the page pause, resume, send home and stop; its address has a token',
     )
-    parser.add_argument(
-        '--no-browser', dest='browser', action='store_false', help='do not open the page'
-    )
+    add('--no-browser', dest='browser', action='store_false', help='do not open the page')
 
 
 def _namespace(text: str) -> str:

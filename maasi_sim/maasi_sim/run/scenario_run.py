@@ -48,8 +48,7 @@ class ScenarioRun:
     """One run of a scenario, from the file to the report; ends when `interruption` is true."""
 
     def __init__(self, options: Options, interruption: Interruption) -> None:
-        self.options = options
-        self.interruption = interruption
+        self.options, self.interruption = options, interruption
         given: dict[str, tuple[Key, Any]] = {
             '--planner': (('planner', 'name'), options.planner),
             '--time-limit': (('limits', 'time'), options.time_limit),

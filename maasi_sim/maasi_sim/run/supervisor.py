@@ -39,8 +39,7 @@ class Supervisor:
         #: Whether all nodes were ready once; until then they may take long.
         self.running = False
         self._scenario = mission.scenario
-        self._options = options
-        self._display = display
+        self._options, self._display = options, display
         self._checked = 0.0
         # Newest step and simulated time, and since when they have been so [s].
         self._moment: tuple[int | None, int] = (None, 0)

@@ -11,7 +11,7 @@ from maasi_planner.settings import PLANNERS
 from maasi_sim.compiling import compiling_said
 from maasi_sim.run.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario
-from maasi_sim.simulation.simulated_world import Simulation
+from maasi_sim.simulation.robots import Simulation
 
 # Messages of all nodes; importing them starts no threads.
 _MESSAGES = ('diagnostic', 'geometry', 'lifecycle', 'maasi', 'nav', 'sensor', 'visualization')

@@ -23,30 +23,27 @@ class EventSettings(Settings):
 class LimitSettings(Settings):
     """When a run is given up."""
 
-    time: Positive = Field(default=600.0, description='Simulated time [s]')
+    time: Positive = Field(600.0, description='Simulated time [s]')
     start: Positive = Field(
-        default=180.0,
-        description='Wall time until all nodes are ready; they may have to compile [s]',
+        180.0, description='Wall time until all nodes are ready; they may have to compile [s]'
     )
     silence: Positive = Field(
-        default=30.0, description='Wall time without a step until a node counts as hung [s]'
+        30.0, description='Wall time without a step until a node counts as hung [s]'
     )
     heartbeat: float = Field(
-        default=4.5,
+        4.5,
         ge=2.0,
         description='Wall time without a sign of life of a node, while it does not wait for a '
         'processor, until it counts as hung; free running [s]',
     )
-    restarts: int = Field(
-        default=3, ge=0, description='Restarts of one node with on_exit: respawn [1]'
-    )
+    restarts: int = Field(3, ge=0, description='Restarts of one node with on_exit: respawn [1]')
 
 
 class RecordSettings(Settings):
     """What the recording holds."""
 
     images: Literal['jpeg', 'png', 'raw'] = Field(
-        default='jpeg', description='How images are stored; png is lossless and slower'
+        'jpeg', description='How images are stored; png is lossless and slower'
     )
 
 
@@ -55,26 +52,26 @@ class BaseScenario(Settings):
 
     version: Literal[1] = Field(description='Of this format')
     plugin_path: Annotated[list[str], AfterValidator(add_folders)] = Field(
-        default=[],
+        [],
         description='Folders in which the modules of plugins (module:Class) are, relative to this '
         'file; its own folder and the current one need not be named',
     )
-    description: str = Field(default='', description='What it shows, in words')
+    description: str = Field('', description='What it shows, in words')
     environment: EnvironmentSettings = Field(description='Where the search takes place')
-    step: float = Field(default=0.05, gt=0.0, le=10.0, description='Between what nodes see [s]')
+    step: float = Field(0.05, gt=0.0, le=10.0, description='Between what nodes see [s]')
     seed: int = Field(
-        default=1, ge=0, le=LARGEST, description='Of all random numbers, unless given otherwise'
+        1, ge=0, le=LARGEST, description='Of all random numbers, unless given otherwise'
     )
     robots: Mapping[str, Any] = Field(min_length=1, description='Robots by name')
     planner: Any = Field(description='Planner')
     events: list[EventSettings] = Field(default_factory=list, description='Events of robots')
     stop: Literal['all_found', 'planner_done'] = Field(
-        default='all_found',
+        'all_found',
         description='When the run ends well: all true targets are found, or all cuboids visited; '
         'or every planner reports that nothing is left to gain',
     )
     on_exit: Literal['end', 'respawn'] = Field(
-        default='end', description='A node that dies ends the run, or is restarted'
+        'end', description='A node that dies ends the run, or is restarted'
     )
     limits: LimitSettings = Field(default_factory=LimitSettings, description='When to give up')
     record: RecordSettings = Field(default_factory=RecordSettings, description='Recording')

@@ -39,8 +39,7 @@ def to_yaml(content: Any) -> str:
     return text
 
 
-# Far more than any scenario has.
-_MOST_ENTRIES = 100_000
+_MOST_ENTRIES = 100_000  # far more than any scenario has
 
 
 @dataclass
@@ -49,8 +48,7 @@ class Layer:
 
     data: Any
     origins: dict[Key, str] = field(default_factory=dict)
-    #: Of the file.
-    folder: Path | None = None
+    folder: Path | None = None  #: of the file
 
     def origin(self, key: Key) -> str:
         """Return `file:line` of a key, or of the closest key above it."""

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from maasi_filter.environment import FILES, EnvironmentSettings
 from maasi_filter.plugins import is_reference, unknown
 from maasi_sim.scenario.base import BaseScenario
-from maasi_sim.scenario.checks import Problems, doubts_about, problems_of
+from maasi_sim.scenario.checks import Problems, covering_grid, doubts_about, problems_of
 from maasi_sim.scenario.layering import (
     Key,
     Layer,
@@ -24,7 +24,6 @@ from maasi_sim.scenario.layering import (
     validate,
 )
 from maasi_sim.scenario.schema import RobotSettings, Scenario
-from maasi_sim.scenario.visibility import covering_grid
 
 AnyScenario = TypeVar('AnyScenario', bound=BaseScenario)
 

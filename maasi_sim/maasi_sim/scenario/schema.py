@@ -40,25 +40,25 @@ class SimulatedSettings(Settings):
     """
 
     noise: NoiseSettings | None = Field(
-        default=None, description="True noise of its sensor; none: the sensor's"
+        None, description="True noise of its sensor; none: the sensor's"
     )
     noise_factor: float = Field(
-        default=1.0, gt=0.0, le=1000.0, description='Factor on the true deviations [1]'
+        1.0, gt=0.0, le=1000.0, description='Factor on the true deviations [1]'
     )
     probability_factor: float = Field(
-        default=1.0,
+        1.0,
         ge=0.0,
         le=100.0,
         description='Factor on the true probability of detection, which is at most 1 [1]',
     )
     clutter_per_scan: float | None = Field(
-        default=None,
+        None,
         ge=0.0,
         le=1e4,
         description='True mean number of false detections in a scan; none: as in the sensor [1]',
     )
     odometry: OdometrySettings | None = Field(
-        default=None,
+        None,
         description='True noise, drift and offset of its odometry, while the covariance it reports '
         'is that of `odometry`; none: they are the same',
     )
@@ -83,14 +83,14 @@ class SimulatedSettings(Settings):
 class BatterySettings(Settings):
     """A robot's battery."""
 
-    capacity: Positive = Field(default=7200.0, description='Energy of a full battery [J]')
-    charge: float = Field(default=1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
-    idle_power: NotNegative = Field(default=2.0, description='Drain at rest or hovering [W]')
+    capacity: Positive = Field(7200.0, description='Energy of a full battery [J]')
+    charge: float = Field(1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
+    idle_power: NotNegative = Field(2.0, description='Drain at rest or hovering [W]')
     charging_power: NotNegative = Field(
-        default=0.0, description='Power at a charger, where it stands; 0: never charged [W]'
+        0.0, description='Power at a charger, where it stands; 0: never charged [W]'
     )
     motion_power: NotNegative = Field(
-        default=4.0, description='Drain for each metre per second on top of it [W/(m/s)]'
+        4.0, description='Drain for each metre per second on top of it [W/(m/s)]'
     )
 
 
@@ -98,47 +98,45 @@ class RobotSettings(Settings):
     """One robot: its type's settings with the scenario's own on top."""
 
     type: str = Field(description='Name of the type: a file in config/robots')
-    description: str = Field(default='', description='What it is, in words')
+    description: str = Field('', description='What it is, in words')
     driver: Annotated[str, DRIVERS, AfterValidator(DRIVERS.check_known)] = Field(
         description='Executable of maasi_drivers that drives it, or module:Class of your own'
     )
     guard: bool | None = Field(
-        default=None,
+        None,
         description='Whether a guard stops it when its driver dies or hangs; none: where it is '
         'reached by topics, as another link has a time limit of its own',
     )
     body: Literal['simulated', 'external'] = Field(
-        default='simulated',
+        'simulated',
         description='With link topics: whether the sim moves it, or another program, as Gazebo, '
         'that publishes its odometry and the time (/clock)',
     )
     link: Literal['topics', 'mambo_wifi', 'mavlink'] = Field(
-        default='topics', description='How its driver reaches it; the other end is simulated'
+        'topics', description='How its driver reaches it; the other end is simulated'
     )
     mambo: MamboSettings | None = Field(
-        default=None,
+        None,
         description='With link mambo_wifi: how, and what it may be made to do; an address that '
         'is not of this host is replaced, as the drone is simulated',
     )
     mavlink: MavlinkSettings | None = Field(
-        default=None, description='With link mavlink: how, and what it may be made to do'
+        None, description='With link mavlink: how, and what it may be made to do'
     )
     autopilot: AutopilotSettings = Field(
         default_factory=AutopilotSettings,
         description='With link mavlink: its autopilot, simulated; or external: another program',
     )
     start: Vector3 = Field(description='Position at the start, x y z [m, map]')
-    yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
-    radius: Positive = Field(default=0.1, description='Of a circle around the robot [m]')
+    yaw: Finite = Field(0.0, description='Heading at the start [rad]')
+    radius: Positive = Field(0.1, description='Of a circle around the robot [m]')
     candidates: CandidateSettings = Field(
         description='Waypoints to choose from; left out: a grid from which it sees everything'
     )
     motion: MotionSettings = Field(description='How it moves')
     sensor: SensorSettings = Field(description='Its sensor, as assumed by the filter')
-    camera: CameraSettings | None = Field(
-        default=None, description='Its camera; none: a ranging sensor'
-    )
-    laser: LaserSettings | None = Field(default=None, description='Its laser scanner, if any')
+    camera: CameraSettings | None = Field(None, description='Its camera; none: a ranging sensor')
+    laser: LaserSettings | None = Field(None, description='Its laser scanner, if any')
     odometry: OdometrySettings = Field(
         default_factory=OdometrySettings, description='Errors of its simulated odometry'
     )
@@ -146,10 +144,10 @@ class RobotSettings(Settings):
         default_factory=BatterySettings, description='Its battery, simulated'
     )
     endurance: EnduranceSettings | None = Field(
-        default=None, description='So that it is home before its battery is empty; none: no matter'
+        None, description='So that it is home before its battery is empty; none: no matter'
     )
     battery_unit: BatteryUnit = Field(
-        default='fraction',
+        'fraction',
         description='Unit of battery_state.percentage: fraction, 0 to 1, or percent, 0 to 100',
     )
     simulated: SimulatedSettings = Field(
@@ -179,12 +177,12 @@ class ScoringSettings(Settings):
     """How found targets are compared with the truth."""
 
     radius: float | None = Field(
-        default=None,
+        None,
         gt=0.0,
         description='Distance within which a found target is true; none: 3 T_z, at most half the '
         'smallest distance of two targets [m]',
     )
-    order: float = Field(default=2.0, ge=1.0, description='p of GOSPA [1]')
+    order: float = Field(2.0, ge=1.0, description='p of GOSPA [1]')
 
 
 class Scenario(BaseScenario):

@@ -279,10 +279,7 @@ class CameraRenderer:
         seed: int,
         robot: str,
     ) -> None:
-        self.camera = camera
-        self.settings = settings
-        self.seed = seed
-        self.robot = robot
+        self.camera, self.settings, self.seed, self.robot = camera, settings, seed, robot
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         points, _ = camera.undistort(np.stack([columns.ravel(), rows.ravel()], axis=1))
         self._rays = np.ascontiguousarray(points.T.reshape(2, camera.height, camera.width))

@@ -19,25 +19,25 @@ class OdometrySettings(Settings):
     """Errors of a robot's odometry; all zero: perfect."""
 
     position_noise: NotNegative = Field(
-        default=0.002, description='Deviation of each coordinate, independent each step [m]'
+        0.002, description='Deviation of each coordinate, independent each step [m]'
     )
     heading_noise: NotNegative = Field(
-        default=0.002, description='Deviation of the heading, independent each step [rad]'
+        0.002, description='Deviation of the heading, independent each step [rad]'
     )
     velocity_noise: NotNegative = Field(
-        default=0.005, description='Deviation of each part of the velocity [m/s]'
+        0.005, description='Deviation of each part of the velocity [m/s]'
     )
     position_drift: NotNegative = Field(
-        default=0.0,
+        0.0,
         description='Deviation of the drift of x and y after one metre; grows with its root [m]',
     )
     heading_drift: NotNegative = Field(
-        default=0.0,
+        0.0,
         description='Deviation of the drift of the heading after one metre; grows with its root '
         '[rad]',
     )
     position_offset: NotNegative = Field(
-        default=0.0,
+        0.0,
         description='Length of a constant error of the position, in a direction drawn for each '
         'run; level where the robot is on the floor [m]',
     )
@@ -70,8 +70,7 @@ class OdometryModel:
     ) -> None:
         self.settings = settings
         self.reported = reported or settings
-        self.seed = seed
-        self.robot = robot
+        self.seed, self.robot = seed, robot
         # Plain numbers: arrays of this size take several times as long.
         to_start = inverse(Pose.from_yaw(start.position, start.yaw))
         self._shift = to_start.position.tolist()

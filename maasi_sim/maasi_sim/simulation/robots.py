@@ -1,6 +1,10 @@
-"""Simulated robots: a body under velocity commands, with battery, odometry and sensors."""
+"""Simulated robots: a body under velocity commands, with battery, odometry and sensors.
 
-from typing import Protocol
+A team of them has one clock, and the events of the scenario.
+"""
+
+import math
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +16,8 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.records import UNLABELLED
 from maasi_planner.motion import Body, RobotState, make_motion
 from maasi_planner.motion.base import check_command
-from maasi_sim.scenario.schema import BatterySettings, RobotSettings
+from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.scenario.schema import BatterySettings, RobotSettings, Scenario, steps_of
 from maasi_sim.simulation.camera import CameraRenderer
 from maasi_sim.simulation.floor import RenderSettings, scene_of
 from maasi_sim.simulation.odometry import OdometryModel, OdometryReading
@@ -62,9 +67,7 @@ class SimulatedRobot:
     def __init__(
         self, name: str, settings: RobotSettings, world: World, floor: RenderSettings, seed: int
     ) -> None:
-        self.name = name
-        self.settings = settings
-        self.world = world
+        self.name, self.settings, self.world = name, settings, world
         self.collisions = 0
         start = Pose.from_yaw(settings.start, settings.yaw)
         self._motion = make_motion(settings.motion)
@@ -194,3 +197,99 @@ class SimulatedRobot:
     def _hits(self, position: FloatArray) -> bool:
         distances = self.world.area.distances(position)
         return bool(len(distances) and distances.min() < self.settings.radius)
+
+
+class SimulatedTeam:
+    """Robots of a scenario on one clock, from step 0, with events applied.
+
+    `away` are those that have left: they stand still and are silent.
+    """
+
+    def __init__(self, scenario: BaseScenario, robots: dict[str, Any]) -> None:
+        self.scenario: Any = scenario
+        self.robots = robots
+        self.step = 0
+        self.away: set[str] = set()
+        self._events: dict[int, list[tuple[str, str]]] = {}
+        for event in sorted(scenario.events, key=lambda event: event.at):
+            # The first step at or after it; a time as close as this to a step is the step's.
+            step = math.ceil(event.at / scenario.step - 1e-6)
+            self._events.setdefault(step, []).append((event.robot, event.do))
+        self._apply_events()
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.step * self.scenario.step
+
+    @property
+    def present(self) -> list[str]:
+        """Robots that take part, in name order."""
+        return [name for name in self.robots if name not in self.away]
+
+    def advance(self) -> None:
+        """Advance by one step, each robot under its last command."""
+        self.step += 1
+        for name, robot in self.robots.items():
+            if name in self.away:
+                robot.stand(self.step)
+            else:
+                robot.step(self.step, self.scenario.step)
+        self._apply_events()
+
+    def _apply_events(self) -> None:
+        for name, change in self._events.get(self.step, []):
+            (self.away.add if change == 'leave' else self.away.discard)(name)
+
+
+class Simulation(SimulatedTeam):
+    """The robots of a search for targets."""
+
+    scenario: Scenario
+    robots: dict[str, SimulatedRobot]
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self.world = scenario.world(seed)
+        robots = {
+            name: SimulatedRobot(name, scenario.robots[name], self.world, scenario.floor, seed)
+            for name in scenario.names()
+        }
+        self._image_steps = {
+            name: steps_of(robot.settings.measuring_period, scenario.step)
+            for name, robot in robots.items()
+        }
+        super().__init__(scenario, robots)
+
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, what the robots use; nothing changes."""
+        for robot in self.robots.values():
+            robot.warm_up()
+
+    def images_due(self, name: str) -> bool:
+        """Return whether the camera, or the ranging sensor, of a robot has data at this step."""
+        return name not in self.away and self.step % self._image_steps[name] == 0
+
+    def scan_due(self, name: str) -> bool:
+        """Return whether the laser scanner of a robot has data at this step."""
+        laser = self.scenario.robots[name].laser
+        return (
+            laser is not None
+            and name not in self.away
+            and self.step % steps_of(1.0 / laser.rate, self.scenario.step) == 0
+        )
+
+    def scan(self, name: str) -> NDArray[np.float32]:
+        """Return a laser scan (beams,) [m] that shows the other robots at its height as well."""
+        robot = self.robots[name]
+        height, radius = robot.state.pose.position[2], robot.settings.radius
+        others = [
+            other
+            for key, other in self.robots.items()
+            if key != name
+            and abs(other.state.pose.position[2] - height) <= radius + other.settings.radius
+        ]
+        return robot.scan(
+            self.step,
+            [other.state.pose.position[:2] for other in others],
+            [other.settings.radius for other in others],
+        )

@@ -29,8 +29,7 @@ class RangingSensor:
     ) -> None:
         self.sensor = sensor
         self.targets = np.asarray(targets, dtype=float)
-        self.seed = seed
-        self.robot = robot
+        self.seed, self.robot = seed, robot
         self.reach = min(reach, sensor.maximum_range)
         self._spread = np.linalg.cholesky(sensor.covariance)
 
@@ -77,13 +76,13 @@ class RangingSensor:
 class LaserSettings(Settings):
     """A planar laser scanner; the defaults are those of the TurtleBot3's."""
 
-    beams: int = Field(default=360, ge=1, le=100_000, description='Beams of a full turn [1]')
-    minimum_range: NotNegative = Field(default=0.12, description='Nearest return [m]')
-    maximum_range: Positive = Field(default=3.5, description='Farthest return [m]')
-    noise: NotNegative = Field(default=0.01, description='Deviation of a range [m]')
-    rate: Positive = Field(default=5.0, description='Turns per second [Hz]')
+    beams: int = Field(360, ge=1, le=100_000, description='Beams of a full turn [1]')
+    minimum_range: NotNegative = Field(0.12, description='Nearest return [m]')
+    maximum_range: Positive = Field(3.5, description='Farthest return [m]')
+    noise: NotNegative = Field(0.01, description='Deviation of a range [m]')
+    rate: Positive = Field(5.0, description='Turns per second [Hz]')
     wall_margin: NotNegative = Field(
-        default=0.3, description='Distance of the walls outside the bounds [m]'
+        0.3, description='Distance of the walls outside the bounds [m]'
     )
 
     @model_validator(mode='after')
@@ -140,9 +139,7 @@ class LaserScanner:
     """
 
     def __init__(self, settings: LaserSettings, area: Area, seed: int, robot: str) -> None:
-        self.settings = settings
-        self.seed = seed
-        self.robot = robot
+        self.settings, self.seed, self.robot = settings, seed, robot
         margin = settings.wall_margin
         low, high = area.bounds[:2, 0] - margin, area.bounds[:2, 1] + margin
         self._walls = np.array([low[0], high[0], low[1], high[1]])

@@ -23,24 +23,20 @@ from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, ScenarioError
 from maasi_sim.simulation.emulators.linked_robots import LinkedRobot, linked_robot
+from maasi_sim.simulation.robots import Simulation
 from maasi_sim.simulation.sim_topics import Connections, ExternalRobot, RobotTopics, publish_truth
-from maasi_sim.simulation.simulated_world import Simulation
 
 RECORDER = 'recorder'
 
-# Period of the checks for nodes that are not ready yet [s].
-_LOOK_PERIOD = 0.02
+_LOOK_PERIOD = 0.02  # period of the checks for nodes that are not ready yet [s]
 # Delay of the first warning about missing nodes, and period of its repetition [s].
 _PATIENCE, _REMINDER = 3.0, 15.0
-# Longest wait for the subscriptions of a node that reports ready [s].
-_CONNECTION_PATIENCE = 5.0
+_CONNECTION_PATIENCE = 5.0  # longest wait for the subscriptions of a node that reports ready [s]
 # Most steps from the recorder to the simulation: a port of Fast DDS holds 512 messages, then they
 # have to be sent again.
 _MOST_AHEAD = 20
-# Period of the clock in lockstep [s].
-_CLOCK_PERIOD = 0.25
-# At shutdown: how long linked robots stay reachable for drivers that stop them [s].
-_FAREWELL = 1.0
+_CLOCK_PERIOD = 0.25  # period of the clock in lockstep [s]
+_FAREWELL = 1.0  # at shutdown: how long linked robots stay reachable for drivers that stop them [s]
 
 
 class SimNodeSettings(NodeSettings):
@@ -49,23 +45,23 @@ class SimNodeSettings(NodeSettings):
     live: ClassVar[frozenset[str]] = frozenset({'command_age'})
 
     step: float = Field(
-        default=0.0, ge=0.0, le=10.0, description="Duration of a step; 0: the scenario's [s]"
+        0.0, ge=0.0, le=10.0, description="Duration of a step; 0: the scenario's [s]"
     )
     scenario: str = Field(
         min_length=1, description='Scenario file, or the name of one in config/scenarios'
     )
     rate: NotNegative = Field(
-        default=1.0,
+        1.0,
         description='Simulated over wall time, at most; 0: as fast as possible, in lockstep only',
     )
     follow_clock: bool = Field(
-        default=False,
+        False,
         description='Whether its time is a /clock that somebody else publishes; not in lockstep, '
         'and `rate` does not count',
     )
-    recorder: bool = Field(default=False, description='Whether it waits for the recorder, too')
+    recorder: bool = Field(False, description='Whether it waits for the recorder, too')
     command_age: Positive = Field(
-        default=1.0,
+        1.0,
         description='Simulated time after which a command is too old; in lockstep each is for its '
         'step [s]',
     )
@@ -104,8 +100,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone)
     """
 
-    #: Name of the node of each robot that commands it.
-    robot_node = 'driver'
+    robot_node = 'driver'  #: name of the node of each robot that commands it
     #: How the scenario is read, and its robots are made.
     load: ClassVar[Any] = staticmethod(load_scenario)
     simulate: ClassVar[Any] = Simulation
@@ -137,8 +132,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         # First step, and last time of the followed clock [ns].
         self._first = 0
         self._followed: int | None = None
-        # Stamp of the last step that was republished.
-        self._repeated = -1
+        self._repeated = -1  # stamp of the last step that was republished
         # Topics that each expected node subscribes to.
         self._expected: dict[str, list[str]] = {}
         self._ready: set[str] = set()
@@ -146,8 +140,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._ready_since: float | None = None
         # In lockstep: nodes that are not done, and command topics without a message yet.
         self._waiting: set[str] = set()
-        # Last step that the recorder has taken.
-        self._recorded = 0
+        self._recorded = 0  # last step that the recorder has taken
         # Robots of the step before.
         self._taking_part: list[str] = []
         self._last_command: dict[str, int] = {}
@@ -435,8 +428,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             if stamp == self._stamp:
                 return True
             if stamp == self._repeated:
-                # Duplicate: the other nodes answer a republished step again.
-                return False
+                return False  # duplicate: the other nodes answer a republished step again
             # Nothing moves while a step waits: a stop command is already fulfilled.
             oldest = newest = self._stamp
         else:

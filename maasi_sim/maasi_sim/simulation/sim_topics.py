@@ -33,9 +33,8 @@ from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import AgentState, RangeArray, RangeMeasurement
 from maasi_planner.motion import RobotState
 from maasi_sim.scenario.schema import steps_of
-from maasi_sim.simulation.robots import SimulatedRobot
+from maasi_sim.simulation.robots import SimulatedRobot, Simulation
 from maasi_sim.simulation.sensors import LaserSettings
-from maasi_sim.simulation.simulated_world import Simulation
 from maasi_sim.simulation.world import World
 
 # Period of battery messages [s of simulated time].
@@ -48,8 +47,7 @@ class RobotTopics:
     """Publish the data of one robot; messages are reused, as creating them takes longer."""
 
     def __init__(self, node: Node, simulation: Simulation, name: str, qos: QoSProfile) -> None:
-        self.name = name
-        self.simulation = simulation
+        self.name, self.simulation = name, simulation
         self.robot: SimulatedRobot = simulation.robots[name]
         self._battery_steps = steps_of(_BATTERY_PERIOD, simulation.scenario.step)
 
@@ -224,8 +222,7 @@ class Connections:
     """Tells whether nodes would receive what is published now, by the topics expected of each."""
 
     def __init__(self, node: Node, expected: Mapping[str, Sequence[str]]) -> None:
-        self._node = node
-        self._expected = expected
+        self._node, self._expected = node, expected
         self._endpoints: dict[tuple[str, str], set[bytes]] = {}
 
     def unheard(self, name: str) -> list[str]:

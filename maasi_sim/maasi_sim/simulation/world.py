@@ -35,31 +35,29 @@ _ATTEMPTS, _RESTARTS = 1000, 10
 class TargetSettings(Settings):
     """Where the targets are: drawn at random, or given."""
 
-    count: int | None = Field(default=None, ge=0, le=100_000, description='How many are drawn [1]')
+    count: int | None = Field(None, ge=0, le=100_000, description='How many are drawn [1]')
     distribution: Literal['uniform', 'prior', 'clustered'] = Field(
-        default='uniform',
+        'uniform',
         description="Drawn anywhere, as the environment's prior says, or around random centres",
     )
     positions: list[list[Finite]] | None = Field(
-        default=None, description='Given positions, instead of drawn ones [m, map]'
+        None, description='Given positions, instead of drawn ones [m, map]'
     )
-    separation: NotNegative = Field(
-        default=0.0, description='Least distance between two targets [m]'
-    )
-    margin: NotNegative = Field(default=0.0, description='Least distance from the bounds [m]')
-    clusters: int = Field(default=3, ge=1, description='Clustered: how many centres [1]')
+    separation: NotNegative = Field(0.0, description='Least distance between two targets [m]')
+    margin: NotNegative = Field(0.0, description='Least distance from the bounds [m]')
+    clusters: int = Field(3, ge=1, description='Clustered: how many centres [1]')
     spread: float | None = Field(
-        default=None,
+        None,
         gt=0.0,
         description="Clustered: deviation around the centres; none: 1/15 of the space's size [m]",
     )
     walk: NotNegative = Field(
-        default=0.0,
+        0.0,
         description='Deviation of a random walk on each axis after one second; ranging sensors '
         'only [m/sqrt(s)]',
     )
     identified: bool = Field(
-        default=False,
+        False,
         description='Whether sensors read the identity of each target, as from a transponder; '
         'ranging sensors only',
     )

@@ -95,9 +95,7 @@ class DeadReckoning:
     """Where the drone is between its position events; times are of the monotonic clock [s]."""
 
     def __init__(self, model: TiltModel, origin: Pose, settings: MamboSettings) -> None:
-        self.model = model
-        self.origin = origin
-        self.settings = settings
+        self.model, self.origin, self.settings = model, origin, settings
         self.course = Course(origin.position, np.zeros(3), origin.yaw)
         #: Steady acceleration by wind, or by a level that is off, (2,) [m/s^2, map].
         self.push = np.zeros(2)

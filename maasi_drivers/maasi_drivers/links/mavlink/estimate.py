@@ -61,8 +61,7 @@ class FlightOrigin:
         self.problem = ''
         self._here = settings.origin == 'here'
         self._place = [*start[:2], settings.ground]
-        self._path = path
-        self._log = log
+        self._path, self._log = path, log
 
     def find(self, position: FloatArray, booted: float, armed: bool) -> FloatArray | None:
         """Return the place (3,), ENU [m], if known; `booted` [s, steady clock]: switched on."""
@@ -142,9 +141,7 @@ class Estimate:
     def __init__(
         self, settings: MavlinkSettings, place: FlightOrigin, on_restart: Callable[[], None]
     ) -> None:
-        self._settings = settings
-        self._place = place
-        self._on_restart = on_restart
+        self._settings, self._place, self._on_restart = settings, place, on_restart
         self.dropped: Counter[str] = Counter()
         self.charge_reports = 0
         self._clear()

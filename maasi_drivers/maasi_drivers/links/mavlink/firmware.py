@@ -144,10 +144,7 @@ class FailsafeCheck:
         #: Of the parameters; None where the autopilot does not have it.
         self.values: dict[str, float | None] = {}
         self.complete = False
-        self._firmware = firmware
-        self._settings = settings
-        self._sender = sender
-        self._log = log
+        self._firmware, self._settings, self._sender, self._log = firmware, settings, sender, log
         self._station = () if firmware.px4 else _STATION
         self._names = [*firmware.failsafes, *self._station, *([_HIGHEST] if self._station else [])]
         self._asked: Counter[str] = Counter()

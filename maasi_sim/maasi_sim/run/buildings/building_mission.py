@@ -9,8 +9,12 @@ from rosbags.typesys.store import Typestore
 
 from maasi_filter.ros.parameters import flatten
 from maasi_planner.buildings.settings import CuboidPlannerSettings
-from maasi_sim.run.buildings.observer import CuboidObserver, CuboidRecord
-from maasi_sim.run.buildings.report import build_cuboid_report, cuboid_summary
+from maasi_sim.run.buildings.observer import (
+    CuboidObserver,
+    CuboidRecord,
+    build_cuboid_report,
+    cuboid_summary,
+)
 from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
@@ -26,8 +30,7 @@ class BuildingMission(Mission[CuboidRecord]):
     found_word = 'visited'
 
     def __init__(self, name: str, scenario: CuboidScenario) -> None:
-        self.name = name
-        self.scenario = scenario
+        self.name, self.scenario = name, scenario
 
     def plan_nodes(self, options: Options, file: Path) -> list[NodePlan]:
         """Return the simulation, and for each robot a planner and a guard: not in lockstep."""

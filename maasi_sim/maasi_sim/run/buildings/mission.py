@@ -9,12 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_planner.buildings.agent import Activity, SearchAgent, Snapshot, decision_stream
-from maasi_planner.buildings.centralized import solve_jointly
+from maasi_planner.buildings.agent import (
+    Activity,
+    Broadcast,
+    SearchAgent,
+    Snapshot,
+    decision_stream,
+)
 from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
-from maasi_planner.buildings.problem import Plan
+from maasi_planner.buildings.problem import Plan, solve_jointly
 from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
-from maasi_planner.buildings.sharing import Broadcast
 
 Scheme = Literal['distributed', 'sequential', 'centralized']
 
@@ -71,9 +75,7 @@ class CuboidMission:
         seed: int = 1,
         scheme: Scheme = 'distributed',
     ) -> None:
-        self.settings = settings
-        self.seed = seed
-        self.scheme = scheme
+        self.settings, self.seed, self.scheme = settings, seed, scheme
         self.mission = plan_mission(settings, area)
         self.agents = {
             name: SearchAgent(name, settings, self.mission, robots[name], step)

@@ -8,9 +8,8 @@ from matplotlib.patches import Rectangle
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.colours import robot_colours
-from maasi_sim.run.buildings.observer import CuboidRecord
+from maasi_sim.run.buildings.observer import CuboidRecord, build_cuboid_report
 from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED
-from maasi_sim.run.buildings.report import build_cuboid_report
 from maasi_sim.run.report_files import reason_of_end
 from maasi_sim.run.report_panels import MARGIN, MapView, draw_report
 

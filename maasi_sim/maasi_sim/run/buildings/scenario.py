@@ -26,9 +26,9 @@ class SearchRobotSettings(SearcherSettings):
     """One robot: its type's settings with the scenario's own on top."""
 
     type: str = Field(description='Name of the type: a file in config/robots')
-    description: str = Field(default='', description='What it is, in words')
+    description: str = Field('', description='What it is, in words')
     link: Literal['topics'] = Field(
-        default='topics', description='How its planner reaches it; the other end is simulated'
+        'topics', description='How its planner reaches it; the other end is simulated'
     )
     dynamics: DynamicsSettings = Field(description='Its body')
     odometry: OdometrySettings = Field(
@@ -53,7 +53,7 @@ class CuboidScenario(BaseScenario):
     """A scenario file of a search of buildings, all layers merged."""
 
     environment: EnvironmentSettings = Field(description='Where robots may be, in 3D')
-    step: float = Field(default=1.0, gt=0.0, le=10.0, description='dT [s]')
+    step: float = Field(1.0, gt=0.0, le=10.0, description='dT [s]')
     robots: dict[str, SearchRobotSettings] = Field(min_length=1, description='Robots by name')
     planner: CuboidPlanner = Field(description='Planner of each robot, and what is searched')
 

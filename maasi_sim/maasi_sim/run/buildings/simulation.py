@@ -10,8 +10,7 @@ from maasi_planner.motion import RobotState
 from maasi_planner.motion.base import check_command
 from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.simulation.odometry import OdometryModel, OdometryReading
-from maasi_sim.simulation.robots import Battery
-from maasi_sim.simulation.simulated_world import SimulatedTeam
+from maasi_sim.simulation.robots import Battery, SimulatedTeam
 
 
 class SearchingRobot:

@@ -15,22 +15,20 @@ from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import unsuitable_lengths, unused_settings
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
 from maasi_sim.run.run_options import Options
-from maasi_sim.run.targets.geojson import found_geojson, ways_geojson
 from maasi_sim.run.targets.observer import TargetObserver
 from maasi_sim.run.targets.report import build_report, target_summary
-from maasi_sim.run.targets.tables import csv_text, found_rows
+from maasi_sim.run.targets.tables import csv_text, found_geojson, found_rows, ways_geojson
 from maasi_sim.run.targets.tally import TargetRecord
 from maasi_sim.run.topics import BATCH, within
+from maasi_sim.scenario.checks import never_seen
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.schema import RobotSettings, Scenario, planner_settings
-from maasi_sim.scenario.visibility import never_seen
 from maasi_sim.simulation.emulators.linked_robots import with_addresses
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Of the robots' frames in lockstep, where each message counts [Hz].
-_LOCKSTEP_TF_RATE = 4.0
+_LOCKSTEP_TF_RATE = 4.0  # of the robots' frames in lockstep, where each message counts [Hz]
 # Settings of a robot that its driver has as well.
 _OF_THE_DRIVER = ['start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'battery_unit', 'link']
 
@@ -41,8 +39,7 @@ class TargetMission:
     found_word = 'found'
 
     def __init__(self, name: str, scenario: Scenario) -> None:
-        self.name = name
-        self.scenario = scenario
+        self.name, self.scenario = name, scenario
 
     def prepare(self) -> None:
         """See `Mission.prepare`."""

@@ -25,8 +25,7 @@ _TRUE, _MISSED, _FALSE = '#222222', '#D62728', '#E6007E'
 _SIGMAS = 3.0
 # Of the longest side: half axes of an ellipse are drawn at least so long.
 _LEAST = {2: 0.012, 3: 0.022}
-# Points on each axis where a field of view is evaluated.
-_VIEW_GRID = 160
+_VIEW_GRID = 160  # points on each axis where a field of view is evaluated
 
 
 def plot_report(record: TargetRecord) -> Figure:

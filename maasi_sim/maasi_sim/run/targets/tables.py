@@ -1,15 +1,22 @@
-"""Found targets as rows of a table, for CSV, GeoJSON and data frames."""
+"""Found targets as rows, for CSV, GeoJSON and data frames; and a search as GeoJSON (RFC 7946)."""
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import shapely
+from shapely.geometry import mapping
+from shapely.geometry.base import BaseGeometry
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget
+from maasi_sim.run.targets.report import explored_after
+from maasi_sim.run.targets.tally import TargetRecord
 
 Row = dict[str, Any]
 
@@ -67,3 +74,75 @@ def csv_text(rows: Sequence[Row], dimension: int, origin: OriginSettings | None)
     writer.writeheader()
     writer.writerows(rows)
     return out.getvalue()
+
+
+def found_geojson(rows: Sequence[Row]) -> str:
+    """Return rows with geodetic coordinates: a point each, to a millimetre."""
+    features = []
+    for row in rows:
+        properties, digits = dict(row), {'longitude': 8, 'latitude': 8, 'altitude': 3}
+        place = [round(properties.pop(name), number) for name, number in digits.items()]
+        features.append(_feature({'type': 'Point', 'coordinates': place}, properties))
+    return _collection(features)
+
+
+def ways_geojson(record: TargetRecord, origin: OriginSettings) -> str:
+    """Return the ways of the robots, and what they have explored."""
+    area = _area(record, origin)
+    return _collection([*area, _explored(record, origin), *_ways(record, origin)])
+
+
+def _area(record: TargetRecord, origin: OriginSettings) -> Iterator[Row]:
+    """Return the area of the search and what in it is not to be entered."""
+    for kind, shapes in Area(record.scenario.environment).shapes.items():
+        for polygon in shapely.get_parts(shapes):
+            yield _polygon(polygon, origin, {'kind': kind})
+
+
+def _explored(record: TargetRecord, origin: OriginSettings) -> Row:
+    """Return where less than half is unseen, in 3D of the whole height."""
+    explored = explored_after(record)
+    unseen = np.atleast_3d(explored.values).mean(axis=2)
+    nodes = explored.nodes().reshape(*unseen.shape, -1, explored.dimension)[:, :, 0, :2]
+    half, (low, high) = 0.5 * explored.step[:2], explored.bounds[:2].T
+    seen = np.clip([nodes[unseen < 0.5] - half, nodes[unseen < 0.5] + half], low, high)
+    # Cells that touch, to a micrometre, become one.
+    cells = shapely.union_all(shapely.box(*seen[0].T, *seen[1].T), grid_size=1e-6)
+    share = round(explored.explored_fraction(), 6)
+    return _polygon(cells, origin, {'kind': 'explored', 'share': share})
+
+
+def _polygon(polygon: BaseGeometry, origin: OriginSettings, properties: Row) -> Row:
+    # Outer rings run counterclockwise.
+    turned = shapely.reverse(shapely.normalize(polygon))
+    placed = shapely.transform(turned, lambda points: _coordinates(points, origin)[:, :2])
+    return _feature(mapping(placed), properties)
+
+
+def _ways(record: TargetRecord, origin: OriginSettings) -> Iterator[Row]:
+    spacing = 1e-3 * np.linalg.norm(np.ptp(record.scenario.environment.array(), axis=1))
+    for robot, states in sorted(record.trajectories.items()):
+        way = states[np.isfinite(states).all(axis=1)]
+        if len(way) < 2:
+            continue
+        lengths = np.linalg.norm(np.diff(way[:, 1:], axis=0), axis=1)
+        passed = np.append(0.0, lengths.cumsum())
+        way = way[np.union1d(np.unique(passed // spacing, return_index=True)[1], len(way) - 1)]
+        places, times = _coordinates(way[:, 1:], origin).tolist(), way[:, 0].tolist()
+        properties = {'kind': 'way', 'robot': robot, 'length': passed[-1], 'times': times}
+        yield _feature({'type': 'LineString', 'coordinates': places}, properties)
+
+
+def _coordinates(positions: FloatArray, origin: OriginSettings) -> FloatArray:
+    """Return longitude, latitude and altitude, to a millimetre (n, 3)."""
+    latitudes, longitudes, altitudes = geodetic(positions, origin).T
+    return np.stack([longitudes.round(8), latitudes.round(8), altitudes.round(3)], axis=1)
+
+
+def _feature(geometry: Any, properties: Row) -> Row:
+    return {'type': 'Feature', 'geometry': geometry, 'properties': properties}
+
+
+def _collection(features: Iterable[Row]) -> str:
+    content = {'type': 'FeatureCollection', 'features': [*features]}
+    return json.dumps(content, indent=1, allow_nan=False) + '\n'

@@ -1,4 +1,4 @@
-"""What the filters have found, update by update, and the record of a search for targets."""
+"""What the filters have found, update by update, with scores; the record of a search."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -6,23 +6,75 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.metrics import Gospa, Match, gospa, match_targets
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import FoundTarget, Label
 from maasi_sim.run.mission import Observer, RunRecord
-from maasi_sim.run.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.run.topics import seconds
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.simulation.world import World
+
+
+def scoring_radius(scenario: Scenario, truth: FloatArray) -> float:
+    """Return the distance within which a found target is true [m]; true positions (n, d) [m].
+
+    The scenario's, or three times T_z, at most half the smallest distance between two targets, so
+    that none can be matched with its neighbour.
+    """
+    if scenario.scoring.radius is not None:
+        return scenario.scoring.radius
+    radius = 3.0 * scenario.removal_distance()
+    if len(truth) > 1:
+        # Deferred: it is the slowest import of a run.
+        from scipy.spatial.distance import pdist
+
+        nearest = float(pdist(truth).min())
+        if nearest == 0.0:
+            raise ValueError('truth: got two targets at the same place, allowed are different ones')
+        radius = min(radius, 0.5 * nearest)
+    return radius
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Found targets against the truth: one-to-one pairs, and GOSPA.
+
+    `radius` is the distance within which a found target is true, and c of GOSPA [m]; `order` its p.
+    """
+
+    radius: float
+    order: float
+    match: Match
+    gospa: Gospa
+
+    @property
+    def complete(self) -> bool:
+        """Whether every true target is found."""
+        return self.match.missed == 0
+
+
+def score(
+    found: Sequence[FoundTarget] | FloatArray, truth: ArrayLike, radius: float, order: float = 2.0
+) -> Scores:
+    """Return the scores of found targets, or of places (n, d), against true ones (m, d) [m]."""
+    if not isinstance(found, np.ndarray):
+        found = np.array([getattr(item, 'position', item) for item in found])
+    return Scores(
+        radius,
+        order,
+        match_targets(found, truth, radius),
+        gospa(found, truth, cutoff=radius, power=order),
+    )
 
 
 @dataclass(frozen=True)
 class FoundCount:
     """Measurements and found targets of all robots so far, after a filter update."""
 
-    #: [s].
-    time: float
+    time: float  #: [s]
     #: k.
     step: int
     measurements: int
@@ -57,8 +109,7 @@ class Tally:
     """Counts what the filters have found, update by update."""
 
     def __init__(self, scenario: Scenario, world: World, run: Observer) -> None:
-        self.scenario = scenario
-        self.world = world
+        self.scenario, self.world = scenario, world
         self.truth = np.asarray(world.targets, dtype=float)
         self.measurements = dict.fromkeys(scenario.names(), 0)
         self.progress: list[FoundCount] = []
@@ -129,8 +180,7 @@ class Tally:
 class TargetRecord(RunRecord):
     """The record of a search for targets."""
 
-    #: At the end.
-    tally: Tally
+    tally: Tally  #: at the end
     #: By robot, in order: chosen ones, (n, 3) [m], and poses at which it measured.
     waypoints: dict[str, FloatArray] = field(default_factory=dict)
     measured_from: dict[str, list[Pose]] = field(default_factory=dict)

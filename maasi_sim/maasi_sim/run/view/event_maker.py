@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import Cluster, FoundTarget
 from maasi_planner.team import Decision
-from maasi_sim.run.targets.scoring import score
+from maasi_sim.run.targets.tally import score
 from maasi_sim.run.topics import point
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning
 
@@ -56,8 +56,7 @@ class EventMaker:
     """Makes the events of a run with a scene, see `scene_of`, and hands each to a listener."""
 
     def __init__(self, scene: Scene, listener: Listener) -> None:
-        self.scene = scene
-        self._listener = listener
+        self.scene, self._listener = scene, listener
         bounds = np.asarray(scene.get('bounds') or [[0.0, 1.0]], dtype=float)
         extent = float((bounds[:, 1] - bounds[:, 0]).max())
         # A ten-thousandth of the environment is not seen.
@@ -163,7 +162,7 @@ class EventMaker:
         self._put(time, 'seen', robot, self._place(position), rows)
 
     def picture(self, time: float, robot: str, content: Sequence[Any]) -> None:
-        """Add what a camera saw as its robot measured, see `maasi_sim.run.view.pictures`."""
+        """Add what a camera saw as its robot measured, see `maasi_sim.run.view.messages`."""
         self._put(time, 'picture', robot, *content)
 
     def filter(

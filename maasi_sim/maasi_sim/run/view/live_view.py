@@ -21,9 +21,8 @@ from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.run.topics import time_at
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, EventLog, Scene
 from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.messages import MARKERS, MessageEvents
+from maasi_sim.run.view.messages import IMAGES, MARKERS, MessageEvents
 from maasi_sim.run.view.page_file import open_browser
-from maasi_sim.run.view.pictures import IMAGES
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.server import Commander, Hub, ViewServer
 from maasi_sim.scenario.schema import Scenario
@@ -166,8 +165,7 @@ class SearchTrace:
     """Gathers calls that make the events of a search, cheaply: they are made when it is shown."""
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
-        self.scenario = scenario
-        self.seed = seed
+        self.scenario, self.seed = scenario, seed
         self._live: LiveView | None = None
         self._calls: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
         self._last_states = -np.inf

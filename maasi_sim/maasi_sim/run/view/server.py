@@ -132,9 +132,7 @@ class ViewServer(ThreadingHTTPServer):
         host: str = '127.0.0.1',
         commander: Commander | None = None,
     ) -> None:
-        self.hub = hub
-        self.host = host
-        self.commander = commander
+        self.hub, self.host, self.commander = hub, host, commander
         number = _number(host)
         # Whether only this machine reaches it.
         self.is_private = host == 'localhost' or (number is not None and number.is_loopback)

@@ -23,23 +23,18 @@ def build_parser() -> argparse.ArgumentParser:
         description=f'Makes {REPLAY}, a page with the whole run inside, and opens it.',
         epilog='Exit codes: 0 done, 2 no recording of a search, 4 it could not be written.',
     )
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         'recording',
         type=Path,
         nargs='?',
         metavar='BAG_OR_RUN',
         help='recording, or folder of a run (default: the newest in runs)',
     )
-    parser.add_argument(
-        '--out', type=Path, metavar='FILE', help=f'page (default: {REPLAY} beside the recording)'
-    )
-    parser.add_argument(
-        '--video', type=Path, metavar='FILE', help='a video instead: FILE.mp4 or FILE.gif'
-    )
-    parser.add_argument(
-        '--speed', type=float, default=5.0, metavar='X', help='of the video (default: 5)'
-    )
-    parser.add_argument('--no-open', action='store_true', help='do not open a browser')
+    add('--out', type=Path, metavar='FILE', help=f'page (default: {REPLAY} beside the recording)')
+    add('--video', type=Path, metavar='FILE', help='a video instead: FILE.mp4 or FILE.gif')
+    add('--speed', type=float, default=5.0, metavar='X', help='of the video (default: 5)')
+    add('--no-open', action='store_true', help='do not open a browser')
     return parser
 
 

@@ -146,8 +146,7 @@ class FakeMambo:
     def __init__(
         self, firmware: MamboFirmware, address: str = '127.0.0.1', command_port: int = 0
     ) -> None:
-        self.firmware = firmware
-        self.address = address
+        self.firmware, self.address = firmware, address
         self.position_sent = 'true'
         self.cut_up = self.cut_down = False
         self.refused = 0

@@ -11,33 +11,31 @@ class AutopilotSettings(Settings):
     """Settings of a fake autopilot; `external`: another program is the autopilot."""
 
     external: bool = Field(
-        default=False,
+        False,
         description='Whether the autopilot is not simulated here, but a simulator of ArduPilot or '
         'PX4, or a real vehicle; in a scenario, autopilot: external',
     )
     firmware: Literal['arducopter', 'ardusub', 'px4'] = Field(
-        default='arducopter', description='Whose behaviour it has'
+        'arducopter', description='Whose behaviour it has'
     )
-    system: int = Field(default=1, ge=1, le=255, description='Its system id')
-    depth: NotNegative = Field(default=0.0, description='Of a submarine when it is switched on [m]')
-    estimator_time: NotNegative = Field(
-        default=2.0, description='Until its position estimate is ready [s]'
-    )
-    second_gnss: bool = Field(default=False, description='Whether it has a second GNSS receiver')
-    noise: NotNegative = Field(default=0.005, description='Deviation of its reported position [m]')
+    system: int = Field(1, ge=1, le=255, description='Its system id')
+    depth: NotNegative = Field(0.0, description='Of a submarine when it is switched on [m]')
+    estimator_time: NotNegative = Field(2.0, description='Until its position estimate is ready [s]')
+    second_gnss: bool = Field(False, description='Whether it has a second GNSS receiver')
+    noise: NotNegative = Field(0.005, description='Deviation of its reported position [m]')
     barometer_drift: Finite = Field(
-        default=0.0, description='Of its estimated height until it is armed [m/s]'
+        0.0, description='Of its estimated height until it is armed [m/s]'
     )
     more_batteries: list[Annotated[float, Field(ge=0.0, le=1.0)]] = Field(
         default_factory=list,
         description='Charges of batteries beside the first, which do not change',
     )
     endurance: Positive = Field(
-        default=1200.0, description='Time for which a full battery lasts in the air [s]'
+        1200.0, description='Time for which a full battery lasts in the air [s]'
     )
-    charge: float = Field(default=1.0, ge=0.0, le=1.0, description='At the start, 0 to 1')
-    speed: Positive = Field(default=2.0, description='Largest speed, level [m/s]')
-    acceleration: Positive = Field(default=1.0, description='Largest acceleration [m/s^2]')
+    charge: float = Field(1.0, ge=0.0, le=1.0, description='At the start, 0 to 1')
+    speed: Positive = Field(2.0, description='Largest speed, level [m/s]')
+    acceleration: Positive = Field(1.0, description='Largest acceleration [m/s^2]')
     parameters: dict[str, float] = Field(
         default_factory=dict, description='Parameters of the autopilot that differ'
     )

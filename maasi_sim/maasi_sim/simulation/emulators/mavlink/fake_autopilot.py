@@ -78,8 +78,7 @@ class FakeAutopilot:
         # Error of the estimated height, and true place of the EKF's origin [m].
         self.height_error = 0.0
         self.origin = np.zeros(3)
-        self._sender = sender
-        self._generator = generator
+        self._sender, self._generator = sender, generator
         self._home = 0.0  # true height at arming [m]
         # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf

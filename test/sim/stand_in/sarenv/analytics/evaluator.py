@@ -13,8 +13,7 @@ from shapely import LineString
 __all__ = ['ComparativeEvaluator', 'LineString', 'PathGenerator', 'paths']
 # As imports of the real one do.
 random.random()
-# Metres of a degree on the equator, in UTM.
-DEGREE = 0.9996 * np.array([111319.49, 110574.3])
+DEGREE = 0.9996 * np.array([111319.49, 110574.3])  # metres of a degree on the equator, in UTM
 
 
 class Victims:
