@@ -189,10 +189,12 @@ def read_shape(value: Any, project: Callable[[FloatArray], FloatArray] | None = 
         rings = value if value and np.ndim(value[0][0]) else [value]
         found = Polygon(rings[0], rings[1:])
     else:
-        parts = [_geometry(feature) for feature in features_of(value)]
-        if project is None:
-            raise ValueError('GeoJSON needs environment.origin')
-        found = shapely.transform(shapely.union_all(parts), project)
+        features = features_of(value)
+        found = shapely.union_all([_geometry(feature) for feature in features])
+        if not all(_facts(feature).get('unit') == 'm' for feature in features):
+            if project is None:
+                raise ValueError('GeoJSON needs environment.origin')
+            found = shapely.transform(found, project)
     if not isinstance(found, (Polygon, MultiPolygon)) or found.is_empty:
         raise ValueError(f'got {str(value)[:60]}, allowed are polygons')
     if not found.is_valid:
@@ -216,6 +218,10 @@ def features_of(value: Any) -> list[dict[str, Any]]:
     if value.get('type') == 'FeatureCollection':
         return list(value['features'])
     return [dict(value) if value.get('type') == 'Feature' else {'geometry': dict(value)}]
+
+
+def _facts(feature: Mapping[str, Any]) -> Mapping[str, Any]:
+    return feature.get('properties') or {}
 
 
 def _geometry(feature: Mapping[str, Any]) -> Any:
@@ -264,12 +270,15 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
         except ValueError as error:
             raise ValueError(f'area: {error}') from None
         for feature in features:
-            role = (feature.get('properties') or {}).get('role', 'area')
-            roles.setdefault(role, []).append(feature)
+            roles.setdefault(_facts(feature).get('role', 'area'), []).append(feature)
         if unknown := roles.keys() - {'area', 'keep_out', 'prior'}:
             raise ValueError(f'area: got role {min(unknown)}, allowed are area, keep_out, prior')
         values['area'] = {'type': 'FeatureCollection', 'features': roles['area']}
-        if not values.get('origin'):
+        facts = [_facts(item) for item in roles['area']]
+        # That of the run on whose page it was drawn.
+        said = [item['origin'] for item in facts if item.get('origin')]
+        values['origin'] = values.get('origin') or next(iter(said), None)
+        if not values['origin'] and any(item.get('unit') != 'm' for item in facts):
             whole = shapely.union_all([_geometry(item) for item in roles['area']])
             west, south, east, north = whole.bounds
             values['origin'] = OriginSettings(
@@ -320,7 +329,7 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
         prior = dict(prior or {})
         parts = list(prior.get('polygons') or [])
         for item in roles['prior']:
-            weight = (item.get('properties') or {}).get('weight', 1.0)
+            weight = _facts(item).get('weight', 1.0)
             parts.append({'polygon': item, 'weight': weight})
         prior['polygons'] = [
             {**item, 'polygon': text(item['polygon'], f'prior.polygons[{index}]')}
