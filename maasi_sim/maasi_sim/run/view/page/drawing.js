@@ -11,7 +11,7 @@ const FILE = 'area.geojson';
 const CLOSING = 9;
 
 export class Drawing {
-  constructor(status, page) {
+  constructor(tools, status, page) {
     this.status = status;
     this.page = page;
     // What clicks on the map draw; null: nothing.
@@ -19,24 +19,26 @@ export class Drawing {
     // What would be saved, first that of the run; null: nothing was drawn yet.
     this.shapes = null;
     this.corners = [];
-    const actions = {
-      area: ['Draw area', () => this.start('area')],
-      keep_out: ['Draw keep-out', () => this.start('keep_out')],
-      undo: ['Undo', () => this.undo()],
-      save: ['Save', () => this.save()],
-    };
-    this.buttons = Object.entries(actions).map(([name, [title, action]]) => {
+    const actions = [
+      ['area', 'Draw area', () => this.start('area')],
+      ['keep_out', 'Draw keep-out', () => this.start('keep_out')],
+      ['undo', 'Undo', () => this.undo()],
+      ['save', 'Save', () => this.save()],
+    ];
+    this.buttons = actions.map(([name, title, action]) => {
       const button = element('button', '', title);
       button.dataset.draw = name;
-      button.disabled = !(name in SHAPES);
-      button.onclick = action;
+      button.onclick = () => {
+        this.shapes ||= shapesOf(page.log, page.time);
+        action();
+      };
       return button;
     });
+    tools.append(...this.buttons);
   }
 
   // Let clicks draw; a second time, or without a kind, they do what they did before.
   start(kind) {
-    this.shapes ||= shapesOf(this.page.log, this.page.time);
     this.kind = this.kind === kind ? null : kind;
     this.tell();
   }
@@ -104,10 +106,7 @@ export class Drawing {
     const hint = `Corners of the ${SHAPES[this.kind]}: ${this.corners.length}. Click to add one; double-click, or click the first, to close.`;
     this.status.textContent = `${news} ${area}, keep-outs: ${closed}. ${this.kind ? hint : ''}`;
     this.status.hidden = false;
-    for (const button of this.buttons) {
-      button.disabled = false;
-      if (button.dataset.draw in SHAPES) button.setAttribute('aria-pressed', String(this.kind === button.dataset.draw));
-    }
+    for (const button of this.buttons.slice(0, 2)) button.setAttribute('aria-pressed', String(this.kind === button.dataset.draw));
     this.page.request();
   }
 

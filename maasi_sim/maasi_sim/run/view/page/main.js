@@ -35,7 +35,7 @@ class Page {
     this.camera = new Camera();
     this.map = new MapView($('map'), this.camera);
     this.curve = new Curve($('curve'));
-    this.drawing = new Drawing($('drawing'), this);
+    this.drawing = new Drawing($('tools'), $('drawing'), this);
     this.fitted = false;
   }
 
@@ -106,9 +106,7 @@ class Page {
     for (const button of $('layers').querySelectorAll('[data-layer]')) {
       button.hidden = log.isOfBuildings && button.dataset.layer !== 'ways';
     }
-    for (const button of $('layers').querySelectorAll('[data-draw]')) {
-      button.hidden = log.isOfBuildings;
-    }
+    $('tools').hidden = log.isOfBuildings;
     $('curve_title').textContent = log.isOfBuildings ? 'Cuboids visited' : `Found and ${log.knowsExpected ? 'expected' : 'potential'}`;
     this.fitted = false;
     this.changed = true;
@@ -134,7 +132,7 @@ class Page {
     space.onclick = () => this.setSpatial(!this.camera.spatial);
     const whole = element('button', '', 'Fit');
     whole.onclick = () => this.fit();
-    $('layers').append(space, whole, ...this.drawing.buttons);
+    $('layers').append(space, whole);
   }
 
   setSpatial(spatial) {
