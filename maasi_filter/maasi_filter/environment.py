@@ -188,10 +188,12 @@ def read_shape(value: Any, project: Callable[[FloatArray], FloatArray] | None = 
         rings = value if value and np.ndim(value[0][0]) else [value]
         found = Polygon(rings[0], rings[1:])
     else:
-        parts = [_geometry(feature) for feature in features_of(value)]
-        if project is None:
-            raise ValueError('GeoJSON needs environment.origin')
-        found = shapely.transform(shapely.union_all(parts), project)
+        features = features_of(value)
+        found = shapely.union_all([_geometry(feature) for feature in features])
+        if not all(_facts(feature).get('unit') == 'm' for feature in features):
+            if project is None:
+                raise ValueError('GeoJSON needs environment.origin')
+            found = shapely.transform(found, project)
     if not isinstance(found, (Polygon, MultiPolygon)) or found.is_empty:
         raise ValueError(f'got {str(value)[:60]}, allowed are polygons')
     if not found.is_valid:
@@ -217,6 +219,10 @@ def features_of(value: Any) -> list[dict[str, Any]]:
     if not isinstance(features, list) or not all(isinstance(one, Mapping) for one in features):
         raise ValueError(f'features: got {str(features)[:60]}, allowed is a list of features')
     return features
+
+
+def _facts(feature: Mapping[str, Any]) -> Mapping[str, Any]:
+    return feature.get('properties') or {}
 
 
 def _geometry(feature: Mapping[str, Any]) -> Any:
@@ -279,11 +285,15 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     if _is_geojson(area):
         with _at(area, 'area'):
             for feature in features_of(area):
-                role = (feature.get('properties') or {}).get('role', 'area')
+                role = _facts(feature).get('role', 'area')
                 if role not in roles:
                     raise ValueError(f'got role {role}, allowed are area, keep_out, prior')
                 roles[role].append(feature)
-            if not origin:
+            facts = [_facts(item) for item in roles['area']]
+            # That of the run on whose page it was drawn.
+            said = [item['origin'] for item in facts if item.get('origin')]
+            origin = origin or next(iter(said), None)
+            if not origin and any(item.get('unit') != 'm' for item in facts):
                 whole = shapely.union_all([_geometry(item) for item in roles['area']])
                 west, south, east, north = whole.bounds
                 origin = {'latitude': 0.5 * (south + north), 'longitude': 0.5 * (west + east)}
@@ -339,7 +349,7 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
             for index, item in enumerate(prior.get('polygons') or [])
         ]
         for key, item in parts:
-            weight = (item.get('properties') or {}).get('weight', 1.0)
+            weight = _facts(item).get('weight', 1.0)
             polygons.append({'polygon': text(item, key), 'weight': weight})
         values['prior'] = {**prior, 'polygons': polygons}
     return values

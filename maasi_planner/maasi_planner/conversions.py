@@ -63,6 +63,7 @@ def _robot_to_ros(name: str, index: int, decision: RobotDecision) -> RobotDecisi
             )
             for position, cost, refinement, exploration, value, length, measurements in rows
         ],
+        tour=list(map(point_to_ros, decision.tour)),
     )
 
 
@@ -122,15 +123,15 @@ def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyG
 
 
 def planner_markers(
-    robots: dict[str, tuple[FloatArray, FloatArray, FloatArray]],
+    robots: dict[str, tuple[FloatArray, FloatArray, FloatArray, FloatArray]],
     tints: dict[str, str],
     header: Header,
     size: float,
 ) -> MarkerArray:
-    """Return markers of robots, waypoints and planned paths, in the colour of each robot."""
+    """Return markers of robots, waypoints, planned paths and tours, in the robots' colours."""
     markers = []
     for number, name in enumerate(sorted(robots)):
-        position, waypoint, path = robots[name]
+        position, waypoint, path, tour = robots[name]
         tint = colour_of(tints[name])
         for namespace, place, shape in (
             ('robots', position, Marker.SPHERE),
@@ -142,14 +143,18 @@ def planner_markers(
             marker.scale.x = marker.scale.y = marker.scale.z = size
             marker.color = tint
             markers.append(marker)
-        line = Marker(header=header, ns='ways', id=number, type=Marker.LINE_STRIP)
-        line.pose.orientation.w = 1.0
-        line.scale.x = 0.2 * size
-        line.color = tint
         thinned = path[:: max(1, len(path) // 50)]
-        line.points = [point_to_ros(point) for point in thinned]
-        line.action = Marker.ADD if len(line.points) > 1 else Marker.DELETE
-        markers.append(line)
+        for namespace, places, width in (
+            ('ways', thinned, 0.2 * size),
+            ('tours', [waypoint, *tour], 0.07 * size),
+        ):
+            line = Marker(header=header, ns=namespace, id=number, type=Marker.LINE_STRIP)
+            line.pose.orientation.w = 1.0
+            line.scale.x = width
+            line.color = tint
+            line.points = [point_to_ros(point) for point in places]
+            line.action = Marker.ADD if len(line.points) > 1 else Marker.DELETE
+            markers.append(line)
     return MarkerArray(markers=markers)
 
 

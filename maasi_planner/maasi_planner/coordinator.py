@@ -75,6 +75,7 @@ class RobotPlan:
     measured_from: int = 0
     positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     yaws: FloatArray = field(default_factory=lambda: np.zeros(0))
+    tour: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     staying: bool = True
     measurements: int = 0
     due: bool = False
@@ -89,6 +90,7 @@ class RobotPlan:
         """Discard its plan: it does not take part."""
         self.decided_at = None
         self.positions, self.yaws = np.zeros((0, 3)), np.zeros(0)
+        self.tour = np.zeros((0, 3))
         self.staying = True
         self.passed = None
         self.due = False
@@ -125,7 +127,7 @@ class RobotPlan:
             self.nearest = self.motion.squared_distance(here, self.passed)
         self.decision += 1
         self.decided_at = step
-        self.positions, self.yaws = chosen.positions, chosen.yaws
+        self.positions, self.yaws, self.tour = chosen.positions, chosen.yaws, chosen.tour
         self.staying, self.waypoint = chosen.stays, chosen.waypoint
         # A waypoint within the radius already is gone to until it is reached.
         near = self.motion.squared_distance(here, chosen.waypoint) <= self.arrival_radius**2

@@ -167,6 +167,8 @@ class RobotDecision:
         Steps K and measurements M of each predicted trajectory.
     reason : str
         Explanation of the choice.
+    tour : (n, 3) array
+        Places where it is to go after the waypoint, of planners that plan so far.
     """
 
     chosen: int
@@ -181,6 +183,7 @@ class RobotDecision:
     lengths: IntArray
     measurements: IntArray
     reason: str
+    tour: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def stays(self) -> bool:

@@ -62,6 +62,15 @@ def test_the_forms_of_an_area_are_the_same_area(tmp_path):
     assert of_file.prior.polygons[0].weight == 3.0
     amid = environment(area=str(file)).origin
     assert amid.latitude == pytest.approx(46.6, abs=1e-3)
+    # As it is drawn on the page of a run: where its map is, or in metres.
+    drawn = environment(area=feature(RING, HOLE, origin=ORIGIN.model_dump()))
+    shape = {'type': 'Polygon', 'coordinates': [[*ring, ring[0]] for ring in (RING, HOLE)]}
+    metres = {'type': 'Feature', 'properties': {'unit': 'm'}, 'geometry': shape}
+    metres = environment(area=metres)
+    assert drawn.origin == ORIGIN and metres.origin is None
+    whole = Area(environment(area=[RING, HOLE])).region
+    for made in (drawn, metres):
+        assert Area(made).region.symmetric_difference(whole).area < 0.1
     solid = environment(area=[RING, HOLE], altitude=[0.0, 20.0])
     assert solid.dimension == 3 and Area(solid).volume == pytest.approx(20280.0, rel=0.01)
 

@@ -43,13 +43,18 @@ def fly(planner, team, name='robot0'):
     """Send a robot to its next waypoint, with measurements on the way; return the waypoint."""
     decision = planner.decide(team)
     check_decision(planner, team, decision)
-    robot, view = decision.robots[name], team.robots[name]
+    robot = decision.robots[name]
     if robot.stays:
         return None
+    follow(team, robot, name)
+    return robot.waypoint
+
+
+def follow(team, robot, name='robot0'):
+    view = team.robots[name]
     for place in robot.positions[::5]:
         team.exploration.update(view.sensor.detection, Pose.from_yaw(place, 0.0))
     view.state = RobotState.at_rest(robot.waypoint)
-    return robot.waypoint
 
 
 def test_a_box_gives_lanes_that_cover_the_area_once():
@@ -101,6 +106,17 @@ def test_others_keep_their_tours_until_a_cluster_appears():
     team.clusters = [Cluster(np.array([4.2, 6.3]), 0.01 * np.eye(2), 0.1, 0.9)]
     seen = [fly(planner, team) for _ in range(30)]
     assert min(np.linalg.norm(place[:2] - [4.2, 6.3]) for place in seen if place is not None) < 1e-6
+
+
+def test_a_decision_has_the_places_that_follow_in_their_order():
+    team, planner = field(starts=((1.0, 1.0, 3.0),)), make_planner('tour')
+    first = planner.decide(team).robots['robot0']
+    follow(team, first)
+    assert (first.tour[:, 2] == 3.0).all()
+    places = [tuple(place) for place in first.tour.round(6)]
+    # Straight runs are one leg, so that some are passed.
+    following = [places.index(tuple(fly(planner, team).round(6))) for _ in range(6)]
+    assert following == sorted(set(following)) and following[0] < 3 < following[-1]
 
 
 def test_a_tour_ends_where_an_obstacle_hides_a_part():

@@ -1,12 +1,15 @@
 """RViz's files: each topic is there, and its quality of service fits the publisher's."""
 
+import numpy as np
 import pytest
 import yaml
 from node_kinds import KINDS
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.ros.conversions import MarkerBoard
+from maasi_planner.conversions import planner_markers
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.rviz_view import view_text
 
@@ -48,6 +51,17 @@ def test_every_display_fits_its_publisher(context, scenario, kinds):
 def publishers(node, topic):
     own = node.get_name()
     return [item for item in node.get_publishers_info_by_topic(topic) if item.node_name == own]
+
+
+def test_a_tour_is_a_line_from_the_waypoint_through_the_places_that_follow():
+    place, way = np.zeros(3), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 2.0]])
+    tours = {'a': np.array([[1.0, 3.0, 2.0], [4.0, 3.0, 2.0]]), 'b': np.zeros((0, 3))}
+    shown = {name: (place, way[-1], way, tour) for name, tour in tours.items()}
+    markers = planner_markers(shown, dict.fromkeys(tours, '#0072B2'), Header(), 1.0).markers
+    full, empty = (marker for marker in markers if marker.ns == 'tours')
+    points = [[point.x, point.y, point.z] for point in full.points]
+    assert points == [[1.0, 0.0, 2.0], *tours['a'].tolist()] and full.action == Marker.ADD
+    assert empty.action == Marker.DELETE
 
 
 def test_the_first_markers_clear_and_later_ones_replace_those_before():

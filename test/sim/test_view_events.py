@@ -4,22 +4,32 @@ import base64
 import gzip
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseArray
 from nav_msgs.msg import OccupancyGrid
-from std_msgs.msg import String
+from rclpy.serialization import serialize_message
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from std_msgs.msg import Header, String
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs import msg
+from maasi_planner.conversions import decision_to_ros
+from maasi_planner.motion import RobotState, make_motion
+from maasi_planner.settings import MotionSettings
+from maasi_planner.team import Decision, single_choice
+from maasi_sim.run.bag import BagWriter, load_types
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog, line, thin
 from maasi_sim.run.view.event_maker import ENDED, LEFT, SILENT, EventMaker
-from maasi_sim.run.view.messages import MessageEvents
+from maasi_sim.run.view.messages import MessageEvents, read_events
 from maasi_sim.run.view.scene import empty_scene, scene_of, scene_of_facts
 from maasi_sim.search import search
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def state(seconds, **fields):
@@ -125,6 +135,40 @@ def test_candidates_that_are_not_allowed_have_no_objective(taken):
     (plan,) = taken.of('plan')
     assert plan[3:5] == ['maasi', 0.25]
     assert [item[6:] for item in plan[7][0][4]] == [[None, 0, 0], [0.5, 7, 2]]
+
+
+def types_without_tours():
+    text = (ROOT / 'maasi_msgs/msg/RobotDecision.msg').read_text()
+    kept = [line for line in text.splitlines() if ' tour ' not in line]
+    assert len(kept) == len(text.splitlines()) - 1
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name in ('Candidate', 'PlanDecision'):
+        content = (ROOT / f'maasi_msgs/msg/{name}.msg').read_text()
+        store.register(get_types_from_msg(content, f'maasi_msgs/msg/{name}'))
+    store.register(get_types_from_msg('\n'.join(kept), 'maasi_msgs/msg/RobotDecision'))
+    return store
+
+
+def test_the_rest_of_a_tour_is_recorded_and_recordings_without_it_are_read(tmp_path):
+    points = np.array([[1.0, 2.0, 3.0]])
+    motion = make_motion(MotionSettings(speed=1.0), None, 0.1)
+    prediction = motion.predict(RobotState.at_rest((0.0, 0.0, 3.0)), points, 0.1)
+    for name, types, tour in (
+        ('now', load_types(), [[4.0, 2.0, 3.0], [4.0, 5.0, 3.0]]),
+        ('before', types_without_tours(), []),
+    ):
+        robot = single_choice(points, prediction, 0, '')
+        robot.tour = np.array(tour).reshape(-1, 3)
+        decided = Decision(0, {'rover': robot})
+        made = decision_to_ros(decided, {'rover': 3}, 'tour', 0, 0.0, Header())
+        data = serialize_message(made)
+        with BagWriter(tmp_path / name, types) as writer:
+            writer.add_topic('/decisions', 'maasi_msgs/msg/PlanDecision')
+            # The length of the list is what is last.
+            writer.write('/decisions', 0, data if tour else data[:-4])
+        (plan,) = [event for event in read_events(tmp_path / name).events if event[1] == 'plan']
+        (row,) = plan[7]
+        assert row[:4] == ['rover', 3, 0, [1.0, 2.0, 3.0]] and row[6] == tour
 
 
 def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario(taken):

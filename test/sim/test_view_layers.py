@@ -126,6 +126,26 @@ def test_the_dark_goes_as_the_field_of_view_moves_and_stays_away_where_it_was_me
         assert sum(here) > sum(beside) + 30
 
 
+def test_the_rest_of_a_tour_is_a_thin_line_in_the_colour_of_its_robot(chromium, opened):
+    blue = {}
+    for tour in ([], [[3.0, 1.0, 0.0], [3.0, 3.0, 0.0]]):
+        row = ['rover', 0, 0, [2.0, 1.0, 0.0], [], '', tour]
+        events = [
+            [0.0, 'robot', 'rover', [1.0, 1.0, 0.0, 0.0], 1.0, 1, ''],
+            [0.0, 'plan', '', 'tour', 0.0, 0.0, '', [row]],
+        ]
+        with chromium() as shown:
+            opened(shown, PLANE, *events)
+            shown.seek(0.0)
+            (x, low), (_, high) = place(shown, 3.0, 1.2), place(shown, 3.0, 2.8)
+            strip = picture(shown)[round(high) : round(low), round(x) - 3 : round(x) + 4, :3]
+            near = np.abs(strip - BLUE).max(axis=2) < 150
+            blue[bool(tour)] = near.any(axis=1).mean()
+            assert near.all(axis=1).sum() == 0
+            assert ('rest of its tour' in shown.page.inner_text('#legend')) == bool(tour)
+    assert blue[False] == 0.0 and 0.2 < blue[True] < 0.8
+
+
 def test_a_ring_runs_out_from_what_is_found_unless_motion_is_to_be_reduced(chromium, opened):
     run = moving({'kind': 'exponential', 'turns': False, 'gain': 0.9, 'size': [0.3, 0.3]})
     green = {}

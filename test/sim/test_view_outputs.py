@@ -94,8 +94,8 @@ def test_a_video_shows_where_a_robot_points_what_it_sees_and_where_it_goes(tmp_p
     scene = scene_of('plane', load_mission('mambo').scenario)
     robot = scene['robots']['mambo']
 
-    def still(yaw=0.0, detections=()):
-        row = ['mambo', 0, 0, [2.0, 0.5, 1.0], [], '']
+    def still(yaw=0.0, detections=(), tour=()):
+        row = ['mambo', 0, 0, [2.0, 0.5, 1.0], [], '', list(tour)]
         events = [
             [0.0, 'robot', 'mambo', [0.5, 0.5, 1.0, yaw], 1.0, 1, ''],
             [0.0, 'seen', 'mambo', [0.5, 0.5, 1.0], detections],
@@ -112,6 +112,10 @@ def test_a_video_shows_where_a_robot_points_what_it_sees_and_where_it_goes(tmp_p
         assert np.abs(unseeing - other).max() > least
     # A robot and its waypoint in the robot's colour, which is blue.
     assert np.diff(np.flatnonzero(bluish(unseeing).any(axis=0))).max() > 100
+    # A thin line from the waypoint to where it goes next.
+    del robot['fence']
+    toured = still(tour=[[1.0, 1.5, 1.0]])
+    assert np.abs(toured - still()).max(axis=2).any(axis=1).sum() > 100
 
 
 @pytest.fixture
@@ -193,7 +197,7 @@ def test_a_replay_plays_by_itself_and_says_what_happens_to_its_end(chromium, sea
 def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chromium, searched):
     path, log = searched
     decision = next(event for event in log.events if event[1] == 'plan')[7][0]
-    name, _, chosen, waypoint, candidates, _ = decision
+    name, _, chosen, waypoint, candidates, *_ = decision
     with chromium() as shown:
         page = shown.page
         shown.open(path.as_uri())

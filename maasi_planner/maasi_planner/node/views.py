@@ -55,9 +55,10 @@ class PlannerViews:
             )
         shown = {}
         for name, robot in robots.items():
-            path = coordinator.plans[name].positions
+            plan = coordinator.plans[name]
             place = np.asarray(robot.state.pose.position)
-            shown[name] = (place, path[-1] if len(path) else place, path)
+            waypoint = plan.positions[-1] if len(plan.positions) else place
+            shown[name] = (place, waypoint, plan.positions, plan.tour)
         # Of the whole team, so that a robot that plans for itself has its colour of the team.
         tints = robot_colours([*coordinator.names, *self._node.settings.others])
         markers = planner_markers(shown, tints, header, self._size)

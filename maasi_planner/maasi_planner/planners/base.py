@@ -98,6 +98,7 @@ def _problem_of(robot: RobotDecision, area: Area) -> str:
     terms = ('control_cost', 'target_refinement', 'exploration', 'objective')
     rows, steps = np.shape(robot.candidates)[:1], np.shape(robot.positions)[:1]
     shapes = {'waypoint': (3,), 'positions': (*steps, 3), 'yaws': steps, 'candidates': (*rows, 3)}
+    shapes['tour'] = (*np.shape(robot.tour)[:1], 3)
     shapes |= dict.fromkeys((*terms, 'lengths', 'measurements'), rows)
     for field, shape in shapes.items():
         value = getattr(robot, field)

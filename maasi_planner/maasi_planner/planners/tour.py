@@ -220,7 +220,10 @@ class Tour(Planner):
             if usable:
                 self._target[name] = (place if whole else waypoint)[:d]
                 reason = f'next place of its tour, prize {prizes[index]:.3g}, {len(way)} to follow'
-                return single_choice(point, prediction, 0, reason)
+                chosen = single_choice(point, prediction, 0, reason)
+                chosen.tour = np.tile(place, (len(way), 1))
+                chosen.tour[:, :d] = self._points[way]
+                return chosen
         return None
 
     def _straight(self, here: FloatArray, index: int, following: int) -> bool:

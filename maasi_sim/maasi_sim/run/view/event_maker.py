@@ -20,6 +20,7 @@ MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
 _ACTIVITIES = ('searching', 'returning', 'recharging')  # of a `CuboidDecision`
 _SILENCE = 3.0  # a robot is silent when others say where they are for so long without it [s]
 _MOST_POINTS = 40  # points of a planned way that are shown
+_MOST_PLACES = 200  # of a tour
 
 
 def padded(values: ArrayLike) -> FloatArray:
@@ -221,7 +222,8 @@ class EventMaker:
                 for values in np.column_stack(columns).tolist()
             ]
             waypoint = self._place(robot.waypoint)
-            rows.append([name, indices[name], robot.chosen, waypoint, candidates, robot.reason])
+            row = [name, indices[name], robot.chosen, waypoint, candidates, robot.reason]
+            rows.append([*row, list(map(self._place, robot.tour[:_MOST_PLACES]))])
             words = f'to {_words(waypoint)}'
             if robot.stays:
                 words = f'stays: {robot.reason or decision.reason or "no candidate"}'

@@ -266,8 +266,10 @@ class MessageEvents:
             places = np.array([point(row.position) for row in item.candidates]).reshape(-1, 3)
             # Planned ways are messages of their own.
             way, waypoint = np.zeros((0, 3)), np.array(point(item.waypoint))
+            # Recordings of earlier versions have no tours.
+            tour = np.array([point(place) for place in getattr(item, 'tour', ())]).reshape(-1, 3)
             robots[item.robot] = RobotDecision(
-                int(item.chosen), waypoint, way, way[:, 0], places, **columns, reason=''
+                int(item.chosen), waypoint, way, way[:, 0], places, **columns, reason='', tour=tour
             )
         indices = {item.robot: int(item.decision) for item in message.robots}
         decision = Decision(message.step, robots, message.objective, reason=message.reason)

@@ -16,7 +16,7 @@ REPLAY = 'replay.html'
 # Each uses only what is before it.
 _MODULES = (
     'run_log camera colours text words shapes labels floor_grid unexplored belief robots buildings '
-    'map why panels pictures legend marks strips tips curve live main'
+    'map why panels pictures legend marks strips tips curve live earth drawing main'
 )
 
 

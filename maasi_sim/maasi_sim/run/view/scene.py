@@ -52,6 +52,7 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
             if obstacle.centre
         ],
         'zones': zones_of(area),
+        'origin': scenario.environment.origin and scenario.environment.origin.model_dump(),
         # Mean over the bounds of what is shown as unexplored, before the search.
         'whole': round(whole / float(unseen.density.max()), 6),
         'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},

@@ -64,8 +64,9 @@ class Moments:
         #: Last event by kind, then by owner; detections of the last moments.
         self.last: dict[str, dict[str, Event]] = defaultdict(dict)
         self.seen: list[Event] = []
-        #: By robot: its way so far, and where it is sent, None: it stays.
+        #: By robot: its way so far, its tour, and where it is sent, None: it stays.
         self.ways: dict[str, list[list[float]]] = defaultdict(list)
+        self.tours: dict[str, list[list[float]]] = {}
         self.waypoints: dict[str, list[float] | None] = {}
         #: Cuboids visited.
         self.visited: set[int] = set()
@@ -86,8 +87,9 @@ class Moments:
             elif kind == 'seen':
                 self.seen.append(event)
             elif kind == 'plan':
-                for name, _, chosen, waypoint, *_ in content[4]:
+                for name, _, chosen, waypoint, _, _, *tour in content[4]:
                     self.waypoints[name] = waypoint if chosen >= 0 else None
+                    self.tours[name] = [waypoint, *chain(*tour)]
             elif kind == 'cuboid':
                 self.visited |= {shot[0] for shot in content[5]}
         self.seen = [event for event in self.seen if event[0] >= time - _FADE]
@@ -314,6 +316,7 @@ class Sheet:
         if status == MOVING:
             self._line(now.last['way'].get(name, [[]])[-1], '--', color=colour, lw=1.3)
             self._line(now.waypoints.get(name) or [], 's', color=colour, ms=8, mfc='none')
+            self._line(now.tours.get(name, []), '--', color=colour, lw=0.6)
         if size == 3 and not away:
             # How high it is.
             foot = [*place[:2], self.bounds[2, 0]]

@@ -11,6 +11,7 @@ function entries(log, time, selected, layers) {
   const isEmpty = !(log.potential.at(time) >= 0.005);
   const robots = Object.values(log.scene.robots);
   const hasZone = (kind) => log.zones(time).some((zone) => zone.kind === kind);
+  const hasTour = log.robots().some((name) => ((log.at('decision', name, time) || {}).robot || [])[6]?.length);
   const cividis = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(scaleColour).join(', ')})`;
   const faceGradient = `linear-gradient(90deg, ${faceColour(0)}, ${faceColour(1)})`;
   const of = (...list) => list.filter(Boolean);
@@ -38,6 +39,7 @@ function entries(log, time, selected, layers) {
     ...ways,
     ['dash', '', 'planned way'],
     ['box', '', 'its waypoint'],
+    hasTour && ['thin', '', 'rest of its tour'],
     robots.some((robot) => robot.view) && ['dotbox', '', 'field of view'],
     ['ring', FOUND, 'found (3 sigma)'],
     ['ring', POTENTIAL, 'potential target (its mass)'],

@@ -2,6 +2,7 @@
 
 import { Camera } from './camera.js';
 import { Curve } from './curve.js';
+import { Drawing } from './drawing.js';
 import { follow, showControls, updateControls } from './live.js';
 import { MapView } from './map.js';
 import { showLegend } from './legend.js';
@@ -34,6 +35,7 @@ class Page {
     this.camera = new Camera();
     this.map = new MapView($('map'), this.camera);
     this.curve = new Curve($('curve'));
+    this.drawing = new Drawing($('tools'), $('drawing'), this);
     this.fitted = false;
   }
 
@@ -104,6 +106,7 @@ class Page {
     for (const button of $('layers').querySelectorAll('[data-layer]')) {
       button.hidden = log.isOfBuildings && button.dataset.layer !== 'ways';
     }
+    $('tools').hidden = log.isOfBuildings;
     $('curve_title').textContent = log.isOfBuildings ? 'Cuboids visited' : `Found and ${log.knowsExpected ? 'expected' : 'potential'}`;
     this.fitted = false;
     this.changed = true;
@@ -179,7 +182,7 @@ class Page {
       ArrowDown: () => this.step(-1),
       Home: () => this.seek(0),
       End: () => this.seek(this.log.duration),
-      Escape: () => this.select(null),
+      Escape: () => (this.drawing.kind ? this.drawing.start(null) : this.select(null)),
     };
     const action = actions[event.key];
     if (!action || (event.key === ' ' && tag === 'BUTTON')) return;
@@ -230,6 +233,10 @@ class Page {
   }
 
   choose(x, y) {
+    if (this.drawing.kind) {
+      this.drawing.click(x, y);
+      return;
+    }
     const hit = this.map.hit(x, y);
     if (!hit) this.select(null);
     else if (hit.robot) this.select(hit.robot);
@@ -356,6 +363,7 @@ class Page {
     // Above a second of a fast replay, too.
     this.map.pulse = reducedMotion.matches ? 0 : Math.max(4, 1.2 * Number($('speed').value));
     this.map.draw(log, time, this.selected);
+    this.drawing.draw(this.map);
     this.curve.draw(log, time);
     showNumbers($('numbers'), log, time);
     showRobots($('robots').tBodies[0], log, time, this.selected, (name) => this.select(name));

@@ -39,7 +39,7 @@ export function drawWays(view, log, time) {
   context.lineWidth = 1;
 }
 
-// The planned way (dashed), and its waypoint (square).
+// The planned way (dashed), its waypoint (square), and the rest of its tour (thin).
 function drawPlan(view, log, time, name, here) {
   const { context, camera } = view;
   const way = log.at('way', name, time);
@@ -53,6 +53,12 @@ function drawPlan(view, log, time, name, here) {
   }
   context.setLineDash([]);
   if (waypoint) {
+    context.lineWidth = 1;
+    context.setLineDash([3, 4]);
+    path(context, camera, [waypoint, ...(decision.robot[6] || [])]);
+    context.stroke();
+    context.setLineDash([]);
+    context.lineWidth = 2;
     const [x, y] = camera.project(waypoint);
     context.strokeRect(x - 5, y - 5, 10, 10);
     dropLine(context, camera, waypoint, view.floor);

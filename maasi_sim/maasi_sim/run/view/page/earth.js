@@ -1,0 +1,28 @@
+// Where places of the map are on the earth (WGS 84).
+
+const RADIUS = 6378137;
+const SQUARED_ECCENTRICITY = 0.00669437999014;
+const RADIANS = Math.PI / 180;
+
+// Return a place in axes that turn with the earth [m].
+function inSpace(longitude, latitude, altitude) {
+  const normal = RADIUS / Math.sqrt(1 - SQUARED_ECCENTRICITY * Math.sin(latitude) ** 2);
+  const level = (normal + altitude) * Math.cos(latitude);
+  return [level * Math.cos(longitude), level * Math.sin(longitude), (normal * (1 - SQUARED_ECCENTRICITY) + altitude) * Math.sin(latitude)];
+}
+
+// Return longitude and latitude [degrees] of a place [m] on the map with an origin.
+export function onEarth([x, y], { latitude, longitude, altitude }) {
+  const [east, north] = [longitude * RADIANS, latitude * RADIANS];
+  const centre = inSpace(east, north, altitude);
+  let found = [east, north];
+  // Each round leaves a hundredth of the error.
+  for (let round = 0; round < 8; round += 1) {
+    const [a, b, c] = inSpace(...found, altitude).map((value, axis) => value - centre[axis]);
+    const out = a * Math.cos(east) + b * Math.sin(east);
+    const right = b * Math.cos(east) - a * Math.sin(east);
+    const up = c * Math.cos(north) - out * Math.sin(north);
+    found = [found[0] + (x - right) / (RADIUS * Math.cos(north)), found[1] + (y - up) / RADIUS];
+  }
+  return found.map((angle) => Number((angle / RADIANS).toFixed(10)));
+}
