@@ -13,6 +13,7 @@ import numpy as np
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 
@@ -87,6 +88,9 @@ class RobotLink(ABC):
 
     def observe(self, placed: StampedPose) -> None:
         """Take note of a new pose, before it is used."""
+
+    def take_area(self, area: Area) -> None:
+        """Take note of other keep-outs."""
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Return why a waypoint (x, y, z) [m, map] is refused, or None."""

@@ -166,6 +166,11 @@ class MavlinkSettings(FlightSettings):
         default=True,
         description='Whether it is armed only if the autopilot acts by itself when the link is cut',
     )
+    fence: Literal['upload', 'none'] = Field(
+        default='upload',
+        description='Whether the area and its keep-outs are uploaded to the autopilot as its '
+        'fence, for which environment.origin is needed; what it does there are its parameters',
+    )
     origin: Literal['local', 'here'] = Field(
         default='local',
         description='What stands at the start in the map: the origin of the local frame of the '

@@ -14,9 +14,11 @@ from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, ArrivalClock, RobotNode
 from maasi_drivers.links.mavlink.estimate import Telemetry
+from maasi_drivers.links.mavlink.fence import fence_items
 from maasi_drivers.links.mavlink.link import VehicleLink
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING
 from maasi_drivers.settings.vehicles import MavlinkSettings
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 
@@ -64,6 +66,7 @@ class MavlinkRobotLink(RobotLink):
         name = f'{self.driver.namespace.replace("/", "_")}_flight_origin.json'
         memory = folder / 'maasi' / name
         self._link = VehicleLink(self._mavlink, self.driver.settings.start, memory)
+        self.take_area(self.driver.area)
 
     def connect(self) -> None:
         """Open the connection; the vehicle is armed only once the driver is active."""
@@ -85,6 +88,20 @@ class MavlinkRobotLink(RobotLink):
             problem = link.vehicle.permit(time.monotonic())
         self._ending &= bool(problem)
         return problem
+
+    def take_area(self, area: Area) -> None:
+        """Upload the fence, if the map's place on the earth is known."""
+        settings, origin, wish = self.driver.settings, area.settings.origin, self._mavlink.fence
+        turned = self._mavlink.map_yaw != 0.0 and not self._localised
+        if wish == 'none' or origin is None or turned:
+            why = 'mavlink.fence is none' if wish == 'none' else 'environment.origin is not given'
+            why = f'{why}, or x is not east there (mavlink.map_yaw)' if turned else why
+            self.driver.get_logger().info(f'fence: not uploaded: {why}')
+            return
+        # Goals may lie on the border of a box; the driver itself acts at the margin.
+        bounds = self.fence + np.array([-MARGIN, MARGIN])
+        with self._link.lock:
+            self._link.vehicle.fence.begin(fence_items(area, origin, settings.start, bounds))
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
         """Send the position that the command leads to, or its target if that is nearer."""
