@@ -25,8 +25,9 @@ BOX = np.array([[-8.0, 8.0], [-6.0, 6.0], [0.0, 5.0]])
 
 def items_of(keep_outs=(BARN, WELL), area=(BORDER, POND), start=(0.0, 0.0, 2.0)):
     place = {'area': area} if area else {'bounds': BOX[:2].tolist()}
+    place['origin'] = ORIGIN
     environment = EnvironmentSettings.model_validate(place | {'keep_outs': list(keep_outs)})
-    return fence_items(Area(environment), ORIGIN, list(start), BOX)
+    return fence_items(Area(environment), list(start), BOX)
 
 
 def play_of(firmware='arducopter', items=None, **changes):
@@ -71,7 +72,7 @@ def test_a_box_and_the_part_of_an_area_at_the_start():
 
 def test_without_the_protocol_that_is_said_and_it_flies():
     play = play_of()
-    play.autopilot.fence.supported = False
+    play.autopilot.capabilities = 0
     play.fly()
     assert 'not uploaded: the autopilot has no protocol for it' in play.said
     assert not play.sent('MISSION_COUNT') and play.autopilot.fence.items == []

@@ -220,7 +220,6 @@ class AgentDriver(RobotNode):
     def _take_area(self, area: Area) -> None:
         """Take other keep-outs; give a goal up whose way they cross: the robot stops."""
         self.area, motion, latest = area, self._motion, self.history.latest
-        self.link.take_area(area)
         goal, ways = self.follower.current, None
         if goal is not None and latest is not None:
             state = RobotState(latest.pose, latest.velocity, latest.angular_velocity)

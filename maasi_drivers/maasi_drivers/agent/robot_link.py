@@ -13,7 +13,6 @@ import numpy as np
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 
@@ -88,9 +87,6 @@ class RobotLink(ABC):
 
     def observe(self, placed: StampedPose) -> None:
         """Take note of a new pose, before it is used."""
-
-    def take_area(self, area: Area) -> None:
-        """Take note of other keep-outs."""
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Return why a waypoint (x, y, z) [m, map] is refused, or None."""

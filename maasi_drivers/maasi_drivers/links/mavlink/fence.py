@@ -1,6 +1,8 @@
 """The area of a search as the fence of an autopilot: uploaded, read back and compared."""
 
 import math
+from collections.abc import Generator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, ReportLog
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.area import Area, level_shape
 from maasi_filter.arrays import FloatArray
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.geodesy import geodetic
 
 # Command, number of corners or radius [m], latitude and longitude [1e-7 degrees].
 Item = tuple[int, float, int, int]
@@ -25,14 +27,13 @@ _PATIENCE, _TRIES, _PAUSE = 1.5, 8, 10.0
 _ROUNDING = 0.5, 0.01, 1.5, 1.5
 
 
-def fence_items(
-    area: Area, origin: OriginSettings, start: list[float], bounds: FloatArray
-) -> list[Item]:
+def fence_items(area: Area, start: list[float], bounds: FloatArray) -> list[Item]:
     """Return the border of an area, or of a box (2 or 3, 2), with its holes and keep-outs.
 
     Autopilots intersect borders, so of an area in parts only the one at the start is a border.
     """
-    zones = area.settings.keep_outs
+    zones, origin = area.settings.keep_outs, area.settings.origin
+    assert origin is not None
     parts = shapely.get_parts(area.shapes['area'] or [shapely.box(*bounds[:2].T.ravel())])
     part = min(parts, key=shapely.Point(start[:2]).distance)
     closed = shapely.get_parts([level_shape(zone) for zone in zones if zone.polygon])
@@ -48,12 +49,7 @@ def fence_items(
 
 
 class FenceUpload:
-    """Gives an autopilot its fence, and checks that it has it; times are of the steady clock [s].
-
-    By the mission protocol of MAVLink (mavlink.io, services/mission): MISSION_COUNT, each
-    MISSION_ITEM_INT when it is requested (by ArduPilot with MISSION_REQUEST), MISSION_ACK; then the
-    same the other way round.
-    """
+    """Gives an autopilot its fence, and checks that it has it; times are of the steady clock."""
 
     def __init__(self, settings: MavlinkSettings, sender: Any, log: ReportLog) -> None:
         #: Why the autopilot may have another fence; empty where it has it, or needs none.
@@ -68,13 +64,10 @@ class FenceUpload:
     def begin(self, items: list[Item] | None = None) -> None:
         """Upload a fence, or the same again."""
         self._items = self._items if items is None else items
-        self.busy, self._reason = bool(self._items), 'no answer'
-        self._enter('ask', -math.inf if self.busy else math.inf)
-
-    def _enter(self, step: str, now: float) -> None:
-        """Begin with a step: 'ask' for the protocol, 'write' or 'read' the fence."""
-        self._step, self._tries, self._due = step, 0, now
-        self._at = -1  # item that was sent or requested last
+        self.busy, self._tries = bool(self._items), 0
+        self._due = -math.inf if self.busy else math.inf
+        self._exchange = self._upload()
+        self._send, self._answers = next(self._exchange)
 
     def tick(self, now: float) -> None:
         """Send what is due."""
@@ -83,66 +76,62 @@ class FenceUpload:
         if not self.busy:
             self.begin()
         elif self._tries == _TRIES:
-            self._conclude(ERROR, f'not verified ({self._reason})', now + _PAUSE)
+            self._conclude(ERROR, 'not verified (no answer)', now)
         else:
-            self._tries += 1
-            self._send(now)
-
-    def _send(self, now: float) -> None:
-        self._due, sender, to = now + _PATIENCE, self._sender, self._vehicle
-        if self._step == 'ask':
-            what = mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
-            sender.command_long_send(*to, *what, *[0.0] * 6)
-        elif self._step == 'read' and self._at < 0:
-            sender.mission_request_list_send(*to, _FENCE)
-        elif self._step == 'read':
-            sender.mission_request_int_send(*to, self._at, _FENCE)
-        elif self._at < 0:
-            sender.mission_count_send(*to, len(self._items), _FENCE)
-        else:
-            command, number, *place = self._items[self._at]
-            head = self._at, mavlink.MAV_FRAME_GLOBAL, command, 0, 1, number
-            sender.mission_item_int_send(*to, *head, *[0.0] * 3, *place, 0.0, _FENCE)
+            self._tries, self._due = self._tries + 1, now + _PATIENCE
+            self._send()
 
     def take(self, message: Any, now: float) -> None:
-        """Take a message; those that are not an answer are left out."""
-        kind, step, last = message.get_type(), self._step, len(self._items) - 1
-        if kind == 'AUTOPILOT_VERSION' and step == 'ask':
-            if message.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE:
-                self._enter('write', now)
-            else:
-                self._conclude(WARNING, 'not uploaded: the autopilot has no protocol for it')
-        elif getattr(message, 'mission_type', None) != _FENCE or message.target_system != self._own:
-            return
-        elif step == 'write' and kind in ('MISSION_REQUEST', 'MISSION_REQUEST_INT'):
-            self._at = min(message.seq, last)
-            self._send(now)
-        elif step == 'write' and kind == 'MISSION_ACK':
-            if message.type == mavlink.MAV_MISSION_ACCEPTED and self._at == last:
-                self._enter('read', now)
-            # An item that came twice changes nothing.
-            elif message.type != mavlink.MAV_MISSION_INVALID_SEQUENCE:
-                self._at = -1
-                self._reason = mavlink.enums['MAV_MISSION_RESULT'][message.type].name
-        elif step == 'read' and kind == 'MISSION_COUNT' and self._at < 0:
-            self._compare(message.count == last + 1, 'the number of its items', now)
-        elif step == 'read' and kind == 'MISSION_ITEM_INT' and message.seq == self._at:
-            read = message.command, message.param1, message.x, message.y
-            same = np.isclose(read, self._items[self._at], 0.0, _ROUNDING).all()
-            self._compare(bool(same), f'item {self._at}', now)
+        """Take a message; what is no answer is left out."""
+        ours = getattr(message, 'target_system', self._own) == self._own
+        ours &= getattr(message, 'mission_type', _FENCE) == _FENCE
+        # An item that came twice changes nothing.
+        ours &= getattr(message, 'type', None) != mavlink.MAV_MISSION_INVALID_SEQUENCE
+        if self.busy and ours and message.get_type() in self._answers:
+            self._tries, self._due = 0, now
+            try:
+                self._send, self._answers = self._exchange.send(message)
+            except StopIteration as end:
+                self._conclude(*end.value, now)
 
-    def _compare(self, same: bool, what: str, now: float) -> None:
-        self._at, self._tries = self._at + 1, 0
-        if not same:
-            self._conclude(ERROR, f'read back, {what} differs', now + _PAUSE)
-        elif self._at < len(self._items):
-            self._send(now)
-        else:
-            self._sender.mission_ack_send(*self._vehicle, mavlink.MAV_MISSION_ACCEPTED, _FENCE)
-            self._conclude(INFO, f'uploaded and verified, {self._at} vertices and circles')
-
-    def _conclude(self, severity: int, result: str, again: float = math.inf) -> None:
+    def _conclude(self, severity: int, result: str, now: float) -> None:
         problem = f'its fence is {result}' if severity == ERROR else ''
         if not problem or problem != self.problem:
             self._log.add(severity, f'fence: {result}')
-        self.problem, self.busy, self._step, self._due = problem, False, '', again
+        self.problem, self.busy = problem, False
+        self._due = now + _PAUSE if problem else math.inf
+
+    def _upload(self) -> Generator[Any, Any, tuple[int, str]]:
+        """Yield what to send and what answers it, by MAVLink's mission protocol, there and back."""
+        sender, to, items = self._sender, self._vehicle, self._items
+        what = mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        ask = partial(sender.command_long_send, *to, *what, *[0.0] * 6)
+        version = yield ask, ('AUTOPILOT_VERSION',)
+        if not version.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE:
+            return WARNING, 'not uploaded: the autopilot has no protocol for it'
+        left, send = len(items), partial(sender.mission_count_send, *to, len(items), _FENCE)
+        while True:
+            # ArduPilot has the older request.
+            answer = yield send, ('MISSION_REQUEST', 'MISSION_REQUEST_INT', 'MISSION_ACK')
+            if answer.get_type() != 'MISSION_ACK' and answer.seq < len(items):
+                left, (command, size, *place) = len(items) - 1 - answer.seq, items[answer.seq]
+                head = answer.seq, mavlink.MAV_FRAME_GLOBAL, command, 0, 1, size, 0.0, 0.0, 0.0
+                send = partial(sender.mission_item_int_send, *to, *head, *place, 0.0, _FENCE)
+            # Where the last answer was lost, another one comes: what is read decides.
+            elif left == 0:
+                break
+            elif getattr(answer, 'type', 0) != mavlink.MAV_MISSION_ACCEPTED:
+                why = mavlink.enums['MAV_MISSION_RESULT'][answer.type].name
+                return ERROR, f'not verified ({why})'
+        count = yield partial(sender.mission_request_list_send, *to, _FENCE), ('MISSION_COUNT',)
+        if count.count != len(items):
+            return ERROR, 'read back, the number of its items differs'
+        for number, item in enumerate(items):
+            send = partial(sender.mission_request_int_send, *to, number, _FENCE)
+            while (answer := (yield send, ('MISSION_ITEM_INT',))).seq != number:
+                pass
+            read = answer.command, answer.param1, answer.x, answer.y
+            if not np.isclose(read, item, 0.0, _ROUNDING).all():
+                return ERROR, f'read back, item {number} differs'
+        sender.mission_ack_send(*to, mavlink.MAV_MISSION_ACCEPTED, _FENCE)
+        return INFO, f'uploaded and verified, {len(items)} vertices and circles'

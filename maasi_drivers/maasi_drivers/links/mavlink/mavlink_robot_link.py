@@ -58,6 +58,7 @@ class MavlinkRobotLink(RobotLink):
         self._telemetry: Telemetry | None = None
         self._heading: float | None = None
         self._ending = False
+        self._fenced: Area | None = None  # the area that the autopilot has
         self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], self._mavlink)
 
     def prepare(self) -> None:
@@ -66,7 +67,6 @@ class MavlinkRobotLink(RobotLink):
         name = f'{self.driver.namespace.replace("/", "_")}_flight_origin.json'
         memory = folder / 'maasi' / name
         self._link = VehicleLink(self._mavlink, self.driver.settings.start, memory)
-        self.take_area(self.driver.area)
 
     def connect(self) -> None:
         """Open the connection; the vehicle is armed only once the driver is active."""
@@ -88,20 +88,6 @@ class MavlinkRobotLink(RobotLink):
             problem = link.vehicle.permit(time.monotonic())
         self._ending &= bool(problem)
         return problem
-
-    def take_area(self, area: Area) -> None:
-        """Upload the fence, if the map's place on the earth is known."""
-        settings, origin, wish = self.driver.settings, area.settings.origin, self._mavlink.fence
-        turned = self._mavlink.map_yaw != 0.0 and not self._localised
-        if wish == 'none' or origin is None or turned:
-            why = 'mavlink.fence is none' if wish == 'none' else 'environment.origin is not given'
-            why = f'{why}, or x is not east there (mavlink.map_yaw)' if turned else why
-            self.driver.get_logger().info(f'fence: not uploaded: {why}')
-            return
-        # Goals may lie on the border of a box; the driver itself acts at the margin.
-        bounds = self.fence + np.array([-MARGIN, MARGIN])
-        with self._link.lock:
-            self._link.vehicle.fence.begin(fence_items(area, origin, settings.start, bounds))
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
         """Send the position that the command leads to, or its target if that is nearer."""
@@ -181,6 +167,8 @@ class MavlinkRobotLink(RobotLink):
             fault = f'link: {link.failure}' if link.failure else vehicle.fault
             charge, reports = estimate.charge, estimate.charge_reports
             telemetry, self._local_origin = estimate.telemetry, estimate.origin
+        if self._fenced is not driver.area:
+            self._upload_fence()
         self._log_reports()
         self._arrivals.observe(time.monotonic(), driver.get_clock().now().nanoseconds)
         if not driver.active:
@@ -202,6 +190,19 @@ class MavlinkRobotLink(RobotLink):
         if telemetry is not None and telemetry is not self._telemetry:
             self._telemetry = telemetry
             self._take_telemetry(telemetry)
+
+    def _upload_fence(self) -> None:
+        area, settings, mavlink = self.driver.area, self.driver.settings, self._mavlink
+        self._fenced = area
+        turned = mavlink.map_yaw != 0.0 and not self._localised
+        if mavlink.fence == 'none' or area.settings.origin is None or turned:
+            needs = 'mavlink.fence: upload, environment.origin, mavlink.map_yaw: 0'
+            self.driver.get_logger().info(f'fence: not uploaded, which needs {needs}')
+            return
+        # Goals may lie on the border of a box; the driver itself acts at the margin.
+        bounds = self.fence + np.array([-MARGIN, MARGIN])
+        with self._link.lock:
+            self._link.vehicle.fence.begin(fence_items(area, settings.start, bounds))
 
     def _log_reports(self) -> None:
         with self._link.lock:

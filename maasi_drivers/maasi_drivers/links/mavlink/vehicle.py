@@ -343,10 +343,7 @@ class Vehicle(Autopilot):
             problem = self.failsafes.problem(now) or self.fence.problem
             if problem:
                 self._permission.end()
-            elif self.fence.busy:
-                self._detail = 'its fence is uploaded'
-                return
-            elif permitted:
+            elif permitted and not self.fence.busy:
                 self._target, self._yaw = self._position(), None
                 self._enter(VehiclePhase.STARTING)
                 return

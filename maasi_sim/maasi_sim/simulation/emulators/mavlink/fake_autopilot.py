@@ -31,7 +31,6 @@ from maasi_sim.simulation.emulators.mavlink.autopilot_settings import (
     WHOLE_NUMBERS,
     AutopilotSettings,
 )
-from maasi_sim.simulation.emulators.mavlink.fake_fence import FakeFence
 from maasi_sim.simulation.emulators.mavlink.flight_model import FlightModel
 
 _DISARM_DELAY = 10.0  # ArduCopter disarms on the ground after so long [s]
@@ -68,6 +67,7 @@ class FakeAutopilot:
             settings.acceleration,
         )
         self.now = 0.0
+        self.capabilities = 0
         self.armed = False
         self.crashed = ''
         self.charge = settings.charge
@@ -79,7 +79,6 @@ class FakeAutopilot:
         # Error of the estimated height, and true place of the EKF's origin [m].
         self.height_error = 0.0
         self.origin = np.zeros(3)
-        self.fence = FakeFence(sender)
         self._sender = sender
         self._generator = generator
         self._home = 0.0  # true height at arming [m]
@@ -144,7 +143,6 @@ class FakeAutopilot:
             if self.body.submarine:
                 self.origin[2] = 0.0  # depths are from the surface
             self.say(6, 'EKF3 IMU0 is using GPS')
-        self.fence.advance(self.now)
         self._move(dt)
         self._look_after_failsafes(dt)
         for name, send in _MESSAGES.items():
@@ -327,15 +325,9 @@ class FakeAutopilot:
             self.periods[known.msgname] = 1e-6 * message.param2
         return int(_ACCEPTED)
 
-    def _send_version(self, message: Any) -> int:
-        if message.param1 != mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
-            return int(mavlink.MAV_RESULT_UNSUPPORTED)
-        able = mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE * self.fence.supported
-        self._sender.autopilot_version_send(able, *[0] * 4, *[[0] * 8] * 3, 0, 0, 0)
+    def _send_version(self, _: Any) -> int:
+        self._sender.autopilot_version_send(self.capabilities, *[0] * 4, *[[0] * 8] * 3, 0, 0, 0)
         return int(_ACCEPTED)
-
-    def _on_fence(self, message: Any) -> None:
-        self.fence.handle(message, self.now)
 
     def _set_mode(self, message: Any) -> int:
         mode = int(message.param2)
@@ -417,7 +409,6 @@ _HANDLERS: dict[str, Callable[[FakeAutopilot, Any], None]] = {
     'PARAM_REQUEST_READ': FakeAutopilot._on_read,
     'COMMAND_LONG': FakeAutopilot._on_command,
     'SET_POSITION_TARGET_LOCAL_NED': FakeAutopilot._on_setpoint,
-    **dict.fromkeys(FakeFence.messages, FakeAutopilot._on_fence),
 }
 _COMMANDS: dict[int, Callable[[FakeAutopilot, Any], int]] = {
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: FakeAutopilot._set_interval,
