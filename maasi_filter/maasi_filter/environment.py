@@ -86,8 +86,7 @@ class PriorSettings(Settings):
 
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
-        default=None,
-        description='File of densities, first row north: .npy or an image',
+        default=None, description='File of densities, first row north: .npy or an image'
     )
     extent: list[Vector2] | None = Field(
         default=None,

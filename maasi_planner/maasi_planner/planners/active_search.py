@@ -16,13 +16,7 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.planners.base import (
-    Planner,
-    all_apart,
-    explain,
-    search_jointly,
-    usable_options,
-)
+from maasi_planner.planners.base import Planner, all_apart, explain, search_jointly, usable_options
 from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
 from maasi_planner.team import (
     Decision,

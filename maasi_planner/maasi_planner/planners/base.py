@@ -18,14 +18,7 @@ from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import (
-    Decision,
-    RobotDecision,
-    RobotView,
-    TeamView,
-    UsableCandidates,
-    stay,
-)
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, UsableCandidates, stay
 
 
 class Planner(ABC):
@@ -213,9 +206,7 @@ def options_of(
 
 
 def usable_options(
-    team: TeamView,
-    decision: Decision,
-    extra: Callable[[str], FloatArray | None] = lambda _: None,
+    team: TeamView, decision: Decision, extra: Callable[[str], FloatArray | None] = lambda _: None
 ) -> dict[str, UsableCandidates]:
     """Return the candidates of the robots that have some; the others stay in `decision`.
 

@@ -38,7 +38,7 @@ def fence_items(area: Area, start: list[float], bounds: FloatArray) -> list[Item
     part = min(parts, key=shapely.Point(start[:2]).distance)
     closed = shapely.get_parts([level_shape(zone) for zone in zones if zone.polygon])
     outside = [*part.interiors, *(polygon.exterior for polygon in closed)]
-    rows = []
+    rows: list[Any] = []
     for command, ring in [(_INSIDE, part.exterior), *((_OUTSIDE, ring) for ring in outside)]:
         corners = shapely.get_coordinates(ring)[:-1]
         rows += [(command, len(corners), corner) for corner in corners]
@@ -76,7 +76,7 @@ class FenceUpload:
         if not self.busy:
             self.begin()
         elif self._tries == _TRIES:
-            self._conclude(ERROR, 'not verified (no answer)', now)
+            self._conclude(now, ERROR, 'not verified (no answer)')
         else:
             self._tries, self._due = self._tries + 1, now + _PATIENCE
             self._send()
@@ -92,9 +92,9 @@ class FenceUpload:
             try:
                 self._send, self._answers = self._exchange.send(message)
             except StopIteration as end:
-                self._conclude(*end.value, now)
+                self._conclude(now, *end.value)
 
-    def _conclude(self, severity: int, result: str, now: float) -> None:
+    def _conclude(self, now: float, severity: int, result: str) -> None:
         problem = f'its fence is {result}' if severity == ERROR else ''
         if not problem or problem != self.problem:
             self._log.add(severity, f'fence: {result}')
@@ -121,8 +121,8 @@ class FenceUpload:
             elif left == 0:
                 break
             elif getattr(answer, 'type', 0) != mavlink.MAV_MISSION_ACCEPTED:
-                why = mavlink.enums['MAV_MISSION_RESULT'][answer.type].name
-                return ERROR, f'not verified ({why})'
+                known = mavlink.enums['MAV_MISSION_RESULT'].get(answer.type)
+                return ERROR, f'not verified ({known.name if known else answer.type})'
         count = yield partial(sender.mission_request_list_send, *to, _FENCE), ('MISSION_COUNT',)
         if count.count != len(items):
             return ERROR, 'read back, the number of its items differs'
