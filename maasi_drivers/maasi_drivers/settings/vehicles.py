@@ -167,9 +167,7 @@ class MavlinkSettings(FlightSettings):
         description='Whether it is armed only if the autopilot acts by itself when the link is cut',
     )
     fence: Literal['upload', 'none'] = Field(
-        default='upload',
-        description='Whether the area and its keep-outs are uploaded to the autopilot as its '
-        'fence, for which environment.origin is needed; what it does there are its parameters',
+        default='upload', description='Whether the area is its fence; needs environment.origin'
     )
     origin: Literal['local', 'here'] = Field(
         default='local',

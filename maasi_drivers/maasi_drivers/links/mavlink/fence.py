@@ -20,6 +20,7 @@ Item = tuple[int, float, int, int]
 _FENCE = mavlink.MAV_MISSION_TYPE_FENCE
 _INSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
 _OUTSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION
+_TWICE = mavlink.MAV_MISSION_INVALID_SEQUENCE  # of an item that came twice, to be ignored
 _ROUND = mavlink.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION
 # Silence after which a message is sent again, how often, and time until the next attempt [s, 1, s].
 _PATIENCE, _TRIES, _PAUSE = 1.5, 8, 10.0
@@ -28,13 +29,11 @@ _ROUNDING = 0.5, 0.01, 1.5, 1.5
 
 
 def fence_items(area: Area, start: list[float], bounds: FloatArray) -> list[Item]:
-    """Return the border of an area, or of a box (2 or 3, 2), with its holes and keep-outs.
-
-    Autopilots intersect borders, so of an area in parts only the one at the start is a border.
-    """
+    """Return the border of an area, or of a box (2 or 3, 2), with its holes and keep-outs."""
     zones, origin = area.settings.keep_outs, area.settings.origin
     assert origin is not None
     parts = shapely.get_parts(area.shapes['area'] or [shapely.box(*bounds[:2].T.ravel())])
+    # Autopilots intersect borders: of an area in parts the one at the start counts.
     part = min(parts, key=shapely.Point(start[:2]).distance)
     closed = shapely.get_parts([level_shape(zone) for zone in zones if zone.polygon])
     outside = [*part.interiors, *(polygon.exterior for polygon in closed)]
@@ -55,7 +54,6 @@ class FenceUpload:
         #: Why the autopilot may have another fence; empty where it has it, or needs none.
         self.problem = ''
         self._items: list[Item] = []
-        self._own = settings.own_system
         self._vehicle = settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1
         self._sender = sender
         self._log = log
@@ -83,10 +81,10 @@ class FenceUpload:
 
     def take(self, message: Any, now: float) -> None:
         """Take a message; what is no answer is left out."""
-        ours = getattr(message, 'target_system', self._own) == self._own
+        own = self._sender.srcSystem
+        ours = getattr(message, 'target_system', own) == own
         ours &= getattr(message, 'mission_type', _FENCE) == _FENCE
-        # An item that came twice changes nothing.
-        ours &= getattr(message, 'type', None) != mavlink.MAV_MISSION_INVALID_SEQUENCE
+        ours &= getattr(message, 'type', None) != _TWICE
         if self.busy and ours and message.get_type() in self._answers:
             self._tries, self._due = 0, now
             try:
@@ -123,8 +121,8 @@ class FenceUpload:
             elif getattr(answer, 'type', 0) != mavlink.MAV_MISSION_ACCEPTED:
                 known = mavlink.enums['MAV_MISSION_RESULT'].get(answer.type)
                 return ERROR, f'not verified ({known.name if known else answer.type})'
-        count = yield partial(sender.mission_request_list_send, *to, _FENCE), ('MISSION_COUNT',)
-        if count.count != len(items):
+        announced = yield partial(sender.mission_request_list_send, *to, _FENCE), ('MISSION_COUNT',)
+        if announced.count != len(items):
             return ERROR, 'read back, the number of its items differs'
         for number, item in enumerate(items):
             send = partial(sender.mission_request_int_send, *to, number, _FENCE)

@@ -192,9 +192,8 @@ class MavlinkRobotLink(RobotLink):
             self._take_telemetry(telemetry)
 
     def _upload_fence(self) -> None:
-        area, settings, mavlink = self.driver.area, self.driver.settings, self._mavlink
-        self._fenced = area
-        turned = mavlink.map_yaw != 0.0 and not self._localised
+        area, mavlink = self.driver.area, self._mavlink
+        self._fenced, turned = area, mavlink.map_yaw != 0.0 and not self._localised
         if mavlink.fence == 'none' or area.settings.origin is None or turned:
             needs = 'mavlink.fence: upload, environment.origin, mavlink.map_yaw: 0'
             self.driver.get_logger().info(f'fence: not uploaded, which needs {needs}')
@@ -202,7 +201,8 @@ class MavlinkRobotLink(RobotLink):
         # Goals may lie on the border of a box; the driver itself acts at the margin.
         bounds = self.fence + np.array([-MARGIN, MARGIN])
         with self._link.lock:
-            self._link.vehicle.fence.begin(fence_items(area, settings.start, bounds))
+            items = fence_items(area, self.driver.settings.start, bounds)
+            self._link.vehicle.fence.begin(items)
 
     def _log_reports(self) -> None:
         with self._link.lock:
