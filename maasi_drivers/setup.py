@@ -21,6 +21,7 @@ setup(
         'pydantic>=2.7',
         'PyYAML>=6.0.1',
         'scipy>=1.11.4',
+        'shapely>=2.0',
     ],
     extras_require={
         'calibration': ['rosbags>=0.11.5'],
@@ -35,18 +36,12 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'mambo_driver = maasi_entry:mambo_driver',
-            'turtlebot_driver = maasi_entry:turtlebot_driver',
-            'plugin_driver = maasi_entry:plugin_driver',
-            'ranging_driver = maasi_entry:ranging_driver',
-            'measurement_feed_sender = maasi_entry:measurement_feed_sender',
-            'mavlink_driver = maasi_entry:mavlink_driver',
-            'mavlink_camera_driver = maasi_entry:mavlink_camera_driver',
-            'calibrate_sensor = maasi_entry:calibrate_sensor',
-            'mambo_onboard_driver = maasi_entry:mambo_onboard_driver',
-            'robot_command = maasi_entry:robot_command',
-            'measure_mambo = maasi_entry:measure_mambo',
-            'guard_node = maasi_entry:guard_node',
+            f'{name} = maasi_entry:{name}'
+            for name in (
+                'mambo_driver turtlebot_driver plugin_driver ranging_driver '
+                'measurement_feed_sender mavlink_driver mavlink_camera_driver calibrate_sensor '
+                'mambo_onboard_driver robot_command measure_mambo guard_node'
+            ).split()
         ]
     },
 )

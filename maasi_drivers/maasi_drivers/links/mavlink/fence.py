@@ -14,8 +14,7 @@ from maasi_filter.area import Area, level_shape
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geodesy import geodetic
 
-# Command, number of corners or radius [m], latitude and longitude [1e-7 degrees].
-Item = tuple[int, float, int, int]
+Item = tuple[int, float, int, int]  # command, corners or radius [m], 1e-7 degrees north, east
 
 _FENCE = mavlink.MAV_MISSION_TYPE_FENCE
 _INSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
@@ -24,8 +23,7 @@ _TWICE = mavlink.MAV_MISSION_INVALID_SEQUENCE  # of an item that came twice, to 
 _ROUND = mavlink.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION
 # Silence after which a message is sent again, how often, and time until the next attempt [s, 1, s].
 _PATIENCE, _TRIES, _PAUSE = 1.5, 8, 10.0
-# Of the numbers of an item, as an autopilot keeps them.
-_ROUNDING = 0.5, 0.01, 1.5, 1.5
+_ROUNDING = 0.5, 0.01, 1.5, 1.5  # of the numbers of an item, as an autopilot keeps them
 
 
 def fence_items(area: Area, start: list[float], bounds: FloatArray) -> list[Item]:
@@ -42,7 +40,7 @@ def fence_items(area: Area, start: list[float], bounds: FloatArray) -> list[Item
         corners = shapely.get_coordinates(ring)[:-1]
         rows += [(command, len(corners), corner) for corner in corners]
     rows += [(_ROUND, zone.radius, zone.centre[:2]) for zone in zones if zone.centre]
-    degrees = geodetic(np.array([place for *_, place in rows]), origin)[:, :2]
+    degrees = geodetic(np.array([row[2] for row in rows]), origin)[:, :2]
     places = np.rint(1e7 * degrees).astype(int).tolist()
     return [(*row[:2], *place) for row, place in zip(rows, places, strict=True)]
 
@@ -55,8 +53,7 @@ class FenceUpload:
         self.problem = ''
         self._items: list[Item] = []
         self._vehicle = settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1
-        self._sender = sender
-        self._log = log
+        self._sender, self._log = sender, log
         self.begin()
 
     def begin(self, items: list[Item] | None = None) -> None:
@@ -81,11 +78,10 @@ class FenceUpload:
 
     def take(self, message: Any, now: float) -> None:
         """Take a message; what is no answer is left out."""
-        own = self._sender.srcSystem
-        ours = getattr(message, 'target_system', own) == own
-        ours &= getattr(message, 'mission_type', _FENCE) == _FENCE
-        ours &= getattr(message, 'type', None) != _TWICE
-        if self.busy and ours and message.get_type() in self._answers:
+        expected = {'target_system': self._sender.srcSystem, 'mission_type': _FENCE}
+        ours = all(getattr(message, key, value) == value for key, value in expected.items())
+        ours &= message.get_type() in self._answers and getattr(message, 'type', None) != _TWICE
+        if self.busy and ours:
             self._tries, self._due = 0, now
             try:
                 self._send, self._answers = self._exchange.send(message)
@@ -109,7 +105,6 @@ class FenceUpload:
             return WARNING, 'not uploaded: the autopilot has no protocol for it'
         left, send = len(items), partial(sender.mission_count_send, *to, len(items), _FENCE)
         while True:
-            # ArduPilot has the older request.
             answer = yield send, ('MISSION_REQUEST', 'MISSION_REQUEST_INT', 'MISSION_ACK')
             if answer.get_type() != 'MISSION_ACK' and answer.seq < len(items):
                 left, (command, size, *place) = len(items) - 1 - answer.seq, items[answer.seq]

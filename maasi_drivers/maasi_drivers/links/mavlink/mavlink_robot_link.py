@@ -201,8 +201,7 @@ class MavlinkRobotLink(RobotLink):
         # Goals may lie on the border of a box; the driver itself acts at the margin.
         bounds = self.fence + np.array([-MARGIN, MARGIN])
         with self._link.lock:
-            items = fence_items(area, self.driver.settings.start, bounds)
-            self._link.vehicle.fence.begin(items)
+            self._link.vehicle.fence.begin(fence_items(area, self.driver.settings.start, bounds))
 
     def _log_reports(self) -> None:
         with self._link.lock:
