@@ -2,6 +2,12 @@ from glob import glob
 
 from setuptools import find_packages, setup
 
+COMMANDS = """
+    mambo_driver turtlebot_driver plugin_driver ranging_driver measurement_feed_sender
+    mavlink_driver mavlink_camera_driver calibrate_sensor mambo_onboard_driver robot_command
+    measure_mambo guard_node
+"""
+
 setup(
     name='maasi_drivers',
     version='0.1.0',
@@ -34,14 +40,5 @@ setup(
     maintainer_email='maasi@users.noreply.github.com',
     description='One node per robot: sensor to detections, waypoint to motion',
     license='Apache-2.0',
-    entry_points={
-        'console_scripts': [
-            f'{name} = maasi_entry:{name}'
-            for name in (
-                'mambo_driver turtlebot_driver plugin_driver ranging_driver '
-                'measurement_feed_sender mavlink_driver mavlink_camera_driver calibrate_sensor '
-                'mambo_onboard_driver robot_command measure_mambo guard_node'
-            ).split()
-        ]
-    },
+    entry_points={'console_scripts': [f'{name} = maasi_entry:{name}' for name in COMMANDS.split()]},
 )

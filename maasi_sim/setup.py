@@ -44,11 +44,13 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            f'{name} = maasi_entry:{name}'
-            for name in (
-                'cuboid_sim_node sim_node fake_mambo fake_mavlink_vehicle view_node compare '
-                'run_scenario'
-            ).split()
+            'cuboid_sim_node = maasi_entry:cuboid_sim_node',
+            'sim_node = maasi_entry:sim_node',
+            'fake_mambo = maasi_entry:fake_mambo',
+            'fake_mavlink_vehicle = maasi_entry:fake_mavlink_vehicle',
+            'view_node = maasi_entry:view_node',
+            'compare = maasi_entry:compare',
+            'run_scenario = maasi_entry:run_scenario',
         ]
     },
 )
