@@ -205,9 +205,9 @@ def test_a_keep_out_on_the_way_home_leads_it_around():
         world.until(lambda: a.moves and a.place[0] < 1.7)
         wall = 'POLYGON ((1.0 0.3, 1.2 0.3, 1.2 0.8, 1.0 0.8, 1.0 0.3))'
         client = world.node.create_client(SetKeepOuts, 'search/keep_outs')
-        answer = client.call_async(SetKeepOuts.Request(zones=[wall]))
-        world.until(answer.done)
-        world.until(lambda: world.logged('a keep-out lies on its way'))
+        world.listen(client.service_is_ready)
+        client.call_async(SetKeepOuts.Request(zones=[wall]))
+        world.listen(lambda: world.logged('a keep-out lies on its way'))
         came_home(world, a)
 
 
