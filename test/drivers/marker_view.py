@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from ideal_floor import ideal
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
@@ -60,7 +61,7 @@ def hard_floor(seed: int) -> RenderSettings:
 
 def one_image(settings: CameraSettings, targets, pose: Pose, floor=None) -> np.ndarray:
     """Return what a camera sees of markers on the floor, without disturbances by default."""
-    floor, space = floor or RenderSettings.ideal(), EnvironmentSettings(bounds=[[-1, 3], [-1, 3]])
+    floor, space = floor or ideal(), EnvironmentSettings(bounds=[[-1, 3], [-1, 3]])
     shapes = scene_of(World.from_settings(space, TargetSettings(positions=targets), 1), floor, 1)
     renderer = CameraRenderer(Camera.from_settings(settings), floor, shapes, 1, 'drone')
     return renderer.render(pose, 0, 0)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from fake_bluepy import BluetoothMambo
+from fenced_autopilot import FencedAutopilot
 from linked_flight import KINDS, YAW, LinkedFlight, mambo_firmware
 from marker_view import one_image
 from numpy.testing import assert_allclose
@@ -36,9 +37,11 @@ from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose, compose
 from maasi_filter.ros.conversions import pose_from_ros, stamp_from_ros
-from maasi_msgs.msg import AgentState
+from maasi_filter.ros.qos import LATCHED
+from maasi_msgs.msg import AgentState, KeepOuts
 from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.simulation.emulators.mambo.firmware import FirmwareSettings
+from maasi_sim.simulation.emulators.mavlink import fake_mavlink_vehicle
 
 
 @pytest.fixture
@@ -411,8 +414,29 @@ def test_a_fault_ends_the_way_and_is_said(fly, capfd):
     assert 'Crash: Disarming' in flight.reason
     said = capfd.readouterr().err
     assert 'is disarmed: by the autopilot or the pilot (' in said
+    assert 'fence: not uploaded, which needs' in said and 'environment.origin' in said
     # It says by itself why it has no position.
     assert 'no LOCAL_POSITION_NED yet' not in said
+
+
+def test_its_fence_is_the_area_and_follows_keep_outs(fly, monkeypatch):
+    monkeypatch.setattr(fake_mavlink_vehicle, 'FakeAutopilot', FencedAutopilot)
+    area = 'POLYGON ((-8 -8, 8 -8, 8 8, -8 8, -8 -8))'
+    place = {'area': area, 'altitude': [-5.0, 5.0], 'keep_outs': ['5 5 1']}
+    origin = {'latitude': 46.6, 'longitude': 9.9}
+    flight = fly('vehicle', environment=place | {'origin': origin}).up()
+    fence = flight.inside.fence
+    assert [item[1] for item in fence.items] == [4, 4, 4, 4, 1]
+    publisher = flight.team.create_publisher(KeepOuts, '/keep_outs', LATCHED)
+    flight.until(publisher.get_subscription_count)
+    publisher.publish(KeepOuts(version=1, zones=['POLYGON ((4 4, 6 4, 5 6, 4 4))']))
+    flight.until(lambda: [item[1] for item in fence.items] == [4, 4, 4, 4, 3, 3, 3])
+    flight.reaches([1.0, 0.0, 0.8])
+    # Another fence than that: it goes nowhere.
+    fence.most = 6
+    publisher.publish(KeepOuts(version=2, zones=['POLYGON ((4 4, 7 4, 5 6, 4 4))']))
+    flight.until_said('its fence is not verified (MAV_MISSION_NO_SPACE)')
+    assert 'its fence is' in flight.team.refused(flight.start)
 
 
 def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from ideal_floor import ideal
 from marker_view import drone_camera, hard_floor, one_image, score
 from numpy.testing import assert_allclose
 
@@ -55,7 +56,7 @@ def test_both_rules_on_a_moderate_floor(rule):
     ],
 )
 def test_covariances_are_honest_about_noise(camera, floor, least):
-    result = score(drone_camera(**camera), RenderSettings.ideal(blur=0.5, **floor), 32, 100)
+    result = score(drone_camera(**camera), ideal(blur=0.5, **floor), 32, 100)
     # Two coordinates: the mean is 2 where the covariance says what the error is.
     assert least < result.nees < 3.0
 
@@ -87,7 +88,7 @@ def test_a_cut_marker_is_kept_with_more_covariance_or_dropped():
 def test_markers_of_the_wrong_size_are_dropped_and_counted(settings, diameter, pixel, dropped):
     detector = MarkerDetector(drone_camera(**settings))
     place = detector.camera.back_project([pixel], DOWN)[0][0]
-    floor = RenderSettings.ideal(marker_diameter=diameter)
+    floor = ideal(marker_diameter=diameter)
     seen = detector.detect(one_image(detector.settings, [place.tolist()], DOWN, floor), DOWN)
     assert len(seen.values) == (dropped is None)
     assert {reason for reason, number in seen.dropped.items() if number} == {dropped} - {None}

@@ -5,10 +5,12 @@ import subprocess
 import sys
 from functools import partial
 
+import numpy as np
 import pytest
-from driven_team import driven
+from driven_team import SETTINGS, START, driven
 from rclpy.action import ActionServer
 from rclpy.node import Node
+from sensor_msgs.msg import BatteryState
 from waiting import PATIENCE, wait_until
 
 from maasi_drivers import robot_command
@@ -17,7 +19,9 @@ from maasi_drivers.robot_command import DONE, FAILED, INTERRUPTED
 from maasi_filter.ros.qos import SENSOR
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
+from maasi_msgs.srv import SetKeepOuts
 from maasi_planner import search_command
+from maasi_planner.endurance import EnduranceSettings
 from maasi_planner.node_settings import PlannerNodeSettings
 
 
@@ -100,6 +104,111 @@ def test_nothing_moves_without_start_and_each_service_does_what_it_says(world):
     assert world.planner.trigger_deactivate().name == 'SUCCESS'
     world.until(world.standing)
     refused('search/start', 'the planner is not active')
+
+
+def came_home(world, a):
+    world.until(
+        lambda: (
+            a.is_near(*START['a'], 0.2) and a.stands and a.state.goal_status == AgentState.REACHED
+        ),
+        lambda: f'not at home: {a.place}, {a.state.goal_id}, {a.state.goal_status}',
+    )
+
+
+def nothing(world, a, reason):
+    pass
+
+
+def paused(world, a, reason):
+    assert world.call('search/pause').success
+
+
+def fault(world, a, reason):
+    """Have its driver say that it cannot go."""
+    health = world.drivers[0].health
+    health.begin('fault', reason)
+    world.until(lambda: a.states and a.state.reason == reason)
+    return lambda: health.end('fault')
+
+
+def at_a_goal(world, a, reason):
+    _, result = world.send('a', (1.0, 1.0), 900)
+    world.until(result.done)
+
+
+def stopped(world, a, reason):
+    assert world.call('a/stop').success
+    world.until(lambda: a.state.reason == reason)
+    return lambda: world.call('a/release')
+
+
+def charging(world, a, reason):
+    publisher = world.node.create_publisher(BatteryState, 'a/battery_state', SENSOR)
+
+    def has(charge):
+        publisher.publish(BatteryState(percentage=charge))
+        return world.coordinator.plans['a'].endurance.charging
+
+    world.coordinator = world.planner.coordinator
+    world.until(lambda: has(0.05))
+    world.until(lambda: has(0.05) and a.stands and a.is_near(1.8, 0.2, 0.1))
+
+
+@pytest.mark.parametrize(
+    ('state', 'searching', 'reason'),
+    [
+        (nothing, False, ''),
+        (nothing, True, ''),
+        (at_a_goal, True, ''),
+        (paused, True, ''),
+        (charging, True, ''),
+        (stopped, True, STOPPED),
+        (fault, False, 'vehicle: not armed: until the service arm is called'),
+        (fault, True, '3.0 m outside of the area'),
+        (fault, True, 'link: nothing heard from system 1'),
+    ],
+)
+def test_from_every_state_it_comes_home_at_once_or_when_it_can(state, searching, reason):
+    """What it cannot do is said in the answer, and done later, without another command."""
+    robots = dict(SETTINGS.robots)
+    endurance = EnduranceSettings(per_metre=0.05, chargers=[[1.8, 0.2, 0.0]])
+    robots['a'] = robots['a'].model_copy(update={'endurance': endurance})
+    with driven(search_on_start=searching, robots=robots) as world:
+        a = world.robots['a']
+        if searching:
+            world.until(world.moving)
+        restore = state(world, a, reason)
+        place = a.place
+        answer = world.call('a/search/home')
+        assert answer.success and (f'does not take part now: {reason}' in answer.message) == bool(
+            reason
+        )
+        if restore is not None:
+            world.pass_steps(40)
+            assert a.stands and np.hypot(*np.subtract(a.place, place)[:2]) < 0.2
+            restore()
+        came_home(world, a)
+        goal = a.state.goal_id
+        world.pass_steps(40)
+        assert a.state.goal_id == goal and a.stands
+
+
+def test_a_keep_out_on_the_way_home_leads_it_around():
+    """The goal whose way it crosses is aborted, and home is its next one."""
+    with driven() as world:
+        a = world.robots['a']
+        assert world.call('search/pause').success
+        world.until(world.standing)
+        _, result = world.send('a', (1.8, 0.5), 900)
+        world.until(result.done)
+        assert world.call('a/search/home').success
+        world.until(lambda: a.moves and a.place[0] < 1.7)
+        wall = 'POLYGON ((1.0 0.3, 1.2 0.3, 1.2 0.8, 1.0 0.8, 1.0 0.3))'
+        client = world.node.create_client(SetKeepOuts, 'search/keep_outs')
+        world.listen(client.service_is_ready)
+        client.call_async(SetKeepOuts.Request(zones=[wall]))
+        world.listen(lambda: world.logged('a keep-out lies on its way'))
+        came_home(world, a)
 
 
 def test_search_command_reaches_planner_and_drivers(world):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from ideal_floor import ideal
 from numpy.testing import assert_allclose, assert_array_equal
 from pydantic import ValidationError
 
@@ -13,7 +14,7 @@ from maasi_sim.simulation.camera import CameraRenderer
 from maasi_sim.simulation.floor import RenderSettings, disc, draw_distractors, scene_of
 from maasi_sim.simulation.world import TargetSettings, World, noise_stream
 
-IDEAL = RenderSettings.ideal()
+IDEAL = ideal()
 DOWN = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
 MARKER = [0.08, 0.17, 0.62]
 
@@ -106,9 +107,7 @@ def test_motion_blur_is_the_mean_of_the_images_along_the_way(velocity, rate):
     exposure = 0.05
     shapes = [disc([0.05, 0.12], 0.02, MARKER)]
     middle = Pose(np.array([0.01, 0.02, 1.0]), np.array([1.0, 0.02, -0.03, 0.3]))
-    blurred = renderer(shapes, RenderSettings.ideal(exposure_time=exposure)).render(
-        middle, 0, 0.0, velocity, rate
-    )
+    blurred = renderer(shapes, ideal(exposure_time=exposure)).render(middle, 0, 0.0, velocity, rate)
     sharp = renderer(shapes)
     images = []
     for time in (np.arange(40) + 0.5) / 40 * exposure - 0.5 * exposure:
@@ -121,7 +120,7 @@ def test_motion_blur_is_the_mean_of_the_images_along_the_way(velocity, rate):
 
 
 def test_noise_has_the_deviation_that_is_set_and_is_keyed():
-    settings = RenderSettings.ideal(read_noise=3.0, shot_noise=0.1)
+    settings = ideal(read_noise=3.0, shot_noise=0.1)
     one = renderer([], settings)
     image = one.render(DOWN, 5, 0.0)
     assert_allclose(image.std(axis=(0, 1)), np.sqrt(9 + 0.1 * 120), rtol=0.03)
@@ -138,12 +137,12 @@ def test_noise_has_the_deviation_that_is_set_and_is_keyed():
 
 
 def test_light_vignetting_and_drift_change_brightness_as_set():
-    light = renderer([], RenderSettings.ideal(light_variation=0.4, light_wavelength=0.4))
+    light = renderer([], ideal(light_variation=0.4, light_wavelength=0.4))
     image = light.render(DOWN, 0, 0.0)[..., 0]
     assert_allclose([image.max(), image.min()], [120 * 1.4, 120 * 0.6], atol=4)
-    corner = renderer([], RenderSettings.ideal(vignetting=0.5)).render(DOWN, 0, 0.0)[0, 0, 0]
+    corner = renderer([], ideal(vignetting=0.5)).render(DOWN, 0, 0.0)[0, 0, 0]
     assert_allclose(corner, 60, atol=2)
-    drifting = renderer([], RenderSettings.ideal(white_balance_drift=0.2, exposure_drift=0.1))
+    drifting = renderer([], ideal(white_balance_drift=0.2, exposure_drift=0.1))
     gains = np.array([drifting.gains(time) for time in np.linspace(0, 100, 400)])
     assert_allclose(np.ptp(gains, axis=0), 0.5, atol=0.12)
     assert gains.min() >= 0.9 * 0.8 - 1e-9
@@ -151,7 +150,7 @@ def test_light_vignetting_and_drift_change_brightness_as_set():
 
 
 def test_texture_stays_on_the_floor():
-    one = renderer([], RenderSettings.ideal(floor_texture=0.1))
+    one = renderer([], ideal(floor_texture=0.1))
     image = one.render(DOWN, 0, 0.0)
     assert 4 < image[..., 0].std() < 12
     shifted = one.render(Pose.from_yaw([0.1, 0.0, 1.0], 0.0), 0, 0.0)
@@ -161,7 +160,7 @@ def test_texture_stays_on_the_floor():
 def test_jpeg_changes_little():
     sharp = [disc([0.0, 0.0], 0.015, MARKER)]
     plain = renderer(sharp).render(DOWN, 0, 0.0).astype(int)
-    coded = renderer(sharp, RenderSettings.ideal(jpeg_quality=90)).render(DOWN, 0, 0.0)
+    coded = renderer(sharp, ideal(jpeg_quality=90)).render(DOWN, 0, 0.0)
     assert 0 < np.abs(coded - plain).mean() < 2
 
 

@@ -162,6 +162,9 @@ class MavlinkSettings(FlightSettings):
         True,
         description='Whether it is armed only if the autopilot acts by itself when the link is cut',
     )
+    fence: Literal['upload', 'none'] = Field(
+        default='upload', description='Whether the area is its fence; needs environment.origin'
+    )
     origin: Literal['local', 'here'] = Field(
         'local',
         description='What stands at the start in the map: the origin of the local frame of the '

@@ -9,6 +9,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.conversions import point_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_msgs.action import GoToWaypoint
+from maasi_msgs.msg import AgentState
 from maasi_planner.coordinator import Coordinator
 from maasi_planner.node.search_modes import Mode, SearchModes
 from maasi_planner.node.team_goals import GoalProgress, HeardState, TeamGoals
@@ -125,7 +126,8 @@ class Orders:
         number = self._homing.get(name, -1)
         if number > 0:
             course = self.goals.course(name, number, heard)
-            if course is GoalProgress.REPLACED:
+            aborted = course is GoalProgress.ENDED and heard.status == AgentState.ABORTED
+            if aborted or course is GoalProgress.REPLACED:
                 self._homing[name] = -1
             elif course is not GoalProgress.UNDER_WAY:
                 self._homing[name] = 0

@@ -77,13 +77,6 @@ class RenderSettings(Settings):
                 raise ValueError(f'{name}: got {colour}, allowed are numbers from 0 to 1')
         return self
 
-    @classmethod
-    def ideal(cls, **changes: object) -> RenderSettings:
-        """Return settings without noise, blur, drift or uneven light, but for the changes given."""
-        drifts = ('exposure_drift', 'white_balance_drift', 'light_variation', 'vignetting')
-        noises = ('floor_texture', 'shot_noise', 'read_noise', 'exposure_time', 'blur')
-        return cls.model_validate(dict.fromkeys((*drifts, *noises), 0.0) | changes)
-
 
 @dataclass(frozen=True)
 class Shape:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from maasi_drivers.links.mavlink.estimate import Estimate, FlightOrigin, swap_enu_ned, swap_yaw
+from maasi_drivers.links.mavlink.fence import FenceUpload
 from maasi_drivers.links.mavlink.firmware import FailsafeCheck, Firmware, identify
 from maasi_drivers.links.mavlink.protocol import DEBUG, ERROR, INFO, WARNING, ReportLog, mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
@@ -60,6 +61,7 @@ class Autopilot:
         self.commands: deque[_Command] = deque()  #: commands that were not answered yet
         #: Numbers of those that were accepted in this phase of the flight.
         self.accepted: set[int] = set()
+        self.fence = FenceUpload(settings, sender, self.log)
         self._sender = sender
         self._received_at = self._heartbeat_at = self._setpoint_at = -math.inf
         self._requested_at = -math.inf  # of the last request for messages
@@ -100,6 +102,7 @@ class Autopilot:
                 else:
                     self._conclude(int(message.result))
         elif self.firmware is not None:
+            self.fence.take(message, now)
             self.estimate.take(message, now, self.armed)
         return None
 
@@ -157,14 +160,17 @@ class Autopilot:
         return self.lost != before
 
     def read_failsafes(self) -> None:
-        """Read the failsafe parameters from the beginning."""
+        """Read the failsafe parameters from the beginning, and upload the fence."""
         assert self.firmware is not None
+        self.fence.begin()
         self.failsafes = FailsafeCheck(self.firmware, self.settings, self._sender, self.log)
 
     def request_data(self, now: float) -> None:
         """Request parameters and messages that are missing."""
         if self.failsafes is not None:
             self.failsafes.read(now)
+        if not self.lost:
+            self.fence.tick(now)
         silence = now - max(self.estimate.silent_since, self._requested_at)
         known = self._requested_at > -math.inf
         if self.commands or self.lost or (known and silence < _STREAM_PATIENCE):

@@ -14,9 +14,11 @@ from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, ArrivalClock, RobotNode
 from maasi_drivers.links.mavlink.estimate import Telemetry
+from maasi_drivers.links.mavlink.fence import fence_items
 from maasi_drivers.links.mavlink.link import VehicleLink
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING
 from maasi_drivers.settings.vehicles import MavlinkSettings
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 
@@ -56,6 +58,7 @@ class MavlinkRobotLink(RobotLink):
         self._telemetry: Telemetry | None = None
         self._heading: float | None = None
         self._ending = False
+        self._fenced: Area | None = None  # the area that the autopilot has
         self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], self._mavlink)
 
     def prepare(self) -> None:
@@ -164,6 +167,8 @@ class MavlinkRobotLink(RobotLink):
             fault = f'link: {link.failure}' if link.failure else vehicle.fault
             charge, reports = estimate.charge, estimate.charge_reports
             telemetry, self._local_origin = estimate.telemetry, estimate.origin
+        if self._fenced is not driver.area:
+            self._upload_fence()
         self._log_reports()
         self._arrivals.observe(time.monotonic(), driver.get_clock().now().nanoseconds)
         if not driver.active:
@@ -185,6 +190,18 @@ class MavlinkRobotLink(RobotLink):
         if telemetry is not None and telemetry is not self._telemetry:
             self._telemetry = telemetry
             self._take_telemetry(telemetry)
+
+    def _upload_fence(self) -> None:
+        area, mavlink = self.driver.area, self._mavlink
+        self._fenced, turned = area, mavlink.map_yaw != 0.0 and not self._localised
+        if mavlink.fence == 'none' or area.settings.origin is None or turned:
+            needs = 'mavlink.fence: upload, environment.origin, mavlink.map_yaw: 0'
+            self.driver.get_logger().info(f'fence: not uploaded, which needs {needs}')
+            return
+        # Goals may lie on the border of a box; the driver itself acts at the margin.
+        bounds = self.fence + np.array([-MARGIN, MARGIN])
+        with self._link.lock:
+            self._link.vehicle.fence.begin(fence_items(area, self.driver.settings.start, bounds))
 
     def _log_reports(self) -> None:
         with self._link.lock:

@@ -107,7 +107,7 @@ class Vehicle(Autopilot):
         if self.place.problem:
             return f'vehicle: {self.place.problem}'
         flying = self.phase is VehiclePhase.FLYING
-        problem = self.estimate.problem(self._fix_needed) if flying else ''
+        problem = self.estimate.problem(self._fix_needed) or self.fence.problem if flying else ''
         what = problem or ': '.join(part for part in (self.phase.value, self._detail) if part)
         return f'vehicle: {what}' if what else ''
 
@@ -170,7 +170,7 @@ class Vehicle(Autopilot):
         if not (self.settings.arm or self.armed):
             return 'mavlink.arm is false'
         if self.phase is VehiclePhase.WAITING and self.failsafes is not None:
-            return self.failsafes.problem(now)
+            return self.failsafes.problem(now) or self.fence.problem
         return ''
 
     def finish(self, ending: Ending, reason: str = '') -> None:
@@ -340,10 +340,10 @@ class Vehicle(Autopilot):
         elif not self.active:
             self._detail = 'the driver is not active'
         else:
-            problem = self.failsafes.problem(now)
+            problem = self.failsafes.problem(now) or self.fence.problem
             if problem:
                 self._permission.end()
-            elif permitted:
+            elif permitted and not self.fence.busy:
                 self._target, self._yaw = self._position(), None
                 self._enter(VehiclePhase.STARTING)
                 return

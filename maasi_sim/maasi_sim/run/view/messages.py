@@ -165,8 +165,9 @@ class MessageEvents:
             return
         self._waits = False
         getattr(self, TOPICS[type_name][0])(topic, message)
-        while self._early:
-            self.take(*self._early.pop(0))
+        early, self._early = self._early, []
+        for item in early:
+            self.take(*item)
 
     def _now(self, topic: str, message: Any) -> float:
         """Return the run's time of a message; begin again if time jumps back on its topic."""

@@ -67,6 +67,7 @@ class FakeAutopilot:
             settings.acceleration,
         )
         self.now = 0.0
+        self.capabilities = 0
         self.armed = False
         self.crashed = ''
         self.charge = settings.charge
@@ -323,6 +324,10 @@ class FakeAutopilot:
             self.periods[known.msgname] = 1e-6 * message.param2
         return int(_ACCEPTED)
 
+    def _send_version(self, _: Any) -> int:
+        self._sender.autopilot_version_send(self.capabilities, *[0] * 4, *[[0] * 8] * 3, 0, 0, 0)
+        return int(_ACCEPTED)
+
     def _set_mode(self, message: Any) -> int:
         mode = int(message.param2)
         if self.firmware is PX4_COPTER:
@@ -407,6 +412,7 @@ _HANDLERS: dict[str, Callable[[FakeAutopilot, Any], None]] = {
 _COMMANDS: dict[int, Callable[[FakeAutopilot, Any], int]] = {
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: FakeAutopilot._set_interval,
     mavlink.MAV_CMD_DO_SET_MODE: FakeAutopilot._set_mode,
+    mavlink.MAV_CMD_REQUEST_MESSAGE: FakeAutopilot._send_version,
     mavlink.MAV_CMD_COMPONENT_ARM_DISARM: FakeAutopilot._arm,
     mavlink.MAV_CMD_NAV_TAKEOFF: FakeAutopilot._take_off,
 }

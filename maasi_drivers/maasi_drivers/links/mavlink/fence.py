@@ -1,0 +1,130 @@
+"""The area of a search as the fence of an autopilot: uploaded, read back and compared."""
+
+import math
+from collections.abc import Generator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import shapely
+
+from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, ReportLog, mavlink
+from maasi_drivers.settings.vehicles import MavlinkSettings
+from maasi_filter.area import Area, level_shape
+from maasi_filter.arrays import FloatArray
+from maasi_filter.geodesy import geodetic
+
+Item = tuple[int, float, int, int]  # command, corners or radius [m], 1e-7 degrees north, east
+
+_FENCE = mavlink.MAV_MISSION_TYPE_FENCE
+_INSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
+_OUTSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION
+_TWICE = mavlink.MAV_MISSION_INVALID_SEQUENCE  # of an item that came twice, to be ignored
+_ROUND = mavlink.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION
+# Silence after which a message is sent again, how often, and time until the next attempt [s, 1, s].
+_PATIENCE, _TRIES, _PAUSE = 1.5, 8, 10.0
+_ROUNDING = 0.5, 0.01, 1.5, 1.5  # of the numbers of an item, as an autopilot keeps them
+
+
+def fence_items(area: Area, start: list[float], bounds: FloatArray) -> list[Item]:
+    """Return the border of an area, or of a box (2 or 3, 2), with its holes and keep-outs."""
+    zones, origin = area.settings.keep_outs, area.settings.origin
+    assert origin is not None
+    parts = shapely.get_parts(area.shapes['area'] or [shapely.box(*bounds[:2].T.ravel())])
+    # Autopilots intersect borders: of an area in parts the one at the start counts.
+    part = min(parts, key=shapely.Point(start[:2]).distance)
+    closed = shapely.get_parts([level_shape(zone) for zone in zones if zone.polygon])
+    outside = [*part.interiors, *(polygon.exterior for polygon in closed)]
+    rows: list[Any] = []
+    for command, ring in [(_INSIDE, part.exterior), *((_OUTSIDE, ring) for ring in outside)]:
+        corners = shapely.get_coordinates(ring)[:-1]
+        rows += [(command, len(corners), corner) for corner in corners]
+    rows += [(_ROUND, zone.radius, zone.centre[:2]) for zone in zones if zone.centre]
+    degrees = geodetic(np.array([row[2] for row in rows]), origin)[:, :2]
+    places = np.rint(1e7 * degrees).astype(int).tolist()
+    return [(*row[:2], *place) for row, place in zip(rows, places, strict=True)]
+
+
+class FenceUpload:
+    """Gives an autopilot its fence, and checks that it has it; times are of the steady clock."""
+
+    def __init__(self, settings: MavlinkSettings, sender: Any, log: ReportLog) -> None:
+        #: Why the autopilot may have another fence; empty where it has it, or needs none.
+        self.problem = ''
+        self._items: list[Item] = []
+        self._vehicle = settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1
+        self._sender, self._log = sender, log
+        self.begin()
+
+    def begin(self, items: list[Item] | None = None) -> None:
+        """Upload a fence, or the same again."""
+        self._items = self._items if items is None else items
+        self.busy, self._tries = bool(self._items), 0
+        self._due = -math.inf if self.busy else math.inf
+        self._exchange = self._upload()
+        self._send, self._answers = next(self._exchange)
+
+    def tick(self, now: float) -> None:
+        """Send what is due."""
+        if now < self._due:
+            return
+        if not self.busy:
+            self.begin()
+        elif self._tries == _TRIES:
+            self._conclude(now, ERROR, 'not verified (no answer)')
+        else:
+            self._tries, self._due = self._tries + 1, now + _PATIENCE
+            self._send()
+
+    def take(self, message: Any, now: float) -> None:
+        """Take a message; what is no answer is left out."""
+        expected = {'target_system': self._sender.srcSystem, 'mission_type': _FENCE}
+        ours = all(getattr(message, key, value) == value for key, value in expected.items())
+        ours &= message.get_type() in self._answers and getattr(message, 'type', None) != _TWICE
+        if self.busy and ours:
+            self._tries, self._due = 0, now
+            try:
+                self._send, self._answers = self._exchange.send(message)
+            except StopIteration as end:
+                self._conclude(now, *end.value)
+
+    def _conclude(self, now: float, severity: int, result: str) -> None:
+        problem = f'its fence is {result}' if severity == ERROR else ''
+        if not problem or problem != self.problem:
+            self._log.add(severity, f'fence: {result}')
+        self.problem, self.busy = problem, False
+        self._due = now + _PAUSE if problem else math.inf
+
+    def _upload(self) -> Generator[Any, Any, tuple[int, str]]:
+        """Yield what to send and what answers it, by MAVLink's mission protocol, there and back."""
+        sender, to, items = self._sender, self._vehicle, self._items
+        what = mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        ask = partial(sender.command_long_send, *to, *what, *[0.0] * 6)
+        version = yield ask, ('AUTOPILOT_VERSION',)
+        if not version.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE:
+            return WARNING, 'not uploaded: the autopilot has no protocol for it'
+        left, send = len(items), partial(sender.mission_count_send, *to, len(items), _FENCE)
+        while True:
+            answer = yield send, ('MISSION_REQUEST', 'MISSION_REQUEST_INT', 'MISSION_ACK')
+            if answer.get_type() != 'MISSION_ACK' and answer.seq < len(items):
+                left, (command, size, *place) = len(items) - 1 - answer.seq, items[answer.seq]
+                head = answer.seq, mavlink.MAV_FRAME_GLOBAL, command, 0, 1, size, 0.0, 0.0, 0.0
+                send = partial(sender.mission_item_int_send, *to, *head, *place, 0.0, _FENCE)
+            # Where the last answer was lost, another one comes: what is read decides.
+            elif left == 0:
+                break
+            elif getattr(answer, 'type', 0) != mavlink.MAV_MISSION_ACCEPTED:
+                known = mavlink.enums['MAV_MISSION_RESULT'].get(answer.type)
+                return ERROR, f'not verified ({known.name if known else answer.type})'
+        announced = yield partial(sender.mission_request_list_send, *to, _FENCE), ('MISSION_COUNT',)
+        if announced.count != len(items):
+            return ERROR, 'read back, the number of its items differs'
+        for number, item in enumerate(items):
+            send = partial(sender.mission_request_int_send, *to, number, _FENCE)
+            while (answer := (yield send, ('MISSION_ITEM_INT',))).seq != number:
+                pass
+            read = answer.command, answer.param1, answer.x, answer.y
+            if not np.isclose(read, item, 0.0, _ROUNDING).all():
+                return ERROR, f'read back, item {number} differs'
+        sender.mission_ack_send(*to, mavlink.MAV_MISSION_ACCEPTED, _FENCE)
+        return INFO, f'uploaded and verified, {len(items)} vertices and circles'
