@@ -2,12 +2,6 @@ from glob import glob
 
 from setuptools import find_packages, setup
 
-COMMANDS = """
-    mambo_driver turtlebot_driver plugin_driver ranging_driver measurement_feed_sender
-    mavlink_driver mavlink_camera_driver calibrate_sensor mambo_onboard_driver robot_command
-    measure_mambo guard_node
-"""
-
 setup(
     name='maasi_drivers',
     version='0.1.0',
@@ -40,5 +34,20 @@ setup(
     maintainer_email='maasi@users.noreply.github.com',
     description='One node per robot: sensor to detections, waypoint to motion',
     license='Apache-2.0',
-    entry_points={'console_scripts': [f'{name} = maasi_entry:{name}' for name in COMMANDS.split()]},
+    entry_points={
+        'console_scripts': [
+            'mambo_driver = maasi_entry:mambo_driver',
+            'turtlebot_driver = maasi_entry:turtlebot_driver',
+            'plugin_driver = maasi_entry:plugin_driver',
+            'ranging_driver = maasi_entry:ranging_driver',
+            'measurement_feed_sender = maasi_entry:measurement_feed_sender',
+            'mavlink_driver = maasi_entry:mavlink_driver',
+            'mavlink_camera_driver = maasi_entry:mavlink_camera_driver',
+            'calibrate_sensor = maasi_entry:calibrate_sensor',
+            'mambo_onboard_driver = maasi_entry:mambo_onboard_driver',
+            'robot_command = maasi_entry:robot_command',
+            'measure_mambo = maasi_entry:measure_mambo',
+            'guard_node = maasi_entry:guard_node',
+        ]
+    },
 )
