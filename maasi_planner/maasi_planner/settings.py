@@ -19,6 +19,7 @@ PLANNERS = PluginGroup(
     'planner',
     'maasi_planner.planners.base:Planner',
     {
+        'auto': 'maasi_planner.planners.auto:Auto',
         'maasi': 'maasi_planner.planners.intermittent:Intermittent',
         'asi': 'maasi_planner.planners.intermittent:Intermittent',
         'maas': 'maasi_planner.planners.active_search:ActiveSearch',
@@ -192,7 +193,7 @@ class PlannerSettings(Settings):
     """Choice of planner, and its parameters. None means the default of the objective."""
 
     name: Annotated[str, PLANNERS, AfterValidator(PLANNERS.check)] = Field(
-        'maasi', description='Planner, or module:Class of your own'
+        'auto', description='Planner, or module:Class of your own'
     )
     settings: Annotated[Any, _PLANNER, AfterValidator(_PLANNER.check)] = Field(
         None, validate_default=True, description='Settings of a planner of your own'

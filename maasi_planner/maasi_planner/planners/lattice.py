@@ -15,7 +15,7 @@ from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import half_view
-from maasi_planner.team import RobotView
+from maasi_planner.team import RobotView, TeamView
 
 # A place is left out if others have taken its gain but for this share, or if it gains less than
 # that share of what the best place does.
@@ -29,6 +29,8 @@ PARTS = 4
 SMALL = 0.3
 # A square of which less than this share is unseen is passed in the middle of that.
 WHOLE = 0.95
+# Squares are turned if they are so many times as wide then, in areas of so many squares.
+ASKEW, LARGE = 1.1, 200
 
 
 def passing(
@@ -140,6 +142,26 @@ class Lattice:
     def gains(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
         """Return the share that each of some places adds to those before it, (m,)."""
         return self.trust[chosen] * _gains(self.unseen(exploration), self.kernel, chosen)
+
+
+def lattice_of(team: TeamView) -> Lattice:
+    """Return the lattice of the robot that sees least to its sides.
+
+    In the plane it is turned where that shows more, as with a box that does not turn.
+    """
+    reach = float(np.linalg.norm(team.bounds[:, 1] - team.bounds[:, 0]))
+
+    def turned_by(heading: float) -> Lattice:
+        seen = [passing(view, team.step_time, reach, heading) for view in team.robots.values()]
+        lattices = [Lattice(team.exploration, *one, heading) for one in seen]
+        return min(lattices, key=lambda lattice: lattice.pitch)
+
+    level = turned_by(0.0)
+    # In small areas the corners that turned squares leave take the gain again.
+    if team.dimension == 3 or team.exploration.volume < LARGE * level.pitch**2:
+        return level
+    askew = turned_by(0.25 * math.pi)
+    return askew if askew.pitch > ASKEW * level.pitch else level
 
 
 def _samples(exploration: UnexploredMap) -> tuple[FloatArray, FloatArray, IntArray]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
@@ -15,7 +13,7 @@ from maasi_planner.planners.base import (
     held_back,
     waiting_places,
 )
-from maasi_planner.planners.lattice import Lattice, passing
+from maasi_planner.planners.lattice import Lattice, lattice_of
 from maasi_planner.planners.orienteering import plan_ways
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
@@ -30,9 +28,6 @@ SAME = 0.1
 ENOUGH = 3
 # A leg has at most one square, or so many times the distance at which the robot turns.
 LEG = 5.0
-# Lanes lie askew if they are so many times as wide then, in areas of so many squares.
-ASKEW = 1.1
-LARGE = 200
 
 
 class Tour(Planner):
@@ -95,24 +90,7 @@ class Tour(Planner):
         )
 
     def _squares(self, team: TeamView) -> Lattice:
-        """Return the lattice: of the robot that sees least to its sides.
-
-        In the plane its lanes lie askew where that shows more, as with a box that does not turn.
-        """
-        if self._lattice is None:
-            reach = float(np.linalg.norm(team.bounds[:, 1] - team.bounds[:, 0]))
-            found = []
-            for heading in (0.0, 0.25 * math.pi)[: 4 - team.dimension]:
-                seen = [
-                    passing(view, team.step_time, reach, heading) for view in team.robots.values()
-                ]
-                lattices = [Lattice(team.exploration, *one, heading) for one in seen]
-                found.append(min(lattices, key=lambda lattice: lattice.pitch))
-            self._lattice, *askew = found
-            # In small areas the corners that are left of turned squares take the gain again.
-            large = team.exploration.volume > LARGE * found[0].pitch ** 2
-            if askew and large and askew[0].pitch > ASKEW * found[0].pitch:
-                self._lattice = askew[0]
+        self._lattice = self._lattice or lattice_of(team)
         return self._lattice
 
     def _prizes(self, team: TeamView) -> FloatArray | None:
