@@ -96,3 +96,27 @@ def test_a_faster_robot_does_more_and_none_without_prizes():
     assert [len(way) for way in plan_ways(points, np.zeros(100), starts, np.ones(2))] == [0, 0]
     one = plan_ways(points[:1], np.ones(1), starts, np.full(2, np.inf))
     assert [len(way) for way in one] == [1, 0]
+
+
+def test_small_budgets_on_a_lattice_end_within_them():
+    points = 20.0 * lattice(4, 5)
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        start, budget = points[7:8] + 0.5, rng.uniform(20.0, 120.0)
+        prizes = 0.1 * rng.random(len(points))
+        (way,) = plan_ways(points, prizes, start, np.array([budget]), points[:1])
+        # The way home is gone in any case.
+        most = max(budget, np.linalg.norm(points[0] - start[0]))
+        assert arrivals(points, start[0], way, points[0])[1] <= most + 1e-9
+
+
+def test_of_equal_ways_the_known_ones_are_kept():
+    points, prizes, budget = lattice(6, 6), np.ones(36), np.array([np.inf])
+    start = points[:1] - 0.5
+    (lanes,) = plan_ways(points, prizes, start, budget)
+    across = lanes % 6 * 6 + lanes // 6
+    for known in (lanes, across):
+        (way,) = plan_ways(points, prizes, start, budget, known=[known])
+        assert way.tolist() == known.tolist()
+        (way,) = plan_ways(points, prizes, start, budget, known=[known[:20]])
+        assert sorted(way) == list(range(36))

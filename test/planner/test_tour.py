@@ -14,6 +14,7 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
+from maasi_planner.endurance import Endurance, EnduranceSettings
 from maasi_planner.planners.base import check_decision
 from maasi_planner.planners.lattice import Lattice, passing
 from maasi_sim.scenario.loading import load_scenario
@@ -168,3 +169,18 @@ def test_the_default_takes_tours_where_the_area_has_many_squares(size, name):
     np.testing.assert_array_equal(
         decision.robots['robot0'].waypoint, same.robots['robot0'].waypoint
     )
+
+
+def test_places_that_the_battery_does_not_afford_are_passed_over_then_it_charges():
+    team, planner = field(), make_planner('tour')
+    view = team.robots['robot0']
+    settings = EnduranceSettings(per_metre=0.01, reserve=0.2)
+    view.endurance = Endurance(settings, view.motion, view.state.pose.position)
+    view.endurance.hear(1.0)
+    planner.decide(team)
+    # Since it planned it has lost most of its battery: what is left is for places near it.
+    view.endurance.hear(0.28)
+    place = fly(planner, team)
+    assert place is not None and np.linalg.norm(place[:2] - 1.0) < 4.0
+    view.endurance.hear(0.21)
+    assert fly(planner, team) is None and view.endurance.spent

@@ -80,7 +80,7 @@ def plan_ways(
     starts : (r, d) array or None
         Where robots are, metres; None: each may start at any node.
     budgets : (r,) array
-        Longest way of each robot, metres; may be infinite.
+        Longest way of each robot, metres; may be infinite; at least straight to its end.
     ends : (r, d) array, optional
         Where the way of each robot has to end, metres.
     speeds : (r,) array, optional
@@ -108,7 +108,9 @@ def plan_ways(
     prize[:n] = prizes[used]
     places = _Places(points, free, prize, _nearest(points, free, n, min(NEIGHBOURS, n)))
     rates = np.ones(robots) if speeds is None else 1.0 / np.asarray(speeds, dtype=float)
-    limits = np.asarray(budgets, dtype=float)
+    # The way to the end is gone in any case.
+    direct = [_gap(points, free, n + k, n + robots + 1 + k) for k in range(robots)]
+    limits = np.maximum(budgets, direct)
     early = _terms(limits, rate=rates)
     begun = []
     if known is not None and any(map(len, known)):
@@ -208,11 +210,11 @@ def _within(places: _Places, routes: _Routes, limits: FloatArray, rates: FloatAr
     usual = places.prizes.sum() / max(routes.lengths().sum(), 1e-9)
     size = 0.01 / max(routes.lengths().max(), 1e-9)
     fit = _terms(limits, 0.01 * usual, size * rates / rates.max(), 1.0, 1e4 * usual)
-    best, most = routes, -1.0
     price, low = np.full(len(limits), usual), np.zeros(len(limits))
     high = np.full(len(limits), np.inf)
     # First the part of ways that collect all early which fits.
     rows = [row[: _reach(places, routes, k, limits[k])] for k, row in enumerate(routes.visited())]
+    best, most = _routes(places, rows), -1.0
     for _ in range(ROUNDS):
         fitted = _routes(places, rows)
         _improve(places, fitted, fit)
