@@ -2,7 +2,7 @@
 
 from maasi_planner.planners.base import Planner
 from maasi_planner.planners.intermittent import Intermittent
-from maasi_planner.planners.lattice import lattice_of
+from maasi_planner.planners.lattice import lanes_of
 from maasi_planner.planners.tour import Tour
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, TeamView
@@ -33,8 +33,7 @@ class Auto(Planner):
 
     def _choice(self, team: TeamView) -> Planner:
         if self._chosen is None:
-            pitch = lattice_of(team).pitch
-            many = team.exploration.volume >= SQUARES * pitch**team.dimension
+            many = team.exploration.volume >= SQUARES * lanes_of(team)[0] ** team.dimension
             settings = self.settings.renamed('tour' if many else 'maasi')
             self._chosen = Tour(settings) if many else Intermittent(settings)
         return self._chosen

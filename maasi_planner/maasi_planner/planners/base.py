@@ -18,6 +18,9 @@ from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, UsableCandidates, stay
 
+# Reason of a robot that lets others pass.
+CROSSED = 'waits: others are on its way'
+
 
 class Planner(ABC):
     """Decides where the robots that plan at a step go next.
@@ -288,11 +291,16 @@ def affordable(
     return allowed
 
 
+def crossed(team: TeamView, name: str, prediction: Trajectories, decision: Decision) -> bool:
+    """Return whether others, also those just decided, are on the only way of a prediction."""
+    others = {key: robot.positions for key, robot in decision.robots.items()}
+    return not ways_apart(team, name, prediction.positions, others)[0]
+
+
 def held_back(team: TeamView, name: str, prediction: Trajectories, decision: Decision) -> str:
     """Return why a robot must not go the only way of a prediction now, or an empty text."""
-    others = {key: robot.positions for key, robot in decision.robots.items()}
-    if not ways_apart(team, name, prediction.positions, others)[0]:
-        return 'waits: others are on its way'
+    if crossed(team, name, prediction, decision):
+        return CROSSED
     if not affordable(team, name, prediction, prediction.reached)[0]:
         return 'stays: it has to save its battery for the way home'
     return ''
@@ -312,7 +320,7 @@ def keep_apart(team: TeamView, decision: Decision) -> None:
             chosen = decision.robots[name]
             if chosen.stays or ways_apart(team, name, ways[name][None], others)[0]:
                 continue
-            decision.robots[name] = stay(team.robots[name], 'waits: others are on its way')
+            decision.robots[name] = stay(team.robots[name], CROSSED)
             ways[name] = team.robots[name].state.pose.position[None]
             changed = True
 

@@ -67,6 +67,34 @@ def turned(heading: float, dimension: int) -> FloatArray:
     return turn
 
 
+def pitch_of(exploration: UnexploredMap, beside: FloatArray, detected: FloatArray) -> float:
+    """Return how wide squares are [m], by what `passing` returned."""
+    sure, half = (
+        2.0 * float(beside[detected >= share * detected.max()].max()) for share in (0.9, 0.5)
+    )
+    return half if exploration.volume >= MANY * half**exploration.dimension else sure
+
+
+def lanes_of(team: TeamView) -> tuple[float, FloatArray, FloatArray, float]:
+    """Return pitch [m], what is seen beside, and heading of lanes, for who sees least to its sides.
+
+    In the plane they lie askew where that shows more, as with a box that does not turn.
+    """
+    reach = float(np.linalg.norm(team.bounds[:, 1] - team.bounds[:, 0]))
+
+    def narrowest(heading: float) -> tuple[float, FloatArray, FloatArray, float]:
+        seen = [passing(view, team.step_time, reach, heading) for view in team.robots.values()]
+        lanes = [(pitch_of(team.exploration, *one), *one, heading) for one in seen]
+        return min(lanes, key=lambda lane: lane[0])
+
+    level = narrowest(0.0)
+    # In small areas the corners that turned squares leave take the gain again.
+    if team.dimension == 3 or team.exploration.volume < LARGE * level[0] ** 2:
+        return level
+    askew = narrowest(0.25 * math.pi)
+    return askew if askew[0] > ASKEW * level[0] else level
+
+
 class Lattice:
     """Squares (in 3D: cubes) as wide as is seen on passing: with half the best detection or more.
 
@@ -85,11 +113,7 @@ class Lattice:
         heading: float = 0.0,
     ) -> None:
         d = exploration.dimension
-        self.turn = turned(heading, d)
-        sure, half = (
-            2.0 * float(beside[detected >= share * detected.max()].max()) for share in (0.9, 0.5)
-        )
-        self.pitch = half if exploration.volume >= MANY * half**d else sure
+        self.turn, self.pitch = turned(heading, d), pitch_of(exploration, beside, detected)
         places, sizes, cells = _samples(exploration)
         corners = np.array(list(itertools.product(*exploration.bounds))) @ self.turn
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -142,26 +166,6 @@ class Lattice:
     def gains(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
         """Return the share that each of some places adds to those before it, (m,)."""
         return self.trust[chosen] * _gains(self.unseen(exploration), self.kernel, chosen)
-
-
-def lattice_of(team: TeamView) -> Lattice:
-    """Return the lattice of the robot that sees least to its sides.
-
-    In the plane it is turned where that shows more, as with a box that does not turn.
-    """
-    reach = float(np.linalg.norm(team.bounds[:, 1] - team.bounds[:, 0]))
-
-    def turned_by(heading: float) -> Lattice:
-        seen = [passing(view, team.step_time, reach, heading) for view in team.robots.values()]
-        lattices = [Lattice(team.exploration, *one, heading) for one in seen]
-        return min(lattices, key=lambda lattice: lattice.pitch)
-
-    level = turned_by(0.0)
-    # In small areas the corners that turned squares leave take the gain again.
-    if team.dimension == 3 or team.exploration.volume < LARGE * level.pitch**2:
-        return level
-    askew = turned_by(0.25 * math.pi)
-    return askew if askew.pitch > ASKEW * level.pitch else level
 
 
 def _samples(exploration: UnexploredMap) -> tuple[FloatArray, FloatArray, IntArray]:

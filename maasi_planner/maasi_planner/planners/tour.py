@@ -6,14 +6,15 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.planners.base import (
+    CROSSED,
     Planner,
     affordable,
+    crossed,
     explain,
     free_of_robots,
-    held_back,
     waiting_places,
 )
-from maasi_planner.planners.lattice import Lattice, lattice_of
+from maasi_planner.planners.lattice import Lattice, lanes_of
 from maasi_planner.planners.orienteering import plan_ways
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
@@ -90,7 +91,8 @@ class Tour(Planner):
         )
 
     def _squares(self, team: TeamView) -> Lattice:
-        self._lattice = self._lattice or lattice_of(team)
+        if self._lattice is None:
+            self._lattice = Lattice(team.exploration, *lanes_of(team)[1:])
         return self._lattice
 
     def _prizes(self, team: TeamView) -> FloatArray | None:
@@ -187,9 +189,9 @@ class Tour(Planner):
             usable = usable and free_of_robots(point, view.radius, places)[0]
             if usable and not affordable(team, name, prediction, prediction.reached)[0]:
                 continue
-            if usable and (held := held_back(team, name, prediction, decision)):
+            if usable and crossed(team, name, prediction, decision):
                 way.insert(0, index)
-                return stay(view, held)
+                return stay(view, CROSSED)
             if not usable or not np.array_equal(point[0], waypoint):
                 squares = [self._chosen[i] for i in passed if i < len(self._chosen)]
                 self._squares(team).trust[squares] *= 0.5
