@@ -193,21 +193,34 @@ def test_from_every_state_it_comes_home_at_once_or_when_it_can(state, searching,
         assert a.state.goal_id == goal and a.stands
 
 
-def test_a_keep_out_on_the_way_home_leads_it_around():
-    """The goal whose way it crosses is aborted, and home is its next one."""
+def test_a_keep_out_on_the_way_home_leads_it_around_and_one_at_home_lets_it_wait():
+    """Goals that are aborted or refused are sent again."""
     with driven() as world:
         a = world.robots['a']
+        client = world.node.create_client(SetKeepOuts, 'search/keep_outs')
+        world.listen(client.service_is_ready)
+
+        def close(*zones):
+            client.call_async(SetKeepOuts.Request(zones=zones))
+
         assert world.call('search/pause').success
         world.until(world.standing)
         _, result = world.send('a', (1.8, 0.5), 900)
         world.until(result.done)
         assert world.call('a/search/home').success
         world.until(lambda: a.moves and a.place[0] < 1.7)
-        wall = 'POLYGON ((1.0 0.3, 1.2 0.3, 1.2 0.8, 1.0 0.8, 1.0 0.3))'
-        client = world.node.create_client(SetKeepOuts, 'search/keep_outs')
-        world.listen(client.service_is_ready)
-        client.call_async(SetKeepOuts.Request(zones=[wall]))
+        close('POLYGON ((1.0 0.3, 1.2 0.3, 1.2 0.8, 1.0 0.8, 1.0 0.3))')
         world.listen(lambda: world.logged('a keep-out lies on its way'))
+        came_home(world, a)
+
+        _, result = world.send('a', (1.8, 0.5), 901)
+        world.until(result.done)
+        close('{} {} 0.2'.format(*START['a'][:2]))
+        assert world.call('a/search/home').success
+        world.until(lambda: world.logged('allowed is what lies inside the area'))
+        world.pass_steps(40)
+        assert a.stands and a.is_near(1.8, 0.5, 0.2)
+        close()
         came_home(world, a)
 
 

@@ -126,11 +126,9 @@ class Orders:
         number = self._homing.get(name, -1)
         if number > 0:
             course = self.goals.course(name, number, heard)
-            aborted = course is GoalProgress.ENDED and heard.status == AgentState.ABORTED
-            if aborted or course is GoalProgress.REPLACED:
-                self._homing[name] = -1
-            elif course is not GoalProgress.UNDER_WAY:
-                self._homing[name] = 0
+            if course is not GoalProgress.UNDER_WAY:
+                ended = course is GoalProgress.ENDED and heard.status != AgentState.ABORTED
+                self._homing[name] = 0 if ended else -1
         if number >= 0:
             return False
         if self.goals.driven(heard):

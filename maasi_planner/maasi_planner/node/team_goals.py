@@ -76,7 +76,7 @@ class TeamGoals:
         names: Sequence[str],
         on_answer: Callable[[str, int, bool], None],
     ) -> None:
-        self._logger = node.get_logger()
+        self._warn = node.warn_throttled
         self._lockstep = node.settings.lockstep
         self._on_answer = on_answer
         self.clients = {}
@@ -192,4 +192,5 @@ class TeamGoals:
         aborted = sent.status == GoalStatus.STATUS_ABORTED and self._sent.get(name) is sent
         # Of a driver that ends the states of the robot say that it takes part no more.
         if aborted and sent.reason != _DRIVER_STOPS:
-            self._logger.warning(f'{name}: goal {sent.number} was aborted: {sent.reason}')
+            text = f'{name}: goal {sent.number} was aborted: {sent.reason}'
+            self._warn(f'{name}: {sent.reason}', text)
