@@ -10,6 +10,12 @@ import pytest
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_addoption(parser):
+    """Add the option of tests that make random searches."""
+    about = 'seeds of random searches, the first and the one after the last'
+    parser.addoption('--search-seeds', nargs=2, type=int, default=[0, 4], help=about)
+
+
 def pytest_sessionfinish():
     """Remove what killed nodes left in shared memory."""
     from maasi_sim.run.domain import remove_dead

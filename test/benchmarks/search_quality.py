@@ -20,11 +20,13 @@ from quality_conditions import RADIANS, changed, copies, robots, wanted
 from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
 from maasi_sim.experiments.experiment import Case
 from maasi_sim.experiments.searches import comparison_of, run_compared, search_settings
-from maasi_sim.experiments.tables import SearchTable
+from maasi_sim.experiments.statistics import bootstrap_difference
+from maasi_sim.experiments.tables import SearchTable, markdown_table
 from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.simulation.world import World
 
 BEGIN, END = '<!-- table: begin -->', '<!-- table: end -->'
+BEGIN_SHORT = '<!-- short: begin -->'
 PAPER = {'objective': 'paper', 'alpha': 0.75, 'beta': 0.75, 'control_weight': 0.0}
 CUBE, PAIR = 'ranging_drone_3d', 'ranging_pair_3d'
 NEAR_3D, NEAR_FLOOR = {'ring': 6, 'distance': 30.0}, {'ring': 8, 'distance': 0.3}
@@ -40,6 +42,7 @@ class Regime(NamedTuple):
     changes: Sequence[Any] = ()
     # Further ones of the world from which the targets are drawn, where the prior is wrong.
     truth: Sequence[Any] = ()
+    runs: int = 64  # most seeds
 
 
 class Kind(NamedTuple):
@@ -125,6 +128,7 @@ def large(squares, detection, number, prior='', **wrong):
         {'ring': 8, 'distance': 20.0},
         [shape, drones(*starts), drone, *priors],
         [likely(side)] if wrong else [],
+        RUNS[squares],
     )
 
 
@@ -134,6 +138,8 @@ DETECTIONS = {
     'box': {'kind': 'box', 'lower': [-10.0] * 2, 'upper': [10.0] * 2, 'frame': 'world'},
     'exponential': {'size': [3.0, 3.0]},
 }
+# Most seeds of an area of so many squares.
+RUNS = {30: 64, 100: 24, 300: 16, 1000: 4}
 for squares, detection, prior, number in itertools.product(
     (30, 100, 300, 1000), DETECTIONS, ('', ', prior'), (1, 3, 10)
 ):
@@ -180,7 +186,7 @@ def comparison(regime, kinds):
             if what.truth:
                 truth = changed(what.scenario, [*what.changes, *what.truth])
                 settings['truth'] = truth.content()
-            cases.append(Case(kind, settings, runs=how.runs))
+            cases.append(Case(kind, settings, runs=min(how.runs, what.runs)))
     return dataclasses.replace(comparison_of(regime, cases), run=run_drawn)
 
 
@@ -194,6 +200,40 @@ def run_drawn(settings, seed):
     return run_compared(settings, seed)
 
 
+def full(works):
+    """Return the tables of each regime in Markdown."""
+    text = ''
+    for name, work in works.items():
+        table = SearchTable(work.results()).markdown()
+        text += f'\n**{name}** (limit {REGIMES[name].limit:g} s)\n\n{table}'
+    return text
+
+
+def short(works):
+    """Return a table in Markdown with a row for each regime: the times to find of each planner."""
+    table = []
+    for name, work in works.items():
+        results = work.results()
+        runs = {case: len(results.runs[case]) for case in results.names()}
+        cells = [name, ' / '.join(map(str, dict.fromkeys(runs.values())))]
+        for case, number in runs.items():
+            times = (results.values(case, quantity).mean() for quantity in FOUND)
+            left = number - round(results.values(case, 'complete').sum())
+            some = f' ({left} incomplete)' if left else ''
+            cells.append(' / '.join(f'{time:.0f}' for time in times) + some)
+        if 'tour' in runs and 'maasi' in runs:
+            ours, theirs = results.pairs('tour', 'maasi', 'most_time')
+            gap, one = bootstrap_difference(ours, theirs), theirs.mean() / 100.0
+            low, high = gap.low / one, gap.high / one
+            cells.append(f'{gap.mean / one:+.0f} % [{low:+.0f}, {high:+.0f}]')
+        table.append(cells)
+    heads = ['regime', 'runs', *runs, '90 %, `tour` to `maasi`']
+    return '\n' + markdown_table([heads[: len(cells)], *table])
+
+
+FOUND = ('half_time', 'most_time', 'time')  # in each cell
+
+
 def main():
     parser = argparse.ArgumentParser(prog='search_quality', description=__doc__)
     parser.add_argument('--planner', nargs='*', choices=tuple(KINDS), default=list(KINDS))
@@ -201,20 +241,21 @@ def main():
     kept = 'folder of the runs; those there are kept'
     parser.add_argument('--out', type=Path, default=folder, metavar='DIR', help=kept)
     parser.add_argument('--document', type=Path, metavar='FILE', help='write the tables into it')
+    brief = 'one table: seconds until half, 90 % and all are found'
+    parser.add_argument('--short', action='store_true', help=brief)
     options, regimes, seeds = wanted(parser, REGIMES, runs=16, jobs=os.cpu_count() or 1)
-    plans = [
-        plan(comparison(regime, options.planner), options.out, len(seeds), first=seeds[0])
+    plans = {
+        regime: plan(comparison(regime, options.planner), options.out, len(seeds), first=seeds[0])
         for regime in regimes
-    ]
-    problems = carry_out_all(plans, max(options.jobs, 1))
-    text = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer for slow planners).\n'
-    for name, work in zip(regimes, plans):
-        table = SearchTable(work.results()).markdown()
-        text += f'\n**{name}** (limit {REGIMES[name].limit:g} s)\n\n{table}'
+    }
+    problems = carry_out_all(list(plans.values()), max(options.jobs, 1))
+    text = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer where runs are slow).\n'
+    text += short(plans) if options.short else full(plans)
     print(text)
     if options.document is not None:
-        before, rest = options.document.read_text(encoding='utf-8').split(BEGIN)
-        page = f'{before}{BEGIN}\n{text}{END}{rest.split(END)[1]}'
+        begin = BEGIN_SHORT if options.short else BEGIN
+        before, rest = options.document.read_text(encoding='utf-8').split(begin)
+        page = f'{before}{begin}\n{text}{END}{rest.partition(END)[2]}'
         options.document.write_text(page, encoding='utf-8')
     return 1 if problems else 0
 

@@ -55,19 +55,27 @@ def test_every_regime_has_every_planner(regime):
     assert cases[0].name == 'before'
 
 
-def test_a_regime_is_run_and_its_table_written_between_marks(tmp_path, capsys, monkeypatch):
-    page = tmp_path / 'page.md'
-    page.write_text(f'above\n{search_quality.BEGIN}\nold\n{search_quality.END}\nbelow\n')
-    arguments = ['one drone', '--planner', 'maasi', '--runs', '1', '--jobs', '1']
+@pytest.mark.parametrize(
+    ('begin', 'option', 'row'),
+    [
+        (search_quality.BEGIN, [], '**one drone** (limit 400 s)'),
+        (search_quality.BEGIN_SHORT, ['--short'], '| one drone | 1 |'),
+    ],
+)
+def test_a_regime_is_run_and_its_table_written(begin, option, row, tmp_path, capsys, monkeypatch):
+    page, end = tmp_path / 'page.md', search_quality.END
+    marks = [search_quality.BEGIN_SHORT, search_quality.BEGIN]
+    page.write_text('above\n' + ''.join(f'{mark}\nold\n{end}\nbelow\n' for mark in marks))
+    before = page.read_text()
+    arguments = ['one drone', '--planner', 'maasi', 'tour', '--runs', '1', '--jobs', '1', *option]
     arguments += ['--out', str(tmp_path), '--document', str(page)]
     monkeypatch.setattr(sys, 'argv', ['search_quality', *arguments])
     assert search_quality.main() == 0
     said = capsys.readouterr().out
-    assert '**one drone** (limit 400 s)' in said and '| maasi | 1 |' in said
-    above, _, rest = page.read_text().partition(f'{search_quality.BEGIN}\n')
-    table, _, below = rest.partition(search_quality.END)
-    assert (above, below) == ('above\n', '\nbelow\n')
+    assert row in said and ('| maasi | 1 |' in said) != bool(option)
+    table = page.read_text().partition(f'{begin}\n')[2].partition(end)[0]
     assert table.startswith('Block `development`') and table in said
+    assert page.read_text().replace(table, 'old\n') == before
 
 
 @pytest.mark.parametrize('name', ['ranging_drone_3d', 'mambo'])

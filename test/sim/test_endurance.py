@@ -44,8 +44,8 @@ def scenario(planner, rng):
     return scenario_from_values(values, 'test')
 
 
-@pytest.mark.parametrize('planner', ['maasi', 'lawnmower', 'nearest_widest'])
-def test_nobody_runs_dry_and_who_is_charged_comes_back(planner, monkeypatch):
+@pytest.mark.parametrize('planner', ['maasi', 'tour', 'lawnmower', 'nearest_widest'])
+def test_nobody_runs_dry_and_who_is_charged_comes_back(planner, monkeypatch, request):
     lowest, drain = [], Battery.drain
 
     def watched(battery, *arguments):
@@ -54,7 +54,7 @@ def test_nobody_runs_dry_and_who_is_charged_comes_back(planner, monkeypatch):
 
     monkeypatch.setattr(Battery, 'drain', watched)
     homes = 0
-    for seed in range(4):
+    for seed in range(*request.config.getoption('--search-seeds')):
         result = search(scenario(planner, np.random.default_rng(seed)), seed)
         for name in 'ab':
             reasons = [
