@@ -26,7 +26,7 @@ from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.simulation.world import World
 
 BEGIN, END = '<!-- table: begin -->', '<!-- table: end -->'
-BEGIN_SHORT = '<!-- short: begin -->'
+BEGIN_SHORT = '<!-- table: begin, short -->'
 PAPER = {'objective': 'paper', 'alpha': 0.75, 'beta': 0.75, 'control_weight': 0.0}
 CUBE, PAIR = 'ranging_drone_3d', 'ranging_pair_3d'
 NEAR_3D, NEAR_FLOOR = {'ring': 6, 'distance': 30.0}, {'ring': 8, 'distance': 0.3}
