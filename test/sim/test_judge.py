@@ -4,9 +4,11 @@ import json
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from shapely.errors import GEOSException
 
 from maasi_sim.experiments import judge
 from maasi_sim.experiments.judge import BASELINES, BOUND, CENTRE, FREE, judge_terrain, main
@@ -81,6 +83,8 @@ def test_worse_ways_find_less_and_longer_ones_are_refused(tmp_path, monkeypatch)
     assert 0.0 < half['found']['8'][FREE] < 0.7 * whole['found']['8'][FREE]
     longer = found(lambda *given: plan(*given[:3], 2.0 * given[3]))
     assert longer['refused'] == f'{FREE}, {CENTRE}: ways longer than 8 km'
+    monkeypatch.setattr(judge.Terrain, '_found', Mock(side_effect=GEOSException('no union')))
+    assert judge_terrain(folder, [8.0], 300, seed=900)['refused'] == 'no union'
 
 
 def test_the_middle_of_each_square_has_its_share_of_the_heat():

@@ -17,6 +17,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from shapely.errors import ShapelyError
 
 from maasi_planner.planners.orienteering import plan_ways
 from maasi_sim.arguments import Parser, count, positive, whole
@@ -91,6 +92,8 @@ def our_ways(swath: float, free: bool, **task: Any) -> list[Any]:
     apart = np.pi * task['max_radius'] ** 2 / budget
     side = float(np.clip(apart, swath / np.sqrt(2.0), swath))
     nodes, prizes = squares(task['probability_map'], task['bounds'], side)
+    # GEOS cannot unite swaths with edges that are equal but for rounding.
+    nodes = nodes.round(3)
     if free:
         [order] = plan_ways(nodes, prizes, None, np.array([budget]))
         return list(toolkit().paths.split_path_for_drones(line(nodes[order]), drones))
@@ -178,7 +181,7 @@ def judge_terrain(folder: Path, budgets: Sequence[float], victims: int, seed: in
         result = Terrain(folder, victims, seed).judge(budgets)
     except FileNotFoundError as error:
         result = {'refused': f'{Path(error.filename).name} is missing'}
-    except (OSError, ValueError, LookupError) as error:
+    except (OSError, ValueError, LookupError, ShapelyError) as error:
         result = {'refused': str(error)}
     return {'terrain': folder.name, **result}
 
