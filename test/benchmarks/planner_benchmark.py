@@ -1,9 +1,11 @@
 """Median times of whole decisions, predicted trajectories included."""
 
+from dataclasses import replace
+
 import numpy as np
 from timing import entry, few, median_time
 
-from maasi_filter.models.detection import ExponentialDetection
+from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
@@ -19,6 +21,7 @@ from maasi_planner import (
     make_planner,
     warm_up,
 )
+from maasi_planner.endurance import Endurance, EnduranceSettings
 from maasi_planner.planners.base import options_of
 
 CUBE = np.array([[0.0, 260.0]] * 3)
@@ -81,6 +84,27 @@ def floor_pair():
     return team_of(robots, 0.05, FLOOR, 0.1, np.random.default_rng(2), 0.1)
 
 
+def field(batteries):
+    """Return three drones at the edge of an area of 2,025 squares of a swath of 20 m."""
+    bounds, grid = np.array([[0.0, 900.0]] * 2), ([3, 3], 300.0, [150.0] * 2)
+    motion = {'speed': 5.0, 'acceleration': 5.0}
+    robots = {
+        f'drone{n}': replace(
+            robot([300.0 * n + 150.0, 1.0, 30.0], bounds, grid, motion, [25.0] * 2, [1.0] * 2),
+            sensor=Sensor.ranging('robot', BoxDetection([-10.0] * 2, [10.0] * 2, 0.98), np.eye(2)),
+        )
+        for n in range(3)
+    }
+    if batteries:
+        # For 9 km and the reserve: two thirds of the area in all.
+        settings = EnduranceSettings(per_metre=0.75 / 9000.0)
+        for name, view in robots.items():
+            endurance = Endurance(settings, view.motion, view.state.pose.position)
+            endurance.hear(1.0)
+            robots[name] = replace(view, endurance=endurance)
+    return TeamView(0, 0.1, robots, [], UnexploredMap(bounds, 5.0))
+
+
 def whole_grid_decision(team):
     """Return the best value of one robot by (17) to (22) as they are written."""
     from plain_objective import plain_terms
@@ -112,3 +136,12 @@ def run(share=1.0):
             ('e on the whole grid, h = 10 m', whole / value) if name == 'asi_decision' else ()
         )
         yield entry(name, 1e3 * value, 'ms', *compared)
+    for batteries in (False, True):
+        team, planners = field(batteries), [make_planner('tour') for _ in range(few(share, 5) + 1)]
+        first = median_time(lambda: planners.pop().decide(team), len(planners) - 1)  # noqa: B023
+        name = 'tour_decision_2025_squares' + '_batteries' * batteries
+        yield entry(name, 1e3 * first, 'ms')
+        planner = make_planner('tour')
+        planner.decide(team)
+        later = median_time(lambda: planner.decide(team), few(share, 20))  # noqa: B023
+        yield entry(f'{name}_at_arrival', 1e3 * later, 'ms', 'the first decision', first / later)
