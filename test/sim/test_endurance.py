@@ -44,6 +44,8 @@ def scenario(planner, rng):
     return scenario_from_values(values, 'test')
 
 
+# Two hundred searches take minutes.
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize('planner', ['maasi', 'tour', 'lawnmower', 'nearest_widest'])
 def test_nobody_runs_dry_and_who_is_charged_comes_back(planner, monkeypatch, request):
     lowest, drain = [], Battery.drain
