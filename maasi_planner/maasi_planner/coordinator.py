@@ -21,8 +21,8 @@ from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
-from maasi_planner.planners.base import check_decision, explain, keep_apart
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
+from maasi_planner.planners.base import check_decision, explain, go_home, keep_apart
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, stay
 
 
 @dataclass
@@ -302,7 +302,7 @@ class Coordinator:
         check_decision(self.planner, team, decision)
         decided = dict(decision.robots)
         for name in planning:
-            home = self._way_home(team, name, decision.robots[name])
+            home = self._way_home(team, name, decision)
             if home is not None:
                 decision.robots[name] = home
         keep_apart(team, decision)
@@ -319,22 +319,20 @@ class Coordinator:
             self.trigger.begin(name, plan.sensor, *way, plan.period, *knowledge)
         return decision if decision.robots else None
 
-    def _way_home(self, team: TeamView, name: str, chosen: RobotDecision) -> RobotDecision | None:
+    def _way_home(self, team: TeamView, name: str, decision: Decision) -> RobotDecision | None:
         """Return the way to a charger of a robot that can afford nothing else, or None."""
         view, endurance = team.robots[name], self.plans[name].endurance
         if endurance is None or math.isnan(endurance.charge):
             return None
         here = view.state.pose.position
-        spent = chosen.stays and endurance.spent
+        spent = decision.robots[name].stays and endurance.spent
         if not (spent or endurance.charging or endurance.must_return(here)):
             return None
         endurance.spent, endurance.charging = False, True
         battery = f'its battery is at {100.0 * endurance.charge:.0f} %'
         if endurance.is_home(here):
             return stay(view, f'charges: {battery}')
-        goal = endurance.way_home(here)[1]
-        prediction = view.motion.predict(view.state, goal[None, :], team.step_time)
-        return single_choice(goal[None, :], prediction, 0, f'goes home to charge: {battery}')
+        return go_home(team, name, decision, f'goes home to charge: {battery}')
 
     def measuring(
         self, step: int, robots: Mapping[str, PresentRobot], able: Collection[str] | None = None

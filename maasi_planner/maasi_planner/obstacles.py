@@ -6,6 +6,8 @@ visibility graph, so that several of them close together are no trap.
 """
 
 import math
+from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -416,6 +418,21 @@ class KeepOut:
     def to_goal(self, goal: Vector) -> FloatArray:
         """Return the table that `next_point` needs for a goal."""
         return _goal_distances(goal, self.circles, self.around.vertices, self._pairs)
+
+    def past(
+        self, robot: FloatArray, goal: FloatArray, others: Sequence[tuple[FloatArray, float]]
+    ) -> FloatArray:
+        """Return the next point, (3,), of the way to a goal past others, by places and radii."""
+        area = copy(self.area)
+        if area is None:
+            return goal
+        # A quarter wider, for robots that cut corners.
+        discs = [[*place, 1.25 * radius + 0.25 * self.radius, 0.0] for place, radius in others]
+        area.circles = np.vstack([area.circles, discs])
+        wide = KeepOut(area, self.radius, self.clearance)
+        x, y, z = robot.tolist()
+        to = (goal[0], goal[1], goal[2])
+        return np.array(next_point((x, y, z), to, wide.to_goal(to), wide.around)[0])
 
     def moved_out(self, robot: ArrayLike, waypoint: ArrayLike) -> FloatArray | None:
         """Return a waypoint moved to the minimum admissible distance (001, section 4.3).

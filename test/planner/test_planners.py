@@ -21,9 +21,11 @@ from maasi_planner import (
     make_motion,
     make_planner,
 )
-from maasi_planner.planners.base import keep_apart
+from maasi_planner.endurance import Endurance, EnduranceSettings
+from maasi_planner.planners.base import go_home, keep_apart
 from maasi_planner.planners.lawnmower import lanes
 from maasi_planner.planners.mutual_information import intensity, mutual_information
+from maasi_planner.team import Decision, stay
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
@@ -352,6 +354,35 @@ def test_robots_keep_apart_on_their_ways(name):
         waits += sum('waits' in robot.reason for robot in decision.robots.values())
         moves += sum(not robot.stays for robot in decision.robots.values())
     assert moves > 400 and waits > 0
+
+
+def test_the_way_home_leads_past_a_robot_that_stands_on_it():
+    team, view = one_robot(waiting=1, radius=0.1)
+    [name] = team.planning()
+    [other] = [robot for key, robot in team.robots.items() if key != name]
+    view.motion = make_motion(view.motion.settings, Area([[0.0, 9.0]] * 2), view.radius)
+    view.endurance = Endurance(EnduranceSettings(), view.motion, [2.0, 1.0, 0.0])
+    other.remaining_path = None
+
+    def step_home():
+        decision = Decision(0, robots={name: stay(view, 'stays')})
+        decision.robots[name] = go_home(team, name, decision, 'goes home')
+        keep_apart(team, decision)
+        return decision.robots[name]
+
+    view.state, other.state = at(0.2, 1.0), at(1.0, 1.0)
+    length, legs = 0.0, 0
+    while not view.endurance.is_home(view.state.pose.position):
+        chosen, legs = step_home(), legs + 1
+        assert not chosen.stays and legs < 6
+        gaps = np.linalg.norm(chosen.positions - other.state.pose.position, axis=1)
+        assert gaps.min() >= view.radius + other.radius - 1e-9
+        length += np.linalg.norm(np.diff(chosen.positions, axis=0), axis=1).sum()
+        view.state = RobotState.at_rest(chosen.positions[-1])
+    assert legs > 1 and length < 1.3 * 1.8
+    # It waits until the charger is free.
+    view.state, other.state = at(0.2, 1.0), at(2.0, 1.0)
+    assert step_home().stays
 
 
 def test_wrong_team_is_refused():

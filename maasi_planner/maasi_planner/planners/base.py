@@ -16,7 +16,15 @@ from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, UsableCandidates, stay
+from maasi_planner.team import (
+    Decision,
+    RobotDecision,
+    RobotView,
+    TeamView,
+    UsableCandidates,
+    single_choice,
+    stay,
+)
 
 # Reason of a robot that lets others pass.
 CROSSED = 'waits: others are on its way'
@@ -260,6 +268,19 @@ def ways_apart(
     stand, or on the rest of their ways. A robot that is too near already may not come nearer.
     """
     view = team.robots[name]
+    free = np.ones(len(ways), dtype=bool)
+    for path, radius in _paths(team, name, others):
+        if view.radius + radius > 0.0:
+            now = float(np.linalg.norm(view.state.pose.position - path[0]))
+            reach = min(view.radius + radius, now)
+            free &= _gaps(ways, np.ascontiguousarray(path, dtype=float)) >= reach - 1e-9
+    return free
+
+
+def _paths(
+    team: TeamView, name: str, others: Mapping[str, FloatArray]
+) -> list[tuple[FloatArray, float]]:
+    """Return where the others go or stand, (n, 3), and their radii."""
     paths = [(place[None, :], radius) for place, radius in team.taken]
     for other in team.names():
         robot = team.robots[other]
@@ -270,13 +291,7 @@ def ways_apart(
             if path is None or not len(path):
                 path = robot.state.pose.position[None, :]
             paths.append((path, robot.radius))
-    free = np.ones(len(ways), dtype=bool)
-    for path, radius in paths:
-        if view.radius + radius > 0.0:
-            now = float(np.linalg.norm(view.state.pose.position - path[0]))
-            reach = min(view.radius + radius, now)
-            free &= _gaps(ways, np.ascontiguousarray(path, dtype=float)) >= reach - 1e-9
-    return free
+    return paths
 
 
 def affordable(
@@ -323,6 +338,22 @@ def keep_apart(team: TeamView, decision: Decision) -> None:
             decision.robots[name] = stay(team.robots[name], CROSSED)
             ways[name] = team.robots[name].state.pose.position[None]
             changed = True
+
+
+def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> RobotDecision:
+    """Send a robot to its charger, past others who are in the way; it waits where one is there."""
+    view, endurance = team.robots[name], team.robots[name].endurance
+    assert endurance is not None
+    here = view.state.pose.position
+    goal = endurance.way_home(here)[1]
+    prediction = view.motion.predict(view.state, goal[None, :], team.step_time)
+    others = {key: robot.positions for key, robot in decision.robots.items() if key != name}
+    places = [(path[-1], radius) for path, radius in _paths(team, name, others)]
+    blocked = not ways_apart(team, name, prediction.positions, others)[0]
+    if blocked and apart(goal, view.radius, places):
+        goal = view.motion.keep_out.past(here, goal, places)
+        prediction = view.motion.predict(view.state, goal[None, :], team.step_time)
+    return single_choice(goal[None, :], prediction, 0, reason)
 
 
 def apart(point: FloatArray, radius: float, others: list[tuple[FloatArray, float]]) -> bool:
