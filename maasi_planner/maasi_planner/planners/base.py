@@ -28,6 +28,13 @@ from maasi_planner.team import (
 
 # Reason of a robot that lets others pass.
 CROSSED = 'waits: others are on its way'
+# Half of a way, turned aside [rad].
+_ASIDE = np.array(
+    [
+        0.5 * np.array([[math.cos(t), -math.sin(t)], [math.sin(t), math.cos(t)], [0.0, 0.0]])
+        for t in (0.5, -0.5, 1.0, -1.0, 1.5, -1.5)
+    ]
+)
 
 
 class Planner(ABC):
@@ -344,16 +351,22 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     """Send a robot to its charger, past others who are in the way; it waits where one is there."""
     view, endurance = team.robots[name], team.robots[name].endurance
     assert endurance is not None
-    here = view.state.pose.position
-    goal = endurance.way_home(here)[1]
-    prediction = view.motion.predict(view.state, goal[None, :], team.step_time)
+    here, keep_out = view.state.pose.position, view.motion.keep_out
+    charger = endurance.way_home(here)[1]
+    prediction = view.motion.predict(view.state, charger[None, :], team.step_time)
     others = {key: robot.positions for key, robot in decision.robots.items() if key != name}
     places = [(path[-1], radius) for path, radius in _paths(team, name, others)]
     blocked = not ways_apart(team, name, prediction.positions, others)[0]
-    if blocked and apart(goal, view.radius, places):
-        goal = view.motion.keep_out.past(here, goal, places)
-        prediction = view.motion.predict(view.state, goal[None, :], team.step_time)
-    return single_choice(goal[None, :], prediction, 0, reason)
+    if not (blocked and apart(charger, view.radius, places)):
+        return single_choice(charger[None, :], prediction, 0, reason)
+    # Past where they will stand; else aside, until they have passed.
+    aside = here + _ASIDE @ (charger - here)[:2]
+    moved = [keep_out.moved_out(here, point) for point in aside]
+    free = [point for point in moved if point is not None and team.area.inside(point[None, :])[0]]
+    goals = np.array([keep_out.past(here, charger, places), *free])
+    prediction = view.motion.predict(view.state, goals, team.step_time)
+    usable = ways_apart(team, name, prediction.positions, others) & prediction.reached
+    return single_choice(goals, prediction, int(np.argmax(usable)), reason)
 
 
 def apart(point: FloatArray, radius: float, others: list[tuple[FloatArray, float]]) -> bool:

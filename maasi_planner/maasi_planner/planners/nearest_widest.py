@@ -8,6 +8,7 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_planner.planners.base import (
     Planner,
+    affordable,
     apart,
     centres_of,
     explain,
@@ -56,7 +57,8 @@ class NearestWidest(Planner):
                 if point is None or not apart(point, view.radius, taken):
                     continue
                 prediction = view.motion.predict(view.state, point[None, :], team.step_time)
-                if not prediction.reached[0] or prediction.lengths[0] == 0:
+                allowed = prediction.reached & (prediction.lengths > 0)
+                if not affordable(team, name, prediction, allowed)[0]:
                     continue
                 self._turns[name] = (kind + 1) % 2
                 word = ('nearest', 'widest')[kind % 2]
