@@ -380,6 +380,16 @@ def test_the_way_home_leads_past_a_robot_that_stands_on_it():
         length += np.linalg.norm(np.diff(chosen.positions, axis=0), axis=1).sum()
         view.state = RobotState.at_rest(chosen.positions[-1])
     assert legs > 1 and length < 1.3 * 1.8
+    # It steps aside for one that comes towards it, and turns off.
+    corners = np.array([[1.2, 1.0, 0.0], [0.7, 1.0, 0.0], [0.7, 1.9, 0.0]])
+    legs = [np.linspace(*pair, 40) for pair in itertools.pairwise(corners)]
+    view.state, other.state, other.remaining_path = at(0.2, 1.0), at(1.2, 1.0), np.vstack(legs)
+    chosen = step_home()
+    steps = np.arange(max(len(chosen.positions), 80))
+    first = chosen.positions[np.minimum(steps, len(chosen.positions) - 1)]
+    gaps = np.linalg.norm(first - other.remaining_path[np.minimum(steps, 79)], axis=1)
+    assert not chosen.stays and gaps.min() >= view.radius + other.radius - 1e-9
+    other.remaining_path = None
     # It waits until the charger is free.
     view.state, other.state = at(0.2, 1.0), at(2.0, 1.0)
     assert step_home().stays
