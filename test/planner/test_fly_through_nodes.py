@@ -1,7 +1,6 @@
 """Free running: goals that preempt one another, and robots whose planner dies meanwhile."""
 
 import threading
-from types import SimpleNamespace
 
 import pytest
 from driven_team import SETTINGS, driven
@@ -99,7 +98,7 @@ def test_robots_that_refuse_waypoints_are_stopped_and_planned_for_again(world, m
     world.until(lambda: world.moving() and not world.planner.fault())
     # A driver that is ended is no warning.
     warnings, sent = [], world.planner._goals._sent['b']
-    monkeypatch.setattr(world.planner._goals, '_logger', SimpleNamespace(warning=warnings.append))
+    monkeypatch.setattr(world.planner._goals, '_warn', lambda _, text: warnings.append(text))
     assert world.drivers[1].trigger_deactivate().name == 'SUCCESS'
     world.until(lambda: sent.reason == 'the driver stops')
     assert warnings == []
