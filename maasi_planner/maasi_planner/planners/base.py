@@ -28,7 +28,7 @@ from maasi_planner.team import (
 
 # Reason of a robot that lets others pass.
 CROSSED = 'waits: others are on its way'
-# Half of a way, turned aside [rad].
+# Turn a way in the plane aside, by angles [rad], and halve it: (6, 3, 2).
 _ASIDE = np.array(
     [
         0.5 * np.array([[math.cos(t), -math.sin(t)], [math.sin(t), math.cos(t)], [0.0, 0.0]])
