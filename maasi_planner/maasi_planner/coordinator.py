@@ -161,10 +161,13 @@ class RobotPlan:
         if not planning and self.decided_at is not None:
             view.phase = (self.measured_from - step) % self.period
             if len(self.positions):
-                first = min(step - self.decided_at, len(self.positions) - 1)
-                view.remaining_path = self.positions[first:]
-                view.remaining_yaws = self.yaws[first:]
+                view.remaining_path, view.remaining_yaws = self.left(step)
         return view
+
+    def left(self, step: int) -> tuple[FloatArray, FloatArray]:
+        """Return the rest of its predicted trajectory: positions (n, 3) and headings (n,)."""
+        first = min(step - (self.decided_at or 0), len(self.positions) - 1)
+        return self.positions[first:], self.yaws[first:]
 
 
 class Coordinator:
@@ -302,16 +305,20 @@ class Coordinator:
         check_decision(self.planner, team, decision)
         decided = dict(decision.robots)
         for name in planning:
-            home = self._way_home(team, name, decision)
+            home = self._way_home(team, name, decision, name in arrived)
             if home is not None:
                 decision.robots[name] = home
-        keep_apart(team, decision)
+        # Who has not arrived, and gets no other way, is still on its present one.
+        under_way = [n for n in planning if n not in arrived and len(self.plans[n].positions)]
+        keep_apart(team, decision, {name: self.plans[name].left(step)[0] for name in under_way})
         if any(decision.robots[name] is not chosen for name, chosen in decided.items()):
             explain(decision)
         for name in planning:
             plan, chosen = self.plans[name], decision.robots[name]
             if name not in arrived and chosen.stays:
                 plan.turning_distance = 0.0
+                if plan.endurance is not None:
+                    plan.endurance.charging = False  # asked again at the next step
                 del decision.robots[name]
                 continue
             plan.adopt(step, robots[name], chosen)
@@ -319,18 +326,22 @@ class Coordinator:
             self.trigger.begin(name, plan.sensor, *way, plan.period, *knowledge)
         return decision if decision.robots else None
 
-    def _way_home(self, team: TeamView, name: str, decision: Decision) -> RobotDecision | None:
+    def _way_home(
+        self, team: TeamView, name: str, decision: Decision, arrived: bool
+    ) -> RobotDecision | None:
         """Return the way to a charger of a robot that can afford nothing else, or None."""
         view, endurance = team.robots[name], self.plans[name].endurance
         if endurance is None or math.isnan(endurance.charge):
             return None
-        here = view.state.pose.position
-        spent = decision.robots[name].stays and endurance.spent
+        here, chosen = view.state.pose.position, decision.robots[name]
+        # Not every planner asks for the battery.
+        way = view.motion.predict(view.state, chosen.waypoint[None], team.step_time)
+        spent = endurance.spent if chosen.stays else not endurance.affords(way, team.step_time)[0]
         if not (spent or endurance.charging or endurance.must_return(here)):
             return None
         endurance.spent, endurance.charging = False, True
         battery = f'its battery is at {100.0 * endurance.charge:.0f} %'
-        if endurance.is_home(here):
+        if arrived and endurance.is_home(here):
             return stay(view, f'charges: {battery}')
         return go_home(team, name, decision, f'goes home to charge: {battery}')
 

@@ -45,8 +45,8 @@ class Endurance:
         self.charging = False  #: whether it is on its way to a charger, or charges
         self.spent = False  #: whether nothing else was affordable at the last decision
 
-    def way_home(self, position: ArrayLike) -> tuple[float, FloatArray]:
-        """Return the shortest way to a charger [m], and that charger (3,)."""
+    def ways_home(self, position: ArrayLike) -> FloatArray:
+        """Return the ways from a position to all chargers [m]."""
         x, y, z = np.asarray(position, dtype=float).tolist()
         lengths = []
         for charger in self.chargers.tolist():
@@ -54,8 +54,14 @@ class Endurance:
             keep_out = self.motion.keep_out
             _, left = next_point((x, y, z), goal, self.motion.table(goal), keep_out.around)
             lengths.append(left)
-        nearest = int(np.argmin(lengths))
-        return lengths[nearest], self.chargers[nearest]
+        return np.array(lengths)
+
+    def chargers_within(self, position: ArrayLike) -> FloatArray:
+        """Return the chargers (n, 3) that the battery reaches, nearest first; at least one."""
+        lengths = self.ways_home(position)
+        order = np.argsort(lengths, kind='stable')
+        usable = [row for row in order if self._use(lengths[row]) <= self.charge]
+        return self.chargers[usable or order[:1]]
 
     def is_home(self, position: ArrayLike) -> bool:
         """Return whether a robot is at a charger."""
@@ -63,8 +69,11 @@ class Endurance:
         return bool(gaps.min() <= 2.0 * self.motion.settings.tolerance)
 
     def use_home(self, position: ArrayLike) -> float:
-        """Return the share of the battery that the way home takes, with a tenth for turns."""
-        metres = 1.1 * self.way_home(position)[0]
+        """Return the share of the battery that the shortest way home takes."""
+        return self._use(self.ways_home(position).min())
+
+    def _use(self, way: float) -> float:
+        metres = 1.1 * way  # a tenth for turns
         seconds = metres / self.motion.settings.speed + 1.0 / self.motion.rate
         return self.settings.per_second * seconds + self.settings.per_metre * metres
 
@@ -74,7 +83,8 @@ class Endurance:
         use = 1.1 * (settings.per_metre + settings.per_second / speed)
         left = max(self.charge - settings.reserve, 0.0)
         known = use > 0.0 and not math.isnan(self.charge)
-        return (left / use if known else math.inf), self.way_home(position)[1]
+        nearest = int(np.argmin(self.ways_home(position)))
+        return (left / use if known else math.inf), self.chargers[nearest]
 
     def affords(self, ways: Trajectories, step: float) -> BoolArray:
         """Return which predicted ways leave enough to come home with the reserve, (W,)."""

@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from maasi_planner.coordinator import Coordinator, Member, PresentRobot
+from maasi_planner.endurance import Endurance, EnduranceSettings
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners.intermittent import Intermittent
@@ -255,3 +256,29 @@ def test_of_two_waypoints_passed_in_a_row_each_is_measured(monkeypatch):
     coordinator.plans['a'].turning_distance = 1.0
     assert coordinator.plan(3, robots) is not None
     assert [item.robot for item in coordinator.measuring(3, robots)] == ['a']
+
+
+def test_a_robot_that_must_turn_home_does_so_as_soon_as_its_charger_is_free():
+    coordinator = make({'a': ROBOT | {'endurance': {'per_metre': 0.01, 'chargers': [[1, 1, 0]]}}})
+    here = RobotState.at_rest([5.0, 5.0, 0.0])
+    coordinator.plan(0, {'a': PresentRobot(here, True, 1.0)})
+    low = {'a': PresentRobot(here, False, 0.1)}
+    occupied = [(np.array([1.0, 1.0, 0.0]), 0.1)]
+    assert coordinator.plan(1, low, occupied) is None
+    chosen = coordinator.plan(2, low).robots['a']
+    assert chosen.reason.startswith('goes home') and chosen.waypoint.tolist() == [1.0, 1.0, 0.0]
+    # Over its charger it is not home before it has stopped there.
+    over = PresentRobot(RobotState.at_rest([1.0, 1.0, 0.0]), False, 0.01)
+    coordinator.plans['a'].endurance.charging = False
+    assert coordinator.plan(3, {'a': over}).robots['a'].reason.startswith('goes home')
+
+
+def test_who_is_sent_further_than_its_battery_affords_goes_home(monkeypatch):
+    """By hand: 2.9 m to the next goal, and 3.5 m and a tenth from there, use 0.34 of the battery."""
+    for charge, waypoint in ((0.6, GOALS[1]), (0.58, (1.0, 1.0))):
+        coordinator = flying(monkeypatch)
+        plan = coordinator.plans['a']
+        settings = EnduranceSettings(per_metre=0.05, reserve=0.25)
+        plan.endurance = Endurance(settings, plan.motion, [1.0, 1.0, 0.0])
+        arrived = PresentRobot(RobotState.at_rest([*GOALS[0], 0.0]), True, charge)
+        assert_allclose(coordinator.plan(30, {'a': arrived}).robots['a'].waypoint[:2], waypoint)

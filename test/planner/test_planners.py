@@ -333,7 +333,7 @@ def test_robots_keep_apart_on_their_ways(name):
         rng = np.random.default_rng(seed)
         team = random_team(rng, planning=3, waiting=2, candidates=8, radius=0.04)
         decision = make_planner(name).decide(team)
-        keep_apart(team, decision)
+        keep_apart(team, decision, {})
         ways = {key: robot.positions for key, robot in decision.robots.items()}
         moving = {key for key, robot in decision.robots.items() if not robot.stays}
         for key, view in team.robots.items():
@@ -356,6 +356,22 @@ def test_robots_keep_apart_on_their_ways(name):
     assert moves > 400 and waits > 0
 
 
+def test_the_way_home_is_to_another_charger_where_the_nearest_is_taken_if_the_battery_allows():
+    team, view = one_robot(waiting=1, radius=0.1)
+    [name] = team.planning()
+    [other] = [robot for key, robot in team.robots.items() if key != name]
+    settings = EnduranceSettings(per_metre=0.1, chargers=[[2.0, 1.0, 0.0], [0.2, 4.0, 0.0]])
+    view.endurance = Endurance(settings, view.motion, np.zeros(3))
+    view.state, other.state, other.remaining_path = at(0.2, 1.0), at(2.0, 1.0), None
+    for charge, charger in ((0.34, 1), (0.3, 0)):
+        view.endurance.hear(charge)
+        decision = Decision(0, robots={name: stay(view, 'stays')})
+        chosen = decision.robots[name] = go_home(team, name, decision, 'goes home')
+        assert chosen.waypoint.tolist() == settings.chargers[charger]
+        keep_apart(team, decision, {})
+        assert decision.robots[name].stays == (charger == 0)
+
+
 def test_the_way_home_leads_past_a_robot_that_stands_on_it():
     team, view = one_robot(waiting=1, radius=0.1)
     [name] = team.planning()
@@ -367,7 +383,7 @@ def test_the_way_home_leads_past_a_robot_that_stands_on_it():
     def step_home():
         decision = Decision(0, robots={name: stay(view, 'stays')})
         decision.robots[name] = go_home(team, name, decision, 'goes home')
-        keep_apart(team, decision)
+        keep_apart(team, decision, {})
         return decision.robots[name]
 
     view.state, other.state = at(0.2, 1.0), at(1.0, 1.0)

@@ -31,11 +31,10 @@ def watch(run, address):
     """Note what a browser sees of a run that is under way."""
     with chromium() as shown:
         shown.open(address)
-        shown.until('maasi.log.duration > 1')
-        run.strips = [
-            strip.get_attribute('aria-label')
-            for strip in shown.page.locator('#strips canvas').all()
-        ]
+        strips = "[...document.querySelectorAll('#strips canvas')].map((strip) => strip.ariaLabel)"
+        # Strips are drawn now and then: until both robots have moved on them.
+        shown.until(f"{strips}.filter((text) => text.includes('on the way')).length === 2")
+        run.strips = shown.page.evaluate(strips)
         shown.page.click('#robots tr[data-robot=turtlebot]')
         shown.page.click('button[data-command=pause]')
         shown.until("/[^.]$/.test(document.querySelector('#controls [role=status]').innerText)")

@@ -328,12 +328,17 @@ def held_back(team: TeamView, name: str, prediction: Trajectories, decision: Dec
     return ''
 
 
-def keep_apart(team: TeamView, decision: Decision) -> None:
+def keep_apart(team: TeamView, decision: Decision, left: Mapping[str, FloatArray]) -> None:
     """Let robots wait whose ways would come too near to each other; the first by name has priority.
 
-    Who waits stands where it is, which may make others wait, too.
+    Who waits stands where it is, which may make others wait, too; left: or is still on the rest
+    (n, 3) of its present way.
     """
-    ways = {name: robot.positions for name, robot in decision.robots.items()}
+    rest = {name: team.robots[name].state.pose.position[None] for name in decision.robots} | left
+    ways = {
+        name: rest[name] if robot.stays else robot.positions
+        for name, robot in decision.robots.items()
+    }
     changed = True
     while changed:
         changed = False
@@ -343,27 +348,28 @@ def keep_apart(team: TeamView, decision: Decision) -> None:
             if chosen.stays or ways_apart(team, name, ways[name][None], others)[0]:
                 continue
             decision.robots[name] = stay(team.robots[name], CROSSED)
-            ways[name] = team.robots[name].state.pose.position[None]
+            ways[name] = rest[name]
             changed = True
 
 
 def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> RobotDecision:
-    """Send a robot to its charger, past others who are in the way; it waits where one is there."""
+    """Send a robot to a charger past others who are in the way; it waits where all are taken."""
     view, endurance = team.robots[name], team.robots[name].endurance
     assert endurance is not None
     here, keep_out = view.state.pose.position, view.motion.keep_out
-    charger = endurance.way_home(here)[1]
-    prediction = view.motion.predict(view.state, charger[None, :], team.step_time)
     others = {key: robot.positions for key, robot in decision.robots.items() if key != name}
     places = [(path[-1], radius) for path, radius in _paths(team, name, others)]
-    blocked = not ways_apart(team, name, prediction.positions, others)[0]
-    if not (blocked and apart(charger, view.radius, places)):
+    chargers = endurance.chargers_within(here)
+    free = [charger for charger in chargers if apart(charger, view.radius, places)]
+    charger = (free or chargers)[0]
+    prediction = view.motion.predict(view.state, charger[None, :], team.step_time)
+    if not free or ways_apart(team, name, prediction.positions, others)[0]:
         return single_choice(charger[None, :], prediction, 0, reason)
     # Past where they will stand; else aside, until they have passed.
     aside = here + _ASIDE @ (charger - here)[:2]
     moved = [keep_out.moved_out(here, point) for point in aside]
-    free = [point for point in moved if point is not None and team.area.inside(point[None, :])[0]]
-    goals = np.array([keep_out.past(here, charger, places), *free])
+    inside = [place for place in moved if place is not None and team.area.inside(place[None, :])[0]]
+    goals = np.array([keep_out.past(here, charger, places), *inside])
     prediction = view.motion.predict(view.state, goals, team.step_time)
     usable = ways_apart(team, name, prediction.positions, others) & prediction.reached
     return single_choice(goals, prediction, int(np.argmax(usable)), reason)
