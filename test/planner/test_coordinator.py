@@ -274,7 +274,7 @@ def test_a_robot_that_must_turn_home_does_so_as_soon_as_its_charger_is_free():
 
 
 def test_who_is_sent_further_than_its_battery_affords_goes_home(monkeypatch):
-    """By hand: 2.9 m to the next goal, and 3.5 m and a tenth from there, use 0.34 of the battery."""
+    """By hand: 2.9 m there, and 3.5 m and a tenth home, use 0.34 of the battery."""
     for charge, waypoint in ((0.6, GOALS[1]), (0.58, (1.0, 1.0))):
         coordinator = flying(monkeypatch)
         plan = coordinator.plans['a']
