@@ -25,7 +25,7 @@ from maasi_planner.endurance import Endurance, EnduranceSettings
 from maasi_planner.planners.base import go_home, keep_apart
 from maasi_planner.planners.lawnmower import lanes
 from maasi_planner.planners.mutual_information import intensity, mutual_information
-from maasi_planner.team import Decision, stay
+from maasi_planner.team import Decision, single_choice, stay
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
@@ -354,6 +354,20 @@ def test_robots_keep_apart_on_their_ways(name):
         waits += sum('waits' in robot.reason for robot in decision.robots.values())
         moves += sum(not robot.stays for robot in decision.robots.values())
     assert moves > 400 and waits > 0
+
+
+def test_a_robot_waits_for_one_that_is_still_on_its_present_way():
+    team, view = one_robot(waiting=1, radius=0.1)
+    [name] = team.planning()
+    [other] = [key for key in team.robots if key != name]
+    team.robots[other].planning = True
+    view.state, team.robots[other].state = at(0.2, 1.0), at(1.0, 0.2)
+    prediction = view.motion.predict(view.state, np.array([[1.8, 1.0, 0.0]]), team.step_time)
+    goes = single_choice(np.array([[1.8, 1.0, 0.0]]), prediction, 0, 'goes')
+    for rest, waits in ((np.tile([1.0, 0.2, 0.0], (9, 1)), False), (goes.positions[::-1], True)):
+        decision = Decision(0, robots={name: goes, other: stay(team.robots[other], 'stays')})
+        keep_apart(team, decision, {other: rest})
+        assert decision.robots[name].stays == waits
 
 
 def test_the_way_home_is_to_another_charger_where_the_nearest_is_taken_if_the_battery_allows():
