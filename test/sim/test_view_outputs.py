@@ -215,6 +215,7 @@ def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chrom
         assert heads == cells
 
         def tip(place):
+            shown.settle()  # the map may just take another size
             x, y = page.evaluate(f'maasi.camera.project({list(place)})')[:2]
             box = page.locator('#map').bounding_box()
             page.mouse.move(box['x'] + x, box['y'] + y)
