@@ -120,6 +120,7 @@ def large(squares, detection, number, prior='', **wrong):
         candidates=grid,
         motion={'speed': 5.0, 'acceleration': 5.0},
         sensor={'detection': DETECTIONS[detection]},
+        battery={'capacity': 1e7},  # lasts until the limit
     )
     priors = [likely(side, **wrong)] if prior else []
     return Regime(
