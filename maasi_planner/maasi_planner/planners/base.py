@@ -334,7 +334,8 @@ def keep_apart(team: TeamView, decision: Decision, left: Mapping[str, FloatArray
     Who waits stands where it is, which may make others wait, too; left: or is still on the rest
     (n, 3) of its present way.
     """
-    rest = {name: team.robots[name].state.pose.position[None] for name in decision.robots} | left
+    rest = {name: team.robots[name].state.pose.position[None] for name in decision.robots}
+    rest.update(left)
     ways = {
         name: rest[name] if robot.stays else robot.positions
         for name, robot in decision.robots.items()
