@@ -334,9 +334,11 @@ class Coordinator:
         if endurance is None or math.isnan(endurance.charge):
             return None
         here, chosen = view.state.pose.position, decision.robots[name]
-        # Not every planner asks for the battery.
-        way = view.motion.predict(view.state, chosen.waypoint[None], team.step_time)
-        spent = endurance.spent if chosen.stays else not endurance.affords(way, team.step_time)[0]
+        spent = endurance.spent
+        if not chosen.stays:
+            # Not every planner asks for the battery.
+            way = view.motion.predict(view.state, chosen.waypoint[None], team.step_time)
+            spent = not endurance.affords(way, team.step_time)[0]
         if not (spent or endurance.charging or endurance.must_return(here)):
             return None
         endurance.spent, endurance.charging = False, True
