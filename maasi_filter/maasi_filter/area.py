@@ -58,14 +58,15 @@ class Area:
         self.solid = _circles(environment.obstacles)
         self._solid_polygons = _polygons(environment.obstacles)
         self._fence = read_shape(environment.area) if environment.area else None
+        #: Level shape in which robots stay: the area, or its bounds.
+        self.border: BaseGeometry = self._fence or box(*self.bounds[:2].T.ravel())
         closed = list(map(level_shape, environment.keep_outs))
         #: Of what is shown: level shapes by what they are, but for round obstacles.
         self.shapes = {'area': [self._fence] if self._fence else [], 'keep_out': closed}
         self.shapes['obstacle'] = self._solid_polygons
         self.region: BaseGeometry | None = None
         if self._fence is not None or closed:
-            whole = self._fence or box(*self.bounds[:2].T.ravel())
-            self.region = whole.difference(shapely.union_all(closed))
+            self.region = self.border.difference(shapely.union_all(closed))
             if self.region.area <= 0.0:
                 raise ValueError('environment.keep_outs: leave nothing of the area')
             shapely.prepare(self.region)
@@ -105,10 +106,8 @@ class Area:
         return np.asarray(within)
 
     def outside_by(self, position: ArrayLike) -> float:
-        """Return how far a place (3,) is outside of the area's border [m]; 0: inside, or none."""
-        if self._fence is None:
-            return 0.0
-        return float(self._fence.distance(shapely.Point(np.asarray(position)[:2])))
+        """Return how far a position (3,) is outside of the border [m]; 0: inside."""
+        return float(self.border.distance(shapely.Point(np.asarray(position)[:2])))
 
     def density(self, points: FloatArray) -> FloatArray:
         """Return how likely targets are at points (n, d or more), (n,): prior times inside.
@@ -158,16 +157,16 @@ class Area:
         return edges_of(self._solid_polygons)
 
     def room(self, reach: float) -> BaseGeometry | None:
-        """Return where robots that keep `reach` metres from its border may be; None: anywhere.
+        """Return where robots that keep `reach` metres from its border may be; None: in a box.
 
-        Round zones are not in it, and the sides of a box need no distance.
+        Round zones are not in it, and the sides of bounds need no distance.
         """
         polygons = _polygons([*self.settings.obstacles, *self.settings.keep_outs])
-        if self._fence is None and not polygons:
+        if self._fence is None and not polygons and not len(self.circles):
             return None
         whole = self._fence
         if whole is None:
-            whole = box(*self.bounds[:2].T.ravel()).buffer(reach, join_style='mitre')
+            whole = self.border.buffer(reach, join_style='mitre')
         return whole.difference(shapely.union_all(polygons))
 
     @cached_property
