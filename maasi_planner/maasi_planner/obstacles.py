@@ -8,15 +8,17 @@ visibility graph, so that several of them close together are no trap.
 import math
 from collections.abc import Sequence
 from copy import copy
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 from numba import njit
 from numpy.typing import ArrayLike
+from shapely.geometry.base import BaseGeometry
 from shapely.ops import nearest_points
 
-from maasi_filter.area import Area, edges_of
+from maasi_filter.area import Area, edges_of, level_shape
 from maasi_filter.arrays import FloatArray
 
 CORNERS = 12
@@ -409,6 +411,29 @@ class KeepOut:
         ]
         return np.array(clear, dtype=float).reshape(-1, 2)
 
+    @cached_property
+    def _open(self) -> BaseGeometry:
+        """Where robots that leave a zone may go: clear of everything by the clearance."""
+        assert self.area is not None
+        reach = self.circles[: self._round, 3] + 0.95 * self.clearance
+        centres = shapely.points(self.circles[: self._round, :2])
+        discs = shapely.buffer(centres, reach / math.cos(math.pi / 64), quad_segs=16)
+        whole = self.area.border if self._places is None else self._places
+        return whole.difference(shapely.union_all(discs))
+
+    @cached_property
+    def _solid(self) -> BaseGeometry:
+        """Where a robot may be that leaves a zone: inside of the border, clear of what is solid."""
+        assert self.area is not None
+        solid = shapely.union_all(list(map(level_shape, self.area.settings.obstacles)))
+        inside = self.area.border.difference(solid.buffer(self.radius))
+        shapely.prepare(inside)
+        return inside
+
+    @property
+    def _step(self) -> float:
+        return max(self.radius + self.clearance, 1e-3)
+
     def is_free(self, position: ArrayLike) -> bool:
         """Return whether a robot at `position` (3,) touches no obstacle and is inside."""
         x, y, z = (float(value) for value in np.asarray(position, dtype=float))
@@ -433,6 +458,40 @@ class KeepOut:
         x, y, z = robot.tolist()
         to = (goal[0], goal[1], goal[2])
         return np.array(next_point((x, y, z), to, wide.to_goal(to), wide.around)[0])
+
+    def exit_from(self, position: ArrayLike) -> FloatArray | None:
+        """Return where a robot at a position (3,) leaves a zone that it is in, or None outside.
+
+        It is the nearest position clear of all zones that a straight line reaches inside of the
+        border and past solid obstacles; around these, the first point of the path there.
+        """
+        here = np.asarray(position, dtype=float)
+        x, y, z = here.tolist()
+        touching = self.circles.copy()
+        touching[:, 3] -= 0.1 * self.clearance
+        if is_clear((x, y, z), (x, y, z), touching, 0.0, False) and not beyond_walls(
+            (x, y, z), self.circles
+        ):
+            return None
+        if self._open.is_empty:
+            return None
+        point = shapely.Point(x, y)
+        near = nearest_points(self._open, point)[0]
+        if not self._solid.covers(shapely.LineString([point, near])):
+            outline = shapely.get_coordinates(self._open.segmentize(0.5 * self._step))
+            lines = shapely.linestrings([[(x, y), corner] for corner in outline.tolist()])
+            straight = shapely.covers(self._solid, lines)
+            if straight.any():
+                rows = np.flatnonzero(straight)
+                near = shapely.Point(outline[rows[np.argmin(shapely.length(lines[rows]))]])
+            else:
+                assert self.area is not None
+                lasting = Area(self.area.settings.without_keep_outs())
+                around = KeepOut(lasting, self.radius, self.clearance)
+                goal = (near.x, near.y, z)
+                (gx, gy, _), _ = next_point((x, y, z), goal, around.to_goal(goal), around.around)
+                return np.array([gx, gy, z])
+        return np.array([near.x, near.y, z])
 
     def moved_out(self, robot: ArrayLike, waypoint: ArrayLike) -> FloatArray | None:
         """Return a waypoint moved to the minimum admissible distance (001, section 4.3).
