@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -14,12 +16,33 @@ from shapely.geometry import box
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.environment import EnvironmentSettings, Zone, read_image, read_shape
+from maasi_filter.environment import (
+    EnvironmentSettings,
+    Zone,
+    check_pixels,
+    read_image,
+    read_shape,
+)
 from maasi_filter.geodesy import OriginSettings, geodetic
 
 _ROUNDING = 1e-6  # of coordinates, also of those that are large [m]
 # Cells of the density along the longer side, and every how many are looked at to check it.
 _CELLS, _CHECKED = 512, 16
+# Ground narrower than this is rounding, not area; twice as far as shapes are rounded [m].
+_NARROWEST = 2e-4
+_ANOTHER_COUNTRY = 100e3  # a zone as far as this from the area is hardly meant [m]
+
+
+class Density(NamedTuple):
+    """Where targets are expected, in cells.
+
+    values (nx, ny): relative to evenly over the region; share: of the bounds that is inside; even:
+    whether the prior promises nothing inside, so that targets are expected evenly.
+    """
+
+    values: FloatArray
+    share: float
+    even: bool
 
 
 class Area:
@@ -38,6 +61,8 @@ class Area:
         Level shape of what may hold targets: the area without keep-outs; None: all of `bounds`.
     circles : (n, 5) array
         Of all round zones: x, y, z, radius [m, map], 1 for a sphere, 0 for a cylinder.
+    doubts : list of str
+        What is valid but has no effect, as a keep-out far away: `key: text`.
 
     Raises
     ------
@@ -67,16 +92,21 @@ class Area:
         self.region: BaseGeometry | None = None
         if self._fence is not None or closed:
             self.region = self.border.difference(shapely.union_all(closed))
-            if self.region.area <= 0.0:
+            if _is_nothing(self.region):
                 raise ValueError('environment.keep_outs: leave nothing of the area')
             shapely.prepare(self.region)
         prior = environment.prior
         self._raster = read_raster(environment) if prior.raster else None
         #: Whether targets are equally likely in all of the bounds.
         self.uniform = self.region is None and not prior.polygons and self._raster is None
+        self.doubts = self._zones_outside()
         # All cells, which take long and not all users need, only where a few promise nothing.
-        if not self.uniform and not np.prod(self._cells(_CHECKED), axis=0).any():
-            _ = self._rasterised  # for its errors
+        suspicious = not self.uniform and not np.prod(self._cells(_CHECKED), axis=0).any()
+        if suspicious and self._rasterised.even:
+            self.doubts.append(
+                'environment.prior: promises nothing inside what is left of the area: targets are '
+                'expected evenly over it'
+            )
 
     @classmethod
     def of(cls, area: Area | EnvironmentSettings | ArrayLike) -> Area:
@@ -87,7 +117,7 @@ class Area:
     def volume(self) -> float:
         """Of the region, m^d."""
         whole = float(np.prod(self.bounds[:, 1] - self.bounds[:, 0]))
-        return whole if self.uniform else whole * self._rasterised[1]
+        return whole if self.uniform else whole * self._rasterised.share
 
     def inside(self, points: ArrayLike, bounded: bool = True) -> BoolArray:
         """Return which points (n, d or more) are finite and in the area, up to rounding.
@@ -117,7 +147,7 @@ class Area:
         if self.uniform:
             return np.ones(len(points))
         low, high = self.bounds[:2].T
-        values = self._rasterised[0]
+        values = self._rasterised.values
         shape_of = np.array(values.shape)
         cell = np.floor((points[:, :2] - low) / (high - low) * shape_of).astype(int)
         cell = np.clip(cell, 0, shape_of - 1)
@@ -138,7 +168,7 @@ class Area:
         if self.uniform:
             return np.asarray(place)
         density = float(self.density(place[None, :])[0])
-        if by_prior and generator.uniform(0.0, float(self._rasterised[0].max())) > density:
+        if by_prior and generator.uniform(0.0, float(self._rasterised.values.max())) > density:
             return None
         return np.asarray(place) if density > 0.0 and self.inside(place[None, :])[0] else None
 
@@ -170,16 +200,52 @@ class Area:
         return whole.difference(shapely.union_all(polygons))
 
     @cached_property
-    def _rasterised(self) -> tuple[FloatArray, float]:
-        """The density in cells (nx, ny), and the share of the bounds that is inside."""
+    def _rasterised(self) -> Density:
+        """Where targets are expected; evenly where the prior promises nothing inside."""
         likely, inside = self._cells()
+        share = float(inside.mean())
         if not inside.any():
-            raise ValueError('environment.area: is too narrow for its bounds')
-        promised = float((likely * inside).sum() / inside.sum())
+            inside, share = self._outlined(inside)
+        likely = _scaled(likely * inside)
+        promised = float(likely.sum() / inside.sum())
         if not promised > 0.0:
-            raise ValueError('environment.prior: promises nothing inside the area')
+            return Density(inside, share, True)
         floor = self.settings.prior.floor
-        return (floor + (1.0 - floor) * likely / promised) * inside, float(inside.mean())
+        return Density((floor + (1.0 - floor) * likely / promised) * inside, share, False)
+
+    def _outlined(self, inside: FloatArray) -> tuple[FloatArray, float]:
+        """Return as inside the cells on the outline of a region narrower than them; its share."""
+        assert self.region is not None
+        low, size = self.bounds[:2, 0], self.bounds[:2, 1] - self.bounds[:2, 0]
+        cell = size / inside.shape
+        outline = shapely.segmentize(self.region.boundary, 0.5 * float(cell.min()))
+        number = ((shapely.get_coordinates(outline) - low) / cell).astype(int)
+        x, y = np.clip(number, 0, np.array(inside.shape) - 1).T
+        marked = np.zeros(inside.shape)
+        marked[x, y] = 1.0
+        return marked, self.region.area / float(np.prod(size))
+
+    def _zones_outside(self) -> list[str]:
+        """Return in words which zones and polygons of the prior touch nothing of the area."""
+        given = self.settings
+        zones = {
+            f'{key}[{index}]': level_shape(zone)
+            for key in ('keep_outs', 'obstacles')
+            for index, zone in enumerate(getattr(given, key))
+        }
+        for index, part in enumerate(given.prior.polygons):
+            zones[f'prior.polygons[{index}]'] = read_shape(part.polygon)
+        gaps = shapely.distance(self.border, list(zones.values())) if zones else []
+        doubts = []
+        for (key, _), gap in zip(zones.items(), gaps):
+            if gap > 0.0:
+                how_far = f'{gap / 1e3:.3g} km' if gap > 1e3 else f'{gap:.3g} m'
+                question = '; latitude and longitude exchanged?' if gap > _ANOTHER_COUNTRY else ''
+                doubts.append(
+                    f'environment.{key}: lies {how_far} outside of the area, where it has no '
+                    f'effect{question}'
+                )
+        return doubts
 
     def _cells(self, every: int = 1) -> tuple[FloatArray, FloatArray]:
         """Return prior, and 1 for inside, at the middle of every n-th cell, (nx, ny)."""
@@ -197,8 +263,14 @@ class Area:
             shapely.prepare(shape_of)
             likely[shapely.contains_xy(shape_of, x, y)] = part.weight
         if self._raster is not None:
-            likely *= self._raster.at(x, y)
+            likely = _scaled(likely) * self._raster.at(x, y)
         return likely, inside
+
+
+def _is_nothing(region: BaseGeometry) -> bool:
+    """Return whether a region is empty but for what rounding leaves."""
+    narrow = region.area <= _NARROWEST * region.length
+    return bool(narrow and region.buffer(-0.5 * _NARROWEST).is_empty)
 
 
 def level_shape(zone: Zone) -> BaseGeometry:
@@ -273,17 +345,31 @@ def read_raster(environment: EnvironmentSettings) -> _Raster:
         if suffix in ('.tif', '.tiff'):
             raster = _of_geotiff(path, environment.origin)
         else:
-            values = np.load(path) if suffix == '.npy' else read_image(path)
+            values = _read_array(path) if suffix == '.npy' else read_image(path)
             extent = environment.prior.extent or environment.bounds[:2]
             raster = _over(np.asarray(values, dtype=float), extent)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, EOFError) as error:
         raise ValueError(f'{key}: {error}') from None
     values = raster.values
     if values.ndim != 2 or not np.isfinite(values).all() or (values < 0.0).any():
         raise ValueError(
             f'{key}: got shape {values.shape}, allowed are two axes of finite numbers from 0'
         )
-    return raster
+    return dataclasses.replace(raster, values=_scaled(values))
+
+
+def _scaled(values: FloatArray) -> FloatArray:
+    """Return values from 0, at most 1, by a power of two: exact, and their sums are finite."""
+    return np.asarray(np.ldexp(values, -np.frexp(values.max(initial=0.0))[1]))
+
+
+def _read_array(path: str) -> FloatArray:
+    """Return the array of a .npy file; it is looked at before it is read."""
+    array = np.load(path, mmap_mode='r')
+    if not isinstance(array, np.ndarray):
+        raise ValueError('holds several arrays, allowed is one')
+    check_pixels(array.shape)
+    return np.array(array, dtype=float)
 
 
 def _over(values: FloatArray, extent: list[list[float]]) -> _Raster:
@@ -309,6 +395,7 @@ def _of_geotiff(path: str, origin: OriginSettings | None) -> _Raster:
     with rasterio.open(path) as file:
         if file.crs is None:
             raise ValueError('has no coordinate system')
+        check_pixels(file.shape)
         crs, grid = file.crs, list(~file.transform)
         values = file.read(1, masked=True).astype(float).filled(0.0)
 

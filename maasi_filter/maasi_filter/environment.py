@@ -6,7 +6,9 @@ Shapes are given in metres of the map, as GeoJSON (degrees, RFC 7946), or as wel
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+import math
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from maasi_filter.geodesy import OriginSettings, to_map
 from maasi_filter.settings import Finite, Positive, Settings, Vector2
 
 _NUMBER = '-+.0123456789'  # with which a number begins
+_MOST_PIXELS = 25_000_000  # of maps and rasters, as 5000 x 5000: 200 MB as numbers
 # Of files that an environment names.
 FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.yaml', '.tif', '.tiff')
 
@@ -102,6 +105,11 @@ class PriorSettings(Settings):
         description='Share of the targets that may be anywhere, whatever the prior promises [1]',
     )
 
+    @field_validator('extent')
+    @classmethod
+    def _ordered(cls, value: list[list[float]] | None) -> list[list[float]] | None:
+        return value if value is None else _ascending(value)
+
 
 class EnvironmentSettings(Settings):
     """Where the targets are, and where robots may go: `bounds`, or an `area` with its altitudes."""
@@ -143,12 +151,7 @@ class EnvironmentSettings(Settings):
     @field_validator('bounds')
     @classmethod
     def _ordered(cls, value: list[list[float]]) -> list[list[float]]:
-        for axis, pair in enumerate(value):
-            if not pair[0] < pair[1]:
-                raise ValueError(
-                    f'axis {axis}: got {pair}, allowed is [lower, upper], lower < upper'
-                )
-        return value
+        return _ascending(value)
 
     @model_validator(mode='after')
     def _fitting(self) -> EnvironmentSettings:
@@ -172,6 +175,41 @@ class EnvironmentSettings(Settings):
     def array(self) -> FloatArray:
         """Return the bounds, (d, 2)."""
         return np.array(self.bounds, dtype=float)
+
+
+def _ascending(bounds: list[list[float]]) -> list[list[float]]:
+    for axis, pair in enumerate(bounds):
+        if not pair[0] < pair[1]:
+            raise ValueError(f'axis {axis}: got {pair}, allowed is [lower, upper], lower < upper')
+    return bounds
+
+
+def shapes_of_texts(zones: Iterable[str]) -> list[Any]:
+    """Return zones that were received as texts; ValueError if one could name a file of this host.
+
+    Allowed are `x y radius`, well-known text, GeoJSON, and rings as JSON.
+    """
+    shapes: list[Any] = []
+    for index, zone in enumerate(zones):
+        text = zone.strip()
+        shape: Any = text
+        if text.startswith(('{', '[')):
+            try:
+                shape = json.loads(text)
+            except (ValueError, RecursionError):
+                raise ValueError(f'keep_outs: {index}: got {text[:60]!r}, is no JSON') from None
+            known = isinstance(shape, list) or 'polygon' not in shape
+        elif text and text[0] in _NUMBER:
+            known = len(text.split()) in (3, 4)
+        else:
+            known = text.upper().startswith(('POLYGON', 'MULTIPOLYGON'))
+        if not known:
+            raise ValueError(
+                f'keep_outs: {index}: got {text[:60]!r}, allowed are x y radius, '
+                'POLYGON ((x y, ...)), GeoJSON and [[x, y], ...], as text'
+            )
+        shapes.append(shape)
+    return shapes
 
 
 def read_shape(value: Any, project: Callable[[FloatArray], FloatArray] | None = None) -> Any:
@@ -237,8 +275,24 @@ def read_image(path: str) -> FloatArray:
     # Deferred: only maps and priors that are images need it.
     from PIL import Image
 
-    with Image.open(path) as image:
-        return np.asarray(image.convert('L'), dtype=float)
+    try:
+        with warnings.catch_warnings():
+            # Sizes are checked here.
+            warnings.simplefilter('ignore', Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                check_pixels((image.height, image.width))
+                return np.asarray(image.convert('L'), dtype=float)
+    except Image.DecompressionBombError:
+        raise ValueError(f'is larger than {_MOST_PIXELS} pixels: scale it down') from None
+
+
+def check_pixels(shape: Sequence[int]) -> None:
+    """Raise ValueError if a raster has more cells than what needs them can hold."""
+    if math.prod(shape) > _MOST_PIXELS:
+        raise ValueError(
+            f'got {" x ".join(map(str, shape))} cells, allowed are at most {_MOST_PIXELS} in all: '
+            'scale it down'
+        )
 
 
 def read_map(path: str) -> Any:
@@ -269,7 +323,7 @@ def _at(value: Any, *key: str | int) -> Iterator[None]:
         yield
     except ValidationError as error:
         problems = [{**item, 'loc': (*key, *item['loc'])} for item in error.errors()]
-    except (ValueError, TypeError, OSError, shapely.errors.ShapelyError) as error:
+    except (ValueError, TypeError, LookupError, OSError, shapely.errors.ShapelyError) as error:
         wrong = ValueError(str(error))
         problems = [{'type': 'value_error', 'loc': key, 'input': value, 'ctx': {'error': wrong}}]
     else:

@@ -12,9 +12,10 @@ from pydantic import ValidationError
 from rasterio.warp import transform
 
 from maasi_filter import BoxDetection, Pose, UnexploredMap
-from maasi_filter.area import Area
+from maasi_filter.area import Area, level_shape
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.geodesy import OriginSettings, geodetic, to_map
+from maasi_filter.ros.keep_outs import with_keep_outs
 from maasi_filter.ros.node_parameters import check
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten, unflatten
@@ -112,6 +113,12 @@ WRONG = [
     ({'origin': {'latitude': 91, 'longitude': 9}}, 'origin.latitude', 'less than or equal to 90'),
     ({'area': None, 'altitude': [0, 1]}, 'altitude', 'allowed with area'),
     ({'area': None, 'bounds': [[0, 1], [1, 1]]}, 'bounds', r'axis 1: got \[1.0, 1.0\]'),
+    (
+        {'prior': {'raster': 'heat.npy', 'extent': [[0, 40], [30, 0]]}},
+        'prior.extent',
+        r'axis 1: got \[30.0, 0.0\], allowed is \[lower, upper\]',
+    ),
+    ({'keep_outs': [[[]]]}, 'keep_outs.0', 'index'),
 ]
 
 
@@ -143,10 +150,10 @@ def test_a_node_names_the_parameter_of_a_wrong_shape():
         ),
         ({'prior': {'raster': 'none.npy'}}, 'environment.prior.raster: none.npy'),
         (
-            {'prior': {'polygons': [{'polygon': RING, 'weight': 0.0}]}},
-            'environment.prior: promises nothing',
+            # But for what rounding leaves.
+            {'keep_outs': [[[-1, -1], [41, -1], [41, 31], [9.9999, 30.0001], [-0.0001, 0]]]},
+            'environment.keep_outs: leave nothing',
         ),
-        ({'area': [[[0, 0], [40, 40], [39.99, 40]]]}, 'environment.area: is too narrow'),
     ],
 )
 def test_areas_that_cannot_be_used_are_refused(values, words):
@@ -269,3 +276,136 @@ def test_the_map_counts_what_is_expected_only():
     assert (uniform.expected() == uniform.values).all()
     explored.take_area(uniform.area)
     assert (explored.cell_volumes() == uniform.cell_volumes()).all()
+
+
+def square(x, y, half):
+    return [[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]]
+
+
+def random_environment(rng):
+    """Return the values of an area, with parts of the prior and zones that may cover it all."""
+    floor = float(rng.choice([0.0, 0.02, 1.0]))
+    polygons = [
+        {
+            'polygon': square(*rng.uniform(-10.0, 50.0, 2), rng.uniform(0.05, 40.0)),
+            'weight': float(rng.choice([0.0, 1e-300, 1.0, 30.0, 1e308])),
+        }
+        for _ in range(rng.integers(0, 4))
+    ]
+    if rng.uniform() < 0.5:
+        # Only what is named is likely.
+        polygons.insert(0, {'polygon': square(20.0, 15.0, 60.0), 'weight': 0.0})
+    zones = [
+        {'centre': rng.uniform(-10.0, 50.0, 2).tolist(), 'radius': float(rng.uniform(0.1, 25.0))}
+        if rng.uniform() < 0.5
+        else square(*rng.uniform(-10.0, 50.0, 2), rng.choice([0.05, 5.0, 25.0, 50.0]))
+        for _ in range(rng.integers(0, 5))
+    ]
+    values = {'area': RING} if rng.uniform() < 0.7 else {'bounds': [[0.0, 40.0], [0.0, 30.0]]}
+    return values | {'keep_outs': zones, 'prior': {'polygons': polygons, 'floor': floor}}
+
+
+def test_a_keep_out_always_wins_over_the_prior():
+    """Whatever zones and prior are: an area results where ground is left, with mean 1."""
+    rng = np.random.default_rng(903)
+    even = refused = 0
+    for _ in range(150):
+        values = random_environment(rng)
+        settings = environment(**values)
+        whole = shapely.Polygon(RING) if 'area' in values else shapely.box(0.0, 0.0, 40.0, 30.0)
+        left = whole.difference(shapely.union_all(list(map(level_shape, settings.keep_outs))))
+        if left.buffer(-1e-3).is_empty:
+            with pytest.raises(ValueError, match=r'environment\.keep_outs: leave nothing'):
+                Area(settings)
+            refused += 1
+            continue
+        area = Area(settings)
+        places = rng.uniform([0.0, 0.0], [40.0, 30.0], (20_000, 2))
+        density = area.density(places)
+        assert np.isfinite(density).all() and (density >= 0.0).all()
+        inner = shapely.contains_xy(left.buffer(-0.1), places[:, 0], places[:, 1])
+        outer = ~shapely.contains_xy(left.buffer(0.1), places[:, 0], places[:, 1])
+        assert not density[outer].any()
+        if any('promises nothing' in doubt for doubt in area.doubts):
+            even += 1
+            assert (density[inner] == 1.0).all()
+        elif values['prior']['floor'] > 0.0:
+            assert (density[inner] > 0.0).all()
+        # Cells of the density are 8 cm wide.
+        rough = 0.1 * left.length + 0.1
+        assert area.volume == pytest.approx(left.area, abs=rough)
+        found = UnexploredMap(area, 2.0)
+        assert found.density.max() > 0.0 or left.area < 16.0
+    assert even >= 5 and refused >= 2
+
+
+def test_slivers_between_the_cells_of_the_density_are_ground():
+    """Of 1 mm, where no middle of a cell is."""
+    slit = (
+        [[-1, 15.001], [41, 15.001], [41, 31], [-1, 31]],
+        [[-1, -1], [41, -1], [41, 15], [-1, 15]],
+    )
+    area = Area(environment(bounds=[[0.0, 40.0], [0.0, 30.0]], keep_outs=list(slit)))
+    assert area.region.area == pytest.approx(0.04, rel=1e-3)
+    assert area.volume == pytest.approx(0.04, rel=1e-3)
+    assert area.density(np.array([[20.0, 15.0005]])).tolist() == [1.0]
+    assert Area(environment(area=[[0, 0], [40, 40], [39.99, 40]])).volume == pytest.approx(0.2)
+
+
+def test_zones_and_priors_far_from_the_area_are_doubted_by_name():
+    far = [[x + 90.0, y] for x, y in SQUARE]
+    prior = {'polygons': [{'polygon': RING, 'weight': 2.0}, {'polygon': far, 'weight': 2.0}]}
+    zones = [SQUARE, far, {'centre': [50.0, 10.0], 'radius': 2.0}, square(-4e6, 2.5e6, 9.0)]
+    area = Area(environment(area=RING, keep_outs=zones, prior=prior, obstacles=[far]))
+    assert area.doubts == [
+        'environment.keep_outs[1]: lies 80 m outside of the area, where it has no effect',
+        'environment.keep_outs[2]: lies 8 m outside of the area, where it has no effect',
+        'environment.keep_outs[3]: lies 4.72e+03 km outside of the area, where it has no effect; '
+        'latitude and longitude exchanged?',
+        'environment.obstacles[0]: lies 80 m outside of the area, where it has no effect',
+        'environment.prior.polygons[1]: lies 80 m outside of the area, where it has no effect',
+    ]
+    assert Area(environment(area=RING, keep_outs=[SQUARE])).doubts == []
+
+
+def test_rasters_of_any_size_and_weight_are_taken_or_refused_by_name(tmp_path):
+    heat = np.ones((30, 40))
+    heat[:15] = 1e308
+    np.save(tmp_path / 'heat.npy', heat)
+    prior = {'polygons': [{'polygon': SQUARE, 'weight': 1e308}], 'floor': 0.0}
+    area = Area(environment(area=RING, prior=prior | {'raster': str(tmp_path / 'heat.npy')}))
+    north, south = area.density(np.array([[33.0, 23.0], [20.0, 5.0]]))
+    assert np.isfinite(north) and north > 10.0 and south == 0.0
+    wrong = {'many.npy': '20000 x 20000 cells', 'many.png': 'scale it down', 'empty.npy': 'No data'}
+    with open(tmp_path / 'many.npy', 'wb') as file:
+        head = {'descr': '<f8', 'fortran_order': False, 'shape': (20000, 20000)}
+        np.lib.format.write_array_header_1_0(file, head)
+        # Without its content, which takes no space on the disk.
+        file.truncate(file.tell() + 8 * 20000**2)
+    Image.new('1', (20000, 20000)).save(tmp_path / 'many.png')
+    Image.new('1', (9000, 9000)).save(tmp_path / 'some.png')
+    (tmp_path / 'empty.npy').touch()
+    for name, words in (wrong | {'some.png': '9000 x 9000 cells, allowed are'}).items():
+        with pytest.raises(ValueError, match=rf'environment\.prior\.raster: .*{name}: .*{words}'):
+            Area(environment(area=RING, prior=str(tmp_path / name)))
+    facts = {'image': 'many.png', 'resolution': 0.05, 'origin': [0, 0, 0], 'negate': 0}
+    (tmp_path / 'room.yaml').write_text(json.dumps({**facts, 'occupied_thresh': 0.65}))
+    with pytest.raises(ValidationError, match=r'room\.yaml: is no map of Nav2: .*scale it down'):
+        environment(area=RING, obstacles=[str(tmp_path / 'room.yaml')])
+
+
+def test_zones_that_are_received_name_no_files(tmp_path):
+    file = tmp_path / 'zone.geojson'
+    file.write_text(json.dumps(feature(SQUARE)))
+    field = environment(area=RING, origin=ORIGIN)
+    wkt = 'POLYGON ((30 20, 36 20, 36 26, 30 26, 30 20))'
+    texts = ['3 2 1', wkt, json.dumps(SQUARE), json.dumps(feature(SQUARE)), file.read_text()]
+    area = with_keep_outs(field, [f' {text} ' for text in texts])
+    kept = list(map(level_shape, area.settings.keep_outs))
+    assert len(kept) == 5 and all(shape.equals_exact(kept[1], 1e-3) for shape in kept[2:])
+    names = [str(file), f'../{file.name}', '/etc/hosts', 'room.yaml', '1.geojson', '', '{', '[']
+    for name in [*names, json.dumps({'polygon': str(file)}), json.dumps([str(file)]), '[[]]']:
+        with pytest.raises(ValueError, match='keep_outs: 1: ') as caught:
+            with_keep_outs(field, [wkt, name])
+        message = str(caught.value)
+        assert '\n' not in message and 'No such file' not in message, message

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from std_msgs.msg import Header
 
 from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.environment import EnvironmentSettings, shapes_of_texts
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
 from maasi_msgs.msg import KeepOuts
@@ -44,6 +44,8 @@ class KeepOutTopic:
         message.zones = [str(zone) for zone in area.settings.keep_outs]
         self._latest = message
         self._node.get_logger().info(f'keep-outs that hold now: {len(message.zones)}')
+        for doubt in area.doubts:
+            self._node.get_logger().warning(doubt)
         if self._publisher is not None:
             self._publisher.publish(message)
         self._on_change(area)
@@ -53,7 +55,8 @@ def with_keep_outs(environment: EnvironmentSettings, zones: Sequence[str]) -> Ar
     """Return the area of an environment with other keep-outs, given as texts."""
     values = environment.model_dump(exclude={'keep_outs'}, exclude_none=True)
     try:
-        return Area(EnvironmentSettings.model_validate({**values, 'keep_outs': list(zones)}))
+        given = {**values, 'keep_outs': shapes_of_texts(zones)}
+        return Area(EnvironmentSettings.model_validate(given))
     except ValueError as error:
         # One line, without the type of error and the address that pydantic adds.
         if not isinstance(error, ValidationError):
