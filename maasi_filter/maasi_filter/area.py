@@ -186,12 +186,14 @@ class Area:
         """Return the edges of solid polygons, (n, 4): x, y, and from there to the other end [m]."""
         return edges_of(self._solid_polygons)
 
-    def room(self, reach: float) -> BaseGeometry | None:
+    def room(self, reach: float, closed: bool = True) -> BaseGeometry | None:
         """Return where robots that keep `reach` metres from its border may be; None: in a box.
 
-        Round zones are not in it, and the sides of bounds need no distance.
+        Round zones are not in it, and the sides of bounds need no distance. closed: whether
+        keep-outs count.
         """
-        polygons = _polygons([*self.settings.obstacles, *self.settings.keep_outs])
+        zones = self.settings.keep_outs if closed else []
+        polygons = _polygons([*self.settings.obstacles, *zones])
         if self._fence is None and not polygons and not len(self.circles):
             return None
         whole = self._fence

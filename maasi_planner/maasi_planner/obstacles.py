@@ -1,29 +1,37 @@
-"""Obstacles, keep-outs and the border of the area, and ways around them.
+"""Obstacles, keep-outs and the border of the area as compiled code meets them at every step.
 
-They are cylinders of any height (in 2D discs), spheres, and walls: the edges of polygons. A robot's
-`KeepOut` holds them inflated by its radius. Ways around cylinders and between walls come from a
-visibility graph, so that several of them close together are no trap.
+They are cylinders of any height (in 2D discs), spheres, and walls: the edges of polygons, all
+inflated by the radius of a robot (`keep_out.KeepOut` makes them). A grid over them lists which are
+near to each of its cells, so that a step costs about the same among a thousand as among ten.
 """
 
 import math
-from collections.abc import Sequence
-from copy import copy
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import shapely
 from numba import njit
-from numpy.typing import ArrayLike
-from shapely.geometry.base import BaseGeometry
-from shapely.ops import nearest_points
 
-from maasi_filter.area import Area, edges_of, level_shape
-from maasi_filter.arrays import FloatArray
-
-CORNERS = 12
+from maasi_filter.arrays import FloatArray, IntArray
 
 Vector = tuple[float, float, float]
+# In more vertices than these the one to head for is looked for anew only where it is reached or
+# hidden; a prediction among fewer is the controller's own, to the bit.
+MANY = 100
+_BEYOND = 1.0  # second number of a cell outside of all walls; 0: in the room; 2: a wall is near
+
+
+class Nearby(NamedTuple):
+    """Which circles are near to each cell of a level grid.
+
+    head (3,): lower corner and width of the cells [m]; cells (nx, ny, 2): how far the middle of a
+    cell is at least from all circles [m], and whether it is in the room that the walls enclose;
+    lists: where the rows of each cell begin, (nx ny + 1), where those of the walls that each row of
+    cells along x meets, (ny + 1), and these rows of `circles`.
+    """
+
+    head: FloatArray
+    cells: FloatArray
+    lists: IntArray
 
 
 class Surroundings(NamedTuple):
@@ -31,12 +39,26 @@ class Surroundings(NamedTuple):
 
     circles (n, 7): x, y, z, radius [m, map], 1 for a sphere, and x and y from there to the other
     end of a wall [m]; vertices (m, 2): of the visibility graph [m, map]; clearance: kept beyond the
-    radius by planned ways [m].
+    radius by planned paths [m]; nearby: of the circles; solid (s, 7): those that also a robot keeps
+    out of that leaves a closed zone; inflation: of all of them [m]; spheres: whether there are any.
     """
 
     circles: FloatArray
     vertices: FloatArray
     clearance: float
+    nearby: Nearby
+    solid: FloatArray
+    inflation: float
+    spheres: bool
+
+
+class Felt(NamedTuple):
+    """Circles that a robot minds at a position: those of `rows` from `first` to `last`."""
+
+    circles: FloatArray
+    rows: IntArray
+    first: int
+    last: int
 
 
 @njit(cache=True, forceinline=True)
@@ -97,18 +119,57 @@ def _wall_distance(start: Vector, end: Vector, circles: FloatArray, i: int) -> f
 
 
 @njit(cache=True)
-def beyond_walls(point: Vector, circles: FloatArray) -> bool:
-    """Return whether a point is outside of the room that the walls enclose, if there are any."""
-    any_wall, inside = False, False
-    for i in range(circles.shape[0]):
+def _crossed_walls(point: Vector, felt: Felt) -> tuple[bool, bool]:
+    """Return whether there are walls, and whether a ray along x crosses an odd number of them."""
+    any_wall, odd = False, False
+    circles = felt.circles
+    for n in range(felt.first, felt.last):
+        i = felt.rows[n]
         dx, dy = circles[i, 5], circles[i, 6]
         if dx != 0.0 or dy != 0.0:
             any_wall = True
             y = point[1] - circles[i, 1]
-            # Whether a ray along x crosses it.
             if (y < 0.0) != (y < dy) and (point[0] - circles[i, 0] < dx * y / dy):
-                inside = not inside
-    return any_wall and not inside
+                odd = not odd
+    return any_wall, odd
+
+
+@njit(cache=True, forceinline=True)
+def _cell(point: Vector, nearby: Nearby) -> tuple[int, int]:
+    """Return the cell of a position, or the one nearest to it."""
+    head, cells = nearby.head, nearby.cells
+    # Before the conversion: numbers may be far outside.
+    u = min(max((point[0] - head[0]) / head[2], 0.0), cells.shape[0] - 1.0)
+    v = min(max((point[1] - head[1]) / head[2], 0.0), cells.shape[1] - 1.0)
+    return int(u), int(v)
+
+
+@njit(cache=True, forceinline=True)
+def felt_at(point: Vector, around: Surroundings) -> Felt:
+    """Return the circles near to a position."""
+    nearby = around.nearby
+    i, j = _cell(point, nearby)
+    n = i * nearby.cells.shape[1] + j
+    return Felt(around.circles, nearby.lists, nearby.lists[n], nearby.lists[n + 1])
+
+
+@njit(cache=True)
+def beyond_walls(point: Vector, around: Surroundings) -> bool:
+    """Return whether a point is outside of the room that the walls enclose, if there are any."""
+    nearby = around.nearby
+    i, j = _cell(point, nearby)
+    known = nearby.cells[i, j, 1]
+    if known <= _BEYOND:
+        return bool(known == _BEYOND)
+    n = nearby.cells.shape[0] * nearby.cells.shape[1] + 1 + j
+    walls = Felt(around.circles, nearby.lists, nearby.lists[n], nearby.lists[n + 1])
+    return not _crossed_walls(point, walls)[1]
+
+
+@njit(cache=True)
+def all_felt(circles: FloatArray) -> Felt:
+    """Return all circles, for a robot that minds each."""
+    return Felt(circles, np.arange(circles.shape[0]), 0, circles.shape[0])
 
 
 @njit(cache=True, forceinline=True)
@@ -141,11 +202,11 @@ def is_far(start: Vector, end: Vector, circles: FloatArray, i: int, reach: float
 
 
 @njit(cache=True)
-def is_clear(
-    start: Vector, end: Vector, circles: FloatArray, extra: float, cylinders_only: bool
-) -> bool:
+def is_clear(start: Vector, end: Vector, felt: Felt, extra: float, cylinders_only: bool) -> bool:
     """Return whether a segment keeps `extra` beyond the radius from every circle."""
-    for i in range(circles.shape[0]):
+    circles = felt.circles
+    for n in range(felt.first, felt.last):
+        i = felt.rows[n]
         if cylinders_only and circles[i, 4] > 0.5:
             continue
         if is_far(start, end, circles, i, circles[i, 3] + extra):
@@ -156,51 +217,51 @@ def is_clear(
 
 
 @njit(cache=True)
-def _all_pairs(vertices: FloatArray, circles: FloatArray, extra: float) -> FloatArray:
-    """Return the lengths of the shortest clear ways between vertices, or inf (Floyd, Warshall)."""
-    number = vertices.shape[0]
-    distance = np.full((number, number), np.inf)
-    for i in range(number):
-        distance[i, i] = 0.0
-        for j in range(i):
-            a, b = (vertices[i, 0], vertices[i, 1], 0.0), (vertices[j, 0], vertices[j, 1], 0.0)
-            if is_clear(a, b, circles, extra, True):
-                distance[i, j] = distance[j, i] = math.hypot(a[0] - b[0], a[1] - b[1])
-    for k in range(number):
-        for i in range(number):
-            if distance[i, k] < np.inf:
-                for j in range(number):
-                    distance[i, j] = min(distance[i, j], distance[i, k] + distance[k, j])
-    return distance
+def is_visible(
+    start: Vector, end: Vector, around: Surroundings, extra: float, cylinders_only: bool
+) -> bool:
+    """Do as `is_clear` for all circles: in strides as long as nothing is near."""
+    nearby = around.nearby
+    if nearby.cells.shape[0] * nearby.cells.shape[1] == 1:
+        return is_clear(start, end, felt_at(start, around), extra, cylinders_only)
+    size = nearby.head[2]
+    way = minus(end, start)
+    length, done, here = norm(way), 0.0, start
+    while True:
+        i, j = _cell(here, nearby)
+        x = here[0] - nearby.head[0] - (i + 0.5) * size
+        y = here[1] - nearby.head[1] - (j + 0.5) * size
+        stride = nearby.cells[i, j, 0] - math.sqrt(x * x + y * y) - extra
+        free = stride > 0.0
+        stride = max(stride, 0.5 * size) if free else 0.5 * size
+        done += stride
+        there = plus(start, done / length, way) if done < length else end
+        if not free and not is_clear(here, there, felt_at(here, around), extra, cylinders_only):
+            return False
+        if done >= length:
+            return True
+        here = there
 
 
 @njit(cache=True)
-def _goal_distances(
-    goal: Vector, circles: FloatArray, vertices: FloatArray, pairs: FloatArray
-) -> FloatArray:
-    """Return the length of the shortest clear way from each vertex to `goal`, (m,), or inf."""
-    out = np.full(vertices.shape[0], np.inf)
-    for j in range(vertices.shape[0]):
-        vertex = (vertices[j, 0], vertices[j, 1], 0.0)
-        if is_clear(vertex, (goal[0], goal[1], 0.0), circles, 0.0, True):
-            last = math.hypot(vertex[0] - goal[0], vertex[1] - goal[1])
-            for i in range(out.shape[0]):
-                out[i] = min(out[i], pairs[i, j] + last)
-    return out
+def is_free_at(point: Vector, around: Surroundings) -> bool:
+    """Return whether a robot at a position touches nothing and is inside of the walls."""
+    clear = is_clear(point, point, felt_at(point, around), 0.0, False)
+    return clear and not beyond_walls(point, around)
 
 
 @njit(cache=True)
 def _nearest_visible(
     position: Vector, to_goal: FloatArray, around: Surroundings, least: float
 ) -> tuple[int, float, float]:
-    """Return the visible vertex on the shortest way, at least `least` away: its distance, the way.
+    """Return the visible vertex on the shortest path, at least `least` away: its distance, the path.
 
     -1 where none is visible.
     """
     px, py, _ = position
     before, rejected = -np.inf, -1
     while True:
-        # The next one by length of the way, as to see a vertex costs more than all these sums.
+        # The next one by length of the path, as to see a vertex costs more than all these sums.
         best, index, away = np.inf, -1, 0.0
         for i in range(around.vertices.shape[0]):
             dx, dy = around.vertices[i, 0] - px, around.vertices[i, 1] - py
@@ -212,20 +273,29 @@ def _nearest_visible(
         if index < 0:
             return -1, away, best
         vertex = (around.vertices[index, 0], around.vertices[index, 1], 0.0)
-        if is_clear((px, py, 0.0), vertex, around.circles, 0.0, True):
+        if is_visible((px, py, 0.0), vertex, around, 0.0, True):
             return index, away, best
         before, rejected = best, index
 
 
 @njit(cache=True)
 def _best_vertex(
-    position: Vector, to_goal: FloatArray, around: Surroundings
+    position: Vector, to_goal: FloatArray, around: Surroundings, before: int
 ) -> tuple[int, float, bool]:
-    """Return the visible vertex on the shortest way, its length, and whether to approach closely.
+    """Return the visible vertex on the shortest path, its length, and whether to approach closely.
 
     A vertex that is as good as reached gives way to the next one, if that is visible already;
-    otherwise it must be approached closely. -1 where no vertex is visible.
+    otherwise it must be approached closely. -1 where no vertex is visible. before: the vertex of
+    the step before, or -1.
     """
+    if before >= 0:
+        vx, vy = around.vertices[before, 0], around.vertices[before, 1]
+        away = math.hypot(vx - position[0], vy - position[1])
+        seen = away >= 0.5 * around.clearance and is_visible(
+            (position[0], position[1], 0.0), (vx, vy, 0.0), around, 0.0, True
+        )
+        if seen:
+            return before, away + to_goal[before], False
     index, away, best = _nearest_visible(position, to_goal, around, 0.0)
     if away >= 0.5 * around.clearance:
         return index, best, False
@@ -279,32 +349,96 @@ def _back_inside(position: Vector, goal: Vector, around: Surroundings) -> Vector
 
 
 @njit(cache=True)
-def next_point(
-    position: Vector, goal: Vector, to_goal: FloatArray, around: Surroundings
-) -> tuple[Vector, float]:
-    """Return the point to head for and the length of the way left.
+def clear_vertices(corners: FloatArray, around: Surroundings) -> FloatArray:
+    """Return those of some corners (n, 2) at which a robot has half of its clearance."""
+    kept, number = np.empty_like(corners), 0
+    for x, y in corners:
+        point = (x, y, 0.0)
+        felt, extra = felt_at(point, around), 0.5 * around.clearance
+        if is_clear(point, point, felt, extra, True) and not beyond_walls(point, around):
+            kept[number, 0], kept[number, 1] = x, y
+            number += 1
+    return kept[:number].copy()
 
-    The point is the goal itself where the straight line is clear.
+
+@njit(cache=True)
+def length_to(position: Vector, goal: Vector, to_goal: FloatArray, around: Surroundings) -> float:
+    """Return the length of the shortest path to a goal, level if it bends; inf: there is none."""
+    if is_visible(position, goal, around, 0.0, True):
+        return norm(minus(goal, position))
+    return _nearest_visible(position, to_goal, around, 0.0)[2]
+
+
+# How a robot moves: in the room; out of a zone to an exit that it was given; back into the room.
+_WITHIN, _LEAVES, _RETURNS = range(3)
+
+
+class Heading(NamedTuple):
+    """Where a robot heads.
+
+    target: next point of its path, the goal itself where the straight line is clear; left: length
+    of the path [m]; manner: _WITHIN, _LEAVES or _RETURNS; vertex: that it heads for, or -1.
     """
-    circles = around.circles
+
+    target: Vector
+    left: float
+    manner: int
+    vertex: int
+
+
+@njit(cache=True)
+def _leaves(position: Vector, goal: Vector, around: Surroundings, inside: int) -> bool:
+    """Return whether a goal is the exit of a zone: just outside of it, past what is solid.
+
+    A robot that only touches the zone `inside` must not cross it: its exit is on its own side.
+    """
+    way = minus(position, goal)
+    length = norm(way)
+    part = min(3.0 * around.clearance / length, 1.0) if length > 0.0 else 0.0
+    if is_free_at(plus(goal, part, way), around):
+        return False
+    if inside >= 0:
+        offset = from_centre(position, around.circles, inside)
+        touches = norm(offset) >= around.circles[inside, 3] - around.inflation
+        if touches and dot(offset, way) > 0.0:
+            return False
+    return is_clear(position, goal, all_felt(around.solid), 0.0, False)
+
+
+@njit(cache=True)
+def head_for(
+    position: Vector, goal: Vector, to_goal: FloatArray, around: Surroundings, before: int
+) -> Heading:
+    """Return where a robot heads on its path to a goal; before: vertex of the step before, or -1."""
     way = minus(goal, position)
-    left, target = norm(way), goal
-    if beyond_walls(position, circles):
-        return _back_inside(position, goal, around), left + around.clearance
-    for i in range(circles.shape[0]):
+    left, target, vertex = norm(way), goal, -1
+    felt = felt_at(position, around)
+    beyond = beyond_walls(position, around)
+    inside, nearest = -1, np.inf
+    if not beyond:
+        for n in range(felt.first, felt.last):
+            i = felt.rows[n]
+            distance = norm(from_centre(position, felt.circles, i))
+            if distance < felt.circles[i, 3]:
+                inside, nearest = i, distance
+                break
+    if beyond or inside >= 0:
+        if _leaves(position, goal, around, inside):
+            return Heading(goal, left, _LEAVES, -1)
+        if beyond:
+            target = _back_inside(position, goal, around)
+            return Heading(target, left + around.clearance, _RETURNS, -1)
         # A robot that was pushed into a circle leaves it.
-        offset = from_centre(position, circles, i)
-        distance = norm(offset)
-        if distance < circles[i, 3]:
-            if distance < 1e-9:
-                offset, distance = (1.0, 0.0, 0.0), 1.0
-            reach = (circles[i, 3] + around.clearance) / distance
-            target = plus(minus(position, offset), reach, offset)
-            if circles[i, 4] <= 0.5:
-                target = (target[0], target[1], goal[2])
-            return target, left + around.clearance
-    if not is_clear(position, goal, circles, 0.0, True):
-        index, best, closely = _best_vertex(position, to_goal, around)
+        offset = from_centre(position, felt.circles, inside)
+        if nearest < 1e-9:
+            offset, nearest = (1.0, 0.0, 0.0), 1.0
+        reach = (felt.circles[inside, 3] + around.clearance) / nearest
+        target = plus(minus(position, offset), reach, offset)
+        if felt.circles[inside, 4] <= 0.5:
+            target = (target[0], target[1], goal[2])
+        return Heading(target, left + around.clearance, _WITHIN, -1)
+    if not is_visible(position, goal, around, 0.0, True):
+        index, best, closely = _best_vertex(position, to_goal, around, before)
         if index >= 0:
             vx, vy = around.vertices[index, 0], around.vertices[index, 1]
             near = math.sqrt((vx - position[0]) ** 2 + (vy - position[1]) ** 2)
@@ -313,30 +447,45 @@ def next_point(
             left = math.sqrt(best * best + way[2] * way[2])
             if closely:
                 left = min(left, 2.0 * near)
+            elif around.vertices.shape[0] > MANY:
+                vertex = index
     first, nearest = -1, np.inf
-    for i in range(circles.shape[0]):
-        away = norm(from_centre(position, circles, i))
-        if circles[i, 4] <= 0.5 or away >= nearest:
+    for i in range(around.circles.shape[0] if around.spheres else 0):
+        away = norm(from_centre(position, around.circles, i))
+        if around.circles[i, 4] <= 0.5 or away >= nearest:
             continue
-        if segment_distance(position, target, circles, i) < circles[i, 3]:
+        if segment_distance(position, target, around.circles, i) < around.circles[i, 3]:
             first, nearest = i, away
     if first >= 0:
         target, beside = _beside_sphere(position, target, first, around)
         left = max(left, beside)
-    return target, left
+    return Heading(target, left, _WITHIN, vertex)
 
 
 @njit(cache=True)
-def hold_back(position: Vector, circles: FloatArray, rate: float, velocity: Vector) -> Vector:
+def minded(position: Vector, manner: int, around: Surroundings) -> tuple[Felt, bool]:
+    """Return the circles that hold a robot back, and whether it is beyond their walls."""
+    if manner == _WITHIN:
+        return felt_at(position, around), False
+    if manner == _RETURNS:
+        return felt_at(position, around), True
+    felt = all_felt(around.solid)
+    walls, inside = _crossed_walls(position, felt)
+    return felt, walls and not inside
+
+
+@njit(cache=True)
+def hold_back(position: Vector, felt: Felt, beyond: bool, rate: float, velocity: Vector) -> Vector:
     """Return `velocity` with limits on its part that points into circles.
 
     Towards a circle at distance d at most `rate` * d is left, and inside of one at least that
-    much outwards. Walls do not hold back who is beyond them.
+    much outwards. Walls do not hold back a robot that is beyond them.
     """
-    shrink, beyond = 1.0, beyond_walls(position, circles)
+    shrink, circles = 1.0, felt.circles
     for attempt in range(9):
         changed = False
-        for i in range(circles.shape[0]):
+        for n in range(felt.first, felt.last):
+            i = felt.rows[n]
             offset = from_centre(position, circles, i)
             size = norm(offset)
             if size < 1e-9 or (beyond and (circles[i, 5] != 0.0 or circles[i, 6] != 0.0)):
@@ -354,183 +503,3 @@ def hold_back(position: Vector, circles: FloatArray, rate: float, velocity: Vect
         if not changed:
             break
     return velocity[0] * shrink, velocity[1] * shrink, velocity[2] * shrink
-
-
-class KeepOut:
-    """What one robot must keep out of: inflated by its radius, with ways around.
-
-    area: where robots may go; None: anywhere; radius: of the robot, metres; clearance: kept beyond
-    that by planned ways and by waypoints, metres; circles (n, 7): as of `Surroundings`, with the
-    inflated radius and a tenth of the clearance; around: the same with the ways. Robots stop short
-    of `circles`, so that rounding does not put them into an obstacle.
-    """
-
-    def __init__(self, area: Area | None, radius: float, clearance: float) -> None:
-        if not (math.isfinite(radius) and radius >= 0.0):
-            raise ValueError(f'radius: got {radius}, allowed are finite numbers from 0')
-        self.area, self.radius = area, radius
-        self.clearance = float(clearance)
-        round_ones = np.zeros((0, 5)) if area is None else area.circles
-        room = None if area is None else area.room(radius + clearance)
-        walls = edges_of([] if room is None else [room])
-        self.circles = np.zeros((len(round_ones) + len(walls), 7))
-        self.circles[: len(round_ones), :5] = round_ones
-        self.circles[len(round_ones) :, [0, 1, 5, 6]] = walls
-        self.circles[:, 3] += radius + 0.1 * clearance
-        # Where waypoints may be; None: anywhere beside round ones.
-        self._places = (
-            None if room is None else room.buffer(-radius - clearance, join_style='mitre')
-        )
-        self._round = len(round_ones)
-        vertices = self._vertices()
-        self.around = Surroundings(self.circles, vertices, self.clearance)
-        self._pairs = _all_pairs(vertices, self.circles, 0.4 * clearance)
-
-    def __len__(self) -> int:
-        return len(self.circles)
-
-    def _vertices(self) -> FloatArray:
-        """Return the vertices of the visibility graph, (m, 2): around cylinders and walls."""
-        corners = []
-        angles = 2.0 * math.pi * np.arange(CORNERS) / CORNERS
-        for circle in self.circles[: self._round]:
-            if circle[4] < 0.5:
-                reach = (circle[3] + 0.9 * self.clearance) / math.cos(math.pi / CORNERS)
-                corners += [
-                    (circle[0] + reach * math.cos(angle), circle[1] + reach * math.sin(angle))
-                    for angle in angles.tolist()
-                ]
-        if self._places is not None:
-            outline = self._places.simplify(0.3 * self.clearance)
-            corners += shapely.get_coordinates(outline.boundary).tolist()
-        clear = [
-            (x, y)
-            for x, y in corners
-            if is_clear((x, y, 0.0), (x, y, 0.0), self.circles, 0.5 * self.clearance, True)
-            and not beyond_walls((x, y, 0.0), self.circles)
-        ]
-        return np.array(clear, dtype=float).reshape(-1, 2)
-
-    @cached_property
-    def _open(self) -> BaseGeometry:
-        """Where robots that leave a zone may go: clear of everything by the clearance."""
-        assert self.area is not None
-        reach = self.circles[: self._round, 3] + 0.95 * self.clearance
-        centres = shapely.points(self.circles[: self._round, :2])
-        discs = shapely.buffer(centres, reach / math.cos(math.pi / 64), quad_segs=16)
-        whole = self.area.border if self._places is None else self._places
-        return whole.difference(shapely.union_all(discs))
-
-    @cached_property
-    def _solid(self) -> BaseGeometry:
-        """Where a robot may be that leaves a zone: inside of the border, clear of what is solid."""
-        assert self.area is not None
-        solid = shapely.union_all(list(map(level_shape, self.area.settings.obstacles)))
-        inside = self.area.border.difference(solid.buffer(self.radius))
-        shapely.prepare(inside)
-        return inside
-
-    @property
-    def _step(self) -> float:
-        return max(self.radius + self.clearance, 1e-3)
-
-    def is_free(self, position: ArrayLike) -> bool:
-        """Return whether a robot at `position` (3,) touches no obstacle and is inside."""
-        x, y, z = (float(value) for value in np.asarray(position, dtype=float))
-        clear = is_clear((x, y, z), (x, y, z), self.circles, 0.0, False)
-        return bool(clear and not beyond_walls((x, y, z), self.circles))
-
-    def to_goal(self, goal: Vector) -> FloatArray:
-        """Return the table that `next_point` needs for a goal."""
-        return _goal_distances(goal, self.circles, self.around.vertices, self._pairs)
-
-    def past(
-        self, robot: FloatArray, goal: FloatArray, others: Sequence[tuple[FloatArray, float]]
-    ) -> FloatArray:
-        """Return the next point, (3,), of the way to a goal past others, by places and radii."""
-        area = copy(self.area)
-        if area is None:
-            return goal
-        # A quarter wider, for robots that cut corners.
-        discs = [[*place, 1.25 * radius + 0.25 * self.radius, 0.0] for place, radius in others]
-        area.circles = np.vstack([area.circles, discs])
-        wide = KeepOut(area, self.radius, self.clearance)
-        x, y, z = robot.tolist()
-        to = (goal[0], goal[1], goal[2])
-        return np.array(next_point((x, y, z), to, wide.to_goal(to), wide.around)[0])
-
-    def exit_from(self, position: ArrayLike) -> FloatArray | None:
-        """Return where a robot at a position (3,) leaves a zone that it is in, or None outside.
-
-        It is the nearest position clear of all zones that a straight line reaches inside of the
-        border and past solid obstacles; around these, the first point of the path there.
-        """
-        here = np.asarray(position, dtype=float)
-        x, y, z = here.tolist()
-        touching = self.circles.copy()
-        touching[:, 3] -= 0.1 * self.clearance
-        if is_clear((x, y, z), (x, y, z), touching, 0.0, False) and not beyond_walls(
-            (x, y, z), self.circles
-        ):
-            return None
-        if self._open.is_empty:
-            return None
-        point = shapely.Point(x, y)
-        near = nearest_points(self._open, point)[0]
-        if not self._solid.covers(shapely.LineString([point, near])):
-            outline = shapely.get_coordinates(self._open.segmentize(0.5 * self._step))
-            lines = shapely.linestrings([[(x, y), corner] for corner in outline.tolist()])
-            straight = shapely.covers(self._solid, lines)
-            if straight.any():
-                rows = np.flatnonzero(straight)
-                near = shapely.Point(outline[rows[np.argmin(shapely.length(lines[rows]))]])
-            else:
-                assert self.area is not None
-                lasting = Area(self.area.settings.without_keep_outs())
-                around = KeepOut(lasting, self.radius, self.clearance)
-                goal = (near.x, near.y, z)
-                (gx, gy, _), _ = next_point((x, y, z), goal, around.to_goal(goal), around.around)
-                return np.array([gx, gy, z])
-        return np.array([near.x, near.y, z])
-
-    def moved_out(self, robot: ArrayLike, waypoint: ArrayLike) -> FloatArray | None:
-        """Return a waypoint moved to the minimum admissible distance (001, section 4.3).
-
-        It moves away from walls to the nearest place, and then out of round obstacles along the
-        line that joins robot and waypoint, towards the robot.
-        """
-        start = np.asarray(robot, dtype=float)
-        point = np.array(waypoint, dtype=float)
-        if self._places is not None:
-            if self._places.is_empty:
-                return None
-            near = nearest_points(self._places, shapely.Point(point[:2]))[0]
-            if near.distance(shapely.Point(point[:2])) > 1e-9:
-                point[:2] = near.x, near.y
-        line = point - start
-        part = 1.0
-        round_ones = self.circles[: self._round]
-        least = round_ones[:, 3] + 0.9 * self.clearance
-        for _ in range(len(round_ones) + 1):
-            here = start + part * line
-            changed = False
-            for circle, reach in zip(round_ones, least):
-                keep = np.array([1.0, 1.0, circle[4]])
-                offset = (here - circle[:3]) * keep
-                if float(offset @ offset) >= reach * reach * (1.0 - 1e-12):
-                    continue
-                direction = line * keep
-                from_start = (start - circle[:3]) * keep
-                a = float(direction @ direction)
-                b = float(direction @ from_start)
-                c = float(from_start @ from_start) - reach * reach
-                if c < 0.0 or a == 0.0:
-                    return None
-                part = (-b - math.sqrt(max(b * b - a * c, 0.0))) / a
-                here = start + part * line
-                changed = True
-            if not changed:
-                return point if part == 1.0 else here if self.is_free(here) else None
-            if part <= 0.0:
-                return None
-        return None

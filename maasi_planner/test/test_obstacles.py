@@ -7,7 +7,7 @@ import shapely
 from maasi_filter.area import Area
 from maasi_filter.environment import EnvironmentSettings
 from maasi_planner import MotionSettings, RobotState, make_motion
-from maasi_planner.obstacles import KeepOut
+from maasi_planner.keep_out import KeepOut
 
 UNICYCLE = {
     'model': 'unicycle',

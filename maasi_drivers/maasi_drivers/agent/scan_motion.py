@@ -13,7 +13,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import RobotState, Unicycle
 from maasi_planner.motion.base import check_waypoint
 from maasi_planner.motion.unicycle import window_command
-from maasi_planner.obstacles import is_clear, next_point
+from maasi_planner.obstacles import all_felt, head_for, is_clear
 from maasi_planner.settings import MotionSettings
 
 _CELL = 0.03  # size of the cells in which points count as one [m]
@@ -61,7 +61,7 @@ def scan_points(
 def _is_free(x: float, y: float, heading: float, reach: float, circles: FloatArray) -> bool:
     end_x = x + reach * math.cos(heading)
     end_y = y + reach * math.sin(heading)
-    return is_clear((x, y, 0.0), (end_x, end_y, 0.0), circles, 0.0, False)
+    return is_clear((x, y, 0.0), (end_x, end_y, 0.0), all_felt(circles), 0.0, False)
 
 
 @njit(cache=True)
@@ -135,7 +135,8 @@ class ScanUnicycle(Unicycle):
             self._heading = math.nan
             return super().command(state, waypoint)
         goal = tuple(check_waypoint(waypoint).tolist())
-        target, left = next_point((x, y, goal[2]), goal, self.table(goal), self.keep_out.around)
+        here_at, around = (x, y, goal[2]), self.keep_out.around
+        target, left, _, _ = head_for(here_at, goal, self.table(goal), around, -1)
         seen = np.zeros((int(near.sum()), 7))
         seen[:, :2] = self.points[near]
         seen[:, 3] = np.minimum(
@@ -146,5 +147,7 @@ class ScanUnicycle(Unicycle):
             x, y, target[0], target[1], circles, self.scan.reach, self._heading
         )
         target, clearance = (target_x, target_y, 0.0), self.keep_out.clearance
-        forward, turn = window_command(here, target, left, self.steering, circles, clearance)
+        forward, turn = window_command(
+            here, target, left, self.steering, all_felt(circles), clearance
+        )
         return np.array([forward, 0.0, 0.0, turn])

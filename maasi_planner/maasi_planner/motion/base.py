@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -16,7 +15,7 @@ from pydantic import BaseModel
 from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.obstacles import KeepOut
+from maasi_planner.keep_out import shared_keep_out
 from maasi_planner.settings import MotionSettings
 
 STEPS_LIMIT = 20_000
@@ -144,9 +143,12 @@ class MotionModel(ABC):
 
     def take_area(self, area: Area | None, radius: float) -> None:
         """Take where it may go, also another area while it moves."""
-        self.keep_out = KeepOut(area, radius, self.settings.clearance)
-        # Way tables of the latest waypoint and of chargers, which are asked for again and again.
-        self.table = lru_cache(maxsize=32)(self.keep_out.to_goal)
+        self.keep_out = shared_keep_out(area, radius, self.settings.clearance, self.reach())
+        self.table = self.keep_out.table
+
+    def reach(self) -> float:
+        """Return the distance at which an obstacle may change what the controller does [m]."""
+        return math.inf
 
     def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
         """Return the trajectory to each waypoint under this controller.

@@ -97,17 +97,22 @@ def _freely(kind: int, steering: Steering, state: FloatArray, goal: Vector) -> C
 
 
 @njit(cache=True)
-def steer(kernel: Kernel, state: FloatArray, goal: Vector, to_goal: FloatArray) -> Command:
-    """Return the command of a robot's controller towards a waypoint."""
+def steer(
+    kernel: Kernel, state: FloatArray, goal: Vector, to_goal: FloatArray, vertex: int
+) -> tuple[Command, int]:
+    """Return the command of a robot's controller towards a waypoint, and the vertex on its path.
+
+    vertex: the one of the step before, or -1.
+    """
     position, yaw, steering = (state[0], state[1], state[2]), state[3], kernel.steering
     if kernel.obstructed and not kernel.term.kind:
         if kernel.kind == UNICYCLE:
-            return drive_among(state, goal, to_goal, steering, kernel.around)
-        return fly_among(position, yaw, goal, to_goal, steering, kernel.around)
+            return drive_among(state, goal, to_goal, steering, kernel.around, vertex)
+        return fly_among(position, yaw, goal, to_goal, steering, kernel.around, vertex)
     command = _freely(kernel.kind, steering, state, goal)
     if kernel.obstructed:
-        return with_obstacle_term(position, yaw, command, kernel.term)
-    return command
+        return with_obstacle_term(position, yaw, command, kernel.term), -1
+    return command, -1
 
 
 @njit(cache=True, forceinline=True)
@@ -141,7 +146,7 @@ def _close_loop(
 ) -> tuple[int, float]:
     """Run controller and body on `state`; return steps, one too many if not there, and u'u."""
     kind, steering, obstructed, _, _, parameters, table, tolerance, periods, h = kernel
-    cost = 0.0
+    cost, vertex = 0.0, -1
     for k in range(yaws.shape[0]):
         x, y, z = state[0], state[1], state[2]
         positions[k, 0], positions[k, 1], positions[k, 2], yaws[k] = x, y, z, state[3]
@@ -150,7 +155,7 @@ def _close_loop(
         if square <= tolerance * tolerance:
             return k, cost
         if obstructed:
-            command = steer(kernel, state, goal, to_goal)
+            command, vertex = steer(kernel, state, goal, to_goal, vertex)
         else:
             command = _freely(kind, steering, state, goal)
         if kind == MAMBO:
@@ -236,7 +241,7 @@ class CompiledMotion(MotionModel):
     def __init__(
         self, settings: MotionSettings, area: Area | None = None, radius: float = 0.0
     ) -> None:
-        super().__init__(settings, area, radius)
+        self.settings = settings
         self.parameters = np.zeros(0)
         speed, barrier, acceleration = self._limits()
         self.steering = Steering(
@@ -249,6 +254,15 @@ class CompiledMotion(MotionModel):
             settings.heading == 'travel',
             settings.avoidance == 'dynamic_window',
         )
+        super().__init__(settings, area, radius)
+
+    def reach(self) -> float:
+        """See `MotionModel.reach`."""
+        speed, clearance = self.steering.speed, self.settings.clearance
+        if self.settings.obstacle_term != 'none':
+            return math.inf
+        braking = speed * speed / self.steering.acceleration
+        return max(1.5 * speed / self.steering.barrier, braking, 1.5 * speed + 4.0 * clearance)
 
     def take_area(self, area: Area | None, radius: float) -> None:
         """See `MotionModel.take_area`."""
@@ -287,7 +301,7 @@ class CompiledMotion(MotionModel):
                 TERMS.index(settings.obstacle_term),
                 settings.obstacle_distance,
                 self._push(settings.obstacle_gain),
-                keep_out.circles,
+                keep_out.pushing(),
             ),
             self.parameters,
             table,
@@ -303,7 +317,7 @@ class CompiledMotion(MotionModel):
         tables = np.zeros((len(waypoints), len(self.keep_out.around.vertices)))
         if tables.shape[1]:
             for table, waypoint in zip(tables, waypoints.tolist()):
-                table[:] = self.keep_out.to_goal(tuple(waypoint))
+                table[:] = self.table(tuple(waypoint))
         start, costs = self._to_array(state), out.control_cost
         kernel = self.kernel(step)
         _roll_out(kernel, start, waypoints, tables, out.positions, out.yaws, out.lengths, costs)
@@ -312,7 +326,8 @@ class CompiledMotion(MotionModel):
         """See `MotionModel.command`."""
         x, y, z = check_waypoint(waypoint).tolist()
         kernel = self.kernel(mambo.PERIOD)
-        return np.array(steer(kernel, self._to_array(state), (x, y, z), self.table((x, y, z))))
+        goal, table = (x, y, z), self.table((x, y, z))
+        return np.array(steer(kernel, self._to_array(state), goal, table, -1)[0])
 
     def body(self, state: RobotState) -> CompiledBody:
         """See `MotionModel.body`."""

@@ -14,13 +14,15 @@ from numba import njit
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.obstacles import (
+    Felt,
     Surroundings,
     Vector,
     dot,
     from_centre,
+    head_for,
     hold_back,
+    minded,
     minus,
-    next_point,
     norm,
 )
 
@@ -64,17 +66,24 @@ def turned(x: float, y: float, yaw: float) -> tuple[float, float]:
 
 
 @njit(cache=True, forceinline=True)
-def _stoppable(position: Vector, way: Vector, steering: Steering, circles: FloatArray) -> float:
-    """Return the speed that can be stopped before the nearest circle, at most the largest."""
-    room = np.inf
-    for i in range(circles.shape[0]):
+def _stoppable(
+    position: Vector, way: Vector, steering: Steering, felt: Felt, beyond: bool
+) -> float:
+    """Return the speed that can be stopped before the nearest circle, at most the largest.
+
+    A circle that the robot is in, or walls that it is beyond, are left at full speed.
+    """
+    room, circles = np.inf, felt.circles
+    for n in range(felt.first, felt.last):
+        i = felt.rows[n]
         offset = from_centre(position, circles, i)
         gap = norm(offset)
         if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
             # Along a wall nothing has to be stopped.
             towards = -dot(offset, way) / max(gap * norm(way), 1e-9)
-            room = min(room, (gap - circles[i, 3]) / towards if towards > 0.0 else np.inf)
-        else:
+            if towards > 0.0 and not beyond:
+                room = min(room, (gap - circles[i, 3]) / towards)
+        elif gap >= circles[i, 3] or dot(offset, way) < 0.0:
             room = min(room, gap - circles[i, 3])
     speed = steering.speed
     return min(speed, math.sqrt(steering.acceleration * max(room, 0.0)) + 0.05 * speed)
@@ -109,20 +118,25 @@ def fly_among(
     to_goal: FloatArray,
     steering: Steering,
     around: Surroundings,
-) -> Command:
-    """Return the command towards a waypoint around obstacles."""
-    target, left = next_point(position, goal, to_goal, around)
+    vertex: int,
+) -> tuple[Command, int]:
+    """Return the command towards a waypoint around obstacles, and the vertex it heads for.
+
+    vertex: the one of the step before, or -1.
+    """
+    target, left, manner, vertex = head_for(position, goal, to_goal, around, vertex)
+    felt, beyond = minded(position, manner, around)
     way, speed = minus(target, position), steering.speed
     size = norm(way)
     if steering.acceleration < np.inf:
-        speed = _stoppable(position, way, steering, around.circles)
+        speed = _stoppable(position, way, steering, felt, beyond)
     scale = min(steering.rate * left, speed) / size if size > 0.0 else 0.0
     velocity = (scale * way[0], scale * way[1], scale * way[2])
-    velocity = hold_back(position, around.circles, steering.barrier, velocity)
+    velocity = hold_back(position, felt, beyond, steering.barrier, velocity)
     fastest = norm(velocity)
     share = speed / fastest if fastest > speed else 1.0
     velocity = (velocity[0] * share, velocity[1] * share, velocity[2] * share)
-    return _towards(way, velocity, yaw, steering)
+    return _towards(way, velocity, yaw, steering), vertex
 
 
 TERMS = ('none', 'printed', 'away')

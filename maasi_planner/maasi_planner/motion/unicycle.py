@@ -22,7 +22,15 @@ from numba import njit
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion.steering import Command, Steering, wrapped
-from maasi_planner.obstacles import Surroundings, Vector, from_centre, is_far, next_point
+from maasi_planner.obstacles import (
+    Felt,
+    Surroundings,
+    Vector,
+    from_centre,
+    head_for,
+    is_far,
+    minded,
+)
 
 # Seconds until the next command at which the window is taken, and for which arcs are followed.
 WINDOW = 0.2
@@ -41,21 +49,26 @@ def _before_disc(along: float, across: float, radius: float) -> float:
 
 
 @njit(cache=True)
-def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray) -> float:
-    """Return how far straight ahead is free of circles, at most `reach` metres."""
+def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: bool) -> float:
+    """Return how far straight ahead is free of circles, at most `reach` metres.
+
+    beyond: whether walls do not count, as the robot is beyond them.
+    """
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
-    free, here = reach, (x, y, 0.0)
-    for i in range(circles.shape[0]):
+    free, here, circles = reach, (x, y, 0.0), felt.circles
+    for n in range(felt.first, felt.last):
+        i = felt.rows[n]
+        wall = circles[i, 5] != 0.0 or circles[i, 6] != 0.0
+        if wall and beyond:
+            continue
         ox = circles[i, 0] - x
         oy = circles[i, 1] - y
         along = ox * cos_yaw + oy * sin_yaw
         across = ox * sin_yaw - oy * cos_yaw
         radius = circles[i, 3]
         free = min(free, _before_disc(along, across, radius))
-        if (circles[i, 5] != 0.0 or circles[i, 6] != 0.0) and not is_far(
-            here, here, circles, i, reach + circles[i, 3]
-        ):
+        if wall and not is_far(here, here, circles, i, reach + circles[i, 3]):
             ahead = circles[i, 5] * cos_yaw + circles[i, 6] * sin_yaw
             aside = circles[i, 5] * sin_yaw - circles[i, 6] * cos_yaw
             free = min(free, _before_disc(along + ahead, across + aside, radius))
@@ -72,11 +85,11 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray)
 
 @njit(cache=True)
 def _arc(
-    state: FloatArray, v: float, w: float, time: float, stopping: float, circles: FloatArray
+    state: FloatArray, v: float, w: float, time: float, stopping: float, felt: Felt
 ) -> tuple[float, float, float, float]:
     """Return the end of an arc and its clearance, -inf if the robot could not stop in time."""
     px, py, heading = state[0], state[1], state[3]
-    room = np.inf
+    room, circles = np.inf, felt.circles
     dt = time / ARC_STEPS
     for k in range(ARC_STEPS):
         heading += 0.5 * w * dt
@@ -84,7 +97,8 @@ def _arc(
         py += v * dt * math.sin(heading)
         heading += 0.5 * w * dt
         travelled = v * dt * (k + 1)
-        for c in range(circles.shape[0]):
+        for n in range(felt.first, felt.last):
+            c = felt.rows[n]
             ox, oy, _ = from_centre((px, py, 0.0), circles, c)
             gap = math.hypot(ox, oy) - circles[c, 3]
             room = min(room, gap)
@@ -101,7 +115,7 @@ def window_command(
     target: Vector,
     left: float,
     steering: Steering,
-    circles: FloatArray,
+    felt: Felt,
     clearance: float,
 ) -> tuple[float, float]:
     """Return forward speed and turn rate of a unicycle with `left` metres to go by `target`."""
@@ -122,7 +136,7 @@ def window_command(
         stopping = 0.5 * v * v / deceleration + v * WINDOW
         for j in range(TURN_SAMPLES):
             w = turn_low + (turn_high - turn_low) * j / (TURN_SAMPLES - 1)
-            px, py, heading, room = _arc(state, v, w, time, stopping, circles)
+            px, py, heading, room = _arc(state, v, w, time, stopping, felt)
             if room == -np.inf:
                 continue
             gap = math.hypot(target[0] - px, target[1] - py)
@@ -134,7 +148,7 @@ def window_command(
             if score > best:
                 best, best_forward, best_turn = score, v, w
     # Limit the speed by the free distance straight ahead.
-    ahead = way_ahead(x, y, yaw, 4.0 * clearance + speed, circles)
+    ahead = way_ahead(x, y, yaw, 4.0 * clearance + speed, felt, False)
     return min(best_forward, steering.barrier * ahead), best_turn
 
 
@@ -194,15 +208,24 @@ def drive_freely(state: FloatArray, goal: Vector, steering: Steering) -> Command
 
 @njit(cache=True)
 def drive_among(
-    state: FloatArray, goal: Vector, to_goal: FloatArray, steering: Steering, around: Surroundings
-) -> Command:
-    """Return the command towards a waypoint around obstacles."""
-    x, y, yaw = state[0], state[1], state[3]
-    circles, clearance = around.circles, around.clearance
-    target, left = next_point((x, y, goal[2]), goal, to_goal, around)
-    if steering.window:
-        forward, turn = window_command(state, target, left, steering, circles, clearance)
-        return forward, 0.0, 0.0, turn
+    state: FloatArray,
+    goal: Vector,
+    to_goal: FloatArray,
+    steering: Steering,
+    around: Surroundings,
+    vertex: int,
+) -> tuple[Command, int]:
+    """Return the command towards a waypoint around obstacles, and the vertex it heads for.
+
+    vertex: the one of the step before, or -1.
+    """
+    x, y, yaw, clearance = state[0], state[1], state[3], around.clearance
+    here = (x, y, goal[2])
+    target, left, manner, vertex = head_for(here, goal, to_goal, around, vertex)
+    felt, beyond = minded(here, manner, around)
+    if steering.window and not beyond:
+        forward, turn = window_command(state, target, left, steering, felt, clearance)
+        return (forward, 0.0, 0.0, turn), vertex
     forward, turn = _drive(target[0] - x, target[1] - y, left, yaw, steering, clearance)
-    free = way_ahead(x, y, yaw, 4.0 * clearance + steering.speed, circles)
-    return min(forward, steering.barrier * free), 0.0, 0.0, turn
+    free = way_ahead(x, y, yaw, 4.0 * clearance + steering.speed, felt, beyond)
+    return (min(forward, steering.barrier * free), 0.0, 0.0, turn), vertex

@@ -1,0 +1,294 @@
+"""What one robot must keep out of, and its paths around that."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from functools import cached_property, lru_cache
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike
+from shapely.geometry.base import BaseGeometry
+from shapely.geometry.polygon import orient
+from shapely.ops import nearest_points
+
+from maasi_filter.area import Area, edges_of, level_shape
+from maasi_filter.arrays import FloatArray
+from maasi_planner.nearby import nearby_of
+from maasi_planner.obstacles import (
+    Surroundings,
+    Vector,
+    all_felt,
+    beyond_walls,
+    clear_vertices,
+    head_for,
+    is_clear,
+    is_free_at,
+    length_to,
+)
+from maasi_planner.visibility import VisibilityGraph
+
+CORNERS = 12  # of the vertices around a cylinder
+# Outlines with more detail than this share of the clearance lose it, to the safe side.
+_DETAIL = 0.2
+_TABLES = 2**22  # numbers in all tables that are kept
+
+
+class KeepOut:
+    """What one robot must keep out of: inflated by its radius, with paths around.
+
+    Parameters
+    ----------
+    area : Area or None
+        Where robots may go; None: anywhere.
+    radius : float
+        Of the robot, metres.
+    clearance : float
+        Kept beyond that by planned paths and by waypoints, metres.
+    reach : float
+        Distance at which an obstacle may change what the robot does, metres.
+
+    Attributes
+    ----------
+    circles : (n, 7) array
+        As of `Surroundings`, with the radius and a tenth of the clearance: robots stop short of
+        them, so that rounding does not put them into an obstacle.
+    around : Surroundings
+        The same with what paths need.
+
+    Raises
+    ------
+    ValueError
+        If the radius is not usable.
+    """
+
+    def __init__(
+        self, area: Area | None, radius: float, clearance: float, reach: float = math.inf
+    ) -> None:
+        if not (math.isfinite(radius) and radius >= 0.0):
+            raise ValueError(f'radius: got {radius}, allowed are finite numbers from 0')
+        self.area, self.radius = area, radius
+        self.clearance = float(clearance)
+        apart = radius + clearance
+        room = None if area is None else area.room(apart)
+        walls = None if room is None else _simplified(room, _DETAIL * clearance)
+        self._round = 0 if area is None else len(area.circles)
+        self.circles = self._inflated(np.zeros((0, 5)) if area is None else area.circles, walls)
+        # Where waypoints may be; None: anywhere beside round ones.
+        self._places = None if room is None else room.buffer(-apart, join_style='mitre')
+        if self._places is not None:
+            shapely.prepare(self._places)
+        outline = self._places
+        if walls is not room and walls is not None:
+            outline = walls.buffer(-apart, join_style='mitre')
+        nearby = nearby_of(self.circles, reach, 0.5 * self.clearance)
+        spheres = bool((self.circles[:, 4] > 0.5).any())
+        inflation = radius + 0.1 * self.clearance
+        none = np.zeros((0, 2))
+        self.around = Surroundings(
+            self.circles, none, self.clearance, nearby, self._solid_circles(), inflation, spheres
+        )
+        corners = clear_vertices(self._corners(outline), self.around)
+        self.around = self.around._replace(vertices=corners)
+        # Tables of the latest waypoints, candidates and chargers, which are asked for repeatedly.
+        most = min(max(_TABLES // max(len(corners), 1), 32), 2048)
+        self.table = lru_cache(maxsize=most)(self.to_goal)
+
+    def __len__(self) -> int:
+        return len(self.circles)
+
+    def _inflated(self, round_ones: FloatArray, room: BaseGeometry | None) -> FloatArray:
+        """Return round obstacles (n, 5) and the walls of a room as circles, (m, 7)."""
+        walls = edges_of([] if room is None else [room])
+        circles = np.zeros((len(round_ones) + len(walls), 7))
+        circles[: len(round_ones), :5] = round_ones
+        circles[len(round_ones) :, [0, 1, 5, 6]] = walls
+        circles[:, 3] += self.radius + 0.1 * self.clearance
+        return circles
+
+    def _solid_circles(self) -> FloatArray:
+        """Return the circles of what is there without keep-outs."""
+        if self.area is None or not self.area.settings.keep_outs:
+            return self.circles
+        room = self.area.room(self.radius + self.clearance, closed=False)
+        return self._inflated(self.area.solid, room)
+
+    def _corners(self, outline: BaseGeometry | None) -> FloatArray:
+        """Return what may be vertices of the visibility graph, (m, 2): around cylinders and walls.
+
+        Of walls those around which a path can bend.
+        """
+        corners = [np.zeros((0, 2))]
+        angles = 2.0 * math.pi * np.arange(CORNERS) / CORNERS
+        ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        for circle in self.circles[: self._round]:
+            if circle[4] < 0.5:
+                reach = (circle[3] + 0.9 * self.clearance) / math.cos(math.pi / CORNERS)
+                corners.append(circle[:2] + reach * ring)
+        if outline is not None:
+            for part in shapely.get_parts(outline.simplify(0.3 * self.clearance)):
+                for edge in shapely.get_rings(orient(part)):
+                    points = shapely.get_coordinates(edge)[:-1]
+                    before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
+                    one, two = points - before, after - points
+                    # The room is to the left.
+                    corners.append(points[one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]])
+        return np.concatenate(corners)
+
+    def pushing(self) -> FloatArray:
+        """Return the circles that the term of 001, eq. (14), is of: all but the sides of bounds."""
+        if self.area is None:
+            return self.circles
+        low, high = self.area.bounds[:2].T
+        middles = self.circles[:, :2] + 0.5 * self.circles[:, 5:]
+        inside = ((middles >= low) & (middles <= high)).all(axis=1)
+        return self.circles[inside | (self.circles[:, 5:] == 0.0).all(axis=1)]
+
+    @cached_property
+    def _graph(self) -> VisibilityGraph:
+        return VisibilityGraph(self.around, 0.4 * self.clearance)
+
+    def to_goal(self, goal: Vector) -> FloatArray:
+        """Return the table that `head_for` needs for a goal: lengths from the vertices, or inf."""
+        if not len(self.around.vertices):
+            return np.zeros(0)
+        return self._graph.to_goal(goal)
+
+    def is_free(self, position: ArrayLike) -> bool:
+        """Return whether a robot at `position` (3,) touches no obstacle and is inside."""
+        x, y, z = (float(value) for value in np.asarray(position, dtype=float))
+        return bool(is_free_at((x, y, z), self.around))
+
+    def path_length(self, position: ArrayLike, goal: ArrayLike) -> float:
+        """Return the length of the path between two positions (3,) [m]; inf: there is none."""
+        x, y, z = (float(value) for value in np.asarray(position, dtype=float))
+        end = tuple(float(value) for value in np.asarray(goal, dtype=float))
+        return float(length_to((x, y, z), end, self.table(end), self.around))
+
+    def past(
+        self, robot: FloatArray, goal: FloatArray, others: Sequence[tuple[FloatArray, float]]
+    ) -> FloatArray:
+        """Return the next point, (3,), of the way to a goal past others, by places and radii."""
+        area = copy(self.area)
+        if area is None:
+            return goal
+        # A quarter wider, for robots that cut corners.
+        discs = [[*place, 1.25 * radius + 0.25 * self.radius, 0.0] for place, radius in others]
+        area.circles = np.vstack([area.circles, discs])
+        wide = KeepOut(area, self.radius, self.clearance)
+        x, y, z = robot.tolist()
+        to = (goal[0], goal[1], goal[2])
+        return np.array(head_for((x, y, z), to, wide.to_goal(to), wide.around, -1).target)
+
+    def exit_from(self, position: ArrayLike) -> FloatArray | None:
+        """Return where a robot at a position (3,) leaves a zone that it is in, or None outside.
+
+        It is the nearest position clear of all zones that a straight line reaches inside of the
+        border and past solid obstacles; around these, the first point of the path there.
+        """
+        here = np.asarray(position, dtype=float)
+        x, y, z = here.tolist()
+        touching = self.circles.copy()
+        touching[:, 3] -= 0.1 * self.clearance
+        clear = is_clear((x, y, z), (x, y, z), all_felt(touching), 0.0, False)
+        if clear and not beyond_walls((x, y, z), self.around):
+            return None
+        if self._open.is_empty:
+            return None
+        point = shapely.Point(x, y)
+        near = nearest_points(self._open, point)[0]
+        if not self._solid.covers(shapely.LineString([point, near])):
+            outline = shapely.get_coordinates(self._open.segmentize(0.5 * self._step))
+            lines = shapely.linestrings([[(x, y), corner] for corner in outline.tolist()])
+            straight = shapely.covers(self._solid, lines)
+            if straight.any():
+                rows = np.flatnonzero(straight)
+                near = shapely.Point(outline[rows[np.argmin(shapely.length(lines[rows]))]])
+            else:
+                assert self.area is not None
+                lasting = Area(self.area.settings.without_keep_outs())
+                around = KeepOut(lasting, self.radius, self.clearance)
+                goal = (near.x, near.y, z)
+                heading = head_for((x, y, z), goal, around.to_goal(goal), around.around, -1)
+                return np.array([*heading.target[:2], z])
+        return np.array([near.x, near.y, z])
+
+    @cached_property
+    def _open(self) -> BaseGeometry:
+        """Where robots that leave a zone may go: clear of everything by the clearance."""
+        assert self.area is not None
+        reach = self.circles[: self._round, 3] + 0.95 * self.clearance
+        centres = shapely.points(self.circles[: self._round, :2])
+        discs = shapely.buffer(centres, reach / math.cos(math.pi / 64), quad_segs=16)
+        whole = self.area.border if self._places is None else self._places
+        return whole.difference(shapely.union_all(discs))
+
+    @cached_property
+    def _solid(self) -> BaseGeometry:
+        """Where a robot may be that leaves a zone: inside of the border, clear of what is solid."""
+        assert self.area is not None
+        solid = shapely.union_all(list(map(level_shape, self.area.settings.obstacles)))
+        inside = self.area.border.difference(solid.buffer(self.radius))
+        shapely.prepare(inside)
+        return inside
+
+    @property
+    def _step(self) -> float:
+        return max(self.radius + self.clearance, 1e-3)
+
+    def moved_out(self, robot: ArrayLike, waypoint: ArrayLike) -> FloatArray | None:
+        """Return a waypoint moved to the minimum admissible distance (001, section 4.3).
+
+        It moves away from walls to the nearest place, and then out of round obstacles along the
+        line that joins robot and waypoint, towards the robot.
+        """
+        start = np.asarray(robot, dtype=float)
+        point = np.array(waypoint, dtype=float)
+        if self._places is not None:
+            if self._places.is_empty:
+                return None
+            level = shapely.Point(point[:2])
+            if not self._places.covers(level):
+                near = nearest_points(self._places, level)[0]
+                if near.distance(level) > 1e-9:
+                    point[:2] = near.x, near.y
+        line = point - start
+        part = 1.0
+        round_ones = self.circles[: self._round]
+        least = round_ones[:, 3] + 0.9 * self.clearance
+        for _ in range(len(round_ones) + 1):
+            here = start + part * line
+            changed = False
+            for circle, reach in zip(round_ones, least):
+                keep = np.array([1.0, 1.0, circle[4]])
+                offset = (here - circle[:3]) * keep
+                if float(offset @ offset) >= reach * reach * (1.0 - 1e-12):
+                    continue
+                direction = line * keep
+                from_start = (start - circle[:3]) * keep
+                a = float(direction @ direction)
+                b = float(direction @ from_start)
+                c = float(from_start @ from_start) - reach * reach
+                if c < 0.0 or a == 0.0:
+                    return None
+                part = (-b - math.sqrt(max(b * b - a * c, 0.0))) / a
+                here = start + part * line
+                changed = True
+            if not changed:
+                return point if part == 1.0 else here if self.is_free(here) else None
+            if part <= 0.0:
+                return None
+        return None
+
+
+def _simplified(room: BaseGeometry, detail: float) -> BaseGeometry:
+    """Return a room without finer detail than given [m], and within itself; as it is without."""
+    if shapely.get_num_coordinates(room.simplify(detail)) == shapely.get_num_coordinates(room):
+        return room
+    return room.buffer(-detail, join_style='mitre').simplify(detail)
+
+
+#: The KeepOut of robots of one kind in one area.
+shared_keep_out = lru_cache(maxsize=64)(KeepOut)

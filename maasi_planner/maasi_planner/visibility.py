@@ -1,0 +1,123 @@
+"""Shortest paths around obstacles: a graph of the corners that see each other."""
+
+import numpy as np
+from numba import njit
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_planner.obstacles import Surroundings, Vector, is_visible
+
+# Pairs of vertices that are looked at. Among more vertices than allow all pairs each looks at the
+# nearest ones, which makes paths a little longer; robots cut them short where they see further.
+PAIRS = 1_000_000
+
+
+class VisibilityGraph:
+    """Vertices that see each other, and the lengths of the shortest paths from them to goals.
+
+    around: obstacles, with the vertices; extra: kept beyond the radius by the edges [m].
+    """
+
+    def __init__(self, around: Surroundings, extra: float) -> None:
+        self.around = around
+        vertices = around.vertices
+        pairs = _pairs(vertices)
+        pairs = pairs[_seen(pairs, around, extra)]
+        gaps = vertices[pairs[:, 0]] - vertices[pairs[:, 1]]
+        lengths, number = np.hypot(gaps[:, 0], gaps[:, 1]), len(vertices)
+        edges = csr_array((lengths, (pairs[:, 0], pairs[:, 1])), (number, number))
+        edges = csr_array(edges + edges.T)
+        self._edges = edges.indptr.astype(np.int64), edges.indices.astype(np.int64), edges.data
+
+    def to_goal(self, goal: Vector) -> FloatArray:
+        """Return the length of the shortest clear path from each vertex to a goal, (m,), or inf."""
+        last = _last_legs(goal, self.around)
+        return _shortest(*self._edges, last)
+
+
+def _pairs(vertices: FloatArray) -> IntArray:
+    """Return pairs of vertices (p, 2): all, or of each the nearest."""
+    number = len(vertices)
+    if number * number <= 2 * PAIRS:
+        return np.stack(np.triu_indices(number, 1), axis=1)
+    nearest = cKDTree(vertices).query(vertices, max(2, 2 * PAIRS // number))[1]
+    pairs = np.stack([np.repeat(np.arange(number), nearest.shape[1]), nearest.ravel()], axis=1)
+    pairs = np.sort(pairs, axis=1)
+    return np.asarray(np.unique(pairs[pairs[:, 0] < pairs[:, 1]], axis=0))
+
+
+@njit(cache=True)
+def _seen(pairs: IntArray, around: Surroundings, extra: float) -> BoolArray:
+    """Return which pairs of vertices see each other, (p,)."""
+    out, vertices = np.zeros(pairs.shape[0], np.bool_), around.vertices
+    for n in range(pairs.shape[0]):
+        i, j = pairs[n]
+        start, end = (vertices[i, 0], vertices[i, 1], 0.0), (vertices[j, 0], vertices[j, 1], 0.0)
+        out[n] = is_visible(start, end, around, extra, True)
+    return out
+
+
+@njit(cache=True)
+def _last_legs(goal: Vector, around: Surroundings) -> FloatArray:
+    """Return the length of the straight line from each vertex to a goal, (m,); inf: not clear."""
+    out, end = np.full(around.vertices.shape[0], np.inf), (goal[0], goal[1], 0.0)
+    for j in range(out.shape[0]):
+        x, y = around.vertices[j, 0], around.vertices[j, 1]
+        if is_visible((x, y, 0.0), end, around, 0.0, True):
+            out[j] = np.hypot(x - goal[0], y - goal[1])
+    return out
+
+
+@njit(cache=True)
+def _shortest(first: IntArray, ends: IntArray, lengths: FloatArray, last: FloatArray) -> FloatArray:
+    """Return the shortest lengths from all vertices, (m,), by Dijkstra's algorithm on a heap."""
+    out = last.copy()
+    number = out.shape[0]
+    heap = np.empty(number, np.int64)  # vertices; the nearest on top
+    where = np.full(number, -1)
+    size = 0
+    for vertex in range(number):
+        if out[vertex] < np.inf:
+            heap[size], where[vertex] = vertex, size
+            size += 1
+            _rise(heap, where, out, size - 1)
+    while size:
+        vertex = heap[0]
+        size -= 1
+        heap[0] = heap[size]
+        where[heap[0]] = 0
+        _sink(heap, where, out, size)
+        where[vertex] = -2
+        for edge in range(first[vertex], first[vertex + 1]):
+            end, total = ends[edge], out[vertex] + lengths[edge]
+            if total < out[end]:
+                out[end] = total
+                if where[end] < 0:
+                    heap[size], where[end] = end, size
+                    size += 1
+                _rise(heap, where, out, where[end])
+    return out
+
+
+@njit(cache=True)
+def _rise(heap: IntArray, where: IntArray, keys: FloatArray, place: int) -> None:
+    while place > 0 and keys[heap[place]] < keys[heap[(place - 1) // 2]]:
+        above = (place - 1) // 2
+        heap[place], heap[above] = heap[above], heap[place]
+        where[heap[place]], where[heap[above]] = place, above
+        place = above
+
+
+@njit(cache=True)
+def _sink(heap: IntArray, where: IntArray, keys: FloatArray, size: int) -> None:
+    place = 0
+    while 2 * place + 1 < size:
+        below = 2 * place + 1
+        if below + 1 < size and keys[heap[below + 1]] < keys[heap[below]]:
+            below += 1
+        if keys[heap[place]] <= keys[heap[below]]:
+            return
+        heap[place], heap[below] = heap[below], heap[place]
+        where[heap[place]], where[heap[below]] = place, below
+        place = below
