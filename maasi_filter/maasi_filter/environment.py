@@ -362,7 +362,11 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     def text(value: Any, *key: str | int) -> str:
         with _at(value, *key):
             found = read_shape(value, project if origin else None)
-        return str(shapely.to_wkt(found, rounding_precision=4))
+        rounded = str(shapely.to_wkt(found, rounding_precision=4))
+        if not shapely.from_wkt(rounded).is_valid:
+            # Corners that touch, as those of cells of a map, may cross where they are rounded.
+            rounded = str(shapely.to_wkt(shapely.set_precision(found, 1e-4), rounding_precision=4))
+        return rounded
 
     def zone(item: Any, *key: str | int) -> Any:
         round_one = isinstance(item, Zone) or (isinstance(item, Mapping) and 'centre' in item)
