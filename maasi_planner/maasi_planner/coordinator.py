@@ -3,11 +3,7 @@
 Used by the planner node and the in-process search (000, algorithms 1 and 2).
 """
 
-import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-
-import numpy as np
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
@@ -16,158 +12,16 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap, default_spacing
 from maasi_planner.candidates import CandidateSet, half_view
-from maasi_planner.endurance import Endurance
+from maasi_planner.endurance import NOTHING_AFFORDABLE, Endurance
+from maasi_planner.homing import Homing, waits_cut_off
 from maasi_planner.measurement_trigger import MeasurementTrigger
-from maasi_planner.motion import MotionModel, RobotState, make_motion
+from maasi_planner.motion import MotionModel, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
-from maasi_planner.planners.base import check_decision, explain, go_home, keep_apart
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, stay
-
-
-@dataclass
-class PresentRobot:
-    """A robot that takes part in a step.
-
-    free: whether it has no goal, or its goal has ended; charge: of its battery, 0 to 1, or unknown.
-    """
-
-    state: RobotState
-    free: bool
-    charge: float = math.nan
-
-
-@dataclass(frozen=True)
-class Member:
-    """A robot that measures at a step: its name, decision index d and measurement index m."""
-
-    robot: str
-    decision: int
-    measurement: int
-
-
-@dataclass
-class RobotPlan:
-    """A robot, and its present plan.
-
-    decision: index of its last decision, -1 before the first; positions (K + 1, 3): predicted
-    trajectory [m]; staying: whether it has no goal: it never had one, refused it, or is commanded
-    to stay.
-    """
-
-    motion: MotionModel
-    sensor: Sensor
-    candidates: CandidateSet
-    period: int
-    radius: float
-    # Distance from a waypoint at which the next one is decided [m]; 0: it stops at each.
-    arrival_radius: float
-    endurance: Endurance | None = None
-    exploration: UnexploredMap | None = None
-    decision: int = -1
-    decided_at: int | None = None
-    waypoint: FloatArray = field(default_factory=lambda: np.zeros(3))
-    turning_distance: float = 0.0  # the same for the present waypoint
-    # Waypoint that was left for the next one, until its closest point, and its distance squared.
-    passed: FloatArray | None = None
-    nearest: float = 0.0
-    # Step from which the periods of measurements count.
-    measured_from: int = 0
-    positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    yaws: FloatArray = field(default_factory=lambda: np.zeros(0))
-    tour: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    staying: bool = True
-    measurements: int = 0
-    due: bool = False
-
-    def destination(self, state: RobotState) -> FloatArray:
-        """Return the final position of its plan at a state, (3,) [m]."""
-        if self.staying or not len(self.positions):
-            return np.array(state.pose.position)
-        return self.positions[-1].copy()
-
-    def leave(self) -> None:
-        """Discard its plan: it does not take part."""
-        self.decided_at = None
-        self.positions, self.yaws = np.zeros((0, 3)), np.zeros(0)
-        self.tour = np.zeros((0, 3))
-        self.staying = True
-        self.passed = None
-        self.due = False
-
-    def lend(self, step: int) -> None:
-        """Note that it follows a goal of another client: it measures without a plan."""
-        began = self.decided_at
-        if began is not None and self.staying and not len(self.positions):
-            return  # it does so already
-        self.leave()
-        if began is None:
-            began = self.measured_from = step
-        self.decided_at = began
-        # Measurements need a decision index, which is not negative.
-        self.decision = max(self.decision, 0)
-
-    def nears(self, robot: PresentRobot) -> bool:
-        """Return whether it is on its way, near enough to turn to the next waypoint."""
-        if robot.free or self.staying or not self.turning_distance:
-            return False
-        left = self.motion.squared_distance(robot.state.pose.position, self.waypoint)
-        return left < self.turning_distance**2
-
-    def adopt(self, step: int, robot: PresentRobot, chosen: RobotDecision) -> None:
-        """Take over what was decided for it."""
-        here = robot.state.pose.position
-        # Of two waypoints passed in a row the first is measured now.
-        self.due = self.due or self.passed is not None
-        self.passed = None
-        if robot.free:
-            self.measured_from = step
-        else:
-            self.passed = self.waypoint
-            self.nearest = self.motion.squared_distance(here, self.passed)
-        self.decision += 1
-        self.decided_at = step
-        self.positions, self.yaws, self.tour = chosen.positions, chosen.yaws, chosen.tour
-        self.staying, self.waypoint = chosen.stays, chosen.waypoint
-        # A waypoint within the radius already is gone to until it is reached.
-        near = self.motion.squared_distance(here, chosen.waypoint) <= self.arrival_radius**2
-        self.turning_distance = 0.0 if near else self.arrival_radius
-
-    def pass_waypoint(self, step: int, robot: PresentRobot) -> None:
-        """Count the measurements from the closest point to a waypoint that is passed."""
-        if self.passed is None or step == self.decided_at:
-            return
-        distance = self.motion.squared_distance(robot.state.pose.position, self.passed)
-        if distance >= self.nearest:
-            self.passed = None
-            self.measured_from = step
-        else:
-            self.nearest = distance
-
-    def view(self, step: int, robot: PresentRobot, planning: bool) -> RobotView:
-        """Return what a planner sees of it."""
-        view = RobotView(
-            state=robot.state,
-            candidates=self.candidates.at(robot.state.pose.position),
-            motion=self.motion,
-            sensor=self.sensor,
-            period_steps=self.period,
-            planning=planning,
-            radius=self.radius,
-            endurance=self.endurance,
-            arrival_radius=self.arrival_radius,
-            exploration=self.exploration,
-        )
-        if not planning and self.decided_at is not None:
-            view.phase = (self.measured_from - step) % self.period
-            if len(self.positions):
-                view.remaining_path, view.remaining_yaws = self.left(step)
-        return view
-
-    def left(self, step: int) -> tuple[FloatArray, FloatArray]:
-        """Return the rest of its predicted trajectory: positions (n, 3) and headings (n,)."""
-        first = min(step - (self.decided_at or 0), len(self.positions) - 1)
-        return self.positions[first:], self.yaws[first:]
+from maasi_planner.planners.base import check_decision, explain, keep_apart
+from maasi_planner.robot_plan import Errand, Member, PresentRobot, RobotPlan
+from maasi_planner.settings import PlannerSettings
+from maasi_planner.team import Decision, RobotDecision, TeamView, stay
 
 
 class Coordinator:
@@ -204,9 +58,12 @@ class Coordinator:
                 arrival_radius=arrival_radius(motion, sensor, self.planner),
                 endurance=None
                 if robot.endurance is None
-                else Endurance(robot.endurance, motion, robot.start),
+                else Endurance(robot.endurance, motion, robot.start, settings.step),
                 exploration=self.exploration.copy() if own else None,
             )
+        self.homing = Homing(self.plans)
+        self._ended = False
+        self._live = _live(settings.planner)
 
     @property
     def names(self) -> list[str]:
@@ -214,8 +71,12 @@ class Coordinator:
         return list(self.plans)
 
     def take_area(self, area: Area) -> None:
-        """Take another area within the same bounds, as with other keep-outs."""
+        """Take another area within the same bounds, as with other keep-outs.
+
+        A search that was finished goes on where that opens something.
+        """
         self.area = area
+        self.finished, self._ended = None, False
         self.exploration.take_area(area)
         for name, plan in self.plans.items():
             plan.motion.take_area(area, plan.radius)
@@ -224,15 +85,25 @@ class Coordinator:
             )
             if plan.exploration is not None:
                 plan.exploration.take_area(area)
+        self.homing.take_area()
 
     def begin_again(self) -> None:
         """Begin a new search with nothing explored; decision indices continue."""
         self.exploration.values[...] = 1.0
-        self.finished = None
+        self.clusters = []
+        self.finished, self._ended = None, False
+        self.homing.begin_again()
         self.planner = make_planner(self.settings.planner.name, self.settings.planner)
         self.trigger = MeasurementTrigger(self.settings.planner)
         for plan in self.plans.values():
             plan.leave()
+            if plan.exploration is not None:
+                plan.exploration.values[...] = 1.0
+
+    @property
+    def ended(self) -> str | None:
+        """Why no gain is left, once the robots with batteries are home; None before."""
+        return self.finished if self._ended else None
 
     def planning(self, step: int, robots: Mapping[str, PresentRobot]) -> list[str]:
         """Return P_k, the robots that plan at a step, in order of their names.
@@ -242,24 +113,16 @@ class Coordinator:
         """
         if self.finished is not None:
             return []
-        chosen = []
-        for name in sorted(robots):
-            plan, robot = self.plans[name], robots[name]
-            if plan.endurance is not None:
-                plan.endurance.hear(robot.charge)
-                here = robot.state.pose.position
-                if plan.endurance.charging:
-                    # Its way home has ended elsewhere.
-                    if robot.free and not plan.endurance.is_home(here):
-                        chosen.append(name)
-                    continue
-                if not robot.free and plan.endurance.must_return(here):
-                    chosen.append(name)
-                    continue
-            waited = plan.decided_at is None or step - plan.decided_at >= plan.period
-            if plan.nears(robot) or (robot.free and (not plan.staying or waited)):
-                chosen.append(name)
-        return chosen
+        return [
+            name
+            for name in sorted(robots)
+            if self.homing.is_available(name, robots[name]) and self._is_due(name, step, robots)
+        ]
+
+    def _is_due(self, name: str, step: int, robots: Mapping[str, PresentRobot]) -> bool:
+        plan, robot = self.plans[name], robots[name]
+        waited = plan.decided_at is None or step - plan.decided_at >= plan.period
+        return plan.nears(robot) or (robot.free and (not plan.staying or waited))
 
     def plan(
         self,
@@ -270,82 +133,134 @@ class Coordinator:
         """Return the joint decision of the robots that plan at a step, None without any.
 
         A robot that nears its waypoint and has nowhere further to go is not in it: it goes on, and
-        plans again when it has arrived.
+        plans again when it has arrived. Robots that leave a closed zone or go home are in it,
+        whatever the planner thinks. At the end of the search a decision without robots has its
+        reason.
 
         robots: those that take part, by name; taken: final positions (3,) of robots of other
         planners [m], and their radii.
         """
-        planning = self.planning(step, robots)
-        if not planning:
-            return None
-        arrived = [name for name in planning if robots[name].free]
-        views = {
-            name: self.plans[name].view(step, robots[name], name in planning)
-            for name in sorted(robots)
-        }
-        knowledge = self.clusters, self.exploration
-        team = TeamView(step, self.settings.step, views, *knowledge, taken)
-        finished = self.planner.finished(team)
-        if finished is not None:
-            for name in planning:
-                self.plans[name].turning_distance = 0.0
-            if not arrived:
-                return None
-            self.finished = finished
+        self._take_settings()
+        self.homing.update(step, robots, self.settings.step)
+        if self.finished is None and not self._closed() and self.homing.exhausted(step, robots):
+            explored = 100.0 * self.exploration.explored_fraction()
+            self.finished = f'{NOTHING_AFFORDABLE} ({explored:.1f} % is explored)'
+        errands = self.homing.errands(step, robots, self.finished is not None)
+        asked = [name for name in self.planning(step, robots) if name not in errands]
+        cut_off = [
+            name
+            for name in sorted(self.homing.alarms)
+            if robots[name].searches and robots[name].free and self._is_due(name, step, robots)
+            if name not in errands
+        ]
+        landed = [name for name in self.homing.landed if name not in errands]
+        decision = Decision(step)
+        if asked or errands or landed or cut_off:
+            views = {
+                name: self.plans[name].view(step, robots[name], name in asked, self.settings.step)
+                for name in sorted(robots)
+            }
+            knowledge = self.clusters, self.exploration
+            team = TeamView(step, self.settings.step, views, *knowledge, taken)
+            if asked and self._concludes(team, robots, asked, decision):
+                errands = self.homing.errands(step, robots, self.finished is not None)
+            elif asked:
+                decision = self._ask(team, robots)
+            before = dict(decision.robots)
+            for name in cut_off:
+                decision.robots[name] = waits_cut_off(views[name])
+            for name in landed:
+                decision.robots[name] = self.homing.at_home(views[name], name)
+            self.homing.decide(team, errands, decision, self.finished is not None)
+            self._carry_out(team, robots, decision, errands, before)
+        if decision.robots or self.finished is None or self._ended:
+            return decision if decision.robots else None
+        self._ended = self.homing.settled(robots)
+        return Decision(step=step, reason=self.finished) if self._ended else None
+
+    def _take_settings(self) -> None:
+        """Hand settings that were changed while the search runs to the planner."""
+        settings = self.settings.planner
+        if (live := _live(settings)) != self._live:
+            self._live = live
+            self.planner.take_settings(settings)
+
+    def _closed(self) -> float:
+        """Return how many targets are expected where zones are closed now; 0 if hardly any."""
+        share = self.exploration.closed_share()
+        least = 1.0 - self.settings.planner.explored_threshold
+        return share * self.area.expected_targets if share > least else 0.0
+
+    def _concludes(
+        self,
+        team: TeamView,
+        robots: Mapping[str, PresentRobot],
+        asked: Sequence[str],
+        decision: Decision,
+    ) -> bool:
+        """Return whether nothing is left to gain now; then the robots wait, or are finished."""
+        conclusion = self.planner.finished(team)
+        if conclusion is None:
+            return False
+        arrived = [name for name in asked if robots[name].free]
+        for name in asked:
+            self.plans[name].turning_distance = 0.0
+        closed = self._closed()
+        for name in arrived if closed else ():
+            reason = f'waits: closed zones hold {closed:.2g} expected targets'
+            decision.robots[name] = stay(team.robots[name], reason)
+        if arrived and not closed:
+            self.finished = conclusion
             for name in arrived:
                 plan = self.plans[name]
                 plan.decision += 1
-                plan.decided_at = plan.measured_from = step
+                plan.decided_at = plan.measured_from = team.step
                 plan.staying = True
-            return Decision(step=step, reason=finished)
-        for name in planning:
-            if (endurance := self.plans[name].endurance) is not None:
-                endurance.spent = False
+        return True
+
+    def _ask(self, team: TeamView, robots: Mapping[str, PresentRobot]) -> Decision:
+        """Return what the planner decides, with the paths home of robots that afford nothing."""
         decision = self.planner.decide(team)
         check_decision(self.planner, team, decision)
         decided = dict(decision.robots)
-        for name in planning:
-            home = self._way_home(team, name, decision, name in arrived)
-            if home is not None:
-                decision.robots[name] = home
-        # Who has not arrived, and gets no other way, is still on its present one.
-        under_way = [n for n in planning if n not in arrived and len(self.plans[n].positions)]
-        keep_apart(team, decision, {name: self.plans[name].left(step)[0] for name in under_way})
+        self.homing.check(team, decision, [name for name in decided if robots[name].free])
         if any(decision.robots[name] is not chosen for name, chosen in decided.items()):
             explain(decision)
-        for name in planning:
-            plan, chosen = self.plans[name], decision.robots[name]
-            if name not in arrived and chosen.stays:
+        return decision
+
+    def _carry_out(
+        self,
+        team: TeamView,
+        robots: Mapping[str, PresentRobot],
+        decision: Decision,
+        errands: Mapping[str, Errand],
+        before: Mapping[str, RobotDecision],
+    ) -> None:
+        """Keep robots apart, and adopt the plans of those that get one.
+
+        before: what was decided before errands were added.
+        """
+        # A robot that has not arrived, and gets no other path, is still on its present one.
+        left = {
+            name: self.plans[name].left(team.step)[0]
+            for name in decision.robots
+            if not robots[name].free and len(self.plans[name].positions)
+        }
+        keep_apart(team, decision, left)
+        for name, chosen in list(decision.robots.items()):
+            plan = self.plans[name]
+            if chosen.stays and not robots[name].free:
                 plan.turning_distance = 0.0
-                if plan.endurance is not None:
-                    plan.endurance.charging = False  # asked again at the next step
+                self.homing.drop(name)
                 del decision.robots[name]
                 continue
-            plan.adopt(step, robots[name], chosen)
-            way = chosen.positions, chosen.yaws
+            plan.adopt(team.step, robots[name], chosen)
+            self.homing.adopt(name, chosen, errands.get(name))
+            way, knowledge = (chosen.positions, chosen.yaws), (self.clusters, self.exploration)
             self.trigger.begin(name, plan.sensor, *way, plan.period, *knowledge)
-        return decision if decision.robots else None
-
-    def _way_home(
-        self, team: TeamView, name: str, decision: Decision, arrived: bool
-    ) -> RobotDecision | None:
-        """Return the way to a charger of a robot that can afford nothing else, or None."""
-        view, endurance = team.robots[name], self.plans[name].endurance
-        if endurance is None or math.isnan(endurance.charge):
-            return None
-        here, chosen = view.state.pose.position, decision.robots[name]
-        spent = endurance.spent
-        if not chosen.stays:
-            # Not every planner asks for the battery.
-            way = view.motion.predict(view.state, chosen.waypoint[None], team.step_time)
-            spent = not endurance.affords(way, team.step_time)[0]
-        if not (spent or endurance.charging or endurance.must_return(here)):
-            return None
-        endurance.spent, endurance.charging = False, True
-        battery = f'its battery is at {100.0 * endurance.charge:.0f} %'
-        if arrived and endurance.is_home(here):
-            return stay(view, f'charges: {battery}')
-        return go_home(team, name, decision, f'goes home to charge: {battery}')
+        changed = any(before.get(name) is not item for name, item in decision.robots.items())
+        if changed or not decision.reason:
+            explain(decision)
 
     def measuring(
         self, step: int, robots: Mapping[str, PresentRobot], able: Collection[str] | None = None
@@ -354,7 +269,7 @@ class Coordinator:
         members = []
         for name in sorted(robots):
             plan = self.plans[name]
-            if plan.decided_at is None:
+            if plan.decided_at is None or not robots[name].searches:
                 continue
             plan.pass_waypoint(step, robots[name])
             gone = step - plan.measured_from
@@ -382,6 +297,13 @@ class Coordinator:
             if plan.exploration is not None:
                 plan.exploration.update(plan.sensor.detection, poses[name])
         self.clusters = clusters
+
+
+def _live(settings: PlannerSettings) -> tuple[object, ...]:
+    """Return the values that may change while a search runs."""
+    names = sorted(PlannerNodeSettings.live)
+    parts = [name.removeprefix('planner.') for name in names if name.startswith('planner.')]
+    return tuple(getattr(settings, part) for part in parts)
 
 
 def arrival_radius(motion: MotionModel, sensor: Sensor, planner: Planner) -> float:

@@ -20,7 +20,7 @@ from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, PlanDecision
 from maasi_msgs.srv import SetKeepOuts
 from maasi_planner import warm_up
 from maasi_planner.conversions import checked_state, decision_to_ros, path_to_ros
-from maasi_planner.coordinator import Coordinator, PresentRobot
+from maasi_planner.coordinator import Coordinator
 from maasi_planner.node.batches import Batches
 from maasi_planner.node.filter_guard import FilterGuard, FoundKeeper
 from maasi_planner.node.orders import Orders
@@ -30,6 +30,7 @@ from maasi_planner.node.search_modes import Mode, SearchModes
 from maasi_planner.node.team_goals import HeardState
 from maasi_planner.node.views import PlannerViews
 from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.robot_plan import PresentRobot
 
 _CHECK_PERIOD = 0.1
 # At shutdown: longest wait for answers to goals, which are then cancelled [s], and executor rounds
@@ -104,6 +105,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         # Free running: why the robots are held; empty if they are not.
         self._held = ''
         self._planning_time = 0.0
+        # What was logged of robots that zones cut off from their chargers.
+        self._alarms: dict[str, str] = {}
 
     # ---- life cycle --------------------------------------------------------------------------
 
@@ -198,6 +201,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         """Return why the robots are held, or that they take no goals."""
         if self._held:
             return f'robots are held: {self._held}'
+        if self._alarms:
+            return '; '.join(f'{name}: {text}' for name, text in sorted(self._alarms.items()))
         refused = self._orders.refused_for
         return f'no goal accepted for {refused:.0f} s' if refused >= _REFUSAL_PATIENCE else ''
 
@@ -260,11 +265,12 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         }
 
     def warnings(self) -> list[str]:
-        """Return the robots that follow goals of other clients."""
-        return [
+        """Return robots that follow goals of other clients, and estimated charges."""
+        lent = [
             f'{name} follows goal {goal} of another client'
             for name, goal in sorted(self._orders.lent.items())
         ]
+        return lent + self.coordinator.homing.estimates()
 
     # ---- input -------------------------------------------------------------------------------
 
@@ -370,7 +376,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 expected_number=update.expected_number,
                 explored=self.coordinator.exploration.explored_fraction(),
             ),
-            self.coordinator.finished or '',
+            self.coordinator.ended or '',
             not self._heard or len(self._away) < len(self.coordinator.names),
         )
 
@@ -425,20 +431,27 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 continue
             heard = self._heard[name]
             free = self._orders.is_free(name, heard, step)
-            if free:
-                self._orders.send_home(name, header)
-            searches = free and self.modes.of[name] is Mode.SEARCHING
-            robots[name] = PresentRobot(heard.state, searches, heard.charge)
-        searching = Mode.SEARCHING in self.modes.of.values() and not self._held
+            if free and self._orders.send_home(name, header):
+                free = False
+            mode = self.modes.of[name]
+            robots[name] = PresentRobot(
+                heard.state,
+                free,
+                heard.charge,
+                searches=mode is Mode.SEARCHING and not self._held,
+                returns=mode not in (Mode.WAITING, Mode.STOPPED),
+            )
+        commanded = any(robot.returns for robot in robots.values())
         begin = time.perf_counter()
-        decision = self.coordinator.plan(step, robots, taken) if searching else None
+        decision = self.coordinator.plan(step, robots, taken) if commanded else None
         if decision is not None:
             self._planning_time = time.perf_counter() - begin
+        self._report_batteries()
         plans = self.coordinator.plans
         self._others.publish(
             header, {name: plans[name].destination(robot.state) for name, robot in robots.items()}
         )
-        if not searching:
+        if not commanded:
             return
         if decision is not None:
             self._announce(decision, header)
@@ -461,18 +474,32 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 header,
             )
         )
-        if self.coordinator.finished is not None:
-            self.get_logger().info(f'nothing is left to gain: {self.coordinator.finished}')
+        if not decision.robots:
+            self.get_logger().info(f'nothing is left to gain: {decision.reason}')
         for name in sorted(decision.robots):
             robot = decision.robots[name]
             if robot.stays:
                 self.warn_throttled(f'{name} stays', f'{name} stays: {robot.reason}')
                 continue
-            endurance = self.coordinator.plans[name].endurance
-            if endurance is not None and endurance.charging:
+            if self.coordinator.plans[name].errand is not None:
                 self.get_logger().info(f'{name} {robot.reason}')
+                self._orders.interrupt_homing(name)
             self._orders.send(name, indices[name] + 1, robot.waypoint, header)
             self._path_publishers[name].publish(path_to_ros(robot.positions, header))
+
+    def _report_batteries(self) -> None:
+        """Log what has changed about batteries, and paths home that zones close."""
+        homing = self.coordinator.homing
+        for text in homing.news:
+            self.get_logger().warning(text)
+        homing.news.clear()
+        for name in sorted(homing.alarms.keys() - self._alarms.keys()):
+            self.get_logger().error(f'{name}: {homing.alarms[name]}; it waits where it is')
+        for name in sorted(self._alarms.keys() - homing.alarms.keys()):
+            self.get_logger().warning(f'{name}: a path to a charger is open again')
+        self._alarms = dict(homing.alarms)
+        for text in homing.estimates():
+            self.warn_throttled(text.partition(':')[0], text)
 
     def _try_done(self) -> None:
         if (

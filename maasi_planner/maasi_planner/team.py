@@ -14,6 +14,22 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.endurance import Endurance
 from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 
+# Reasons of robots that stay, by which the coordinator knows why.
+#: It lets others pass.
+CROSSED = 'waits: others are on its way'
+#: Others are in its way, for now.
+BLOCKED = (
+    'other robots are on all ways',
+    'other robots stand at all candidates',
+    'another robot is sent to every candidate',
+    'another robot takes its candidates',
+    'all chargers are taken',
+)
+#: Nothing that is left is affordable.
+SAVES_BATTERY = 'it has to save its battery for the path home'
+#: Of a planner that gives it nothing; with a full battery there may be more.
+NOTHING_LEFT = 'nothing is left for it'
+
 
 @dataclass
 class RobotView:
@@ -189,6 +205,21 @@ class RobotDecision:
     def stays(self) -> bool:
         """Whether the robot stays at its present position."""
         return self.chosen < 0
+
+    @property
+    def blocked(self) -> bool:
+        """Whether it stays as others are in its way."""
+        return self.stays and any(text in self.reason for text in (CROSSED, *BLOCKED))
+
+    @property
+    def saves_battery(self) -> bool:
+        """Whether it stays as nothing that is left is affordable."""
+        return self.stays and SAVES_BATTERY in self.reason
+
+    @property
+    def unaffordable(self) -> bool:
+        """Whether it stays, and a better charged battery may help."""
+        return self.stays and any(text in self.reason for text in (SAVES_BATTERY, NOTHING_LEFT))
 
     @property
     def length(self) -> int:

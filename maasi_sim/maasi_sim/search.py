@@ -18,9 +18,10 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.make_filter import make_filter
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import AgentMeasurement, FoundTarget
-from maasi_planner.coordinator import Coordinator, PresentRobot
+from maasi_planner.coordinator import Coordinator
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planners import Planner
+from maasi_planner.robot_plan import PresentRobot
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.compiling import compiling_said
 from maasi_sim.run.targets.tally import Scores, numbered, score, scoring_radius
@@ -242,7 +243,7 @@ class _Search:
         if self._complete and self.scenario.stop == 'all_found':
             return 'all_found'
         searching = [group for group in self._groups if self._here.keys() & set(group.names)]
-        if searching and all(group.coordinator.finished is not None for group in searching):
+        if searching and all(group.coordinator.ended is not None for group in searching):
             return 'planner_done'
         measured = sum(self._result.measurements.values())
         if most_measurements is not None and measured >= most_measurements:

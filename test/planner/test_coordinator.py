@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from maasi_planner.coordinator import Coordinator, Member, PresentRobot
-from maasi_planner.endurance import Endurance, EnduranceSettings
+from maasi_planner.coordinator import Coordinator
+from maasi_planner.endurance import Endurance, EnduranceSettings, Phase
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners.intermittent import Intermittent
+from maasi_planner.robot_plan import Member, PresentRobot
 from maasi_planner.team import Decision, single_choice, stay
 
 ROBOT = {
@@ -65,7 +66,7 @@ def test_who_arrives_plans_alone_and_starts_its_period_anew():
     coordinator = started()
     robots = there(a=(2.0, 2.0)) | there(free=False, b=(8.5, 8.5))
     # The planner receives the other's destination and its next measurement.
-    view = coordinator.plans['b'].view(5, robots['b'], False)
+    view = coordinator.plans['b'].view(5, robots['b'], False, 0.1)
     assert view.phase == 3
     assert view.remaining_path == pytest.approx(coordinator.plans['b'].positions[5:])
     assert list(coordinator.plan(6, robots).robots) == ['a']
@@ -264,13 +265,24 @@ def test_a_robot_that_must_turn_home_does_so_as_soon_as_its_charger_is_free():
     coordinator.plan(0, {'a': PresentRobot(here, True, 1.0)})
     low = {'a': PresentRobot(here, False, 0.1)}
     occupied = [(np.array([1.0, 1.0, 0.0]), 0.1)]
-    assert coordinator.plan(1, low, occupied) is None
-    chosen = coordinator.plan(2, low).robots['a']
+    chosen = coordinator.plan(1, low, occupied).robots['a']
+    assert chosen.reason.endswith('all chargers are taken')
+    near = np.linalg.norm(chosen.waypoint - [1.0, 1.0, 0.0])
+    assert 0.2 < near < 2.0
+    # Near it, it waits; as soon as it is free it goes there.
+    low = {'a': PresentRobot(RobotState.at_rest(chosen.waypoint), True, 0.1)}
+    assert coordinator.plan(20, low, occupied).robots['a'].reason == 'waits: all chargers are taken'
+    assert coordinator.plan(22, low, occupied) is None
+    chosen = coordinator.plan(24, low).robots['a']
     assert chosen.reason.startswith('goes home') and chosen.waypoint.tolist() == [1.0, 1.0, 0.0]
     # Over its charger it is not home before it has stopped there.
-    over = PresentRobot(RobotState.at_rest([1.0, 1.0, 0.0]), False, 0.01)
-    coordinator.plans['a'].endurance.charging = False
-    assert coordinator.plan(3, {'a': over}).robots['a'].reason.startswith('goes home')
+    over = RobotState.at_rest([1.0, 1.0, 0.0])
+    assert coordinator.plan(40, {'a': PresentRobot(over, False, 0.01)}) is None
+    assert coordinator.plans['a'].endurance.phase is Phase.RETURNING
+    landed = coordinator.plan(41, {'a': PresentRobot(over, True, 0.01)}).robots['a']
+    assert landed.reason == 'charges: its battery is at 1 %'
+    assert coordinator.plan(60, {'a': PresentRobot(over, True, 0.5)}) is None
+    assert coordinator.plan(80, {'a': PresentRobot(over, True, 0.96)}).robots['a'].chosen >= 0
 
 
 def test_who_is_sent_further_than_its_battery_affords_goes_home(monkeypatch):

@@ -10,9 +10,10 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE, UPDATES
 from maasi_msgs.msg import BatchMember, FilterUpdate, MeasurementBatch
 from maasi_planner.conversions import checked_update
-from maasi_planner.coordinator import Coordinator, Member
+from maasi_planner.coordinator import Coordinator
 from maasi_planner.node.filter_guard import FilterGuard
 from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.robot_plan import Member
 
 _MEASUREMENTS_KEPT = 1000  # measurements that are remembered, to recognise duplicate updates
 

@@ -55,9 +55,10 @@ class Orders:
     def hold(self, names: Iterable[str]) -> None:
         """Stop robots where they are, but for those on their way home; they get new goals."""
         for name in names:
-            if name not in self._homing:
+            plan = self._coordinator.plans[name]
+            if name not in self._homing and (plan.errand is None or plan.staying):
                 self.goals.cancel(name)
-                self._coordinator.plans[name].staying = True
+                plan.staying = True
 
     def set_homing(self, names: Iterable[str], home: bool) -> None:
         """Send robots to their starts as soon as they are free, or no more."""
@@ -65,6 +66,12 @@ class Orders:
             self._homing.pop(name, None)
             if home:
                 self._homing[name] = -1
+                self._coordinator.homing.release(name)
+
+    def interrupt_homing(self, name: str) -> None:
+        """Note that a robot which was sent to its start goes elsewhere before that."""
+        if name in self._homing:
+            self._homing[name] = -1
 
     def leave(self, name: str) -> None:
         """Forget the goals of a robot that takes part no more."""
@@ -82,14 +89,15 @@ class Orders:
         goal.waypoint.pose.orientation.w = 1.0
         self.goals.send(name, goal)
 
-    def send_home(self, name: str, header: Header) -> None:
-        """Send a free robot to its start, if it has to go there."""
-        if name not in self._homing:
-            return
+    def send_home(self, name: str, header: Header) -> bool:
+        """Send a free robot to its start, and return whether it has to go there now."""
+        if name not in self._homing or self._coordinator.homing.occupies(name):
+            return False
         plan = self._coordinator.plans[name]
         plan.decision += 1
         number = self._homing[name] = plan.decision + 1
         self.send(name, number, np.array(self._node.settings.robots[name].start), header)
+        return True
 
     def _on_answer(self, name: str, number: int, accepted: bool) -> None:
         if not accepted:

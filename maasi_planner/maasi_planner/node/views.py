@@ -13,8 +13,9 @@ from maasi_filter.ros.conversions import MarkerBoard, particles_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED
 from maasi_planner.conversions import area_markers, exploration_to_ros, planner_markers
-from maasi_planner.coordinator import Coordinator, PresentRobot
+from maasi_planner.coordinator import Coordinator
 from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.robot_plan import PresentRobot
 
 
 class PlannerViews:

@@ -12,11 +12,14 @@ from pydantic import BaseModel
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.models.pose import Pose
 from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
-from maasi_planner.motion.base import Trajectories
+from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import (
+    BLOCKED,
+    SAVES_BATTERY,
     Decision,
     RobotDecision,
     RobotView,
@@ -25,9 +28,12 @@ from maasi_planner.team import (
     single_choice,
     stay,
 )
+from maasi_planner.team import (
+    CROSSED as CROSSED,
+)
 
-# Reason of a robot that lets others pass.
-CROSSED = 'waits: others are on its way'
+# Steps in which a robot brakes at most, and the speed below which it stands [m/s].
+_BRAKING_STEPS, _STANDS = 400, 1e-3
 # Turn a way in the plane aside, by angles [rad], and halve it: (6, 3, 2).
 _ASIDE = np.array(
     [
@@ -210,13 +216,13 @@ def options_of(
     if allowed.any():
         allowed &= ways_apart(team, name, prediction.positions, {})
         if not allowed.any():
-            return 'other robots are on all ways'
+            return BLOCKED[0]
         allowed = affordable(team, name, prediction, allowed)
         if not allowed.any():
-            return 'it has to save its battery for the way home'
+            return SAVES_BATTERY
         return UsableCandidates(points, prediction, allowed)
     if not free.any():
-        return 'other robots stand at all candidates'
+        return BLOCKED[1]
     if (prediction.lengths == 0).any():
         return 'it is at its only candidate already'
     return 'no candidate can be reached'
@@ -251,19 +257,57 @@ def centres_of(team: TeamView, view: RobotView, clusters: Sequence[Cluster]) -> 
 
 @njit(cache=True)
 def _gaps(ways: FloatArray, other: FloatArray) -> FloatArray:
-    """Return how near each of the ways (W, K, 3) comes to another (n, 3), step by step, (W,).
+    """Return how near each of the ways (W, K, 3) comes to another (n, 3), also between steps, (W,).
 
     At their ends robots stand.
     """
     out = np.full(ways.shape[0], np.inf)
     for w in range(ways.shape[0]):
+        dx = dy = dz = 0.0
         for k in range(max(ways.shape[1], other.shape[0])):
             here, there = min(k, ways.shape[1] - 1), min(k, other.shape[0] - 1)
-            square = 0.0
-            for axis in range(3):
-                square += (ways[w, here, axis] - other[there, axis]) ** 2
+            x = ways[w, here, 0] - other[there, 0]
+            y = ways[w, here, 1] - other[there, 1]
+            z = ways[w, here, 2] - other[there, 2]
+            square = x * x + y * y + z * z
+            if k > 0:
+                # Between two steps both move evenly.
+                mx, my, mz = x - dx, y - dy, z - dz
+                moved = mx * mx + my * my + mz * mz
+                along = -(dx * mx + dy * my + dz * mz)
+                if 0.0 < along < moved:
+                    before = dx * dx + dy * dy + dz * dz
+                    square = min(square, max(before - along * along / moved, 0.0))
             out[w] = min(out[w], square)
+            dx, dy, dz = x, y, z
     return np.sqrt(out)
+
+
+def braking_path(motion: MotionModel, state: RobotState, step: float) -> FloatArray:
+    """Return where a robot goes that is commanded to stand, (n, 3), from its present position on.
+
+    It is its position alone where it stands, or drifts by less than a tenth of its tolerance.
+    """
+    path = [np.array(state.pose.position, dtype=float)]
+    if np.linalg.norm(state.velocity) > _STANDS:
+        body = motion.body(state)
+        for _ in range(_BRAKING_STEPS):
+            body.step(np.zeros(4), step)
+            now = body.robot_state()
+            path.append(np.array(now.pose.position))
+            if np.linalg.norm(now.velocity) <= _STANDS:
+                break
+    drift = math.dist(path[0], path[-1])
+    return np.array(path if drift > 0.1 * motion.settings.tolerance else path[:1])
+
+
+def with_braking(motion: MotionModel, robot: RobotDecision, step: float) -> FloatArray:
+    """Return the predicted path (n, 3) of a robot, with what it drifts after it has arrived."""
+    path = robot.positions
+    if len(path) < 2:
+        return path
+    state = RobotState(Pose.from_yaw(path[-1], robot.yaws[-1]), (path[-1] - path[-2]) / step)
+    return np.vstack([path, braking_path(motion, state, step)[1:]])
 
 
 def ways_apart(
@@ -308,9 +352,7 @@ def affordable(
     endurance = team.robots[name].endurance
     if endurance is None:
         return allowed
-    allowed = allowed & endurance.affords(prediction, team.step_time)
-    endurance.spent = not allowed.any()
-    return allowed
+    return allowed & endurance.affords(prediction, team.step_time)
 
 
 def crossed(team: TeamView, name: str, prediction: Trajectories, decision: Decision) -> bool:
@@ -324,22 +366,23 @@ def held_back(team: TeamView, name: str, prediction: Trajectories, decision: Dec
     if crossed(team, name, prediction, decision):
         return CROSSED
     if not affordable(team, name, prediction, prediction.reached)[0]:
-        return 'stays: it has to save its battery for the way home'
+        return f'stays: {SAVES_BATTERY}'
     return ''
 
 
 def keep_apart(team: TeamView, decision: Decision, left: Mapping[str, FloatArray]) -> None:
     """Let robots wait whose ways would come too near to each other; the first by name has priority.
 
-    Who waits stands where it is, which may make others wait, too; left: or is still on the rest
-    (n, 3) of its present way.
+    A robot that waits brakes, which may make others wait, too; left: or it is still on the rest
+    (n, 3) of its present path.
     """
-    rest = {name: team.robots[name].state.pose.position[None] for name in decision.robots}
-    rest.update(left)
-    ways = {
-        name: rest[name] if robot.stays else robot.positions
-        for name, robot in decision.robots.items()
-    }
+    ways, rest = {}, dict(left)
+    for name, robot in decision.robots.items():
+        view = team.robots[name]
+        if name not in rest:
+            rest[name] = braking_path(view.motion, view.state, team.step_time)
+        going = rest[name] if robot.stays else with_braking(view.motion, robot, team.step_time)
+        ways[name] = going
     changed = True
     while changed:
         changed = False
@@ -364,7 +407,9 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     free = [charger for charger in chargers if apart(charger, view.radius, places)]
     charger = (free or chargers)[0]
     prediction = view.motion.predict(view.state, charger[None, :], team.step_time)
-    if not free or ways_apart(team, name, prediction.positions, others)[0]:
+    if not free:
+        return _wait_near(team, name, charger, others, reason)
+    if ways_apart(team, name, prediction.positions, others)[0]:
         return single_choice(charger[None, :], prediction, 0, reason)
     # Past where they will stand; else aside, until they have passed.
     aside = here + _ASIDE @ (charger - here)[:2]
@@ -374,6 +419,35 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     prediction = view.motion.predict(view.state, goals, team.step_time)
     usable = ways_apart(team, name, prediction.positions, others) & prediction.reached
     return single_choice(goals, prediction, int(np.argmax(usable)), reason)
+
+
+def _wait_near(
+    team: TeamView, name: str, charger: FloatArray, others: Mapping[str, FloatArray], reason: str
+) -> RobotDecision:
+    """Send a robot near a charger that is taken, where it waits; it stays if it is there."""
+    view = team.robots[name]
+    here, motion, taken = view.state.pose.position, view.motion, 'all chargers are taken'
+    places = [(path[-1], radius) for path, radius in _paths(team, name, others)]
+    reach = 4.0 * (view.radius + max(radius for _, radius in places))
+    reach += 4.0 * motion.settings.tolerance
+    if math.dist(here, charger) <= 1.5 * reach:
+        return stay(view, f'waits: {taken}')
+    turns = np.linspace(0.0, 2.0 * math.pi, 8, endpoint=False)
+    turns += math.atan2(here[1] - charger[1], here[0] - charger[0])
+    ring = charger + reach * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
+    free = [
+        bool(team.area.inside(point[None, :])[0] and motion.keep_out.is_free(point))
+        and apart(point, view.radius, places)
+        for point in ring
+    ]
+    if not any(free):
+        return stay(view, f'waits: {taken}')
+    goals = ring[free]
+    prediction = motion.predict(view.state, goals, team.step_time)
+    usable = ways_apart(team, name, prediction.positions, others) & prediction.reached
+    if not usable.any():
+        return stay(view, CROSSED)
+    return single_choice(goals, prediction, int(np.argmax(usable)), f'{reason}; {taken}')
 
 
 def apart(point: FloatArray, radius: float, others: list[tuple[FloatArray, float]]) -> bool:

@@ -67,9 +67,6 @@ class Tour(Planner):
                 self._target.pop(name, None)
                 view = team.robots[name]
                 chosen = stay(view, 'stays: nothing is left for it')
-                if view.endurance is not None:
-                    # More may be in its reach with a full battery.
-                    view.endurance.spent = True
             decision.robots[name] = chosen
             places.append((chosen.waypoint, team.robots[name].radius))
         return explain(decision)
