@@ -11,12 +11,14 @@ from maasi_drivers.settings.camera import CameraSettings
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
+from maasi_planner.endurance import EnduranceSettings
 from maasi_planner.motion import RobotState
 from maasi_planner.settings import MotionSettings
+from maasi_sim.scenario.loading import load_scenario, robot_type, scenario_from_values
 from maasi_sim.scenario.schema import BatterySettings, RobotSettings
 from maasi_sim.simulation.floor import RenderSettings
 from maasi_sim.simulation.odometry import OdometryModel, OdometrySettings
-from maasi_sim.simulation.robots import SimulatedRobot
+from maasi_sim.simulation.robots import SimulatedRobot, Simulation
 from maasi_sim.simulation.sensors import LaserSettings
 from maasi_sim.simulation.world import TargetSettings, World
 
@@ -161,3 +163,83 @@ def test_a_robot_that_follows_is_where_its_leader_is():
     leader.state = RobotState.at_rest([2.0, 2.0, 1.0])
     one.stand(8)
     assert_allclose(one.state.pose.position, [2.0, 2.0, 1.0])
+
+
+def test_a_charger_charges_unless_the_battery_cannot_be():
+    """In charging_time by default; without endurance a start is no charger."""
+    minute = {'capacity': 1000.0, 'charge': 0.5, 'idle_power': 0.0}
+    home = EnduranceSettings()
+    for battery, endurance, charge in (
+        ({}, home, 0.5 + 60.0 / 1800.0),
+        ({'charging_time': 240.0}, home, 0.75),
+        ({'charging_power': 10.0}, home, 1.0),
+        ({'charging_power': 0.0}, home, 0.5),
+        ({}, None, 0.5),
+        ({'charging_power': 5.0}, None, 0.8),
+    ):
+        settings = BatterySettings(**minute | battery)
+        assert settings.chargeable == (battery.get('charging_power') != 0.0)
+        one = robot('unicycle', GROUND, battery=settings, endurance=endurance)
+        drive(one, 60, (0.0, 0.0, 0.0, 0.0), dt=1.0)
+        assert_allclose(one.battery.charge, charge, atol=1e-9)
+        drive(one, 60, (0.4, 0.0, 0.0, 0.0), first=61)
+        before = one.battery.charge
+        drive(one, 60, (0.0, 0.0, 0.0, 0.0), first=121)
+        assert one.battery.charge <= before
+    types = ('mambo', 'mavlink_drone', 'ranging_drone', 'rover', 'turtlebot3_burger', 'bluerov2')
+    for name in types:
+        battery = robot_type(name).battery
+        seconds = battery.capacity / battery.power_at_charger
+        assert battery.chargeable and 600.0 <= seconds <= 7200.0
+
+
+@pytest.mark.parametrize('model', ['constant_speed', 'quadrotor'])
+def test_wind_carries_robots_that_fly(model):
+    """Speed is that through the air: 8 m/s against 3 m/s of wind is 5 m/s over the ground."""
+    sensor = SensorSettings(detection={'kind': 'box', 'lower': [-9, -9], 'upper': [9, 9]})
+    motion = MotionSettings(model=model, speed=8.0, acceleration=3.0)
+    battery = BatterySettings(capacity=1e6, idle_power=0.0, motion_power=1.0)
+
+    def flown(command, wind=(-3.0, 0.0, 0.0), start=Pose.from_yaw([0.0, 0.0, 20.0], 0.0)):
+        one = robot(model, start, sensor=sensor, motion=motion, battery=battery)
+        one.wind[:] = wind
+        drive(one, 200, command, dt=0.1)
+        before, charge = one.state.pose.position, one.battery.charge
+        drive(one, 100, command, dt=0.1, first=201)
+        moved = (one.state.pose.position - before) / 10.0
+        assert_allclose(one.state.velocity, moved, atol=0.02)
+        return moved[:2], 1e6 * (charge - one.battery.charge) / 10.0
+
+    fastest, calm = flown((8.0, 0.0, 0.0, 0.0), np.zeros(3))
+    speed = fastest[0]
+    assert 7.2 < speed < 8.001 and calm == pytest.approx(speed, abs=0.01)
+    for command, moved, air in (
+        ((8.0, 0.0, 0.0, 0.0), [speed - 3.0, 0.0], speed),
+        ((-8.0, 0.0, 0.0, 0.0), [-8.0, 0.0], 5.0),
+        ((4.0, 0.0, 0.0, 0.0), [4.0, 0.0], 7.0),
+        ((0.0, 0.0, 0.0, 0.0), [0.0, 0.0], 3.0),
+        ((0.0, 2.0, 0.0, 0.0), [0.0, 2.0], np.hypot(2.0, 3.0)),
+    ):
+        over_ground, power = flown(command)
+        assert_allclose(over_ground, moved, atol=0.02)
+        # What it uses is by its speed through the air.
+        assert power == pytest.approx(air, abs=0.05)
+    # Commands are turned by the heading, wind is not.
+    turned = Pose.from_yaw([0.0, 0.0, 20.0], 1.2)
+    assert_allclose(flown((0.0, 0.0, 0.0, 0.0), start=turned)[0], 0.0, atol=0.02)
+    # No controller holds a position in wind that is faster.
+    assert_allclose(
+        flown((0.0, 0.0, 0.0, 0.0), (0.0, 12.0, 0.0))[0], [0.0, 12.0 - speed], atol=0.02
+    )
+
+
+def test_wind_carries_nothing_on_the_ground():
+    rover, drone = (load_scenario('field').robots[name] for name in ('rover', 'east'))
+    values = load_scenario('field').content() | {'simulated': {'wind': [2.0, -1.0]}}
+    simulation = Simulation(scenario_from_values(values, 'windy'), 1)
+    for one in simulation.robots.values():
+        assert one.wind.tolist() == [2.0, -1.0, 0.0]
+    for _ in range(50):
+        simulation.advance()
+    assert_array_equal(simulation.robots['rover'].state.pose.position, rover.start)
+    assert_allclose(simulation.robots['east'].state.pose.position, drone.start, atol=1e-9)

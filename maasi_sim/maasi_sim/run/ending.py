@@ -9,12 +9,13 @@ from types import FrameType
 DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, NOT_WRITTEN, INTERRUPTED = 0, 1, 2, 3, 4, 130
 EXIT_CODES = {
     DONE: 'all targets found (or, with stop: planner_done, ended as meant)',
-    NOT_ALL_FOUND: 'not all targets were found',
+    NOT_ALL_FOUND: 'not all targets were found, or the planners ended with less than half explored',
     WRONG_INPUT: 'wrong input',
     NODE_FAILED: 'a node died or hung',
     NOT_WRITTEN: 'bag or report not written (disk full) or with gaps',
     INTERRUPTED: 'interrupted',
 }
+LEAST_EXPLORED = 0.5  # share with which a search that its planners end is complete [1]
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -26,6 +27,18 @@ class Ending:
     code: int
     text: str = ''
     nodes: Collection[str] = ()
+
+
+def end_of_planners(reason: str, explored: float, meant: bool) -> Ending:
+    """Return how a run ends whose planners all report that they are finished.
+
+    reason: theirs; explored: share of what is expected, 0 to 1; meant: whether the scenario stops
+    there. A search that gave up with less than half explored is no success.
+    """
+    if explored < LEAST_EXPLORED:
+        text = f'{reason}; {explored:.1%} explored, less than half: the search is not complete'
+        return Ending('planner_done', NOT_ALL_FOUND, text)
+    return Ending('planner_done', DONE if meant else NOT_ALL_FOUND, reason)
 
 
 class Interruption:

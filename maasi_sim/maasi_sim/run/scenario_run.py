@@ -13,11 +13,13 @@ from maasi_sim.run.domain import Domain
 from maasi_sim.run.ending import (
     DONE,
     INTERRUPTED,
+    LEAST_EXPLORED,
     NODE_FAILED,
     NOT_ALL_FOUND,
     NOT_WRITTEN,
     Ending,
     Interruption,
+    end_of_planners,
 )
 from maasi_sim.run.mission import RunEnd
 from maasi_sim.run.missions import load_mission, send_warning
@@ -293,10 +295,15 @@ class ScenarioRun:
             return Ending('not_recorded', NOT_WRITTEN)
         if observer.settled is not None:
             meant = self._scenario.stop == 'planner_done'
-            return Ending('planner_done', DONE if meant else NOT_ALL_FOUND, observer.settled)
+            return end_of_planners(observer.settled, self._explored, meant)
         if recorder.elapsed >= limit:
             return Ending('time_limit', NOT_ALL_FOUND)
         return None
+
+    @property
+    def _explored(self) -> float:
+        """Share that is explored, by the planner that reports most of it."""
+        return max(self.observer.explored, self.recorder.explored)
 
     def _show(self) -> None:
         observer = self.observer
@@ -304,11 +311,10 @@ class ScenarioRun:
         seconds = self.recorder.elapsed
         wall = time.monotonic() - (self._begun or time.monotonic())
         targets = f' of {observer.total}' if observer.total else ''
-        explored = max(observer.explored, self.recorder.explored)
         self.display.show(
             f'{seconds:7.1f} s   {observer.measurements:4d} measurements   '
             f'{observer.found} {self.mission.found_word}{targets}   '
-            f'{100.0 * explored:3.0f} % explored   '
+            f'{100.0 * self._explored:3.0f} % explored   '
             f'{seconds / wall if wall > 0.0 else 0.0:.1f} x real time',
             observer.found,
         )
@@ -361,7 +367,8 @@ class ScenarioRun:
             self._leave_replay()
         self.display.close()
         code = ending.code
-        if ending.reason == 'planner_done' and report.get('missed') == 0:
+        complete = self._explored >= LEAST_EXPLORED
+        if ending.reason == 'planner_done' and complete and report.get('missed') == 0:
             code = DONE
         return NOT_WRITTEN if self.unwritten and code in (DONE, NOT_ALL_FOUND) else code
 

@@ -16,6 +16,8 @@ from maasi_filter.plugins import unknown
 from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_parts
 from maasi_planner.settings import CandidateSettings
 from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.scenario.charger_checks import charger_problems, endurance_doubts
+from maasi_sim.scenario.free_space import FreeSpace
 from maasi_sim.scenario.schema import RobotSettings, Scenario, SimulatedSettings
 
 Problems = Iterator[str]  # each is `key: text`
@@ -39,11 +41,13 @@ def problems_of(scenario: Scenario) -> Problems:
     yield from _world_problems(scenario)
     yield from name_problems(scenario)
     yield from event_problems(scenario)
+    yield from _overlapping_starts(scenario)
     ports: dict[str, str] = {}
     for name in scenario.names():
         robot = scenario.robots[name]
         for problems in (
             _place_problems(robot, scenario, area),
+            _room_problems(robot, area),
             _sensor_problems(robot, scenario),
             _simulated_problems(robot, scenario),
             _link_problems(robot),
@@ -104,6 +108,30 @@ def _place_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> Pro
             yield 'candidates: leave no waypoint inside the environment'
     except ValueError as error:
         yield f'candidates.{error}'.replace('candidates.candidates: ', 'candidates: ')
+
+
+def _room_problems(robot: RobotSettings, area: Area) -> Problems:
+    """Yield problems of the room that its body has in the area, and of its chargers."""
+    space = FreeSpace(robot, area)
+    if not space.parts:
+        yield (
+            f'radius: read {robot.radius:g}, with motion.clearance {robot.motion.clearance:g}; the '
+            'area is too narrow for it, allowed are values for which some of it is left'
+        )
+        return
+    # Of a start that is wrong, all else would be.
+    if area.inside([robot.start])[0]:
+        yield from charger_problems(space)
+
+
+def _overlapping_starts(scenario: Scenario) -> Problems:
+    for (first, one), (name, robot) in combinations(scenario.robots.items(), 2):
+        gap, bodies = math.dist(one.start, robot.start), one.radius + robot.radius
+        if gap < bodies:
+            yield (
+                f'robots.{name}.start: read {robot.start}, {gap:.3g} m from the start of {first}; '
+                f'allowed is at least both radii, {bodies:g} m: their bodies overlap'
+            )
 
 
 def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
@@ -233,14 +261,35 @@ def doubts_about(scenario: BaseScenario) -> Problems:
                 f'robots.{name}.yaw: read {robot.yaw:g}, more than a turn: it is in radians, and '
                 f'{robot.yaw:g} degrees are {math.radians(robot.yaw):.4g}'
             )
+    area = Area(scenario.environment)
+    yield from area.doubts
+    if isinstance(scenario, Scenario):
+        yield from _robot_doubts(scenario, area)
+        return
     for (first, one), (name, robot) in combinations(robots.items(), 2):
-        gap = math.dist(one.start, robot.start)
-        bodies = getattr(one, 'radius', 0.0) + getattr(robot, 'radius', 0.0)
-        if gap == 0.0 or gap < bodies:
+        if one.start == robot.start:
+            yield f'robots.{name}.start: read {robot.start}, which is the start of {first} as well'
+
+
+def _robot_doubts(scenario: Scenario, area: Area) -> Problems:
+    for name, robot in scenario.robots.items():
+        wind = scenario.simulated.wind
+        if robot.flies and math.hypot(*wind) >= robot.motion.speed:
             yield (
-                f'robots.{name}.start: read {robot.start}, {gap:.3g} m from the start of {first}: '
-                'their bodies overlap'
+                f'simulated.wind: read {wind}, at least the speed of {name}, '
+                f'{robot.motion.speed:g} m/s: it is blown away'
             )
+        doubts = [*endurance_doubts(robot), *_start_doubts(robot, area)]
+        yield from (f'robots.{name}.{doubt}' for doubt in doubts)
+
+
+def _start_doubts(robot: RobotSettings, area: Area) -> Problems:
+    gap = FreeSpace(robot, area).gap(robot.start)
+    if gap < robot.radius:
+        yield (
+            f'start: read {robot.start}, {gap:.3g} m from the border or a keep-out, nearer than '
+            f'the radius, {robot.radius:g} m: first of all it moves away'
+        )
 
 
 def event_problems(scenario: BaseScenario) -> Problems:

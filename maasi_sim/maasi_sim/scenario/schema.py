@@ -19,6 +19,7 @@ from maasi_filter.settings import (
     Positive,
     SensorSettings,
     Settings,
+    Vector2,
     Vector3,
 )
 from maasi_planner.endurance import EnduranceSettings
@@ -86,11 +87,38 @@ class BatterySettings(Settings):
     capacity: Positive = Field(7200.0, description='Energy of a full battery [J]')
     charge: float = Field(1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
     idle_power: NotNegative = Field(2.0, description='Drain at rest or hovering [W]')
-    charging_power: NotNegative = Field(
-        0.0, description='Power at a charger, where it stands; 0: never charged [W]'
+    charging_time: Positive = Field(
+        1800.0, description='Time of a full charge at a charger, or of a change of batteries [s]'
+    )
+    charging_power: float | None = Field(
+        None,
+        ge=0.0,
+        description='Power at a charger, in place of charging_time; 0: it cannot be charged [W]',
     )
     motion_power: NotNegative = Field(
         4.0, description='Drain for each metre per second on top of it [W/(m/s)]'
+    )
+
+    @property
+    def power_at_charger(self) -> float:
+        """Power with which it is charged [W]; 0: it cannot be."""
+        if self.charging_power is not None:
+            return self.charging_power
+        return self.capacity / self.charging_time
+
+    @property
+    def chargeable(self) -> bool:
+        """Whether a charger charges it."""
+        return self.power_at_charger > 0.0
+
+
+class WeatherSettings(Settings):
+    """What disturbs all robots of the simulation, and no filter or planner knows."""
+
+    wind: Vector2 = Field(
+        [0.0, 0.0],
+        description='Steady velocity of the air, which carries flying robots [m/s, map]; their '
+        '`motion.speed` is that through the air, and what they use is by that speed',
     )
 
 
@@ -168,6 +196,11 @@ class RobotSettings(Settings):
         return self.sensor.period if self.camera is None else 1.0 / self.camera.rate
 
     @property
+    def flies(self) -> bool:
+        """Whether it starts in the air: not on the ground, and not under water."""
+        return self.motion.model != 'unicycle' and self.start[2] > 0.0
+
+    @property
     def takes_off(self) -> bool:
         """Whether it is simulated, and takes off when its driver's service `arm` is called."""
         return self.link != 'topics' and not self.external
@@ -195,6 +228,9 @@ class Scenario(BaseScenario):
     floor: RenderSettings = Field(
         default_factory=lambda: RenderSettings.model_validate({}),
         description='Images of simulated cameras',
+    )
+    simulated: WeatherSettings = Field(
+        default_factory=WeatherSettings, description='What disturbs robots in the simulation'
     )
     scoring: ScoringSettings = Field(default_factory=ScoringSettings, description='Scores')
 

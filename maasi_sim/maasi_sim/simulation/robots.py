@@ -45,7 +45,7 @@ class Battery:
     def charging(self, dt: float) -> None:
         """Charge it for `dt` seconds."""
         self.charge = min(
-            self.charge + self.settings.charging_power * dt / self.settings.capacity, 1.0
+            self.charge + self.settings.power_at_charger * dt / self.settings.capacity, 1.0
         )
 
 
@@ -79,11 +79,12 @@ class SimulatedRobot:
                 f'radius ({settings.radius} m) from every obstacle'
             )
         self._command = np.zeros(4)
-        self._flies = settings.motion.model != 'unicycle' and start.position[2] > 0.0
+        self._flies = settings.flies
         self._resting = False
+        #: Velocity of the air (3,) [m/s, map], which carries a robot that flies.
+        self.wind = np.zeros(3)
         self.battery = Battery(settings.battery)
-        chargers = settings.endurance.chargers if settings.endurance else []
-        self._chargers = np.array(chargers or [settings.start])
+        self._chargers = _chargers(settings)
         self._at_charger = 2.0 * settings.motion.tolerance + settings.radius
         odometry = settings.simulated.odometry or settings.odometry
         self._odometry = OdometryModel(odometry, start, seed, name, settings.odometry)
@@ -128,8 +129,7 @@ class SimulatedRobot:
             command = np.array([0.0, 0.0, -0.3 if self._flies else 0.0, 0.0])
         before = self.state
         if not self._resting:
-            self._body.step(command, dt)
-            self.state = self._body.robot_state()
+            self._move(command, dt)
             position = self.state.pose.position
             if self._hits(position):
                 self.collisions += 1
@@ -140,8 +140,10 @@ class SimulatedRobot:
         velocity = self.state.velocity
         speed = float(np.sqrt((velocity * velocity).sum()))
         gaps = np.linalg.norm(self._chargers - self.state.pose.position, axis=1)
-        if self.battery.settings.charging_power and speed < 0.1 and gaps.min() < self._at_charger:
+        if speed < 0.1 and gaps.min(initial=math.inf) < self._at_charger:
             self.battery.charging(dt)
+        elif self._carried:
+            self.battery.drain(float(np.linalg.norm(velocity - self.wind)), dt)
         else:
             self.battery.drain(speed, dt)
         self.odometry = self._odometry.step(self.state, step)
@@ -190,6 +192,32 @@ class SimulatedRobot:
         if self.ranging is not None:
             self.sweep(0)
 
+    @property
+    def _carried(self) -> bool:
+        return self._flies and not self._resting and bool(self.wind.any())
+
+    def _move(self, command: FloatArray, dt: float) -> None:
+        """Move the body under a command: in the air, which the wind moves over the ground.
+
+        The body follows the commanded velocity over the ground as long as its speed through the air
+        allows it; gusts, and wind that changes with the height, are left out.
+        """
+        if not self._carried:
+            self._body.step(command, dt)
+            self.state = self._body.robot_state()
+            return
+        ground, yaw = self.state, self.state.pose.yaw
+        body = self._motion.body(
+            RobotState(ground.pose, ground.velocity - self.wind, ground.angular_velocity)
+        )
+        x, y = self.wind[:2]
+        along = [math.cos(yaw) * x + math.sin(yaw) * y, math.cos(yaw) * y - math.sin(yaw) * x]
+        body.step(command - np.array([*along, self.wind[2], 0.0]), dt)
+        after = body.robot_state()
+        pose = Pose(after.pose.position + self.wind * dt, after.pose.orientation)
+        self.state = RobotState(pose, after.velocity + self.wind, after.angular_velocity)
+        self._body = self._motion.body(self.state)
+
     def _halt(self, pose: Pose) -> None:
         self._body = self._motion.body(RobotState(Pose.from_yaw(pose.position, pose.yaw)))
         self.state = self._body.robot_state()
@@ -197,6 +225,18 @@ class SimulatedRobot:
     def _hits(self, position: FloatArray) -> bool:
         distances = self.world.area.distances(position)
         return bool(len(distances) and distances.min() < self.settings.radius)
+
+
+def _chargers(settings: RobotSettings) -> FloatArray:
+    """Return where a robot is charged, (n, 3): nowhere if it cannot be, or has no endurance.
+
+    A power that is given charges also a robot without endurance, at its start.
+    """
+    given = settings.battery.charging_power is not None
+    if not settings.battery.chargeable or not (settings.endurance or given):
+        return np.zeros((0, 3))
+    named = settings.endurance.chargers if settings.endurance else []
+    return np.array(named or [settings.start])
 
 
 class SimulatedTeam:
@@ -254,6 +294,8 @@ class Simulation(SimulatedTeam):
             name: SimulatedRobot(name, scenario.robots[name], self.world, scenario.floor, seed)
             for name in scenario.names()
         }
+        for robot in robots.values():
+            robot.wind[:2] = scenario.simulated.wind
         self._image_steps = {
             name: steps_of(robot.settings.measuring_period, scenario.step)
             for name, robot in robots.items()

@@ -1,0 +1,106 @@
+"""Where a robot may be: the connected parts of its area, and whether it gets to a charger."""
+
+import math
+from functools import cached_property
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike
+from shapely.geometry.base import BaseGeometry
+
+from maasi_filter.area import Area
+from maasi_filter.arrays import FloatArray
+from maasi_planner.motion import MotionModel, RobotState, make_motion
+from maasi_sim.scenario.schema import RobotSettings
+
+_ROUNDING = 1e-6  # [m]
+_STEP = 0.2  # of the path that is predicted where the geometry leaves it open [s]
+# Share of the clearance that a robot keeps at least, as its motion model does.
+_LEAST = 0.1
+
+
+class FreeSpace:
+    """The level parts of an area in which the centre of a robot may be.
+
+    It keeps its radius and its clearance from the border, keep-outs and obstacles; only the sides
+    of plain bounds need no distance. Spheres are passed above or below, and are no part of it.
+    """
+
+    def __init__(self, robot: RobotSettings, area: Area) -> None:
+        self.robot, self.area = robot, area
+
+    @cached_property
+    def parts(self) -> list[BaseGeometry]:
+        """Connected parts of what it can be sent to, the largest first."""
+        parts = shapely.get_parts(self._region(self.robot.motion.clearance))
+        return sorted((part for part in parts if part.area > 0.0), key=lambda part: -part.area)
+
+    @cached_property
+    def reachable(self) -> list[BaseGeometry]:
+        """Parts that it gets to from its start."""
+        own, others = self._parts_of(self.robot.start)
+        if not others:
+            return own
+        # Narrow passages may join them.
+        places = [[*part.representative_point().coords[0], self.robot.start[2]] for part in others]
+        reached = [part for part, place in zip(others, places) if self.gets_to(place)]
+        return sorted([*own, *reached], key=lambda part: -part.area)
+
+    def gap(self, position: ArrayLike) -> float:
+        """Return how far a robot at a position (3,) is from border, keep-outs and obstacles [m]."""
+        x, y, z = np.asarray(position, dtype=float).tolist()
+        point, reach = shapely.Point(x, y), self._reach
+        room = self.area.room(reach)
+        gaps = [math.inf]
+        if room is not None:
+            gaps.append(room.boundary.distance(point) if room.covers(point) else 0.0)
+        for cx, cy, cz, radius, sphere in self.area.circles.tolist():
+            gaps.append(math.hypot(cx - x, cy - y, (cz - z) * sphere) - radius)
+        return max(min(gaps), 0.0)
+
+    def gets_to(self, position: ArrayLike) -> bool:
+        """Return whether a robot gets to a position (3,) from its start."""
+        here, goal = (shapely.Point(np.asarray(at)[:2]) for at in (self.robot.start, position))
+        widest = self._region(_LEAST * self.robot.motion.clearance)
+        one, other = (_part_at(shapely.get_parts(widest), at) for at in (here, goal))
+        if one is None or other is None or not one.equals(other):
+            return False
+        one, other = (_part_at(self.parts, at) for at in (here, goal))
+        if one is not None and other is not None and one is other:
+            return True
+        # Joined by a passage that is narrower than its clearance: its own prediction tells.
+        start = RobotState.at_rest(self.robot.start, self.robot.yaw)
+        points = np.asarray(position, dtype=float)[None, :]
+        return bool(self._motion.predict(start, points, _STEP).reached[0])
+
+    @cached_property
+    def _motion(self) -> MotionModel:
+        return make_motion(self.robot.motion, self.area, self.robot.radius)
+
+    @property
+    def _reach(self) -> float:
+        return self.robot.radius + self.robot.motion.clearance
+
+    def _parts_of(self, position: ArrayLike) -> tuple[list[BaseGeometry], list[BaseGeometry]]:
+        """Return the part that a position is in, or nearest to, and the others."""
+        point = shapely.Point(np.asarray(position)[:2])
+        if not self.parts:
+            return [], []
+        nearest = int(np.argmin(shapely.distance(self.parts, point)))
+        return [self.parts[nearest]], [*self.parts[:nearest], *self.parts[nearest + 1 :]]
+
+    def _region(self, clearance: float) -> BaseGeometry:
+        """Return where its centre may be with a clearance."""
+        room = self.area.room(self._reach)
+        apart = self.robot.radius + clearance
+        region = self.area.border
+        if room is not None:
+            region = room.buffer(-apart, join_style='mitre').intersection(region)
+        circles: FloatArray = self.area.circles[self.area.circles[:, 4] < 0.5]
+        discs = shapely.buffer(shapely.points(circles[:, :2]), circles[:, 3] + apart, quad_segs=32)
+        return region.difference(shapely.union_all(discs))
+
+
+def _part_at(parts: list[BaseGeometry], point: shapely.Point) -> BaseGeometry | None:
+    """Return the part that a position is in, up to rounding."""
+    return next((part for part in parts if part.distance(point) <= _ROUNDING), None)
