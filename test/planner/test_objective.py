@@ -9,7 +9,8 @@ from planner_helpers import random_team
 
 from maasi_filter.models.detection import BoxDetection
 from maasi_planner import PlannerSettings, make_planner
-from maasi_planner.objective.joint_search import search, total_value
+from maasi_planner.objective.candidate_table import total_value
+from maasi_planner.objective.joint_search import search
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import all_apart, free_of_robots, waiting_places
 from maasi_planner.team import UsableCandidates

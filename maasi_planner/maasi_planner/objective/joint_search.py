@@ -1,106 +1,22 @@
-"""The value J of candidates given the choices of others, and the joint choice: 000, (17), (26)."""
+"""The joint choice of a team: 000, (26)."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from maasi_filter.arrays import BoolArray, FloatArray, IntArray
-from maasi_planner.objective.predicted_measurements import Measurements
-from maasi_planner.objective.terms import Terms, exploration_given, refinement_given
+from maasi_filter.arrays import FloatArray, IntArray
+from maasi_planner.objective.candidate_table import (
+    CandidateTable,
+    Ranking,
+    candidate_value,
+    collides,
+    total_value,
+)
+from maasi_planner.objective.large_teams import search_in_turn
 from maasi_planner.settings import PlannerSettings
 
-
-class CandidateTable(NamedTuple):
-    """G candidates of R planning robots; if `shared`, what two see counts for the shorter way."""
-
-    allowed: BoolArray
-    waypoints: FloatArray
-    radii: FloatArray
-    cost: FloatArray
-    norm: FloatArray
-    alpha: float
-    beta: float
-    shared: bool
-    planned: Measurements
-    terms: Terms
-
-
-@njit(cache=True, forceinline=True)
-def candidate_value(table: CandidateTable, g: int, chosen: IntArray) -> tuple[float, float, float]:
-    """Return T, E and J (17), (26) of g, given the others' choices (R,), -1 for none."""
-    robot = table.planned.robot[g]
-    # Chosen candidates whose measurements g gets no credit for.
-    others, number = np.empty(chosen.shape[0], np.int64), 0
-    for r in range(chosen.shape[0]):
-        other = chosen[r]
-        if r == robot or other < 0:
-            continue
-        if not table.shared or (table.norm[other], r) < (table.norm[g], robot):
-            others[number] = other
-            number += 1
-    others = others[:number]
-    refinement, exploration = refinement_given(table.terms, g, others), 0.0
-    if table.beta > 0.0:
-        exploration = exploration_given(table.terms, table.planned, g, others)
-    value = -table.cost[g] + table.alpha * refinement
-    return refinement, exploration, (value + table.beta * exploration) / table.norm[g]
-
-
-@njit(cache=True)
-def collides(table: CandidateTable, g: int, chosen: IntArray) -> bool:
-    """Return whether the waypoint of g is within the radii of another chosen waypoint."""
-    robot = table.planned.robot[g]
-    for r in range(chosen.shape[0]):
-        if r == robot or chosen[r] < 0:
-            continue
-        reach = table.radii[robot] + table.radii[r]
-        if reach > 0.0:
-            square = 0.0
-            for axis in range(3):
-                square += (table.waypoints[g, axis] - table.waypoints[chosen[r], axis]) ** 2
-            if square < reach * reach:
-                return True
-    return False
-
-
-@njit(cache=True)
-def total_value(table: CandidateTable, chosen: IntArray) -> float:
-    """Return the sum of J over all chosen candidates (26)."""
-    total = 0.0
-    for r in range(chosen.shape[0]):
-        if chosen[r] >= 0:
-            total += candidate_value(table, chosen[r], chosen)[2]
-    return total
-
-
-@njit(cache=True)
-def values_given(table: CandidateTable, first: int, last: int, chosen: IntArray) -> FloatArray:
-    """Return T, E and J of the candidates `first` to `last`, given the others' choices, (n, 3)."""
-    out = np.empty((last - first, 3))
-    for g in range(first, last):
-        row = out[g - first]
-        row[0], row[1], row[2] = candidate_value(table, g, chosen)
-        if not table.allowed[g] or collides(table, g, chosen):
-            out[g - first, 2] = -np.inf
-    return out
-
-
 PAIRS_LIMIT = 5  # moves of two robots at once are tried in teams up to this size
-
-
-class Ranking(NamedTuple):
-    """The admissible candidates, robot after robot, each robot's best first.
-
-    order (A,): these; robot r has start[r] to start[r + 1]; alone (G,): J of a candidate without
-    the other planning robots, an upper bound of J with them.
-    """
-
-    table: CandidateTable
-    order: IntArray
-    start: IntArray
-    alone: FloatArray
 
 
 @njit(cache=True)
@@ -223,7 +139,8 @@ def search(
     tries = []
     for backwards in (False, True):
         chosen = np.full(robots, -1, np.int64)
-        value, work = _search_in_turn(ranking, settings.improvement_rounds, backwards, chosen)
+        in_turn = _search_in_turn if robots <= PAIRS_LIMIT else search_in_turn
+        value, work = in_turn(ranking, settings.improvement_rounds, backwards, chosen)
         if (chosen >= 0).all() and math.prod(counts.tolist()) <= settings.enumeration_limit:
             partial = np.full(robots, -1, np.int64)
             value, count = _search_exactly(ranking, partial, 0, 0.0, chosen, value)

@@ -1,7 +1,7 @@
 """Predicted measurements along trajectories, and what they leave unseen."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from maasi_filter.models.detection import (
 from maasi_planner.team import RobotView
 
 NEVER = 1 << 60  # after every measurement [steps]
+MOST_CHANCES = 500_000  # numbers that a part of `chances` has at most
 # x, y and z (n,) [m]: each on its own, so that loops over them become vector instructions.
 Places = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -141,6 +142,20 @@ def reach_of(detection: DetectionModel) -> float:
         return math.inf
     x, y, z = np.maximum(np.abs(parameters[1:4]), np.abs(parameters[4:7])).tolist()
     return max(math.hypot(x, y), z if math.isfinite(z) else 0.0) + 2.0 * float(parameters[7])
+
+
+def part_of(measured: Measurements, begin: int, end: int) -> Measurements:
+    """Return the measurements on the trajectories from `begin` to before `end`."""
+    own = ('robot', 'number', 'own', 'times', 'places', 'yaws')
+    return measured._replace(**{name: getattr(measured, name)[begin:end] for name in own})
+
+
+def parts_of(measured: Measurements, points: int) -> Iterator[tuple[slice, Measurements]]:
+    """Yield parts of the trajectories, so small that `chances` at the points need little memory."""
+    total, each = len(measured.own), measured.times.shape[1] * max(1, points)
+    number = max(1, MOST_CHANCES // each)
+    for begin in range(0, total, number):
+        yield slice(begin, begin + number), part_of(measured, begin, begin + number)
 
 
 @njit(cache=True)

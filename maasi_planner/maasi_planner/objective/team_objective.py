@@ -1,19 +1,26 @@
 """The objective J of joint candidates: control cost, target refinement, exploration."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from maasi_filter.arrays import FloatArray, IntArray
-from maasi_planner.objective.joint_search import CandidateTable, values_given
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_planner.objective.candidate_table import CandidateTable, part_of_table, values_given
+from maasi_planner.objective.information_terms import InformationTerms, joined, reduced
+from maasi_planner.objective.joint_search import PAIRS_LIMIT
+from maasi_planner.objective.paper_terms import paper_terms
 from maasi_planner.objective.predicted_measurements import Ways, predicted, remaining_way
-from maasi_planner.objective.terms import information_terms, paper_terms
+from maasi_planner.objective.terms import Terms
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import TeamView, UsableCandidates
+from maasi_planner.team import RobotView, TeamView, UsableCandidates
 
 # Above this number of pairs of a candidate and another robot, reported values of candidates that
 # were not chosen neglect the other planning robots.
 REPORT_LIMIT = 600
+# Most nodes that the candidates of all robots see together; above, the joint choice is among the
+# candidates of each robot that are best without the others. 12 bytes each.
+MOST_ENTRIES = 8_000_000
+LEAST_KEPT = 8  # candidates of a robot that the joint choice has in any case
 
 
 class TeamObjective:
@@ -22,7 +29,8 @@ class TeamObjective:
     team: the team; robots that do not plan count with the rest of their trajectories; settings:
     weights; options: candidates of the planning robots that have some; names: these, in order;
     start (R + 1,): where the candidates of each begin among all; table: all candidates; alone
-    (G, 3): T, E and J of each candidate without the other planning robots.
+    (G, 3): T, E and J of each candidate without the other planning robots; kept (G,): which of
+    them the joint choice is among.
     """
 
     def __init__(
@@ -44,21 +52,15 @@ class TeamObjective:
             rest += map(remaining_way, views)
         lengths = np.concatenate([way.lengths for way in ways])
         cost = np.concatenate([option.prediction.control_cost for option in choices])
-        planned = predicted(ways, int(lengths.max()), weights.extend)
-        settled = predicted(rest, int(lengths.max()), weights.extend)
-        centres = np.zeros((len(team.clusters), 3))
-        for centre, cluster in zip(centres, team.clusters):
-            centre[: team.dimension] = cluster.position[: team.dimension]
-        if weights.information:
-            groups = (views, planned), ([way.view for way in rest], settled)
-            terms = information_terms(team, settings, *groups, first, centres)
-        else:
-            grid = team.exploration.kernel()
-            terms = paper_terms(planned, settled, first, weights.own, centres, grid)
+        # By information, what a robot measures at its end counts for nobody.
+        extend = weights.extend and not weights.information
+        planned = predicted(ways, int(lengths.max()), extend)
+        settled = predicted(rest, int(lengths.max()), extend)
         norm = lengths.astype(float)
         if weights.per_distance:
             norm = np.concatenate([option.prediction.distances() for option in choices])
-        self.table = CandidateTable(
+        self.kept: BoolArray = np.ones(len(norm), np.bool_)
+        table = CandidateTable(
             allowed=np.concatenate([option.allowed for option in choices]),
             waypoints=np.concatenate([option.points for option in choices]),
             radii=np.array([view.radius for view in views], float),
@@ -66,12 +68,51 @@ class TeamObjective:
             norm=np.maximum(norm, 1e-9),
             alpha=float(weights.alpha),
             beta=float(weights.beta),
-            shared=weights.information,
             planned=planned,
-            terms=terms,
+            terms=Terms(weights.information, np.zeros(0), np.zeros(1, np.int64)),
         )
+        if weights.information:
+            others = [way.view for way in rest], settled
+            build = InformationTerms(team, settings, others, planned.kind)
+            self.table, self.alone = self._by_robot(table, build, views, first)
+            return
+        centres = np.zeros((len(team.clusters), 3))
+        for centre, cluster in zip(centres, team.clusters):
+            centre[: team.dimension] = cluster.position[: team.dimension]
+        grid = team.exploration.kernel()
+        terms = paper_terms(planned, settled, first, weights.own, centres, grid)
+        self.table = table._replace(terms=terms)
         nobody = np.full(len(self.names), -1, np.int64)
         self.alone = values_given(self.table, 0, len(norm), nobody)
+
+    def _by_robot(
+        self,
+        table: CandidateTable,
+        build: InformationTerms,
+        views: Sequence[RobotView],
+        first: int,
+    ) -> tuple[CandidateTable, FloatArray]:
+        """Return the table with its terms, and T, E and J of each candidate by itself."""
+        robots = len(views)
+        whole = robots <= PAIRS_LIMIT and build.are_few(len(self.kept))
+        nobody = np.full(robots, -1, np.int64)
+        parts, alone = [], []
+        for view, begin, end in zip(views, self.start[:-1].tolist(), self.start[1:].tolist()):
+            part = part_of_table(table, begin, end)
+            terms = build.of(view, part.planned, first, whole)
+            values = values_given(part._replace(terms=terms), 0, end - begin, nobody)
+            if robots > 1:
+                kept = best_of(values[:, 2], np.diff(terms.first), MOST_ENTRIES // robots)
+                self.kept[begin:end] = kept
+                terms = reduced(terms, kept)
+            parts.append(terms)
+            alone.append(values)
+        return table._replace(terms=joined(parts)), np.concatenate(alone)
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Largest J (G,) that a candidate of the joint choice can have; -inf for the others."""
+        return np.where(self.kept, self.alone[:, 2], -np.inf)
 
     def given(self, robot: int, chosen: IntArray) -> FloatArray:
         """Return T, E and J of each candidate of one robot, given the others' choices, (W, 3).
@@ -80,9 +121,19 @@ class TeamObjective:
         """
         others, g = len(self.names) - 1, int(chosen[robot])
         first, last = self.start[robot : robot + 2].tolist()
-        if 0 < len(self.alone) * others <= REPORT_LIMIT:
+        if 0 < len(self.alone) * others <= REPORT_LIMIT and self.kept.all():
             return values_given(self.table, first, last, chosen)
         rows = self.alone[first:last].copy()
         if others and g >= 0:
             rows[g - first] = values_given(self.table, g, g + 1, chosen)[0]
         return rows
+
+
+def best_of(values: FloatArray, counts: IntArray, most: int) -> BoolArray:
+    """Return the best candidates (W,), as many as see at most `most` nodes together."""
+    order = np.argsort(-values, kind='stable')
+    fits = counts[order].cumsum() <= most
+    fits[:LEAST_KEPT] = True
+    kept = np.zeros(len(values), np.bool_)
+    kept[order[fits]] = True
+    return kept

@@ -1,0 +1,291 @@
+"""Terms by information: T about clusters, and E as expected new targets."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_filter.models.detection import BOX, detection_probability_at
+from maasi_filter.models.pose import Pose
+from maasi_planner.objective.predicted_measurements import (
+    NEVER,
+    Measurements,
+    apply_misses,
+    chances,
+    part_of,
+    parts_of,
+)
+from maasi_planner.objective.terms import IndexArray, Terms
+from maasi_planner.settings import PlannerSettings
+from maasi_planner.team import RobotView, TeamView
+
+# Up to so many numbers rows have all nodes, which is faster where robots are few.
+MOST_WHOLE = 4_000_000
+# Information about a cluster in units of its covariance that is neglected in large teams.
+LEAST_GAIN = 1e-7
+
+
+class Nodes(NamedTuple):
+    """L nodes where targets are unseen.
+
+    numbers (nx, ny, nz): which of them a cell is, or -1; lower (3,) and step (3,) of the grid [m]; places (3, L)
+    [m]; unseen (L,), the expected targets of each.
+    """
+
+    numbers: IndexArray
+    lower: FloatArray
+    step: FloatArray
+    places: FloatArray
+    unseen: FloatArray
+
+
+@njit(cache=True)
+def _add_information(
+    rows: FloatArray,
+    lower: FloatArray,
+    chance: FloatArray,
+    owner: IntArray,
+    cluster: IntArray,
+    out: FloatArray,
+) -> None:
+    """Add pi H' R^-1 H to out; rows H (n, d, d) become H in units of the noise, in place."""
+    d = lower.shape[0]
+    for i in range(chance.shape[0]):
+        for a in range(d):
+            for b in range(d):
+                for k in range(a):
+                    rows[i, a, b] -= lower[a, k] * rows[i, k, b]
+                rows[i, a, b] /= lower[a, a]
+        for a in range(d):
+            for b in range(d):
+                total = 0.0
+                for k in range(d):
+                    total += rows[i, k, a] * rows[i, k, b]
+                out[owner[i], cluster[i], a, b] += chance[i] * total
+
+
+def _information(
+    view: RobotView, measured: Measurements, first: int, centres: FloatArray, d: int
+) -> FloatArray:
+    """Return sum pi H' R^-1 H of one robot's measurements from `first` on, (W, C, d, d)."""
+    out = np.zeros((len(measured.own), len(centres), d, d))
+    lower: FloatArray = np.linalg.cholesky(view.sensor.covariance).astype(float)
+    for where, part in parts_of(measured, len(centres)):
+        chance = chances(part, first, centres)
+        owner, index, cluster = np.nonzero(chance)
+        offsets = (centres[cluster] - part.places[owner, index])[:, :d]
+        # Nearer than the noise of the range the linear model would promise too much.
+        distance = np.sqrt((offsets * offsets).sum(axis=1))
+        offsets *= np.maximum(1.0, lower[0, 0] / np.maximum(distance, 1e-12))[:, None]
+        jacobian = view.sensor.measurement.jacobian(offsets, Pose(np.zeros(3)))
+        seen = chance[owner, index, cluster]
+        _add_information(jacobian, lower, seen, owner, cluster, out[where])
+    return out
+
+
+def _nodes(team: TeamView, settings: PlannerSettings, every_node: bool) -> Nodes:
+    """Return the nodes of e, or blocks of them, with the targets that are unseen there."""
+    values, lower, step = team.exploration.kernel()
+    volumes = team.exploration.cell_volumes().reshape(values.shape)
+    most, stride = settings.exploration_nodes, 1
+    while not every_node and np.prod([-(-size // stride) for size in values.shape]) > most:
+        stride += 1
+    # Nodes of each axis by the block that they are in.
+    x, y, z = np.ix_(*(np.arange(size) // stride for size in values.shape))
+    shape = [int(blocks.max()) + 1 for blocks in (x, y, z)]
+    block = (x * shape[1] + y) * shape[2] + z
+    left = np.bincount(block.ravel(), (values * volumes).ravel()).astype(float)
+    start, distance = lower + 0.5 * (stride - 1) * step, stride * step
+    places = start[:, None] + distance[:, None] * np.indices(shape).reshape(3, -1)
+    unseen = left * (team.area.expected_targets / float(volumes.sum()))
+    index = np.arange(len(left), dtype=np.int32).reshape(shape)
+    return Nodes(index, start, distance, places, unseen)
+
+
+def _without(nodes: Nodes, settled: Measurements) -> Nodes:
+    """Return the nodes that robots which do not plan leave something of."""
+    unseen = nodes.unseen.copy()
+    counts, node, miss = rows_of(settled, 0, nodes, False)
+    for last, count in zip(counts.cumsum().tolist(), counts.tolist()):
+        unseen[node[last - count : last]] *= miss[last - count : last]
+    kept = np.flatnonzero(unseen > 0.0)
+    index = np.full(nodes.numbers.size, -1, np.int32)
+    index[kept] = np.arange(len(kept))
+    places = np.ascontiguousarray(nodes.places[:, kept])
+    return Nodes(index.reshape(nodes.numbers.shape), nodes.lower, nodes.step, places, unseen[kept])
+
+
+@njit(cache=True)
+def _miss_near(
+    measured: Measurements, g: int, first: int, nodes: Nodes, miss: FloatArray, seen: IndexArray
+) -> int:
+    """Multiply miss (L,) by 1 - pi within the reach; fill and count the nodes it is not 1 at."""
+    robot, count = measured.robot[g], 0
+    reach, shape = measured.reach[robot], nodes.numbers.shape
+    low, high = np.zeros(2, np.int64), np.zeros(2, np.int64)
+    for e in range(first, measured.own[g]):
+        for axis in range(2):
+            begin = measured.places[g, e, axis] - nodes.lower[axis]
+            low[axis] = max(0, np.int64((begin - reach) / nodes.step[axis]) - 1)
+            last = np.int64(max(-1.0, (begin + reach) / nodes.step[axis])) + 2
+            high[axis] = min(shape[axis], last)
+        x, y, z = measured.places[g, e]
+        cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
+        kind, parameters = measured.kind[robot], measured.parameters[robot]
+        for i in range(low[0], high[0]):
+            for j in range(low[1], high[1]):
+                for n in nodes.numbers[i, j]:
+                    if n < 0 or miss[n] == 0.0:
+                        continue
+                    dx, dy = nodes.places[0, n] - x, nodes.places[1, n] - y
+                    if abs(dx) > reach or abs(dy) > reach:
+                        continue
+                    chance = detection_probability_at(
+                        kind, parameters, dx, dy, nodes.places[2, n] - z, cosine, sine
+                    )
+                    if 1.0 - chance < 1.0:
+                        if miss[n] == 1.0:
+                            seen[count] = n
+                            count += 1
+                        miss[n] *= 1.0 - chance
+    return count
+
+
+@njit(cache=True)
+def rows_of(
+    measured: Measurements, first: int, nodes: Nodes, whole: bool
+) -> tuple[IntArray, IndexArray, FloatArray]:
+    """Return the nodes that the planned measurements from `first` on see, trajectory by trajectory.
+
+    How many each sees (G,), these nodes in order and the product of 1 - pi there (N,). With `whole`
+    all nodes are in each row.
+    """
+    total, number = measured.own.shape[0], nodes.unseen.shape[0]
+    counts, used = np.zeros(total, np.int64), 0
+    node, row = np.empty(number, np.int32), np.empty(number)
+    miss, seen = np.ones(number), np.empty(number, np.int32)
+    until = np.full(number, NEVER)
+    at = nodes.places[0], nodes.places[1], nodes.places[2]
+    for g in range(total):
+        if measured.reach[measured.robot[g]] < np.inf:
+            count = _miss_near(measured, g, first, nodes, miss, seen)
+            seen[:count].sort()
+        else:
+            apply_misses(at, until, miss, measured, g, first, measured.own[g])
+            count = 0
+            for n in range(number):
+                if miss[n] < 1.0:
+                    seen[count] = n
+                    count += 1
+        length = number if whole else count
+        if used + length > node.shape[0]:
+            more = np.empty(2 * (used + length), np.int32), np.empty(2 * (used + length))
+            more[0][:used], more[1][:used] = node[:used], row[:used]
+            node, row = more
+        for i in range(length):
+            n = i if whole else seen[i]
+            node[used + i], row[used + i] = n, miss[n]
+        for i in range(count):
+            miss[seen[i]] = 1.0
+        counts[g], used = length, used + length
+    return counts, node[:used], row[:used]
+
+
+def starts_of(counts: IntArray) -> IntArray:
+    """Return where rows of so many entries (G,) begin, and where the last one ends, (G + 1,)."""
+    return np.concatenate([[0], counts.cumsum()])
+
+
+class InformationTerms:
+    """The terms of the candidates of each robot, then of all of them together.
+
+    Parameters
+    ----------
+    team : TeamView
+        The team.
+    settings : PlannerSettings
+        Of the planner.
+    settled : sequence of RobotView, and Measurements
+        Robots whose measurements do not depend on the choice, and these.
+    kinds : (R,) array
+        Kinds of pi of the robots that plan.
+    """
+
+    def __init__(
+        self,
+        team: TeamView,
+        settings: PlannerSettings,
+        settled: tuple[Sequence[RobotView], Measurements],
+        kinds: IntArray,
+    ) -> None:
+        self._d = d = team.dimension
+        self._centres = np.zeros((len(team.clusters), 3))
+        self._nodes = _without(_nodes(team, settings, bool((kinds >= BOX).any())), settled[1])
+        for centre, cluster in zip(self._centres, team.clusters):
+            centre[:d] = cluster.position[:d]
+        self._base = np.zeros((len(self._centres), d, d))
+        views, measured = settled
+        for robot, view in enumerate(views):
+            begin, end = np.searchsorted(measured.robot, [robot, robot + 1]).tolist()
+            gains = _information(view, part_of(measured, begin, end), 0, self._centres, d)
+            self._base += gains.sum(axis=0)
+        self._mass = np.array([min(1.0, max(0.0, c.mass)) for c in team.clusters], float)
+        covariance = np.array([c.covariance[:d, :d] for c in team.clusters], float)
+        self._covariance = covariance.reshape(-1, d, d)
+
+    def are_few(self, candidates: int) -> bool:
+        """Return whether rows of so many candidates may have all nodes."""
+        return candidates * len(self._nodes.unseen) <= MOST_WHOLE
+
+    def of(self, view: RobotView, planned: Measurements, first: int, whole: bool) -> Terms:
+        """Return the terms of one robot's candidates by measurements from `first` on."""
+        counts, node, miss = rows_of(planned, first, self._nodes, whole)
+        gains = _information(view, planned, first, self._centres, self._d)
+        if whole:
+            known = np.ones(gains.shape[:2], np.bool_)
+        else:
+            known = np.einsum('cab,gcba->gc', self._covariance, gains) > LEAST_GAIN
+        return Terms(
+            information=True,
+            refinement=np.zeros(len(counts)),
+            first=starts_of(counts),
+            node=node,
+            miss=miss,
+            unseen=self._nodes.unseen,
+            mass=self._mass,
+            covariance=self._covariance,
+            base=self._base,
+            gain_first=starts_of(known.sum(axis=1)),
+            cluster=np.nonzero(known)[1].astype(np.int32),
+            gain=gains[known],
+        )
+
+
+def reduced(terms: Terms, kept: BoolArray) -> Terms:
+    """Return terms without the rows of candidates that are not kept (G,)."""
+    if kept.all():
+        return terms
+    counts, gains = np.diff(terms.first), np.diff(terms.gain_first)
+    entries, rows = np.repeat(kept, counts), np.repeat(kept, gains)
+    return terms._replace(
+        first=starts_of(np.where(kept, counts, 0)),
+        node=terms.node[entries],
+        miss=terms.miss[entries],
+        gain_first=starts_of(np.where(kept, gains, 0)),
+        cluster=terms.cluster[rows],
+        gain=terms.gain[rows],
+    )
+
+
+def joined(parts: Sequence[Terms]) -> Terms:
+    """Return the terms of all robots from those of each."""
+    if len(parts) == 1:
+        return parts[0]
+    first = starts_of(np.concatenate([np.diff(part.first) for part in parts]))
+    gain_first = starts_of(np.concatenate([np.diff(part.gain_first) for part in parts]))
+    rows = ('refinement', 'node', 'miss', 'cluster', 'gain')
+    together: Any = {name: np.concatenate([getattr(part, name) for part in parts]) for name in rows}
+    return parts[0]._replace(first=first, gain_first=gain_first, **together)
