@@ -1,7 +1,6 @@
 """A vehicle's driver side and a fake autopilot on a wire in memory, in simulated time."""
 
 import numpy as np
-from fenced_autopilot import FencedAutopilot
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.links.mavlink.link import make_sender
@@ -9,6 +8,7 @@ from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.links.mavlink.vehicle import Vehicle, VehiclePhase
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.simulation.emulators.mavlink.fake_autopilot import FakeAutopilot
 
 PERIOD = 0.02
 ARM, TAKE_OFF = mavlink.MAV_CMD_COMPONENT_ARM_DISARM, mavlink.MAV_CMD_NAV_TAKEOFF
@@ -38,7 +38,7 @@ class Wire:
         return messages
 
 
-class RoutingAutopilot(FencedAutopilot):
+class RoutingAutopilot(FakeAutopilot):
     """One with two links: what comes on link 1 for all is passed on to the driver, as by ArduPilot.
 
     Heartbeats only where their system and component are not known there

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from fake_bluepy import BluetoothMambo
-from fenced_autopilot import FencedAutopilot
 from linked_flight import KINDS, YAW, LinkedFlight, mambo_firmware
 from marker_view import one_image
 from numpy.testing import assert_allclose
@@ -41,7 +40,6 @@ from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import AgentState, KeepOuts
 from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.simulation.emulators.mambo.firmware import FirmwareSettings
-from maasi_sim.simulation.emulators.mavlink import fake_mavlink_vehicle
 
 
 @pytest.fixture
@@ -419,8 +417,7 @@ def test_a_fault_ends_the_way_and_is_said(fly, capfd):
     assert 'no LOCAL_POSITION_NED yet' not in said
 
 
-def test_its_fence_is_the_area_and_follows_keep_outs(fly, monkeypatch):
-    monkeypatch.setattr(fake_mavlink_vehicle, 'FakeAutopilot', FencedAutopilot)
+def test_its_fence_is_the_area_and_follows_keep_outs(fly):
     area = 'POLYGON ((-8 -8, 8 -8, 8 8, -8 8, -8 -8))'
     place = {'area': area, 'altitude': [-5.0, 5.0], 'keep_outs': ['5 5 1']}
     origin = {'latitude': 46.6, 'longitude': 9.9}

@@ -187,10 +187,13 @@ class AgentDriver(RobotNode):
         self.link.observe(placed)
         self.silence.end()
         outside = self.area.outside_by(placed.pose.position)
-        if outside > MARGIN:
+        # Goals may be on the sides of a box, where the robot is beyond them by its radius.
+        allowed = 0.0 if self.settings.environment.area else self.settings.radius
+        if outside > allowed + MARGIN:
             self.health.begin(AREA, f'{outside:.1f} m outside of the area')
-        elif not outside:
+        elif outside <= allowed:
             self.health.end(AREA, 'inside the area again')
+        self._watchdog.watch_charge(placed.stamp)
         if self.health.end(ODOMETRY, f'{self.pose_name}: received again'):
             self._watchdog.sensed_at = None  # it may have been silent with the odometry
         if self.settings.lockstep:
@@ -217,15 +220,20 @@ class AgentDriver(RobotNode):
             self.take_pose(self._pose_speed.place(stamp, pose))
 
     def _take_area(self, area: Area) -> None:
-        """Take other keep-outs; give a goal up whose way they cross: the robot stops."""
+        """Take other keep-outs; give a goal up whose way leads into one: the robot stops.
+
+        The part of the way on which a robot leaves a zone that it is in does not count.
+        """
         self.area, motion, latest = area, self._motion, self.history.latest
         goal, ways = self.follower.current, None
         if goal is not None and latest is not None:
             state = RobotState(latest.pose, latest.velocity, latest.angular_velocity)
             ways = motion.predict(state, goal.waypoint[None, :], 0.2).positions
         motion.take_area(area, self.settings.radius)
-        if ways is not None and not all(map(motion.keep_out.is_free, ways[0])):
-            self.end_goal(GoalStatus.ABORTED, 'a keep-out lies on its way')
+        if ways is not None:
+            free = [motion.keep_out.is_free(position) for position in ways[0]]
+            if not all(free[free.index(True) if True in free else 0 :]):
+                self.end_goal(GoalStatus.ABORTED, 'a keep-out lies on its way')
 
     def take_charge(self, charge: float) -> None:
         """Take the charge of the battery, 0 to 1; anything else is unknown."""

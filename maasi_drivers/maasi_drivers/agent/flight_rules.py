@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.arrays import FloatArray
 
@@ -39,6 +40,44 @@ class ArmPermission:
         if over:
             self.end()
         return over
+
+
+# At a charger its charge rises at least by this in the time after which it lands otherwise [1].
+_RISE = 0.005
+
+
+class HomeLanding:
+    """Whether a vehicle that was sent to a charger lands there, as its charge does not rise.
+
+    Times are of the steady clock [s].
+    """
+
+    def __init__(self, settings: DriverSettings, timeout: float) -> None:
+        self._chargers = np.array(settings.chargers or [settings.start])
+        self._reach = 2.0 * settings.motion.tolerance + settings.radius
+        self._timeout = timeout
+        # Whether it had a goal: after a take-off it waits for one.
+        self._sent = False
+        self._since = self._least = math.inf
+
+    def leave(self) -> None:
+        """Note a goal."""
+        self._sent = True
+        self._since, self._least = math.inf, math.inf
+
+    def judge(self, position: FloatArray, charge: float, now: float) -> str:
+        """Return why a vehicle without a goal lands, or nothing; an unknown charge is below 0."""
+        gaps = np.linalg.norm(self._chargers[:, :2] - position[:2], axis=1)
+        if not (self._sent and self._timeout and charge >= 0.0 and gaps.min() <= self._reach):
+            self._since = self._least = math.inf
+            return ''
+        if self._since == math.inf or charge >= self._least + _RISE:
+            self._since, self._least = now, charge
+        self._least = min(self._least, charge)
+        if now - self._since < self._timeout:
+            return ''
+        self._sent = False
+        return f'as its charge, {charge:.2f}, does not rise at home'
 
 
 _HEIGHT = 1.0  # between the heights of start and ground and the geofence, where none is given [m]

@@ -6,6 +6,7 @@ from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, FROZEN_POSE, ODOMETRY, SENSOR, RobotNode
 from maasi_drivers.agent.sensor_input import SensorInput
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_filter.ros.qos import LIVELINESS_PERIOD, LIVELY
 from maasi_msgs.msg import AgentState
@@ -60,6 +61,7 @@ class StatePublisher:
 PERIOD = 0.1
 # Time without a first pose, or without a charge, after which a warning is logged [s].
 _PATIENCE, _CHARGE_PATIENCE = 3.0, 10.0
+_DEFAULT_MINIMUM = DriverSettings.model_fields['battery_minimum'].default
 
 
 class Watchdog:
@@ -74,6 +76,9 @@ class Watchdog:
         self._changed_at = 0
         self.sensed_at: int | None = None
         self._checked_at = self._charged_at = time.monotonic()
+        # Stamp of the pose at the last charge [ns], and that charge.
+        self._charge_stamp: int | None = None
+        self._last_charge = -1.0
         self._stalled = False
         self._checks = 0
 
@@ -94,7 +99,10 @@ class Watchdog:
         if self._stalled:
             return  # this process was suspended: odometry may be waiting in the queue
         self._link.poll()
-        if driver.settings.battery_minimum and now - self._charged_at > _CHARGE_PATIENCE:
+        # The default minimum is for robots that report a charge at all.
+        minimum = driver.settings.battery_minimum
+        asked = minimum not in (0.0, _DEFAULT_MINIMUM) or (minimum and self._last_charge >= 0.0)
+        if asked and now - self._charged_at > _CHARGE_PATIENCE:
             driver.warn_throttled(
                 'battery',
                 f'no charge of the battery for {now - self._charged_at:.0f} s: battery_minimum '
@@ -121,12 +129,29 @@ class Watchdog:
         self._state.charge = charge if 0.0 <= charge <= 1.0 else -1.0
         if self._state.charge < 0.0:
             return
-        self._charged_at = time.monotonic()
+        self._charged_at, self._last_charge = time.monotonic(), charge
+        latest = self._driver.history.latest
+        self._charge_stamp = None if latest is None else latest.stamp
         minimum, health = self._driver.settings.battery_minimum, self._driver.health
         if charge < minimum:
             health.begin(BATTERY, f'battery at {charge:.2f}, below {minimum:.2f}')
         else:
             health.end(BATTERY)
+
+    def watch_charge(self, stamp: int) -> None:
+        """Let a charge of long before a pose's stamp [ns] be unknown, and say so once."""
+        timeout = self._driver.settings.battery_timeout
+        if self._state.charge < 0.0 or not timeout:
+            return
+        before = self._charge_stamp
+        if before is None or stamp < before:
+            self._charge_stamp = stamp
+        elif (age := 1e-9 * (stamp - before)) > timeout:
+            self._state.charge = -1.0
+            self._driver.get_logger().warning(
+                f'no charge of the battery for {age:.0f} s, since {1e-9 * before:.1f} s: it was '
+                f'{self._last_charge:.2f} and counts as unknown'
+            )
 
     def note_frame(self, topic: str, repeated: bool) -> None:
         """Note an image or sweep; see `RobotNode.take_frame`."""

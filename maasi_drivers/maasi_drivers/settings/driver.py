@@ -91,6 +91,7 @@ class DriverSettings(NodeSettings):
             'frozen_pose_timeout',
             'sensor_timeout',
             'battery_minimum',
+            'battery_timeout',
             'scan.timeout',
             'scan.blocked_timeout',
         }
@@ -221,10 +222,20 @@ class DriverSettings(NodeSettings):
         'percent, 0 to 100 as a TurtleBot3 has it',
     )
     battery_minimum: float = Field(
-        0.0,
+        0.05,
         ge=0.0,
         lt=1.0,
-        description='Charge below which the robot takes no goals; 0: disabled [1]',
+        description='Charge below which the robot takes no goals, and lands where it can; '
+        '0: disabled [1]',
+    )
+    battery_timeout: float = Field(
+        30.0,
+        ge=0.0,
+        description='Time by the odometry without a charge after which that counts as unknown; '
+        '0: the last one stays [s]',
+    )
+    chargers: list[Vector3] = Field(
+        default_factory=list, description='Where it is charged; none: at its start [m, map]'
     )
 
     @property

@@ -178,8 +178,8 @@ class MavlinkSettings(FlightSettings):
         1.0,
         gt=0.0,
         le=5.0,
-        description='Setpoints are as far ahead as it flies in this time, so that it stops by '
-        'itself where none follows [s]',
+        description='Setpoints are as far ahead as it flies in this time, under ArduCopter also as '
+        'it needs to brake, so that it stops by itself where none follows [s]',
     )
     setpoint_rate: float = Field(
         20.0, ge=4.0, le=100.0, description='Setpoints; PX4 needs more than 2 [1/s]'
@@ -201,6 +201,12 @@ class MavlinkSettings(FlightSettings):
         ge=-1,
         le=255,
         description='Id of the battery that counts (BATTERY_STATUS.id); -1: the emptiest of all',
+    )
+    home_timeout: float = Field(
+        30.0,
+        ge=0.0,
+        description='Time without a goal at one of `chargers` in which its charge does not rise, '
+        'after which it lands there; 0: it hovers [s]',
     )
     at_end: Ending = Field(
         'land',

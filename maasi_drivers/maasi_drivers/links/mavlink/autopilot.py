@@ -1,6 +1,7 @@
 """The messages of an autopilot: its type, mode and parameters, and requests to it."""
 
 import math
+import re
 import struct
 from collections import deque
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from maasi_drivers.links.mavlink.estimate import Estimate, FlightOrigin, swap_en
 from maasi_drivers.links.mavlink.fence import FenceUpload
 from maasi_drivers.links.mavlink.firmware import FailsafeCheck, Firmware, identify
 from maasi_drivers.links.mavlink.protocol import DEBUG, ERROR, INFO, WARNING, ReportLog, mavlink
+from maasi_drivers.links.mavlink.setpoints import SetpointCheck
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.arrays import FloatArray
 
@@ -28,10 +30,16 @@ _MESSAGES = {
     'GPS_RAW_INT': 2.0,
     'GPS2_RAW': 2.0,
 }
+# The same of firmwares that fly to set-points by limits: these reject some, and say no more of it.
+_OWN_MESSAGES = {'POSITION_TARGET_LOCAL_NED': 5.0, 'FENCE_STATUS': 2.0}
 # Period and number of tries of a command that is not answered [s, 1].
 _ANSWER_PATIENCE, _TRIES = 0.5, 5
-# Position only, and yaw: no velocity, acceleration, yaw rate; and no yaw either.
-_POSITION_AND_YAW, _NO_YAW = 0x9F8, 0x400
+# Position only, and yaw: no velocity, acceleration, yaw rate; velocity only; and no yaw either.
+_POSITION_AND_YAW, _VELOCITY, _NO_YAW = 0x9F8, 0x9C7, 0x400
+
+
+# Of texts on a breach of the fence, of older and newer versions of ArduPilot.
+_BREACH = re.compile('fence breach', re.IGNORECASE)
 
 
 @dataclass
@@ -62,6 +70,8 @@ class Autopilot:
         #: Numbers of those that were accepted in this phase of the flight.
         self.accepted: set[int] = set()
         self.fence = FenceUpload(settings, sender, self.log)
+        self.setpoints = SetpointCheck()
+        self.breached_at = -math.inf  #: when it reported last that it is outside of its fence
         self._sender = sender
         self._received_at = self._heartbeat_at = self._setpoint_at = -math.inf
         self._requested_at = -math.inf  # of the last request for messages
@@ -92,7 +102,12 @@ class Autopilot:
             self.mode = int(message.custom_mode)
             return before
         if kind == 'STATUSTEXT':
-            self.log.add_text(int(message.severity), message.text.rstrip('\0').strip(), now)
+            text = message.text.rstrip('\0').strip()
+            self.log.add_text(int(message.severity), text, now)
+            if _BREACH.search(text):
+                self.breached_at = now
+        elif kind == 'FENCE_STATUS':
+            self.breached_at = now if message.breach_status else self.breached_at
         elif kind == 'PARAM_VALUE':
             self._take_parameter(message)
         elif kind == 'COMMAND_ACK':
@@ -104,6 +119,9 @@ class Autopilot:
         elif self.firmware is not None:
             self.fence.take(message, now)
             self.estimate.take(message, now, self.armed)
+            if kind == 'POSITION_TARGET_LOCAL_NED':
+                place = swap_enu_ned((message.x, message.y, message.z))
+                self.setpoints.take(message, place, now)
         return None
 
     def _shows_own_id(self, message: Any) -> bool:
@@ -176,7 +194,8 @@ class Autopilot:
         if self.commands or self.lost or (known and silence < _STREAM_PATIENCE):
             return
         self._requested_at = now
-        for name, rate in _MESSAGES.items():
+        own = _OWN_MESSAGES if self.firmware is not None and self.firmware.limits else {}
+        for name, rate in (_MESSAGES | own).items():
             number = getattr(mavlink, f'MAVLINK_MSG_ID_{name}')
             interval = 1e6 / (rate or self.settings.position_rate)
             self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (number, interval))
@@ -227,19 +246,30 @@ class Autopilot:
         command.sent = now
         command.tries += 1
 
-    def send_setpoint(self, position: FloatArray, yaw: float | None, now: float) -> None:
-        """Send where it is to be, (3,) [m], if that is due; without a yaw it keeps its own."""
+    def send_setpoint(self, position: FloatArray | None, yaw: float | None, now: float) -> bool:
+        """Send where it is to be, (3,) [m], if that is due, and return whether; None: it stops.
+
+        Without a yaw it keeps its own.
+        """
         if now - self._setpoint_at < 1.0 / self.settings.setpoint_rate - 1e-6:
-            return
+            return False
         self._setpoint_at = now
+        if position is None:
+            # A velocity of zero: no fence rejects it, other than the place where it is.
+            self.setpoints.reset()
+            mask, place = _VELOCITY, [0.0] * 3
+        else:
+            self.setpoints.note(position, now)
+            mask, place = _POSITION_AND_YAW, swap_enu_ned(position).tolist()
         self._sender.set_position_target_local_ned_send(
             int(now * 1000.0) & 0xFFFFFFFF,
             self.settings.system,
             mavlink.MAV_COMP_ID_AUTOPILOT1,
             mavlink.MAV_FRAME_LOCAL_NED,
-            _POSITION_AND_YAW | (_NO_YAW if yaw is None else 0),
-            *swap_enu_ned(position).tolist(),
+            mask | (_NO_YAW if yaw is None else 0),
+            *place,
             *[0.0] * 6,
             0.0 if yaw is None else swap_yaw(yaw),
             0.0,
         )
+        return True

@@ -217,13 +217,13 @@ class Estimate:
             self._from_batteries = True
             left = message.battery_remaining
             self._charges[int(message.id)] = left / 100.0 if 0 <= left <= 100 else -1.0
-            self.charge_reports += 1
+            self.charge_reports += self._settings.battery in (-1, message.id)
         elif kind == 'SYS_STATUS':
             # The first battery's charge, where BATTERY_STATUS does not come.
             left = message.battery_remaining
             if 0 <= left <= 100 and not (self._from_batteries and 0 in self._charges):
                 self._charges[0] = left / 100.0
-                self.charge_reports += 1
+                self.charge_reports += self._settings.battery in (-1, 0)
         elif kind == 'EXTENDED_SYS_STATE':
             self.landed = int(message.landed_state)
         elif kind in _RECEIVERS:

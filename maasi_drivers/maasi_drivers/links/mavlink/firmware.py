@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from maasi_drivers.links.mavlink.protocol import INFO, WARNING, ReportLog, mavlink, mavutil
@@ -37,6 +37,9 @@ class Firmware:
     land: int
     rise: Literal['command', 'setpoint']  # how it leaves its place
     failsafes: Mapping[str, Failsafe]  # by parameter
+    # Limits of its guided flight: by kind the names of the parameter, of older and newer versions,
+    # and their units [m, s]. With any, set-points lead by its braking, and it is told its speed.
+    limits: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def px4(self) -> bool:
@@ -68,6 +71,10 @@ ARDUCOPTER = Firmware(
         'FS_EKF_ACTION': Failsafe('the position estimate fails'),
         'BATT_FS_LOW_ACT': Failsafe('the battery is low'),
         'FENCE_ENABLE': Failsafe('it leaves the fence of the autopilot'),
+    },
+    limits={
+        'acceleration': {'WPNAV_ACCEL': 0.01, 'WP_ACC': 1.0},
+        'jerk': {'PSC_JERK_XY': 1.0, 'PSC_JERK_NE': 1.0},
     },
 )
 
@@ -127,6 +134,8 @@ def identify(autopilot: int, vehicle_type: int) -> Firmware:
 # Parameters of ArduPilot of which one holds the system id of the ground station that it listens
 # to, and the one with the highest of these ids, where newer versions have a range.
 _STATION, _HIGHEST = ('SYSID_MYGCS', 'MAV_GCS_SYSID'), 'MAV_GCS_SYSID_HI'
+# Of the factory, where the autopilot does not answer: level acceleration and jerk [m, s].
+_FACTORY = {'acceleration': 2.5, 'jerk': 5.0}
 # Period and number of requests for a parameter that is not answered [s, 1].
 _ANSWER_TIMEOUT, _TRIES = 0.5, 5
 _FOREIGN_AGE = 5.0  # a message with our system id counts for this time [s]
@@ -146,7 +155,10 @@ class FailsafeCheck:
         self.complete = False
         self._firmware, self._settings, self._sender, self._log = firmware, settings, sender, log
         self._station = () if firmware.px4 else _STATION
-        self._names = [*firmware.failsafes, *self._station, *([_HIGHEST] if self._station else [])]
+        # Names of one parameter in older and newer versions.
+        self._same = [self._station, *map(tuple, firmware.limits.values())]
+        self._names = [*firmware.failsafes, *(name for names in self._same for name in names)]
+        self._names += [_HIGHEST] if self._station else []
         self._asked: Counter[str] = Counter()
         self._asked_at = self._foreign_at = -math.inf
 
@@ -167,10 +179,10 @@ class FailsafeCheck:
         if self.complete or now - self._asked_at < _ANSWER_TIMEOUT:
             return
         self._asked_at = now
-        if any(self.values.get(name) is not None for name in self._station):
-            # Older and newer versions have other names for it.
-            for name in self._station:
-                self.values.setdefault(name, None)
+        for names in self._same:
+            if any(self.values.get(name) is not None for name in names):
+                for name in names:
+                    self.values.setdefault(name, None)
         for name in self._names:
             if name in self.values:
                 continue
@@ -191,6 +203,13 @@ class FailsafeCheck:
                 self._log.add(WARNING if off else INFO, text)
             if problem := self._station_problem():
                 self._log.add(WARNING, problem)
+
+    def limit(self, kind: str) -> float:
+        """Return a limit of the autopilot's guided flight [m, s]."""
+        for name, unit in self._firmware.limits[kind].items():
+            if value := self.values.get(name):
+                return unit * value
+        return _FACTORY[kind]
 
     def problem(self, now: float) -> str:
         """Return why the vehicle must not be armed; empty where nothing speaks against it."""

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import MARGIN, make_fence
+from maasi_drivers.agent.flight_rules import MARGIN, HomeLanding, make_fence
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, ArrivalClock, RobotNode
+from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
 from maasi_drivers.links.mavlink.estimate import Telemetry
 from maasi_drivers.links.mavlink.fence import fence_items
 from maasi_drivers.links.mavlink.link import VehicleLink
@@ -23,11 +24,12 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 
 POLL_PERIOD = 0.02
-_VEHICLE, _GEOFENCE = 'vehicle', 'geofence'  # kinds of faults
+_VEHICLE, _GEOFENCE, _SETPOINT = 'vehicle', 'geofence', 'set-point'  # kinds of faults
 _STOP_TIME = 1.0  # at the end: longest wait until the autopilot confirms that it holds or lands [s]
 # Between a localiser's pose and the autopilot's for the same instant, at most [ns].
 _LONGEST_LAG = 300_000_000
 _TURNING = 0.3  # closer than this to its target, the vehicle keeps its heading [m]
+_STILL = 0.5  # without a goal it stops first, and holds its position below this speed [m/s]
 
 
 class MavlinkRobotLink(RobotLink):
@@ -59,6 +61,9 @@ class MavlinkRobotLink(RobotLink):
         self._heading: float | None = None
         self._ending = False
         self._fenced: Area | None = None  # the area that the autopilot has
+        # Whether a set-point was rejected since the last goal.
+        self._rejected = False
+        self._landing = HomeLanding(driver.settings, self._mavlink.home_timeout)
         self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], self._mavlink)
 
     def prepare(self) -> None:
@@ -66,7 +71,9 @@ class MavlinkRobotLink(RobotLink):
         folder = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
         name = f'{self.driver.namespace.replace("/", "_")}_flight_origin.json'
         memory = folder / 'maasi' / name
-        self._link = VehicleLink(self._mavlink, self.driver.settings.start, memory)
+        settings = self.driver.settings
+        self._link = VehicleLink(self._mavlink, settings.start, memory)
+        self._link.vehicle.speed = settings.motion.speed
 
     def connect(self) -> None:
         """Open the connection; the vehicle is armed only once the driver is active."""
@@ -90,17 +97,26 @@ class MavlinkRobotLink(RobotLink):
         return problem
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
-        """Send the position that the command leads to, or its target if that is nearer."""
-        position, yaw = placed.pose.position, placed.pose.yaw
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        along, aside, up = command[:3]
-        ahead = self._mavlink.lead * np.array(
-            [cosine * along - sine * aside, sine * along + cosine * aside, up]
-        )
-        target = self.driver.follower.target
-        way = np.zeros(3) if target is None else target - position
-        if float(ahead @ ahead) < float(way @ way):
-            way = ahead
+        """Send the position that the command leads to, or its target if that is nearer.
+
+        Out of a zone it goes straight to the exit: the autopilot rejects set-points inside.
+        """
+        follower, position, yaw = self.driver.follower, placed.pose.position, placed.pose.yaw
+        moving = follower.status == GoalStatus.MOVING
+        if self._rejected and not moving:
+            return  # it stays where the autopilot has it
+        way = None
+        if not self.driver.area.outside_by(position):
+            way = follower.motion.keep_out.exit_from(position)
+        if way is not None:
+            way = way - position if moving else None
+        elif moving:
+            way = self._ahead(placed, command)
+        elif self._rests(placed):
+            way = np.zeros(3) if follower.target is None else follower.target - position
+        if way is None:
+            self._brake()
+            return
         if self._heading is None:
             self._heading = yaw
         travels = self.driver.settings.motion.heading == 'travel'
@@ -108,12 +124,59 @@ class MavlinkRobotLink(RobotLink):
             self._heading = math.atan2(way[1], way[0])
         self._send_target(position + way, self._heading)
 
+    def _rests(self, placed: StampedPose) -> bool:
+        """Return whether a vehicle without a goal has stopped, or is at its last goal."""
+        follower = self.driver.follower
+        if follower.status != GoalStatus.REACHED and float(np.hypot(*placed.velocity[:2])) > _STILL:
+            follower.stay()
+            return False
+        return True
+
+    def _ahead(self, placed: StampedPose, command: Sequence[float]) -> FloatArray:
+        """Return the way (3,) to a set-point at which it flies as commanded, in free space."""
+        position, yaw = placed.pose.position, placed.pose.yaw
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        along, aside, up = command[:3]
+        velocity = np.array([cosine * along - sine * aside, sine * along + cosine * aside, up])
+        target, speed = self.driver.follower.target, float(np.linalg.norm(velocity))
+        to_target = np.zeros(3) if target is None else target - position
+        if speed == 0.0:
+            return velocity
+        with self._link.lock:
+            lead = self._link.vehicle.lead(speed)
+        least = self._mavlink.lead * speed
+        away = float(np.linalg.norm(to_target))
+        if away <= min(lead, least):
+            return to_target
+        # If nothing comes after it, the vehicle goes on to there.
+        lead = max(self._free(position, velocity / speed, min(lead, away)), min(least, lead))
+        return to_target if away <= lead else velocity * (lead / speed)
+
+    def _free(self, position: FloatArray, direction: FloatArray, lead: float) -> float:
+        """Return how much of a straight way, at most `lead` [m], is clear of all zones."""
+        keep_out = self.driver.follower.motion.keep_out
+        if not len(keep_out):
+            return lead
+        # No zone is thinner, as the robot's radius is around it.
+        step = lead / math.ceil(lead / max(keep_out.radius, 0.1))
+        free = 0.0
+        while free < lead - 1e-6 and keep_out.is_free(position + (free + step) * direction):
+            free += step
+        return free
+
     def hold(self) -> None:
-        """Have the vehicle stay at its last pose."""
-        latest = self.driver.history.latest
-        # Without a pose the last set-point stays, a short way ahead.
-        if latest is not None and ODOMETRY not in self.driver.health:
-            self._send_target(latest.pose.position, latest.pose.yaw)
+        """Have the vehicle stop now; with the next pose it holds where it has stopped."""
+        self._brake()
+
+    def _brake(self) -> None:
+        self._heading = None
+        with self._link.lock:
+            self._link.vehicle.brake()
+
+    def goal_taken(self, goal: Goal) -> None:
+        """Take set-points for positions again."""
+        self._rejected = False
+        self._landing.leave()
 
     def stop(self) -> None:
         """Have the vehicle hold its position or land, and wait until it confirms."""
@@ -167,6 +230,7 @@ class MavlinkRobotLink(RobotLink):
             fault = f'link: {link.failure}' if link.failure else vehicle.fault
             charge, reports = estimate.charge, estimate.charge_reports
             telemetry, self._local_origin = estimate.telemetry, estimate.origin
+            rejected, in_air = vehicle.rejected, vehicle.in_air
         if self._fenced is not driver.area:
             self._upload_fence()
         self._log_reports()
@@ -180,6 +244,7 @@ class MavlinkRobotLink(RobotLink):
             # The first text is logged with the fault.
             if before and fault != before:
                 driver.get_logger().info(fault)
+        self._judge_setpoint(rejected)
         if reports != self._charge_reports:
             self._charge_reports = reports
             driver.take_charge(charge)
@@ -187,9 +252,34 @@ class MavlinkRobotLink(RobotLink):
             # Again and again: a vehicle that the pilot has meanwhile may be given back.
             self._ending = True
             link.finish(self._mavlink.on_low_battery, 0.0)
+        elif in_air and (reason := self._at_home(charge)):
+            with link.lock:
+                vehicle.finish('land', reason)
         if telemetry is not None and telemetry is not self._telemetry:
             self._telemetry = telemetry
             self._take_telemetry(telemetry)
+
+    def _judge_setpoint(self, rejected: FloatArray | None) -> None:
+        """Begin or end the fault of a set-point (3,), local, that the autopilot rejects."""
+        health = self.driver.health
+        if rejected is None:
+            health.end(_SETPOINT, 'the autopilot takes set-points again')
+        elif _SETPOINT not in health:
+            self._rejected = True
+            there = compose(self._map_from_local, Pose(rejected - self._local_origin)).position
+            x, y, z = there.tolist()
+            health.begin(
+                _SETPOINT,
+                f'set-point rejected: the autopilot does not go to ({x:.1f}, {y:.1f}, {z:.1f}) m, '
+                'as where that is outside of its own fence',
+            )
+
+    def _at_home(self, charge: float) -> str:
+        """Return why a vehicle that hovers at a charger lands, or nothing."""
+        latest, follower = self.driver.history.latest, self.driver.follower
+        if latest is None or follower.current is not None:
+            return ''
+        return self._landing.judge(latest.pose.position, charge, time.monotonic())
 
     def _upload_fence(self) -> None:
         area, mavlink = self.driver.area, self._mavlink

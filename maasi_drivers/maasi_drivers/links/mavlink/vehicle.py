@@ -12,6 +12,7 @@ from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission
 from maasi_drivers.links.mavlink.autopilot import Autopilot
 from maasi_drivers.links.mavlink.firmware import Firmware
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, mavlink
+from maasi_drivers.links.mavlink.setpoints import braking_lead
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 from maasi_filter.arrays import FloatArray
 
@@ -43,6 +44,11 @@ COMMANDED = (
 
 
 _MODE, _TAKE_OFF = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_NAV_TAKEOFF
+_SPEED, _GROUND_SPEED = mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.SPEED_TYPE_GROUNDSPEED
+_REJECTED = 2.0  # a rejected set-point is a fault for so long; meanwhile it stands [s]
+_SAME_TIME = 5.0  # a breach of the fence and another mode belong together within this [s]
+# Modes that an autopilot takes by itself.
+_FAILSAFE_MODES = frozenset({'RTL', 'LAND', 'BRAKE', 'SMART_RTL', 'AUTO_RTL', 'SURFACE'})
 _ENDING_PERIOD = 0.3  # period of requests for the final mode [s]
 _ARMING_PERIOD = 2.0  # period of attempts to arm; the autopilot reports refusals [s]
 _STREAM_AHEAD = 1.2  # time for which set-points are sent before a mode that needs them [s]
@@ -69,9 +75,15 @@ class Vehicle(Autopilot):
         self.phase = VehiclePhase.CONNECTING
         self.active = False
         self._permission = ArmPermission(settings.arm_timeout)
-        # Where it is to be, and its yaw there; none: it keeps its own.
+        # Where it is to be, and its yaw there; none: it stops, and it keeps its own.
         self._target: FloatArray | None = None
         self._yaw: float | None = None
+        #: What it is to fly at, at most [m/s]; none: as the autopilot has it.
+        self.speed: float | None = None
+        self._speed_due = True
+        #: The set-point (3,) that the autopilot has just rejected, or None.
+        self.rejected: FloatArray | None = None
+        self._rejected_at = self._released_at = -math.inf
         # Smallest distance to its height so far [m], and the time at which it became less.
         self._least_left, self._nearer_at = math.inf, -math.inf
         self._detail = ''
@@ -108,8 +120,18 @@ class Vehicle(Autopilot):
             return f'vehicle: {self.place.problem}'
         flying = self.phase is VehiclePhase.FLYING
         problem = self.estimate.problem(self._fix_needed) or self.fence.problem if flying else ''
-        what = problem or ': '.join(part for part in (self.phase.value, self._detail) if part)
+        phase = self._taken_over if self.phase is VehiclePhase.RELEASED else self.phase.value
+        what = problem or ': '.join(part for part in (phase, self._detail) if part)
         return f'vehicle: {what}' if what else ''
+
+    @property
+    def _taken_over(self) -> str:
+        """By whom it was taken from the driver."""
+        if abs(self.breached_at - self._released_at) < _SAME_TIME:
+            return 'its fence was breached, and the autopilot has taken over by itself'
+        if self._firmware.mode_name(self.mode) in _FAILSAFE_MODES:
+            return 'the pilot or a failsafe has taken over'
+        return VehiclePhase.RELEASED.value
 
     @property
     def _firmware(self) -> Firmware:
@@ -135,8 +157,24 @@ class Vehicle(Autopilot):
             raise ValueError(
                 f'setpoint: got {target.tolist()}, {yaw}, allowed are finite numbers [m, rad]'
             )
-        if self.phase is VehiclePhase.FLYING:
+        if self.phase is VehiclePhase.FLYING and self.rejected is None:
             self._target, self._yaw = target, float(yaw)
+
+    def brake(self) -> None:
+        """Have it stop, and stay there."""
+        if self.phase is VehiclePhase.FLYING:
+            self._target, self._yaw = None, None
+
+    def lead(self, speed: float) -> float:
+        """Return how far ahead set-points lie for a speed [m/s], so that it is flown [m]."""
+        lead, failsafes = self.settings.lead * speed, self.failsafes
+        if failsafes is None or not self._firmware.limits:
+            return lead
+        braking = braking_lead(speed, failsafes.limit('acceleration'), failsafes.limit('jerk'))
+        if self.speed is None or _SPEED not in self.accepted:
+            return braking
+        # Farther than for the speed only where the autopilot itself limits that.
+        return braking + lead * min(speed / self.speed, 1.0) ** 2
 
     def permit(self, now: float) -> str:
         """Let it take off once, or be taken over where it flies; return why not, or nothing."""
@@ -202,9 +240,8 @@ class Vehicle(Autopilot):
         elif was_armed and not armed:
             self._on_disarmed(now)
         elif mode not in self._own_modes(before):
-            name = firmware.mode_name(mode)
-            text = f'the pilot or a failsafe has taken over: mode {name}; the driver lets go'
-            self.log.add(WARNING, text)
+            name, self._released_at = firmware.mode_name(mode), now
+            self.log.add(WARNING, f'{self._taken_over}: mode {name}; the driver lets go')
             self.commands.clear()
             self._permission.end()
             self._target = None
@@ -272,8 +309,35 @@ class Vehicle(Autopilot):
         self.request_data(now)
         self._continue(now)
         self.send_commands(now)
-        if self._target is not None and self._streams_setpoints:
-            self.send_setpoint(self._target, self._yaw, now)
+        if self._streams_setpoints:
+            self._stream(now)
+
+    def _stream(self, now: float) -> None:
+        flying = self.phase is VehiclePhase.FLYING
+        if flying:
+            self._judge_setpoint(now)
+        if (self._target is None and not flying) or not self.send_setpoint(
+            self._target, self._yaw, now
+        ):
+            return
+        if self._target is None:
+            self._speed_due = True
+        elif flying and self._speed_due and self.speed is not None and self._firmware.limits:
+            # Valid from the first position on, until a velocity is sent.
+            self._speed_due = False
+            self.command(_SPEED, (_GROUND_SPEED, self.speed, -1.0))
+
+    def _judge_setpoint(self, now: float) -> None:
+        telemetry, check = self.estimate.telemetry, self.setpoints
+        if telemetry is not None:
+            check.observe(telemetry.position, telemetry.velocity, now)
+        rejected = check.rejected(now)
+        if rejected is not None:
+            self.rejected, self._rejected_at = rejected, now
+            self._target, self._yaw = check.other, None
+            check.reset()
+        elif now - self._rejected_at > _REJECTED:
+            self.rejected = None
 
     @property
     def _streams_setpoints(self) -> bool:
@@ -407,6 +471,8 @@ class Vehicle(Autopilot):
         if self.phase is not VehiclePhase.FLYING:
             self._fix_needed = self.estimate.has_fix
         self.commands.clear()
+        self.setpoints.reset()
+        self.rejected, self._speed_due = None, True
         self._enter(VehiclePhase.FLYING)
 
     def _end(self, now: float) -> None:

@@ -40,6 +40,12 @@ class AutopilotSettings(Settings):
         default_factory=dict, description='Parameters of the autopilot that differ'
     )
 
+    def all_parameters(self) -> dict[str, float]:
+        """Return the parameters of the autopilot; its speed limits are those of the vehicle."""
+        limits = {'WPNAV_SPEED': 100.0 * self.speed, 'WPNAV_ACCEL': 100.0 * self.acceleration}
+        own = limits if self.firmware == 'arducopter' else {}
+        return {**PARAMETERS[self.firmware], **own, **self.parameters}
+
     @model_validator(mode='before')
     @classmethod
     def _from_word(cls, value: Any) -> Any:
@@ -50,6 +56,12 @@ class AutopilotSettings(Settings):
 # id of the driver as that of the ground station.
 PARAMETERS: dict[str, dict[str, float]] = {
     'arducopter': {
+        'GUID_TIMEOUT': 3,
+        'PSC_JERK_XY': 5,
+        'PSC_JERK_Z': 5,
+        'WPNAV_ACCEL_Z': 100,
+        'FENCE_TYPE': 7,
+        'FENCE_ACTION': 1,
         'FS_GCS_ENABLE': 5,
         'FS_GCS_TIMEOUT': 5,
         'FS_THR_ENABLE': 1,

@@ -6,7 +6,11 @@ is refused in the air (`Mode::do_user_takeoff_U_m`) and ends within a tenth of i
 (`_AutoTakeoff::run`), EXTENDED_SYS_STATE tells take-off from flight
 (`GCS_MAVLINK_Copter::landed_state`), and the ground station failsafe looks at the system id of
 heartbeats alone (`GCS::sysid_is_gcs`). Positions that it reports are from the EKF's origin, which
-is where the vehicle is when the EKF starts, also after a restart.
+is where the vehicle is when the EKF starts, also after a restart. Between set-points it flies as in
+`GuidedFlight`. A destination outside of its fence is rejected without a word, in any FENCE_ACTION
+(`ModeGuided::set_destination`), a velocity is not (`set_velaccel`); POSITION_TARGET_LOCAL_NED
+reports what was accepted last (`send_position_target_local_ned`). A breach of the fence takes the
+mode of FENCE_ACTION once (`Copter::fence_checks_async`).
 """
 
 import math
@@ -27,17 +31,21 @@ from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_sim.simulation.emulators.mavlink.autopilot_settings import (
-    PARAMETERS,
     WHOLE_NUMBERS,
     AutopilotSettings,
 )
+from maasi_sim.simulation.emulators.mavlink.fake_fence import ACTIONS, FakeFence
 from maasi_sim.simulation.emulators.mavlink.flight_model import FlightModel
+from maasi_sim.simulation.emulators.mavlink.guided_flight import GuidedFlight
 
 _DISARM_DELAY = 10.0  # ArduCopter disarms on the ground after so long [s]
 # PX4 wants setpoints for so long, and not so long ago, before OFFBOARD [s].
 _OFFBOARD_STREAM, _OFFBOARD_AGE = 1.0, 0.5
 _LANDING, _SURFACING = 0.5, 0.3
-_POSITION_IGNORED, _YAW_IGNORED = 0b111, 1 << 10
+_RTL_HEIGHT = 15.0  # RTL_ALT of the factory [m]
+_POSITION_IGNORED, _VELOCITY_IGNORED, _YAW_IGNORED = 0b111, 0b111 << 3, 1 << 10
+_ONLY_POSITION, _ONLY_VELOCITY = 0xDF8, 0xDC7  # masks of POSITION_TARGET_LOCAL_NED
+_FENCE_PERIOD = 0.1  # between two looks at the fence [s]
 _EKF_GOOD, _EKF_START = 1 | 2 | 4 | 8 | 16 | 32, 1 | 128  # of EKF_STATUS_REPORT
 # From the loss of GNSS to that of the position estimate [s].
 _DEAD_RECKONING = 8.0
@@ -57,7 +65,7 @@ class FakeAutopilot:
     ) -> None:
         self.settings = settings
         self.firmware = FIRMWARES[settings.firmware]
-        self.parameters = {**PARAMETERS[settings.firmware], **settings.parameters}
+        self.parameters = settings.all_parameters()
         submarine = self.firmware.kind == 'submarine'
         self.body = FlightModel(
             np.array([0.0, 0.0, -settings.depth if submarine else 0.0]),
@@ -66,8 +74,12 @@ class FakeAutopilot:
             settings.speed,
             settings.acceleration,
         )
-        self.now = 0.0
-        self.capabilities = 0
+        self._guided = (
+            GuidedFlight(self.body, self.parameters) if self.firmware is ARDUCOPTER else None
+        )
+        self.fence = FakeFence(sender, self.parameters)
+        self.now = self._fence_at = 0.0
+        self.capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
         self.armed = False
         self.crashed = ''
         self.charge = settings.charge
@@ -80,7 +92,8 @@ class FakeAutopilot:
         self.height_error = 0.0
         self.origin = np.zeros(3)
         self._sender, self._generator = sender, generator
-        self._home = 0.0  # true height at arming [m]
+        # Place and height at arming, and highest of a return [m].
+        self._armed_place, self._home, self._returns_at = np.zeros(3), 0.0, 0.0
         # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
         self._armed_at = -math.inf
@@ -97,6 +110,8 @@ class FakeAutopilot:
         self.periods |= {'LOCAL_POSITION_NED': 0.25, 'ATTITUDE_QUATERNION': 0.25}
         if self.firmware is not PX4_COPTER:
             self.periods['EKF_STATUS_REPORT'] = 1.0
+        if self._guided is not None:
+            self.periods['FENCE_STATUS'] = 1.0
 
     @property
     def mode_name(self) -> str:
@@ -127,8 +142,11 @@ class FakeAutopilot:
             mode = next(key for key, name in self.firmware.modes.items() if name == mode)
         self.mode = mode
         self._rising_to: float | None = None  # height of a take-off [m]
-        # Place and yaw of the last set-point.
+        # Place and yaw of the last set-point, or a velocity instead of the place.
         self._setpoint: tuple[FloatArray, float | None] | None = (self.body.position.copy(), None)
+        self._velocity: FloatArray | None = None
+        if self._guided is not None:
+            self._guided.begin()
 
     def advance(self, dt: float) -> None:
         """Advance by `dt` seconds: move, check failsafes, send due messages."""
@@ -143,7 +161,9 @@ class FakeAutopilot:
                 self.origin[2] = 0.0  # depths are from the surface
             self.say(6, 'EKF3 IMU0 is using GPS')
         self._move(dt)
+        self.fence.advance(self.now)
         self._look_after_failsafes(dt)
+        self._look_after_fence()
         for name, send in _MESSAGES.items():
             since = self.now - self._sent_at.get(name, -math.inf)
             if since >= self.periods.get(name, math.inf) - 1e-6 and name not in self.muted:
@@ -178,10 +198,29 @@ class FakeAutopilot:
             body.fly_to(target, None, dt)
             if abs(body.position[2] - self._rising_to) < 0.1 * (self._rising_to - self._home):
                 self._setpoint, self._rising_to = (target, None), None
-        elif setpoint is None:
-            body.fly(np.zeros(3), dt)
+                if self._guided is not None:
+                    self._guided.hold(target)
+        elif self.mode_name == 'RTL':
+            self._return(dt)
+        elif self._guided is not None and self.mode == self.firmware.external:
+            self._guided.run(self.now, dt)
+        elif self._velocity is not None or setpoint is None:
+            body.fly(np.zeros(3) if self._velocity is None else self._velocity, dt)
         else:
             body.fly_to(*setpoint, dt)
+
+    def _return(self, dt: float) -> None:
+        """Climb, fly to where it was armed, and land; `ModeRTL`."""
+        body, home = self.body, self._armed_place
+        height = home[2] + max(_RTL_HEIGHT, self._returns_at)
+        if math.hypot(*(body.position - home)[:2]) < 0.5:
+            body.fly(np.array([0.0, 0.0, -_LANDING]), dt)
+            if body.grounded:
+                self.disarm('Landed')
+            return
+        self._returns_at = max(self._returns_at, float(body.position[2] - home[2]))
+        low = body.position[2] < height - 0.5
+        body.fly_to(np.array([*(body.position if low else home)[:2], height]), None, dt)
 
     def disarm(self, text: str) -> None:
         """Turn the motors off, and say why."""
@@ -207,6 +246,17 @@ class FakeAutopilot:
             self.take_mode(firmware.land)
         if self.charge < 0.05 and self._acts('Battery', 'BATT_FS_LOW_ACT', 'COM_LOW_BAT_ACT'):
             self.take_mode(firmware.land)
+
+    def _look_after_fence(self) -> None:
+        if self._guided is None or self.now - self._fence_at < _FENCE_PERIOD or not self.ready:
+            return
+        self._fence_at = self.now
+        place = self.body.position + self.offset
+        text = self.fence.check(place, float(self.body.position[2]) - self._home)
+        if text and self.armed and not self.body.grounded:
+            self.say(5, text)
+            if mode := ACTIONS.get(int(self.parameters['FENCE_ACTION'])):
+                self.take_mode(mode)
 
     def _acts(self, kind: str, *names: str) -> bool:
         if kind in self._failed or not any(self.parameters.get(name, 0) for name in names):
@@ -294,6 +344,9 @@ class FakeAutopilot:
         handler = _HANDLERS.get(message.get_type())
         if handler is not None and target in (0, self.settings.system):
             handler(self, message)
+        of_fence = getattr(message, 'mission_type', None) == mavlink.MAV_MISSION_TYPE_FENCE
+        if of_fence and message.get_type() in FakeFence.messages:
+            self.fence.handle(message, self.now)
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.get_srcSystem() == self.parameters.get('SYSID_MYGCS'):
@@ -350,13 +403,19 @@ class FakeAutopilot:
         return int(_ACCEPTED)
 
     def _arm(self, message: Any) -> int:
-        if not self.ready or self.charge < 0.05:
-            low = 'Battery below minimum arming capacity'
-            self.say(2, f'PreArm: {low if self.ready else "Need Position Estimate"}')
+        problem = self.fence.problem if self._guided is not None else ''
+        if self.charge < 0.05:
+            problem = 'Battery below minimum arming capacity'
+        if not self.ready:
+            problem = 'Need Position Estimate'
+        if problem:
+            self.say(2, f'PreArm: {problem}')
             return int(_FAILED)
         if not self.armed:
             self.armed, self._armed_at = True, self.now
+            self._armed_place = self.body.position.copy()
             self._home = float(self.body.position[2])
+            self._returns_at = 0.0
             self._station_at = min(self._station_at, self.now)
             self.say(6, 'Arming motors')
         return int(_ACCEPTED)
@@ -375,9 +434,11 @@ class FakeAutopilot:
 
     def _on_setpoint(self, message: Any) -> None:
         position = (message.x, message.y, message.z)
+        velocity = (message.vx, message.vy, message.vz)
         wants_position = not message.type_mask & _POSITION_IGNORED
+        wants_velocity = not message.type_mask & _VELOCITY_IGNORED
         wants_yaw = not message.type_mask & _YAW_IGNORED
-        used = position * wants_position + (message.yaw,) * wants_yaw
+        used = position * wants_position + velocity * wants_velocity + (message.yaw,) * wants_yaw
         if not all(map(math.isfinite, used)):
             self.crashed = f'SET_POSITION_TARGET_LOCAL_NED: {used} is not finite'
             self.armed = False
@@ -388,9 +449,44 @@ class FakeAutopilot:
         if self.now - self._streamed_at > _OFFBOARD_AGE:
             self._streaming_since = self.now
         self._streamed_at = self.now
-        if wants_position and self.mode == self.firmware.external and self._rising_to is None:
-            yaw = swap_yaw(message.yaw) if wants_yaw else None
-            self._setpoint = swap_enu_ned(position) - self.offset, yaw
+        yaw = swap_yaw(message.yaw) if wants_yaw else None
+        if self.mode != self.firmware.external or self._rising_to is not None:
+            return
+        if wants_position:
+            self._go_to(swap_enu_ned(position), yaw)
+        elif wants_velocity:
+            self._velocity = swap_enu_ned(velocity)
+            self._setpoint = self.body.position.copy(), yaw
+            if self._guided is not None:
+                self._guided.take(self._velocity, True, yaw, self.now)
+
+    def _go_to(self, place: FloatArray, yaw: float | None) -> None:
+        """Take a destination, in what it believes to be its local frame."""
+        true = place - self.offset
+        if self._guided is not None:
+            if self.fence.breach(place, float(true[2]) - self._home):
+                return
+            self._guided.take(true, False, yaw, self.now)
+        self._setpoint, self._velocity = (true, yaw), None
+
+    def _change_speed(self, message: Any) -> int:
+        if self._guided is None or not message.param2 > 0.0:
+            return int(_FAILED)
+        self._guided.speed = float(message.param2)
+        return int(_ACCEPTED)
+
+    def _send_target(self) -> None:
+        guided = self._guided
+        if guided is None or self.mode != self.firmware.external:
+            return
+        place = swap_enu_ned(guided.target + (0.0 if guided.by_velocity else self.offset))
+        numbers = [*np.zeros(3), *place] if guided.by_velocity else [*place, *np.zeros(3)]
+        mask = _ONLY_VELOCITY if guided.by_velocity else _ONLY_POSITION
+        head = self._milliseconds, mavlink.MAV_FRAME_LOCAL_NED, mask
+        self._sender.position_target_local_ned_send(*head, *numbers, *[0.0] * 5)
+
+    def _send_fence_status(self) -> None:
+        self.fence.send_status()
 
 
 _MESSAGES: dict[str, Callable[[FakeAutopilot], None]] = {
@@ -402,6 +498,8 @@ _MESSAGES: dict[str, Callable[[FakeAutopilot], None]] = {
     'EKF_STATUS_REPORT': FakeAutopilot._send_estimator,
     'GPS_RAW_INT': FakeAutopilot._send_gnss,
     'GPS2_RAW': FakeAutopilot._send_second_gnss,
+    'POSITION_TARGET_LOCAL_NED': FakeAutopilot._send_target,
+    'FENCE_STATUS': FakeAutopilot._send_fence_status,
 }
 _HANDLERS: dict[str, Callable[[FakeAutopilot, Any], None]] = {
     'HEARTBEAT': FakeAutopilot._on_heartbeat,
@@ -412,6 +510,7 @@ _HANDLERS: dict[str, Callable[[FakeAutopilot, Any], None]] = {
 _COMMANDS: dict[int, Callable[[FakeAutopilot, Any], int]] = {
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: FakeAutopilot._set_interval,
     mavlink.MAV_CMD_DO_SET_MODE: FakeAutopilot._set_mode,
+    mavlink.MAV_CMD_DO_CHANGE_SPEED: FakeAutopilot._change_speed,
     mavlink.MAV_CMD_REQUEST_MESSAGE: FakeAutopilot._send_version,
     mavlink.MAV_CMD_COMPONENT_ARM_DISARM: FakeAutopilot._arm,
     mavlink.MAV_CMD_NAV_TAKEOFF: FakeAutopilot._take_off,

@@ -39,6 +39,10 @@ class FlightModel:
         beyond = math.sqrt(2.0 * self.acceleration * max(left - 0.5 * reach, 0.0))
         speed = _GAIN * left if left <= reach else beyond
         self.fly(error * (speed / left if left else 0.0), dt)
+        self.turn(yaw, dt)
+
+    def turn(self, yaw: float | None, dt: float) -> None:
+        """Turn towards a heading for `dt` seconds; without one it keeps its own."""
         self.yaw_rate = 0.0
         if yaw is not None:
             turn = math.atan2(math.sin(yaw - self.yaw), math.cos(yaw - self.yaw))

@@ -1,0 +1,167 @@
+"""A driver's link over ArduCopter and a fake one, in simulated time and without ROS."""
+
+import contextlib
+import math
+from types import SimpleNamespace
+
+import numpy as np
+from mavlink_play import Play
+
+from maasi_drivers.agent.agent_driver import AgentDriver
+from maasi_drivers.agent.odometry import PoseHistory
+from maasi_drivers.agent.robot_node import Health, RobotNode
+from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
+from maasi_drivers.links.mavlink import mavlink_robot_link
+from maasi_drivers.links.mavlink.link import make_sender
+from maasi_drivers.links.mavlink.mavlink_robot_link import MavlinkRobotLink
+from maasi_drivers.links.mavlink.vehicle import Vehicle
+from maasi_drivers.settings.driver import DriverSettings
+from maasi_filter.area import Area
+from maasi_filter.geodesy import OriginSettings
+from maasi_planner.motion import RobotState
+
+ORIGIN = OriginSettings(latitude=46.6, longitude=9.9)
+START = [0.0, 0.0, 30.0]
+# The drone of docs/field_sitl.yaml, and an area wide enough to reach its speed.
+MOTION = {'speed': 8.0, 'acceleration': 2.5, 'clearance': 2.0, 'tolerance': 1.0}
+FIELD = {'area': 'POLYGON ((-200 -200, 200 -200, 200 200, -200 200, -200 -200))'}
+COPTER = {'speed': 10.0, 'acceleration': 2.5}
+FENCE = {'FENCE_ENABLE': 1, 'FENCE_TYPE': 4, 'FENCE_ACTION': 0}
+
+
+class PlainDriver:
+    """What a link and the parts of a driver that are tried here need of the node."""
+
+    judge = RobotNode.judge
+    take_pose, take_area = AgentDriver.take_pose, AgentDriver._take_area
+
+    def __init__(self, settings, make_link):
+        self.settings, self.area = settings, Area(settings.environment)
+        self.bounds, self.active, self.pose_name = self.area.bounds, True, 'odometry'
+        self.namespace, self.history = 'rover', PoseHistory()
+        self.logged = []
+        log = SimpleNamespace(
+            **dict.fromkeys(('error', 'warning', 'info', 'debug'), self.logged.append)
+        )
+        self.health = Health(log, self._on_fault)
+        self.silence = SimpleNamespace(end=lambda: None)
+        self._responder = SimpleNamespace(serve=lambda: None)
+        self._watchdog = SimpleNamespace(
+            watch_charge=lambda _: None, note_pose=lambda _: None, moving=False
+        )
+        self.get_logger = lambda: log
+        self.take_charge = lambda charge: setattr(self, 'charge', charge)
+        self.restart_if_back = lambda *_: False
+        self.charge, self.ended = -1.0, []
+        self.link = make_link(self)
+        self._motion = self.link.make_motion()
+        self.follower = WaypointFollower(self._motion)
+
+    def _on_fault(self, text):
+        self.end_goal(GoalStatus.ABORTED, text)
+        self.follower.let_go()
+
+    def end_goal(self, status, reason):
+        goal = self.follower.end(status, reason)
+        if goal is not None:
+            self.ended.append(reason)
+
+    def _control(self, placed):
+        robot = RobotState(placed.pose, placed.velocity, placed.angular_velocity)
+        command, _ = self.link.steer(robot, None)
+        self.link.send(placed, command.tolist())
+
+
+class GuidedPlay(Play):
+    """A copter, its driver's link and what went over the wire; `go_to` is a goal of the planner."""
+
+    def __init__(self, monkeypatch, environment=(), motion=(), parameters=(), **changes):
+        place = FIELD | {'altitude': [0.0, 60.0], 'origin': ORIGIN} | dict(environment)
+        if 'bounds' in place:
+            place.pop('area')
+            place.pop('altitude')
+        own = {'arm': True} | changes.pop('mavlink', {})
+        self.driver_settings = DriverSettings.model_validate(
+            {
+                'environment': place,
+                'start': START,
+                'radius': 0.5,
+                'motion': MOTION | dict(motion),
+                'link': 'mavlink',
+                'mavlink': own,
+            }
+            | changes
+        )
+        clock = SimpleNamespace(monotonic=lambda: self.now)
+        monkeypatch.setattr(mavlink_robot_link, 'time', clock)
+        autopilot = COPTER | {'parameters': FENCE | dict(parameters), 'endurance': 1e9}
+        super().__init__('arducopter', autopilot, **own)
+        self.body.climb = 2.5
+        self.autopilot.fence.home = ORIGIN
+        self.speeds = []
+
+    def start_driver(self):
+        sender = make_sender(self.settings.own_system)
+        sender.file = self.to_autopilot
+        self.vehicle = Vehicle(self.settings, START, sender, None)
+        self.vehicle.active = self.driver_lives = True
+        self.reports = []
+        self.driver = PlainDriver(self.driver_settings, MavlinkRobotLink)
+        self.link = link = self.driver.link
+        link._link = SimpleNamespace(
+            vehicle=self.vehicle,
+            lock=contextlib.nullcontext(),
+            failure='',
+            finish=lambda ending, _: self.vehicle.finish(ending),
+        )
+        self.vehicle.speed = self.driver_settings.motion.speed
+        self.driver.get_clock = lambda: SimpleNamespace(
+            now=lambda: SimpleNamespace(nanoseconds=round(1e9 * self.now))
+        )
+
+    def turn(self):
+        super().turn()
+        if self.driver_lives:
+            self.link._update()
+        self.speeds.append(self.speed)
+
+    def go_to(self, *position):
+        """Send a goal."""
+        goal = Goal(1, 0, np.array(position, dtype=float))
+        replaced = self.driver.follower.take(goal)
+        assert replaced is None
+        self.link.goal_taken(goal)
+        return self
+
+    def arrives(self, limit=120.0):
+        """Run until the goal is reached."""
+        return self.until(lambda: self.status is GoalStatus.REACHED, limit)
+
+    def draw(self, *zones):
+        """Close zones while it flies; the fence follows."""
+        environment = self.driver_settings.environment
+        zones = type(environment).model_validate(
+            environment.model_dump() | {'keep_outs': list(zones)}
+        )
+        self.driver.take_area(Area(zones))
+        return self
+
+    @property
+    def status(self):
+        return self.driver.follower.status
+
+    @property
+    def place(self):
+        """On the map, whose origin is that of the local frame."""
+        return self.body.position + np.array([START[0], START[1], 0.0])
+
+    @property
+    def fault(self):
+        return self.driver.health.text
+
+    @property
+    def said(self):
+        return ' | '.join([*self.driver.logged, *(text for _, text in self.reports)])
+
+    def away(self, *position):
+        return math.dist(self.place[:2], position[:2])

@@ -1,0 +1,207 @@
+"""How a drone under ArduCopter flies to its goals, leaves zones, and stops, against a fake one."""
+
+import numpy as np
+import pytest
+from guided_play import GuidedPlay
+
+from maasi_drivers.agent.waypoint_follower import GoalStatus
+from maasi_drivers.links.mavlink.vehicle import VehiclePhase
+
+
+@pytest.fixture
+def guided(monkeypatch):
+    """Return a function that starts a drone, which has risen to its height."""
+
+    def start(**changes):
+        play = GuidedPlay(monkeypatch, **changes).fly().run(6.0)
+        assert play.fault == '' and play.place[2] == pytest.approx(30.0, abs=3.5)
+        play.speeds.clear()
+        return play
+
+    return start
+
+
+@pytest.mark.parametrize('speed', [2.0, 5.0, 8.0])
+def test_it_flies_at_the_speed_that_is_planned_with(guided, speed):
+    play = guided(motion={'speed': speed})
+    far = 18.0 * speed
+    play.go_to(far, 0.0, 30.0).run(12.0)
+    cruise = play.speeds[-100:]
+    assert min(cruise) > 0.95 * speed and max(play.speeds) < 1.02 * speed
+    play.arrives()
+    assert play.away(far, 0.0) <= 1.1
+    play.run(10.0)
+    assert play.away(far, 0.0) < 0.2 and play.speed < 0.05
+
+
+def test_it_stops_soon_without_a_goal_and_does_not_fly_back(guided):
+    play = guided().go_to(150.0, 0.0, 30.0)
+    play.run(8.0)
+    here = play.place.copy()
+    play.driver.end_goal(GoalStatus.CANCELED, 'cancelled')
+    play.link.hold()
+    east = []
+    play.run(12.0, lambda: east.append(play.place[0]))
+    # 8 m/s are braked with 2.5 m/s^2 in 12.8 m.
+    assert 12.0 < play.away(*here) < 17.0 and play.speed < 0.05
+    assert np.diff(east).min() > -0.01
+
+
+# The circles of the issue's flights, and a polygon: they lie over the drone.
+ZONES = {'12 m': '3 0 12', '5 m': '3 0 5', 'polygon': 'POLYGON ((-4 -9, 9 -9, 9 9, -4 9, -4 -9))'}
+
+
+@pytest.mark.parametrize('zone', ZONES.values(), ids=ZONES)
+def test_it_leaves_a_zone_drawn_over_it_by_the_exit_and_stays_until_it_is_sent(guided, zone):
+    play = guided()
+    play.draw(zone).run(10.0)
+    # Nothing moves without a goal, and nothing is at fault.
+    assert play.away(0.0, 0.0) < 0.3 and play.fault == ''
+    keep_out = play.driver.follower.motion.keep_out
+    assert not keep_out.is_free(play.place)
+    far = keep_out.exit_from(play.place)
+    began = play.now
+    play.go_to(*far).until(lambda: keep_out.is_free(play.place), 30.0)
+    way = play.away(0.0, 0.0)
+    # As it would fly from rest to rest.
+    assert play.now - began < 2.0 * np.sqrt(way / 2.5) + 2.5, (way, play.now - began)
+    play.arrives(10.0)
+    # From there on it searches.
+    play.go_to(-60.0, 50.0, 30.0).arrives()
+    assert play.fault == '' and not play.driver.ended
+
+
+def test_a_goal_whose_way_only_leaves_a_zone_goes_on_and_others_end(guided):
+    play = guided().go_to(60.0, 0.0, 30.0).run(4.0)
+    x = float(play.place[0])
+    play.draw([[x - 8.0, -8.0], [x + 5.0, -8.0], [x + 5.0, 8.0], [x - 8.0, 8.0]])
+    play.arrives()
+    assert not play.driver.ended and play.fault == ''
+    play.go_to(-60.0, 0.0, 30.0).run(2.0)
+    play.draw([[-45.0, -8.0], [-25.0, -8.0], [-25.0, 8.0], [-45.0, 8.0]])
+    assert play.driver.ended == ['a keep-out lies on its way']
+    play.run(8.0)
+    assert play.speed < 0.05 and play.driver.follower.motion.keep_out.is_free(play.place)
+
+
+@pytest.mark.parametrize('limit', ['fence', 'stuck'])
+def test_a_rejected_setpoint_is_a_fault_with_its_reason(guided, limit):
+    if limit == 'fence':
+        play = guided(parameters={'FENCE_TYPE': 7, 'FENCE_RADIUS': 50.0})
+    else:
+        play = guided()
+        play.autopilot.muted.add('POSITION_TARGET_LOCAL_NED')
+        play.autopilot._go_to = lambda *_: None
+    play.go_to(80.0, 0.0, 30.0)
+    play.until(lambda: play.fault, 60.0)
+    assert 'set-point rejected: the autopilot does not go to (' in play.fault
+    assert ' m, as where that is outside of its own fence' in play.fault
+    assert play.driver.ended == [play.fault]
+    play.run(10.0)
+    assert play.speed < 0.05 and play.fault == '' and play.away(0.0, 0.0) < 50.0
+    if limit == 'fence':
+        # It goes elsewhere.
+        play.go_to(-20.0, 10.0, 30.0).arrives()
+        assert play.fault == ''
+
+
+@pytest.mark.parametrize(('action', 'mode'), [(1, 'RTL'), (2, 'LAND'), (4, 'BRAKE')])
+def test_the_autopilot_that_acts_on_its_fence_is_not_taken_for_the_pilot(guided, action, mode):
+    play = guided(parameters={'FENCE_ACTION': action}).go_to(60.0, 0.0, 30.0).run(4.0)
+    x, y, _ = play.place.tolist()
+    play.draw(f'{x} {y} 15')
+    play.until(lambda: play.phase is VehiclePhase.RELEASED, 10.0)
+    play.run(0.1)
+    assert f'its fence was breached, and the autopilot has taken over by itself: mode {mode}' in (
+        play.fault
+    )
+    assert 'the pilot' not in play.fault and 'the pilot' not in play.said
+    sent = len(play.sent('SET_POSITION_TARGET_LOCAL_NED'))
+    play.run(2.0)
+    assert len(play.sent('SET_POSITION_TARGET_LOCAL_NED')) == sent
+    # A pilot is one.
+    other = guided()
+    other.autopilot.take_mode('LOITER')
+    other.run(2.0)
+    assert other.fault == 'vehicle: the pilot has taken over: mode LOITER'
+
+
+def test_bounds_are_an_area_and_it_comes_back_from_outside(guided):
+    play = guided(environment={'bounds': [[-30.0, 30.0], [-30.0, 30.0]]})
+    assert len(play.autopilot.fence.items) == 4
+    play.go_to(20.0, 0.0, 30.0).run(2.0)
+    play.body.position[:2] = 51.0, 0.0
+    play.run(0.1)
+    assert ' m outside of the area' in play.fault and 'it returns' in play.fault
+    assert ' m outside the geofence' in play.driver.ended[0]
+    play.until(lambda: play.fault == '', 60.0).run(5.0)
+    assert play.place[0] < 30.6 and play.speed < 0.05
+    # At the side of the box noise is no fault.
+    play.go_to(30.3, 0.0, 30.0).arrives()
+    for _ in range(50):
+        play.body.position[0] += 0.004
+        play.run(0.1)
+        assert play.fault == ''
+
+
+@pytest.mark.parametrize('seed', range(900, 904))
+def test_where_the_driver_dies_it_stops_in_free_space(guided, seed):
+    """Killed, hung or cut off: its last set-point is where it may be."""
+    generator = np.random.default_rng(seed)
+    zones = [
+        f'{x:.1f} {y:.1f} {radius:.1f}'
+        for x, y, radius in generator.uniform([20.0, -60.0, 3.0], [110.0, 60.0, 12.0], (8, 3))
+    ]
+    play = guided(environment={'keep_outs': zones})
+    keep_out = play.driver.follower.motion.keep_out
+    goal = next(
+        point
+        for point in generator.uniform([90.0, -60.0], [120.0, 60.0], (50, 2))
+        if keep_out.is_free([*point, 30.0]) and keep_out.exit_from([*point, 30.0]) is None
+    )
+    play.go_to(*goal, 30.0)
+    play.run(generator.uniform(6.0, 14.0), lambda: check(play, keep_out))
+    before, speed = play.place.copy(), play.speed
+    play.driver_lives = False
+    play.to_driver.cut = play.to_autopilot.cut = bool(seed % 2)
+    play.autopilot.parameters['FS_GCS_TIMEOUT'] = 60.0
+    play.run(9.0, lambda: check(play, keep_out))
+    assert play.speed < 0.05
+    # As long as it brakes, and a second.
+    assert play.away(*before) < speed**2 / 5.0 + 1.6 * speed + 2.0
+
+
+def check(play, keep_out):
+    assert keep_out.is_free(play.place), play.place
+
+
+def test_at_home_a_drone_that_is_not_charged_lands(guided):
+    play = guided(mavlink={'home_timeout': 20.0})
+    # After its take-off it waits for a goal.
+    play.run(30.0)
+    assert play.phase is VehiclePhase.FLYING
+    play.autopilot.charge = 0.4
+    play.go_to(40.0, 0.0, 30.0).arrives().run(30.0)
+    assert play.phase is VehiclePhase.FLYING
+    play.go_to(0.0, 0.0, 30.0).arrives()
+    # One that is charged there does not.
+
+    def charge():
+        play.autopilot.charge += 0.02 * 0.001
+
+    play.run(40.0, charge)
+    assert play.phase is VehiclePhase.FLYING
+    play.until(lambda: play.phase is VehiclePhase.ENDING, 25.0).run(0.1)
+    assert play.mode == 'LAND'
+    play.until(lambda: not play.autopilot.armed, 90.0).run(2.0)
+    assert 'it has landed, as its charge, 0.44, does not rise at home' in play.fault
+    play.run(20.0)
+    assert not play.autopilot.armed and play.body.grounded
+
+
+def test_with_the_parameters_of_the_document_it_arms_only_with_a_fence(monkeypatch):
+    play = GuidedPlay(monkeypatch, mavlink={'fence': 'none'}).run(20.0)
+    assert not play.autopilot.armed
+    assert 'PreArm: Fences enabled, but none selected' in play.said
+    play = GuidedPlay(monkeypatch).fly()
+    assert 'fence: uploaded and verified, 4 vertices and circles' in play.said
