@@ -78,10 +78,12 @@ class Coordinator:
         self.area = area
         self.finished, self._ended = None, False
         self.exploration.take_area(area)
+        # Waypoints in closed zones are dropped at each decision.
+        lasting = Area(area.settings.without_keep_outs())
         for name, plan in self.plans.items():
             plan.motion.take_area(area, plan.radius)
             plan.candidates = CandidateSet(
-                plan.candidates.settings, area, self.settings.robots[name].start[2]
+                plan.candidates.settings, lasting, self.settings.robots[name].start[2]
             )
             if plan.exploration is not None:
                 plan.exploration.take_area(area)
@@ -144,7 +146,7 @@ class Coordinator:
         self.homing.update(step, robots, self.settings.step)
         if self.finished is None and not self._closed() and self.homing.exhausted(step, robots):
             explored = 100.0 * self.exploration.explored_fraction()
-            self.finished = f'{NOTHING_AFFORDABLE} ({explored:.1f} % is explored)'
+            self.finished = f'{NOTHING_AFFORDABLE} ({explored:.1f} % of the environment is explored)'
         errands = self.homing.errands(step, robots, self.finished is not None)
         asked = [name for name in self.planning(step, robots) if name not in errands]
         cut_off = [

@@ -1,6 +1,7 @@
 """Home in time: no robot's battery is empty before it is home, whatever the planner."""
 
 import copy
+import itertools
 import math
 
 import numpy as np
@@ -9,12 +10,12 @@ from small_field import SMALL_FIELD
 
 from maasi_filter.area import Area
 from maasi_planner import MotionSettings, RobotState, make_motion
-from maasi_planner.endurance import Endurance, EnduranceSettings
+from maasi_planner.endurance import Endurance, EnduranceSettings, Phase
 from maasi_planner.planners import Planner
 from maasi_planner.team import Decision, single_choice
 from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.search import search
-from maasi_sim.simulation.robots import Battery
+from maasi_sim.simulation.robots import Simulation
 
 IDLE, MOTION = 100.0, 20.0  # W, and W for each m/s
 
@@ -33,46 +34,96 @@ class Careless(Planner):
         return decision
 
 
-def scenario(rng):
-    """Return a search with two drones whose batteries hold a fifth less than they say."""
+AREAS = {
+    'bounds': {'bounds': [[0.0, 200.0], [0.0, 200.0]]},
+    # A corridor between two fields, and a hole.
+    'corridor': {
+        'area': (
+            'POLYGON ((0 0, 90 0, 90 90, 110 90, 110 0, 200 0, 200 200, 110 200, 110 100, 90 100, '
+            '90 200, 0 200, 0 0), (140 90, 170 90, 170 120, 140 120, 140 90))'
+        )
+    },
+}
+
+
+def scenario(rng, weak, area='bounds'):
+    """Return a search with two drones, whose batteries may hold a fifth less than they say."""
     capacity = float(rng.uniform(12e3, 25e3))
     drone = {
         'type': 'ranging_drone',
         'candidates': {'grid': [8, 8], 'spacing': 25.0, 'corner': [12.5, 12.5]},
+        'motion': {'clearance': 0.5, 'tolerance': 0.5},
         'sensor': {'detection': {'kind': 'box', 'lower': [-15.0] * 3, 'upper': [15.0] * 3}},
+        'odometry': {'position_noise': 0.0, 'heading_noise': 0.0, 'velocity_noise': 0.0},
         'endurance': {'per_second': IDLE / capacity, 'per_metre': MOTION / capacity},
         'battery': {
-            'capacity': 0.8 * capacity,
+            'capacity': (0.8 if weak else 1.0) * capacity,
             'idle_power': IDLE,
             'motion_power': MOTION,
             'charging_power': 1000.0,
         },
     }
+    starts = rng.uniform(5.0, 85.0, 2), rng.uniform(115.0, 195.0, 2)
     values = copy.deepcopy(SMALL_FIELD) | {
-        'environment': {'bounds': [[0.0, 200.0], [0.0, 200.0]], 'expected_targets': 8.0},
+        'environment': AREAS[area] | {'expected_targets': 8.0},
         'targets': {'count': 8, 'separation': 5.0, 'margin': 5.0},
         'robots': {
-            name: drone | {'start': [*rng.uniform(5.0, 195.0, 2).tolist(), 10.0]} for name in 'ab'
+            name: drone | {'start': [*start.tolist(), 10.0]} for name, start in zip('ab', starts)
         },
         'limits': {'time': 150.0},
     }
     return scenario_from_values(values, 'test')
 
 
+class Watch:
+    """The true positions and charges of the robots of a search, step by step."""
+
+    def __init__(self, monkeypatch):
+        self.positions, self.charges, self.homes, advance = [], [], [], Simulation.advance
+        self.radii = np.zeros(0)
+
+        def watched(simulation):
+            advance(simulation)
+            robots = [simulation.robots[name] for name in sorted(simulation.robots)]
+            self.positions.append([robot.state.pose.position for robot in robots])
+            self.charges.append([robot.battery.charge for robot in robots])
+            self.radii = np.array([robot.settings.radius for robot in robots])
+
+        monkeypatch.setattr(Simulation, 'advance', watched)
+
+    def clear(self):
+        self.positions, self.charges = [], []
+
+    def lowest(self):
+        """Return the lowest charge of all."""
+        return float(np.min(self.charges))
+
+    def on_arrival(self):
+        """Return the charges with which robots came home: where they begin to rise."""
+        rises = np.diff(np.array(self.charges), axis=0) > 0.0
+        begins = rises[1:] & ~rises[:-1]
+        return np.array(self.charges)[1:-1][begins]
+
+    def nearest(self):
+        """Return the least distance of two robots beyond their radii [m]; inf of a single one."""
+        places, least = np.array(self.positions), math.inf
+        for i, j in itertools.combinations(range(places.shape[1]), 2):
+            gaps = np.linalg.norm(places[:, i] - places[:, j], axis=1)
+            least = min(least, float(gaps.min() - self.radii[i] - self.radii[j]))
+        return least
+
+
 # Two hundred searches take minutes.
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize('planner', ['maasi', 'tour', 'lawnmower', 'nearest_widest', Careless])
 def test_nobody_runs_dry_and_who_is_charged_comes_back(planner, monkeypatch, request):
-    lowest, drain = [], Battery.drain
-
-    def watched(battery, *arguments):
-        drain(battery, *arguments)
-        lowest.append(battery.charge)
-
-    monkeypatch.setattr(Battery, 'drain', watched)
-    homes = 0
+    watch, homes = Watch(monkeypatch), 0
     for seed in range(*request.config.getoption('--search-seeds')):
-        result = search(scenario(np.random.default_rng(seed)), seed, planner=planner)
+        rng = np.random.default_rng(seed)
+        weak, area = bool(seed % 2), ('bounds', 'corridor')[seed // 2 % 2]
+        made = scenario(rng, weak, area)
+        watch.clear()
+        result = search(made, seed, planner=planner)
         for name in 'ab':
             reasons = [
                 decision.robots[name].reason
@@ -83,7 +134,14 @@ def test_nobody_runs_dry_and_who_is_charged_comes_back(planner, monkeypatch, req
             homes += len(home)
             # It decides again after it was charged.
             assert all(i + 1 in home or i + 1 < len(reasons) for i in home[:-1])
-    assert min(lowest) > 0.0 and homes >= 4
+        endurance = made.robots['a'].endurance
+        speed = made.robots['a'].motion.speed
+        step = made.step * (endurance.per_second + endurance.per_metre * speed)
+        # A battery that holds less is known after a while only.
+        least = endurance.reserve - (0.05 if weak else 0.0) - step
+        assert watch.lowest() > 0.0 and watch.nearest() >= 0.0
+        assert (watch.on_arrival() >= least).all(), (seed, watch.on_arrival())
+    assert homes >= 4
 
 
 def test_a_way_is_afforded_if_the_way_home_is_left_with_the_reserve():
@@ -108,7 +166,7 @@ def test_a_way_is_afforded_if_the_way_home_is_left_with_the_reserve():
     assert endurance.must_return([200.0, 0.0, 0.0]) and not endurance.must_return([10.0, 0.0, 0.0])
     endurance.hear(-1.0)
     assert not endurance.must_return([200.0, 0.0, 0.0])
-    endurance.charging = True
+    endurance.begin(Phase.CHARGING)
     endurance.hear(0.94)
     assert endurance.charging
     endurance.hear(0.96)

@@ -72,6 +72,10 @@ class Planner(ABC):
         """The planner's own settings."""
         return self.settings.settings
 
+    def take_settings(self, settings: PlannerSettings) -> None:
+        """Take other numbers while it plans; they are used from its next decision on."""
+        self.settings = settings
+
     @abstractmethod
     def decide(self, team: TeamView) -> Decision:
         """Return a decision for every robot in the team that plans.
@@ -89,6 +93,15 @@ class Planner(ABC):
         if explored < self.settings.explored_threshold:
             return None
         return self._settled(team, f'{100.0 * explored:.1f} % of the environment is explored')
+
+    def searching(self, team: TeamView) -> list[str]:
+        """Return the names of the robots that still search, in order: not those that are done."""
+        views = team.robots
+        return [
+            name
+            for name in team.names()
+            if (endurance := views[name].endurance) is None or not endurance.done_reason
+        ]
 
     def _settled(self, team: TeamView, reason: str) -> str | None:
         return None if self.heavy(team) else f'{reason} and no potential target is left'
@@ -428,9 +441,10 @@ def _wait_near(
     view = team.robots[name]
     here, motion, taken = view.state.pose.position, view.motion, 'all chargers are taken'
     places = [(path[-1], radius) for path, radius in _paths(team, name, others)]
-    reach = 4.0 * (view.radius + max(radius for _, radius in places))
-    reach += 4.0 * motion.settings.tolerance
-    if math.dist(here, charger) <= 1.5 * reach:
+    # Far enough that the robot at the charger can leave it.
+    reach = 3.0 * (view.radius + max(radius for _, radius in places))
+    reach += 2.0 * motion.settings.tolerance
+    if math.dist(here, charger) <= 1.25 * reach:
         return stay(view, f'waits: {taken}')
     turns = np.linspace(0.0, 2.0 * math.pi, 8, endpoint=False)
     turns += math.atan2(here[1] - charger[1], here[0] - charger[0])
