@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -10,13 +11,25 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.detection import DetectionModel
+from maasi_filter.models.detection import (
+    BOX,
+    CUSTOM,
+    REACH,
+    DetectionModel,
+    detection_probability_at,
+)
 from maasi_filter.models.pose import Pose
 
-_PARTS = 5  # places along each axis at which the density of a cell is sampled
+# Positions along each axis at which the density of a cell is sampled, and those on an axis of a
+# fine map, of which a cell has fewer.
+_PARTS, _SAMPLES = 5, 1000
 # Cells along the mean side of the environment, in 2D and 3D.
 CELLS = {2: 54, 3: 13}
 MAXIMUM_NODES = 20_000_000
+# A swath is at least so many cells wide, unless that takes more than so many cells: with 1,000,000
+# decisions take 0.1 s.
+SWATH_CELLS, MOST_CELLS = 3.0, 1_000_000
+_ROUNDING = 1e-9  # of shares of cells that are open
 
 
 @njit(cache=True, error_model='numpy')
@@ -66,6 +79,63 @@ def default_spacing(bounds: FloatArray) -> float:
     return float(np.prod(size)) ** (1.0 / len(bounds)) / CELLS[len(bounds)]
 
 
+def spacing_for(bounds: FloatArray, swath: float) -> tuple[float, bool]:
+    """Return the spacing of a grid on which a swath is explored, and whether it is too coarse.
+
+    It is that of `default_spacing`, or a third of the swath where that is less, as far as the grid
+    has at most `MOST_CELLS` cells. It is too coarse if the swath is narrower than a cell.
+
+    swath: width of what the sensor that sees least detects on passing [m]; may be infinite.
+    """
+    size = bounds[:, 1] - bounds[:, 0]
+    least = (float(np.prod(size)) / MOST_CELLS) ** (1.0 / len(bounds))
+    spacing = min(default_spacing(bounds), max(swath / SWATH_CELLS, least))
+    return spacing, spacing > swath
+
+
+def reach_of(detection: DetectionModel) -> tuple[float, float]:
+    """Return the level and the vertical distance beyond which pi is 0 [m]; inf if there is none."""
+    kind, parameters = detection.kernel()
+    if kind == CUSTOM:
+        return float(parameters[REACH]), float(parameters[REACH])
+    if kind != BOX:
+        return math.inf, math.inf
+    x, y, z = np.maximum(np.abs(parameters[1:4]), np.abs(parameters[4:7])).tolist()
+    edge = 2.0 * float(parameters[7])
+    return math.hypot(x, y) + edge, z + edge
+
+
+@njit(cache=True, error_model='numpy')
+def _update_near(
+    values: FloatArray,
+    lower: FloatArray,
+    step: FloatArray,
+    kernel: tuple[int, FloatArray],
+    pose: tuple[FloatArray, float, float],
+    reach: tuple[float, float],
+    solid: bool,
+) -> None:
+    """Multiply values (nx, ny, nz) by 1 - pi at the nodes within the reach of a pose."""
+    place, cosine, sine = pose
+    kind, parameters = kernel
+    low, high = np.zeros(3, np.int64), np.ones(3, np.int64)
+    for axis in range(3 if solid else 2):
+        middle, last = (place[axis] - lower[axis]) / step[axis], float(values.shape[axis])
+        width = (reach[1] if axis == 2 else reach[0]) / step[axis]
+        # Bounded as floats: what is far away or infinite is no integer.
+        low[axis] = np.int64(min(max(np.floor(middle - width), 0.0), last))
+        high[axis] = np.int64(min(max(np.ceil(middle + width) + 1.0, 0.0), last))
+    for i in range(low[0], high[0]):
+        dx = lower[0] + step[0] * i - place[0]
+        for j in range(low[1], high[1]):
+            dy = lower[1] + step[1] * j - place[1]
+            for k in range(low[2], high[2]):
+                dz = lower[2] + step[2] * k - place[2] if solid else 0.0
+                values[i, j, k] *= 1.0 - detection_probability_at(
+                    kind, parameters, dx, dy, dz, cosine, sine
+                )
+
+
 class UnexploredMap:
     """The exploration function e on a grid: 1 is unseen, 0 is explored.
 
@@ -85,6 +155,9 @@ class UnexploredMap:
         Spacing used on each axis, metres.
     volume : float
         Of the area, m^d.
+    ground : array
+        Of the shape of `values`: the volume that each node stands for times its density, of all
+        that is or was open since the map was made.
 
     Raises
     ------
@@ -114,33 +187,59 @@ class UnexploredMap:
         height = [0.0] * (3 - self.dimension)
         self._lower = np.array([*self.bounds[:, 0], *height])
         self._step = np.array([*self.step, *height])
-        grids = np.meshgrid(*self.axes(), indexing='ij')
-        # One row for each axis, as kernels read them.
-        self._nodes = np.array([grid.ravel() for grid in grids]).T
         cells = np.ones(())
         for number, step in zip(shape, self.step):
             lengths = np.full(number, step)
             lengths[[0, -1]] *= 0.5
             cells = np.multiply.outer(cells, lengths)
         self._cells = cells
-        self.take_area(area)
+        self._take(area)
+        self.ground, self._ever_open = self._volumes, self._open
 
     def take_area(self, area: Area) -> None:
-        """Take another area within the same bounds; e stays."""
+        """Take another area within the same bounds; e stays.
+
+        Ground that is closed now still counts as ground, and what was never open before does from
+        now on.
+        """
+        self._take(area)
+        opened = np.broadcast_to(self._open > self._ever_open + _ROUNDING, self._values.shape)
+        opened = opened.reshape(self.values.shape)
+        if not opened.any():
+            return
+        # Both are relative to their own areas: what neither closed nor opened tells the scale.
+        same = (np.abs(self._open - self._ever_open) <= _ROUNDING) & (self._open > 0.0)
+        same = np.broadcast_to(same, self._values.shape).reshape(self.values.shape)
+        same = same & (self._volumes > 0.0)
+        scale = float(np.median(self.ground[same] / self._volumes[same])) if same.any() else 1.0
+        added = np.maximum(self.ground, scale * self._volumes)
+        self.ground = np.where(opened, added, self.ground)
+        self._ever_open = np.maximum(self._open, self._ever_open)
+
+    def _take(self, area: Area) -> None:
         self.area, self.volume = area, area.volume
         #: Prior times inside at the nodes, (nx, ny, 1), with mean 1 over the area; 1: uniform.
         self.density = np.ones((1, 1, 1))
+        # Share of each cell where targets may be.
+        self._open = np.ones((1, 1, 1))
         self._volumes = self._cells
         if area.uniform:
             return
-        parts = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
+        shape = self._values.shape[:2]
+        number = [min(_PARTS, -(-_SAMPLES // count)) for count in shape]
         x, y = (
-            np.clip(axis[:, None] + parts * step, low, high)
-            for axis, step, (low, high) in zip(self.axes()[:2], self.step, self.bounds)
+            np.clip(axis[:, None] + ((np.arange(n) + 0.5) / n - 0.5) * step, low, high)
+            for n, axis, step, (low, high) in zip(number, self.axes(), self.step, self.bounds)
         )
-        places = np.stack(np.meshgrid(x.ravel(), y.ravel(), indexing='ij'), axis=-1)
-        density = area.density(places.reshape(-1, 2)).reshape(*x.shape, *y.shape)
-        self.density = density.mean(axis=(1, 3))[:, :, None]
+        self.density, self._open = np.empty((2, *shape, 1))
+        # Row by row: all samples of a fine map take much memory.
+        rows = max(1, _SAMPLES**2 // (number[0] * y.size))
+        for first in range(0, shape[0], rows):
+            part = x[first : first + rows]
+            places = np.stack(np.meshgrid(part.ravel(), y.ravel(), indexing='ij'), axis=-1)
+            density = area.density(places.reshape(-1, 2)).reshape(*part.shape, *y.shape)
+            self.density[first : first + rows, :, 0] = density.mean(axis=(1, 3))
+            self._open[first : first + rows, :, 0] = (density > 0.0).mean(axis=(1, 3))
         volumes = self._cells.reshape(self._values.shape) * self.density
         self._volumes = volumes.reshape(self.values.shape)
 
@@ -158,14 +257,26 @@ class UnexploredMap:
         """Return the positions of all nodes, (n, d), in the order of `values.ravel()`."""
         return self._nodes
 
+    @cached_property
+    def _nodes(self) -> FloatArray:
+        grids = np.meshgrid(*self.axes(), indexing='ij')
+        # One row for each axis, as kernels read them.
+        return np.array([grid.ravel() for grid in grids]).T
+
     def kernel(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return (values (nx, ny, nz), lower (3,), step (3,)) for `interpolate_at`."""
         return self._values, self._lower, self._step
 
     def update(self, detection: DetectionModel, pose: Pose) -> None:
         """Multiply e by 1 - pi for one measurement at `pose` (000, eq. (20))."""
-        missed = 1.0 - detection.probability(self._nodes, pose)
-        self._values *= missed.reshape(self._values.shape)
+        reach = reach_of(detection)
+        if math.isinf(reach[0]):
+            missed = 1.0 - detection.probability(self._nodes, pose)
+            self._values *= missed.reshape(self._values.shape)
+            return
+        turn = pose.position, math.cos(pose.yaw), math.sin(pose.yaw)
+        solid = self.dimension == 3
+        _update_near(*self.kernel(), detection.kernel(), turn, reach, solid)
 
     def diffuse(self, variance: float) -> None:
         """Diffuse e as for targets in a random walk, `variance` [m^2], with reflecting bounds."""
@@ -198,7 +309,7 @@ class UnexploredMap:
         """Return the volume (2D: area) each node stands for times its density, as `values`.
 
         The trapezoid rule: half a step at the ends of each axis. The density is prior times inside,
-        with mean 1 over the area.
+        with mean 1 over the area; closed ground has 0.
         """
         return self._volumes
 
@@ -211,11 +322,24 @@ class UnexploredMap:
         return np.asarray(shown.reshape(self.values.shape))
 
     def explored_fraction(self) -> float:
-        """Return 1 - mean of e over the environment, in [0, 1]."""
-        return 1.0 - float((self._volumes * self.values).sum() / self._volumes.sum())
+        """Return 1 - mean of e over the ground, in [0, 1]; also over what is closed now."""
+        return 1.0 - float((self.ground * self.values).sum() / self.ground.sum())
+
+    def closed_share(self) -> float:
+        """Return the share of the expected targets that is unseen on ground that is closed now.
+
+        That is ground which was open once, as below a keep-out that came later.
+        """
+        closed = self._ever_open - self._open > _ROUNDING
+        if not closed.any():
+            return 0.0
+        left = np.where(closed, 1.0 - self._open / np.maximum(self._ever_open, _ROUNDING), 0.0)
+        left = np.broadcast_to(left, self._values.shape).reshape(self.values.shape)
+        return float((left * self.ground * self.values).sum() / self.ground.sum())
 
     def copy(self) -> UnexploredMap:
         """Return an independent copy."""
         other = UnexploredMap(self.area, self.spacing)
         other._values[...] = self._values
+        other.ground, other._ever_open = self.ground, self._ever_open
         return other

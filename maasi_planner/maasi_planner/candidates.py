@@ -10,9 +10,15 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.models.detection import BOX, CUSTOM, detection_probability_at
+from maasi_filter.models.detection import (
+    BOX,
+    CUSTOM,
+    EXPONENTIAL,
+    GAUSSIAN,
+    detection_probability_at,
+)
 from maasi_filter.models.sensor import Sensor
-from maasi_filter.unexplored_map import UnexploredMap
+from maasi_filter.unexplored_map import UnexploredMap, spacing_for
 from maasi_planner.objective.predicted_measurements import reach_of
 from maasi_planner.settings import CandidateSettings
 
@@ -251,6 +257,33 @@ def half_view(sensor: Sensor) -> float:
         return 0.5 * float((high - low).min())
     scale = float(parameters[1:3].max())
     return 1.0 / scale if scale > 0.0 else math.inf
+
+
+def swath_of(sensor: Sensor) -> float:
+    """Return how wide a sensor sees with half of its best detection or more [m]; inf: everything.
+
+    Of a box it is the smaller side.
+    """
+    kind, width = sensor.detection.kernel()[0], 2.0 * half_view(sensor)
+    if kind == EXPONENTIAL:
+        return width * 2.0 * math.log(2.0)
+    return width * math.sqrt(2.0 * math.log(2.0)) if kind == GAUSSIAN else width
+
+
+def map_spacing(bounds: FloatArray, sensors: Iterable[Sensor]) -> tuple[float, str]:
+    """Return the spacing of the exploration map for a team [m], and a warning, which may be empty.
+
+    The warning says that the map is coarser than what the sensor that sees least detects.
+    """
+    swath = min(map(swath_of, sensors), default=math.inf)
+    spacing, coarse = spacing_for(bounds, swath)
+    if not coarse:
+        return spacing, ''
+    return spacing, (
+        f'the exploration map has cells of {spacing:.3g} m, but a sensor sees a swath of only '
+        f'{swath:.3g} m: what is explored is counted too low; search a smaller area, or set '
+        'filter.exploration_spacing [m]'
+    )
 
 
 def _parts(grid: UnexploredMap, seen: BoolArray) -> Unseen:

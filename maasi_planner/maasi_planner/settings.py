@@ -271,8 +271,13 @@ class PlannerSettings(Settings):
     mass_threshold: Positive = Field(
         0.1, description='Mass of a cluster that is still worth a visit [1]'
     )
-    gain_threshold: NotNegative = Field(
-        1e-3, description='Gain of all candidates below which nothing is left, information only [1]'
+    gain_threshold: float = Field(
+        1e-4,
+        ge=0.0,
+        lt=1.0,
+        description='Share of the expected targets that are unseen where robots can go on at which '
+        'the search may end: of all (tour), of those that the candidates showed at most (maasi '
+        'with information) [1]',
     )
     horizon: int = Field(1, ge=1, le=3, description='maas: waypoints planned ahead [1]')
     agent_exploration: Literal['own', 'shared'] = Field(

@@ -20,6 +20,12 @@ class Auto(Planner):
         super().__init__(settings)
         self._chosen: Planner | None = None
 
+    def take_settings(self, settings: PlannerSettings) -> None:
+        """See `Planner.take_settings`; also of the planner that it has chosen."""
+        super().take_settings(settings)
+        if self._chosen is not None:
+            self._chosen.take_settings(settings.renamed(self._chosen.settings.name))
+
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
         planner = self._choice(team)

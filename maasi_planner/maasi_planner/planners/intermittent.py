@@ -1,8 +1,11 @@
 """Active search with intermittent measurements, ASI and MAASI (000, sections 4 and 6)."""
 
-from maasi_filter.arrays import FloatArray
+from numba import njit
+
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_planner.objective.joint_search import search
 from maasi_planner.objective.team_objective import TeamObjective
+from maasi_planner.objective.terms import Terms
 from maasi_planner.planners.base import Planner, centres_of, explain, usable_options
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, TeamView, single_choice, stay
@@ -18,7 +21,10 @@ class Intermittent(Planner):
 
     def __init__(self, settings: PlannerSettings) -> None:
         super().__init__(settings)
+        # Of each robot, how many unseen targets its candidates show together: at its last decision,
+        # and at most until now.
         self._prospects: dict[str, float] = {}
+        self._most: dict[str, float] = {}
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
@@ -28,18 +34,19 @@ class Intermittent(Planner):
             return explain(decision)
         objective, weights = TeamObjective(team, self.settings, options), self.settings.weights()
         chosen, decision.objective, decision.exact, decision.evaluated = search(
-            objective.table, objective.alone[:, 2], self.settings
+            objective.table, objective.bounds, self.settings
         )
         for index, name in enumerate(objective.names):
             option, terms = options[name], objective.given(index, chosen)
+            first, last = objective.start[index : index + 2].tolist()
             if weights.information:
-                gains = weights.alpha * terms[:, 0] + weights.beta * terms[:, 1]
-                self._prospects[name] = float(gains[option.allowed].max(initial=0.0))
+                shown = _shown_by(objective.table.terms, first, last, option.allowed)
+                self._prospects[name] = shown
+                self._most[name] = max(shown, self._most.get(name, 0.0))
             if chosen[index] < 0:
                 reason = 'stays: another robot is sent to every candidate'
                 decision.robots[name] = stay(team.robots[name], reason)
                 continue
-            first, last = objective.start[index : index + 2].tolist()
             best = int(chosen[index]) - first
             refinement, exploration, value = terms[best]
             reason = (
@@ -61,15 +68,18 @@ class Intermittent(Planner):
         return centres_of(team, team.robots[name], heavy) if heavy else None
 
     def finished(self, team: TeamView) -> str | None:
-        """See `Planner.finished`; also when no candidate of any robot has an expected gain."""
+        """See `Planner.finished`; also when the candidates of no robot show much any more.
+
+        That is judged by the share that they show together of what they showed at most.
+        """
         reason = super().finished(team)
         if reason is not None or self.settings.objective == 'paper':
             return reason
-        known = [name for name in team.names() if name in self._prospects]
-        if len(known) < len(team.robots) or not known:
+        names = self.searching(team)
+        if not names or not all(name in self._prospects for name in names):
             return None
-        largest = max(self._prospects[name] for name in known)
-        if largest > self.settings.gain_threshold:
+        least = self.settings.gain_threshold
+        if any(self._prospects[name] > least * self._most[name] for name in names):
             return None
         explored = 100.0 * team.exploration.explored_fraction()
         return self._settled(
@@ -77,3 +87,14 @@ class Intermittent(Planner):
             f'no candidate of any robot promises to show more ({explored:.1f} % of the '
             'environment is explored)',
         )
+
+
+@njit(cache=True)
+def _shown_by(terms: Terms, first: int, last: int, allowed: BoolArray) -> float:
+    """Return how many unseen targets the allowed candidates from `first` on show together."""
+    left = terms.unseen.copy()
+    for g in range(first, last):
+        if allowed[g - first]:
+            for i in range(terms.first[g], terms.first[g + 1]):
+                left[terms.node[i]] *= terms.miss[i]
+    return float((terms.unseen - left).sum())

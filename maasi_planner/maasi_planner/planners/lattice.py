@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import functools
+import heapq
 import itertools
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import half_view
@@ -23,8 +24,9 @@ OVERLAP = 0.3
 LEAST = 0.01
 # Squares of half the best detection in an area from which on lanes of them are regular enough.
 MANY = 30
-# Parts of a cell of the map along each axis: each lies in one square. Even: none on a border.
-PARTS = 4
+# Parts of a cell of the map along each axis: each lies in one square. Even: none on a border. On
+# fine maps, with more than so many parts, there are fewer.
+PARTS, FEWER, FINE = 4, 2, 2_000_000
 # A square that holds less than this share of a whole one belongs to its neighbour.
 SMALL = 0.3
 # A square of which less than this share is unseen is passed in the middle of that.
@@ -112,24 +114,27 @@ class Lattice:
         detected: FloatArray,
         heading: float = 0.0,
     ) -> None:
-        d = exploration.dimension
+        d, nodes = exploration.dimension, exploration.values.size
         self.turn, self.pitch = turned(heading, d), pitch_of(exploration, beside, detected)
-        places, sizes, cells = _samples(exploration)
+        parts = PARTS if nodes * PARTS**d <= FINE else FEWER
+        samples = _samples(exploration, parts)
         corners = np.array(list(itertools.product(*exploration.bounds))) @ self.turn
         low, high = corners.min(axis=0), corners.max(axis=0)
         size = np.maximum(self.pitch, exploration.step)
         counts = np.maximum(1, np.ceil((high - low) / size - 0.1)).astype(int)
         widths = (high - low) / counts
-        rows = np.clip(((places @ self.turn - low) / widths).astype(int), 0, counts - 1)
-        squares = _joined(np.ravel_multi_index(tuple(rows.T), tuple(counts)), places, sizes)
         number = int(counts.prod())
+        squares = _squares_of(samples, self.turn, low, widths, counts)
+        held, sums = _middles(samples, squares, number)
+        squares = _joined(held, sums[:, :d] / np.maximum(held, 1e-12)[:, None])[squares]
         self.shape = (*counts.tolist(), 1)[:3]
         self.trust = np.ones(number)
         # Share of each cell of the map that lies in each square.
-        shares = np.full(len(squares), float(PARTS) ** -d)
-        self._parts = csr_array((shares, (squares, cells)), (number, exploration.values.size))
-        self._cells = np.bincount(cells, sizes)
-        self._held, self._centres = _middles(squares, places, sizes, number)
+        table = _shares(squares, samples.parts, number)
+        self._parts = csr_array(table, (number, nodes))
+        self._cells = _cell_sizes(samples)
+        self._held, sums = _middles(samples, squares, number)
+        self._centres = sums[:, :d] / np.maximum(self._held, 1e-12)[:, None]
         centres = (low + (np.indices(tuple(counts)).reshape(d, -1).T + 0.5) * widths) @ self.turn.T
         whole = np.abs(self._held / widths.prod() - 1.0) < 1.0 - WHOLE
         self._centres[whole] = centres[whole]
@@ -168,40 +173,127 @@ class Lattice:
         return self.trust[chosen] * _gains(self.unseen(exploration), self.kernel, chosen)
 
 
-def _samples(exploration: UnexploredMap) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return parts of the map's cells: places (n, d) [m], sizes in the area, and cells (n,)."""
-    parts, sizes = [], []
+class _Samples(NamedTuple):
+    """Parts of the map's cells, in rows along each axis; in 2D the third one has one part.
+
+    axes: positions [m]; sizes: lengths, in 2D 1 along the third axis; inside: which cells are in
+    the area; parts: of a cell along the axes.
+    """
+
+    axes: tuple[FloatArray, FloatArray, FloatArray]
+    sizes: tuple[FloatArray, FloatArray, FloatArray]
+    inside: BoolArray
+    parts: tuple[int, int, int]
+
+
+def _samples(exploration: UnexploredMap, parts: int) -> _Samples:
+    axes: list[FloatArray] = []
+    sizes: list[FloatArray] = []
     for (low, high), nodes, step in zip(exploration.bounds, exploration.axes(), exploration.step):
         first, last = np.maximum(nodes - 0.5 * step, low), np.minimum(nodes + 0.5 * step, high)
-        shares = (np.arange(PARTS) + 0.5) / PARTS
-        parts.append((first[:, None] + shares * (last - first)[:, None]).ravel())
-        sizes.append(np.repeat((last - first) / PARTS, PARTS))
-    places = np.stack(np.meshgrid(*parts, indexing='ij'), axis=-1)
-    size = functools.reduce(np.multiply.outer, sizes).ravel()
-    rows = np.indices(places.shape[:-1]).reshape(len(parts), -1) // PARTS
-    cells = np.ravel_multi_index(tuple(rows), exploration.values.shape[: len(parts)])
-    inside = (exploration.cell_volumes() > 0.0).ravel()[cells]
-    return places.reshape(-1, len(parts)), size * inside, np.asarray(cells, np.int64)
+        shares = (np.arange(parts) + 0.5) / parts
+        axes.append((first[:, None] + shares * (last - first)[:, None]).ravel())
+        sizes.append(np.repeat((last - first) / parts, parts))
+    inside = (exploration.cell_volumes() > 0.0).reshape(exploration.kernel()[0].shape)
+    several = (parts, parts, parts)
+    if len(axes) == 2:
+        axes, sizes, several = [*axes, np.zeros(1)], [*sizes, np.ones(1)], (parts, parts, 1)
+    return _Samples((axes[0], axes[1], axes[2]), (sizes[0], sizes[1], sizes[2]), inside, several)
 
 
-def _middles(
-    squares: IntArray, places: FloatArray, sizes: FloatArray, number: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return how much of the area squares hold, (n,), and the middle of that, (n, d)."""
-    held = np.asarray(np.bincount(squares, sizes, number), dtype=float)
-    sums = [np.bincount(squares, sizes * axis, number) for axis in places.T]
-    return held, np.stack(sums, axis=1) / np.maximum(held, 1e-12)[:, None]
+@njit(cache=True)
+def _squares_of(samples, turn, low, widths, counts):  # type: ignore[no-untyped-def]
+    """Return the square that each part is in, (nx, ny, nz)."""
+    x, y, z = samples.axes
+    out = np.empty((len(x), len(y), len(z)), np.int32)
+    for i in range(len(x)):
+        for j in range(len(y)):
+            for k in range(len(z)):
+                square = 0
+                for axis in range(len(low)):
+                    along = x[i] * turn[0, axis] + y[j] * turn[1, axis]
+                    if len(low) == 3:
+                        along += z[k] * turn[2, axis]
+                    row = int((along - low[axis]) / widths[axis])
+                    square = square * counts[axis] + min(max(row, 0), counts[axis] - 1)
+                out[i, j, k] = square
+    return out
 
 
-def _joined(squares: IntArray, places: FloatArray, sizes: FloatArray) -> IntArray:
-    """Return the squares of samples (n,), those that hold little joined with the nearest others."""
-    number = int(squares.max()) + 1
-    held, middles = _middles(squares, places, sizes, number)
+@njit(cache=True)
+def _size(samples, i, j, k):  # type: ignore[no-untyped-def]
+    a, b, c = samples.parts
+    inside = samples.inside[i // a, j // b, k // c]
+    return samples.sizes[0][i] * samples.sizes[1][j] * samples.sizes[2][k] if inside else 0.0
+
+
+@njit(cache=True)
+def _middles(samples, squares, number):  # type: ignore[no-untyped-def]
+    """Return how much of the area squares hold, (n,), and the sum of that times place, (n, 3)."""
+    held, sums = np.zeros(number), np.zeros((number, 3))
+    x, y, z = samples.axes
+    for i in range(len(x)):
+        for j in range(len(y)):
+            for k in range(len(z)):
+                square, size = squares[i, j, k], _size(samples, i, j, k)
+                held[square] += size
+                sums[square, 0] += size * x[i]
+                sums[square, 1] += size * y[j]
+                sums[square, 2] += size * z[k]
+    return held, sums
+
+
+@njit(cache=True)
+def _cell_sizes(samples):  # type: ignore[no-untyped-def]
+    """Return how much of the area each cell of the map holds, (n,)."""
+    out = np.zeros(samples.inside.shape)
+    a, b, c = samples.parts
+    for i in range(len(samples.axes[0])):
+        for j in range(len(samples.axes[1])):
+            for k in range(len(samples.axes[2])):
+                out[i // a, j // b, k // c] += _size(samples, i, j, k)
+    return out.ravel()
+
+
+@njit(cache=True)
+def _shares(squares, parts, number):  # type: ignore[no-untyped-def]
+    """Return the share of each cell in each square: data, cells, and where the squares begin."""
+    a, b, c = parts
+    shape = squares.shape[0] // a, squares.shape[1] // b, squares.shape[2] // c
+    begin, last = np.zeros(number + 1, np.int64), np.zeros(number, np.int64)
+    data, cells = np.zeros(0), np.zeros(0, np.int64)
+    # First how many cells each square has; cells come in order, so its last one is the same or not.
+    for fill in range(2):
+        last[:] = -1
+        used = begin[:-1].copy()
+        for cell in range(shape[0] * shape[1] * shape[2]):
+            i, j = cell // (shape[1] * shape[2]), cell // shape[2] % shape[1]
+            k = cell % shape[2]
+            for square in squares[
+                i * a : (i + 1) * a, j * b : (j + 1) * b, k * c : (k + 1) * c
+            ].flat:
+                if last[square] != cell:
+                    last[square] = cell
+                    used[square] += 1
+                if fill:
+                    cells[used[square] - 1] = cell
+                    data[used[square] - 1] += 1.0 / (a * b * c)
+        if not fill:
+            begin[1:] = np.cumsum(used)
+            data, cells = np.zeros(begin[-1]), np.zeros(begin[-1], np.int64)
+    return data, cells, begin
+
+
+def _joined(held: FloatArray, middles: FloatArray) -> IntArray:
+    """Return for each square itself, or for one that holds little the nearest other one, (n,).
+
+    held (n,): how much of the area squares hold; middles (n, d): the middle of that [m].
+    """
     small = (held > 0.0) & (held < SMALL * held.max())
     large = np.flatnonzero(held >= SMALL * held.max())
-    owner = np.arange(number)
+    owner = np.arange(len(held))
     owner[small] = large[cKDTree(middles[large]).query(middles[small])[1]]
-    return owner[squares]
+    return owner.astype(np.int32)
 
 
 @njit(cache=True)
@@ -235,20 +327,21 @@ def _choose(unseen, kernel, trust, overlap, least, enough):  # type: ignore[no-u
     alone = np.empty(unseen.size)
     for place in range(unseen.size):
         alone[place] = trust[place] * _seen(unseen, kernel, place, False)
-    # What a place adds only falls: it is computed again when it is the largest one.
-    bound, fresh = alone.copy(), np.full(unseen.size, -1)
     chosen, gains = np.empty(unseen.size, np.int64), np.empty(unseen.size)
     number, least = 0, least * alone.max()
-    while True:
-        place = int(np.argmax(bound))
-        if bound[place] <= least or number == unseen.size:
-            return chosen[:number], gains[:number]
-        if fresh[place] < number:
-            bound[place] = trust[place] * _seen(unseen, kernel, place, False)
-            fresh[place] = number
-            if number >= enough and bound[place] < overlap * alone[place]:
-                bound[place] = 0.0
+    # What a place adds only falls: it is computed again when it is the largest one. Of equal ones
+    # the first is taken.
+    queue = [(-alone[place], place, -1) for place in range(unseen.size) if alone[place] > least]
+    heapq.heapify(queue)
+    while queue:
+        bound, place, fresh = heapq.heappop(queue)
+        if -bound <= least:
+            break
+        if fresh < number:
+            left = trust[place] * _seen(unseen, kernel, place, False)
+            if number < enough or left >= overlap * alone[place]:
+                heapq.heappush(queue, (-left, place, number))
             continue
         chosen[number], gains[number] = place, trust[place] * _seen(unseen, kernel, place, True)
-        bound[place] = 0.0
         number += 1
+    return chosen[:number], gains[:number]

@@ -12,7 +12,15 @@ from maasi_filter.arrays import FloatArray
 from maasi_planner.candidates import half_view
 from maasi_planner.planners.base import Planner, explain, held_back
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
+from maasi_planner.team import (
+    SAVES_BATTERY,
+    Decision,
+    RobotDecision,
+    RobotView,
+    TeamView,
+    single_choice,
+    stay,
+)
 
 
 def lanes(
@@ -56,6 +64,11 @@ class Lawnmower(Planner):
         self._blocks: list[list[FloatArray]] = []
         self._side: dict[str, tuple[int, int]] = {}
         self._pending: dict[str, list[FloatArray]] = {}
+        # Lanes that some robots cannot afford with a full battery, and these robots.
+        self._too_far: list[tuple[FloatArray, set[str]]] = []
+        # Of each robot the lane that it is on, and the robots that could not afford that.
+        self._lane: dict[str, FloatArray] = {}
+        self._refused: dict[str, set[str]] = {}
         self._started = False
 
     def _spacing(self, team: TeamView) -> float:
@@ -109,21 +122,35 @@ class Lawnmower(Planner):
             members = self._blocks[block]
             if not members:
                 continue
-            lane = members.pop(0 if side == 0 else -1)
-            view = team.robots[name]
-            here = view.state.pose.position
-            ends = [lane[0].copy(), lane[1].copy()]
-            if team.dimension == 2:
-                height = view.candidates[0, 2] if len(view.candidates) else here[2]
-                for end in ends:
-                    end[2] = height
-            # Start from the nearer end.
-            gaps = [float(((end - here) ** 2).sum()) for end in ends]
-            if gaps[1] < gaps[0]:
-                ends.reverse()
-            self._pending[name] = [ends[1]]
-            return ends[0]
+            return self._begin(team, name, members.pop(0 if side == 0 else -1))
+        for row, (lane, names) in enumerate(self._too_far):
+            if name not in names:
+                del self._too_far[row]
+                return self._begin(team, name, lane, names)
         return None
+
+    def _begin(
+        self, team: TeamView, name: str, lane: FloatArray, refused: set[str] | None = None
+    ) -> FloatArray:
+        """Put a robot on a lane; return the nearer end. refused: by these robots."""
+        view = team.robots[name]
+        here = view.state.pose.position
+        ends = [lane[0].copy(), lane[1].copy()]
+        if team.dimension == 2:
+            height = view.candidates[0, 2] if len(view.candidates) else here[2]
+            for end in ends:
+                end[2] = height
+        gaps = [float(((end - here) ** 2).sum()) for end in ends]
+        if gaps[1] < gaps[0]:
+            ends.reverse()
+        self._pending[name] = [ends[1]]
+        self._lane[name], self._refused[name] = lane, refused or set()
+        return ends[0]
+
+    def _give_up(self, name: str) -> None:
+        """Leave the lane of a robot to others, as it cannot afford it with a full battery."""
+        self._pending[name] = []
+        self._too_far.append((self._lane[name], self._refused[name] | {name}))
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
@@ -136,11 +163,11 @@ class Lawnmower(Planner):
 
     def _decide_one(self, team: TeamView, name: str, decision: Decision) -> RobotDecision:
         view = team.robots[name]
-        here = view.state.pose.position
+        here, out_of_reach = view.state.pose.position, 'stays: all lanes are done'
         while True:
             target = self._next(team, name)
             if target is None:
-                return stay(view, 'stays: all lanes are done')
+                return stay(view, out_of_reach)
             point = view.motion.keep_out.moved_out(here, target)
             if point is None:
                 continue
@@ -148,17 +175,40 @@ class Lawnmower(Planner):
             if not prediction.reached[0] or prediction.lengths[0] == 0:
                 continue
             if held := held_back(team, name, prediction, decision):
+                if SAVES_BATTERY in held and _is_full(view):
+                    self._give_up(name)
+                    out_of_reach = held
+                    continue
                 self._pending[name].insert(0, target)
                 return stay(view, held)
             return single_choice(point[None, :], prediction, 0, 'next point of the lawnmower')
 
     def finished(self, team: TeamView) -> str | None:
-        """See `Planner.finished`; also when every lane is done."""
+        """See `Planner.finished`; also when every lane is done that some robot can afford."""
         if self._started and not any(self._blocks) and not any(self._pending.values()):
+            searching = set(self.searching(team))
+            left = [names for _, names in self._too_far if not searching <= names]
             standing = all(
                 view.remaining_path is None or len(view.remaining_path) <= 1
                 for view in team.robots.values()
             )
-            if standing:
-                return 'all lanes of the lawnmower are done'
+            if standing and not left:
+                return self._reason(team)
         return super().finished(team)
+
+    def _reason(self, team: TeamView) -> str:
+        if not self._too_far:
+            return 'all lanes of the lawnmower are done'
+        explored = 100.0 * team.exploration.explored_fraction()
+        return (
+            f'all lanes of the lawnmower are done but {len(self._too_far)} that no robot can '
+            f'afford with a full battery ({explored:.1f} % of the environment is explored)'
+        )
+
+
+def _is_full(view: RobotView) -> bool:
+    """Return whether a robot is at its charger with all the charge that it gives."""
+    endurance = view.endurance
+    return (
+        endurance is not None and endurance.topped and endurance.is_home(view.state.pose.position)
+    )

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_planner.planners.base import (
-    CROSSED,
     Planner,
     affordable,
     crossed,
@@ -17,7 +17,17 @@ from maasi_planner.planners.base import (
 from maasi_planner.planners.lattice import Lattice, lanes_of
 from maasi_planner.planners.orienteering import plan_ways
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
+from maasi_planner.team import (
+    CROSSED,
+    NOTHING_LEFT,
+    SAVES_BATTERY,
+    Decision,
+    RobotDecision,
+    RobotView,
+    TeamView,
+    single_choice,
+    stay,
+)
 
 # Tours are planned again when prizes on them have changed by this share in all.
 CHANGE = 0.2
@@ -43,17 +53,20 @@ class Tour(Planner):
     def __init__(self, settings: PlannerSettings) -> None:
         super().__init__(settings)
         self._lattice: Lattice | None = None
+        self._area: Area | None = None
         # What is planned with: places of the lattice, then clusters, and the prizes of both.
         self._chosen = np.zeros(0, np.int64)
         self._points = np.zeros((0, 0))
         self._planned = np.zeros(0)
         self._ways: dict[str, list[int]] = {}
-        # Where each robot was sent last.
+        # Where each robot was sent last, and which ones could not afford a place at this step.
         self._target: dict[str, FloatArray] = {}
+        self._refused: set[str] = set()
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
         decision, places = Decision(step=team.step), waiting_places(team)
+        self._refused.clear()
         prizes = self._prizes(team)
         again = prizes is None
         if prizes is None:
@@ -65,38 +78,43 @@ class Tour(Planner):
                 chosen = self._next(team, name, prizes, places, decision)
             if chosen is None:
                 self._target.pop(name, None)
-                view = team.robots[name]
-                chosen = stay(view, 'stays: nothing is left for it')
+                why = SAVES_BATTERY if name in self._refused else NOTHING_LEFT
+                chosen = stay(team.robots[name], f'stays: {why}')
             decision.robots[name] = chosen
             places.append((chosen.waypoint, team.robots[name].radius))
         return explain(decision)
 
     def finished(self, team: TeamView) -> str | None:
-        """See `Planner.finished`; also when no place is worth a visit."""
+        """See `Planner.finished`; also when too little is left that robots can reach.
+
+        That is the share of the expected targets that is unseen where places can be visited.
+        """
         reason = super().finished(team)
         if reason is not None:
             return reason
-        lattice, least = self._squares(team), self.settings.gain_threshold
-        least /= team.area.expected_targets
-        # Of its own square a place sees about all: mostly that is enough to know.
-        here = 0.5 * lattice.trust * lattice.unseen(team.exploration).ravel()
-        if here.max() > least or lattice.choose(team.exploration)[1].max(initial=0.0) > least:
+        lattice = self._squares(team)
+        left = float((lattice.trust * lattice.unseen(team.exploration).ravel()).sum())
+        if left > self.settings.gain_threshold:
             return None
         explored = 100.0 * team.exploration.explored_fraction()
         return self._settled(
-            team, f'no place is worth a visit ({explored:.1f} % of the environment is explored)'
+            team,
+            f'no place is worth a visit: {100.0 * left:.2g} % of the expected targets are within '
+            f'reach and unseen ({explored:.1f} % of the environment is explored)',
         )
 
     def _squares(self, team: TeamView) -> Lattice:
-        if self._lattice is None:
-            self._lattice = Lattice(team.exploration, *lanes_of(team)[1:])
+        if self._lattice is None or self._area is not team.area:
+            # Where zones were closed or opened, all is planned again.
+            self._lattice, self._area = Lattice(team.exploration, *lanes_of(team)[1:]), team.area
+            self._ways = {}
         return self._lattice
 
     def _prizes(self, team: TeamView) -> FloatArray | None:
         """Return what the places of the plan are worth now; None: it has to be made again."""
         lattice, number = self._squares(team), len(self._chosen)
         left = np.array([index for way in self._ways.values() for index in way], np.int64)
-        if set(team.names()) != set(self._ways):
+        if set(self.searching(team)) != set(self._ways):
             return None
         prizes = np.zeros(len(self._points))
         # In the order of choice, as each sees what those before it leave.
@@ -114,7 +132,7 @@ class Tour(Planner):
 
     def _plan(self, team: TeamView) -> FloatArray:
         """Plan the tours of all robots from where they are, or will be; return the prizes."""
-        lattice, names, heavy = self._squares(team), team.names(), self.heavy(team)
+        lattice, names, heavy = self._squares(team), self.searching(team), self.heavy(team)
         number = len(self._chosen)
         before = {
             name: self._chosen[[i for i in way if i < number]].tolist()
@@ -132,17 +150,18 @@ class Tour(Planner):
             path = None if view.planning else view.remaining_path
             end = path[-1] if path is not None and len(path) else view.state.pose.position
             starts.append(end[: team.dimension])
-            budget, home = (
-                (np.inf, end) if view.endurance is None else view.endurance.range_from(end)
-            )
+            budget, home = np.inf, end
+            if view.endurance is not None:
+                budget, home = view.endurance.range_from(end)
             budgets.append(budget)
-            ends.append(home[: team.dimension])
+            # Without a limit it need not end at home.
+            ends.append(home[: team.dimension] + (0.0 if np.isfinite(budget) else np.nan))
             if name in self._target:
                 # It is on its way there.
                 gaps = np.linalg.norm(self._points - self._target[name], axis=1)
                 prizes[gaps < SAME * lattice.pitch] = 0.0
         speeds = np.array([team.robots[name].motion.settings.speed for name in names])
-        homes = np.array(ends) if np.isfinite(budgets).all() else None
+        homes = np.array(ends) if np.isfinite(budgets).any() else None
         # Lanes are those of the lattice.
         points, places = self._points @ lattice.turn, np.array(starts) @ lattice.turn
         homes = None if homes is None else homes @ lattice.turn
@@ -164,7 +183,7 @@ class Tour(Planner):
         decision: Decision,
     ) -> RobotDecision | None:
         """Return the next leg of a robot's tour, past what has lost its prize; None: none left."""
-        view, way, d = team.robots[name], self._ways[name], team.dimension
+        view, way, d = team.robots[name], self._ways.get(name, []), team.dimension
         here = view.state.pose.position
         while way:
             index = way.pop(0)
@@ -185,6 +204,7 @@ class Tour(Planner):
             usable = prediction.reached[0] and prediction.lengths[0] > 0
             usable = usable and free_of_robots(point, view.radius, places)[0]
             if usable and not affordable(team, name, prediction, prediction.reached)[0]:
+                self._refused.add(name)
                 continue
             if usable and crossed(team, name, prediction, decision):
                 way.insert(0, index)
