@@ -97,6 +97,36 @@ def test_a_cancelled_goal_stops_the_robot(play, kind):
     assert_allclose(team.command, np.zeros(4), atol=1e-9)
 
 
+@pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
+def test_a_robot_in_a_closed_zone_stays_until_it_is_sent_out(play, kind):
+    """And then it leaves at its full speed; what it is sent into is refused."""
+    changes = {'environment': {'bounds': [[-0.3, 6.0], [-0.3, 6.0]]}, 'start': [1.0, 1.0, 1.0]}
+    driver, team = play(kind, **changes)
+    team.move()
+    publisher = team.create_publisher(KeepOuts, '/keep_outs', LATCHED)
+    team.until(lambda: publisher.get_subscription_count())
+    publisher.publish(KeepOuts(version=1, zones=['1.2 1.0 1.0']))
+    team.until(lambda: len(driver.area.circles))
+    team.move(40)
+    assert_allclose(team.place[:2], [1.0, 1.0], atol=0.01)
+    assert 'keep-outs' in team.refused([1.3, 1.0, 1.0])
+    keep_out = driver.follower.motion.keep_out
+    goal = keep_out.exit_from(team.place)
+    assert np.linalg.norm(goal - team.place) < 1.5
+    _, result = team.send_accepted(goal.tolist())
+    speeds = []
+    for _ in range(400):
+        team.move()
+        speeds.append(float(np.linalg.norm(team.body.robot_state().velocity)))
+        if keep_out.exit_from(team.place) is None:
+            break
+    assert keep_out.exit_from(team.place) is None
+    assert max(speeds) > 0.8 * driver.settings.motion.speed
+    # Its goal goes on.
+    team.until(lambda: team.move() or result.done())
+    assert result.result().result.reached
+
+
 def test_a_keep_out_on_the_way_stops_the_robot_and_goals_in_it_are_refused(play):
     """What comes while it moves; then the way leads around."""
     driver, team = play()

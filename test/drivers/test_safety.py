@@ -22,6 +22,7 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE
 from maasi_msgs.msg import AgentState
+from maasi_planner.motion import RobotState
 
 
 def gives_up(team, result, reason):
@@ -200,6 +201,66 @@ def test_a_battery_is_read_in_its_unit_and_a_low_one_ends_the_way(play, capfd, m
     assert 'battery at 0.15' in team.state.reason
     read(0.9 * full, 0.9)
     assert team.takes([1.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize('lockstep', [False, True])
+def test_a_battery_that_falls_silent_is_unknown_after_a_while(play, capfd, lockstep):
+    _, team = play(lockstep=lockstep, battery_timeout=1.0)
+    team.move()
+    message = BatteryState(percentage=0.53)
+    team.battery.publish(stamped(message, team.step * NANOSECONDS))
+    team.until(lambda: team.move() or team.state.battery == pytest.approx(0.53))
+    begin = team.step
+    team.until(lambda: team.move() or team.state.battery == -1.0)
+    assert (team.step - begin) * STEP == pytest.approx(1.0, abs=0.5)
+    said = capfd.readouterr().err
+    assert said.count('no charge of the battery for 1 s') == 1
+    assert 'it was 0.53 and counts as unknown' in said
+    # It is no fault, and it comes back.
+    assert team.state.goal_status == AgentState.IDLE
+    team.battery.publish(stamped(BatteryState(percentage=0.5), team.step * NANOSECONDS))
+    team.until(lambda: team.move() or team.state.battery == pytest.approx(0.5))
+
+
+def test_every_battery_has_a_floor(play):
+    """By default, too; below it the robot stops and says so, and goes on once it is charged."""
+    _, team = play()
+    team.move()
+    team.battery.publish(BatteryState(percentage=0.06))
+    team.until(lambda: team.move() or team.state.battery == pytest.approx(0.06))
+    _, result = team.send_accepted([1.5, 1.5, 0.0])
+    team.move(5)
+    team.battery.publish(BatteryState(percentage=0.04))
+    team.until(lambda: team.move() or team.state.battery == pytest.approx(0.04))
+    gives_up(team, result, 'battery at 0.04, below 0.05')
+    team.battery.publish(BatteryState(percentage=0.3))
+    team.until(lambda: team.move() or team.state.battery == pytest.approx(0.3))
+    assert team.takes([1.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
+def test_a_robot_outside_of_its_bounds_is_stopped(play, kind):
+    """Bounds are an area; noise at their side is no fault, as goals may lie there."""
+    driver, team = play(kind, environment={'bounds': [[-0.3, 2.4], [-0.3, 2.4]]})
+    team.move()
+    generator, height = np.random.default_rng(1), team.place[2]
+
+    def put(x, y):
+        team.body = team.motion.body(RobotState.at_rest([x, y, height]))
+        team.move()
+
+    for _ in range(20):
+        # Beyond the side by its radius, with an odometry that is off by some centimetres.
+        dx, dy = generator.normal(0.0, 0.05, 2).tolist()
+        put(2.51 + dx, 1.0 + dy)
+        assert 'area' not in driver.health
+    _, result = team.send_accepted([1.0, 1.0, height])
+    team.move(5)
+    put(3.4, 1.0)
+    assert '1.0 m outside of the area' in team.aborted(result)
+    assert team.state.goal_status == AgentState.UNAVAILABLE
+    put(2.3, 1.0)
+    assert team.takes([1.0, 1.0, height])
 
 
 def test_a_flying_robot_in_the_plane_is_not_sent_to_another_height(play):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from maasi_drivers.agent.flight_rules import MARGIN
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import MotionModel, RobotState
 
@@ -96,11 +97,29 @@ class WaypointFollower:
             goal.status = GoalStatus.REACHED
             self._hold = goal.waypoint
             reached = goal
-        if self.on_ground:
+        # In a zone it stays as well: it leaves that when it is sent out.
+        if self.on_ground or self.exit_from(position) is not None:
             return np.zeros(4), reached
         if self._hold is None:
-            self._hold = np.array(position)
+            self._hold = self._resting(position)
         return self.motion.command(state, self._hold), reached
+
+    def _resting(self, position: FloatArray) -> FloatArray:
+        """Return where a robot holds: where it is, or inside of the border if it is far outside."""
+        keep_out = self.motion.keep_out
+        area = keep_out.area
+        if area is not None and area.outside_by(position) > MARGIN + keep_out.radius:
+            inside = keep_out.exit_from(position)
+            if inside is not None:
+                return inside
+        return np.array(position)
+
+    def exit_from(self, position: FloatArray) -> FloatArray | None:
+        """Return where a robot leaves a closed zone that it is in, (3,); None outside of zones."""
+        keep_out = self.motion.keep_out
+        if not len(keep_out) or keep_out.area is None or keep_out.area.outside_by(position):
+            return None
+        return keep_out.exit_from(position)
 
     @property
     def target(self) -> FloatArray | None:

@@ -178,6 +178,13 @@ class RobotSettings(Settings):
         'fraction',
         description='Unit of battery_state.percentage: fraction, 0 to 1, or percent, 0 to 100',
     )
+    battery_minimum: float = Field(
+        0.05,
+        ge=0.0,
+        lt=1.0,
+        description='Charge below which its driver takes no goals, and lands it where it can; '
+        '0: disabled [1]',
+    )
     simulated: SimulatedSettings = Field(
         default_factory=SimulatedSettings,
         description='True parameters in the simulation, where they differ from those assumed',

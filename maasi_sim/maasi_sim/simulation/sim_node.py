@@ -189,7 +189,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
                 depth: QoSProfile | int = RELIABLE if lockstep else 10
                 self.create_subscription(TwistStamped, f'{name}/cmd_vel', command, depth)
                 continue
-            robot = linked_robot(name, self.scenario.robots[name], self.settings.seed)
+            robot = linked_robot(name, self.scenario, self.settings.seed)
             self._linked[name] = robot
             self.simulation.robots[name].follow(robot)
             if isinstance(robot, ExternalRobot):

@@ -105,9 +105,7 @@ class MavlinkRobotLink(RobotLink):
         moving = follower.status == GoalStatus.MOVING
         if self._rejected and not moving:
             return  # it stays where the autopilot has it
-        way = None
-        if not self.driver.area.outside_by(position):
-            way = follower.motion.keep_out.exit_from(position)
+        way = follower.exit_from(position)
         if way is not None:
             way = way - position if moving else None
         elif moving:

@@ -2,9 +2,12 @@
 
 from typing import Protocol
 
+import numpy as np
+
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
+from maasi_filter.geodesy import OriginSettings, geodetic
 from maasi_filter.models.pose import Pose
-from maasi_sim.scenario.schema import RobotSettings, Scenario
+from maasi_sim.scenario.schema import Scenario
 from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.simulation.emulators.mambo.firmware import FirmwareSettings, MamboFirmware
 from maasi_sim.simulation.robots import Leader
@@ -29,8 +32,9 @@ class LinkedRobot(Leader, Protocol):
         """Close it."""
 
 
-def linked_robot(name: str, robot: RobotSettings, seed: int) -> LinkedRobot:
+def linked_robot(name: str, scenario: Scenario, seed: int) -> LinkedRobot:
     """Return the simulated end of a robot's link; it runs in real time at once."""
+    robot = scenario.robots[name]
     if robot.external:
         return ExternalRobot(Pose.from_yaw(robot.start, robot.yaw))
     if robot.link == 'mambo_wifi':
@@ -49,12 +53,17 @@ def linked_robot(name: str, robot: RobotSettings, seed: int) -> LinkedRobot:
 
     link = robot.mavlink or MavlinkSettings()
     host, port = link.url.removeprefix('udpin:').split(':')
-    return FakeVehicle(
+    place = np.array([[*robot.start[:2], link.ground]])
+    vehicle = FakeVehicle(
         robot.autopilot.model_copy(update={'system': link.system}),
         f'udpout:{"127.0.0.1" if host == "0.0.0.0" else host}:{port}',
-        Pose.from_yaw([*robot.start[:2], link.ground], robot.yaw),
+        Pose.from_yaw(place[0], robot.yaw),
         noise_stream(seed, name, purpose='autopilot'),
     )
+    if origin := scenario.environment.origin:
+        latitude, longitude, _ = geodetic(place, origin)[0].tolist()
+        vehicle.autopilot.fence.home = OriginSettings(latitude=latitude, longitude=longitude)
+    return vehicle
 
 
 def with_addresses(scenario: Scenario) -> Scenario:
