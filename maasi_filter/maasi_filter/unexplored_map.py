@@ -29,6 +29,7 @@ MAXIMUM_NODES = 20_000_000
 # A swath is at least so many cells wide, unless that takes more than so many cells: with 1,000,000
 # decisions take 0.1 s.
 SWATH_CELLS, MOST_CELLS = 3.0, 1_000_000
+MOST_SHOWN = 300  # cells along an axis of what is drawn, published or stored
 _ROUNDING = 1e-9  # of shares of cells that are open
 
 
@@ -320,6 +321,21 @@ class UnexploredMap:
         """
         shown = self._values * (self.density / self.density.max())
         return np.asarray(shown.reshape(self.values.shape))
+
+    def shown(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return first node (d,), steps (d,) [m] and `expected`, to be drawn, published or stored.
+
+        Of a fine map means of blocks of nodes, at most `MOST_SHOWN` along each axis.
+        """
+        values, number = self.expected(), -(-max(self.values.shape) // MOST_SHOWN)
+        if number > 1:
+            counts = np.ones(values.shape)
+            for axis, size in enumerate(values.shape):
+                begin = np.arange(0, size, number)
+                values = np.add.reduceat(values, begin, axis)
+                counts = np.add.reduceat(counts, begin, axis)
+            values = values / counts
+        return self.bounds[:, 0] + 0.5 * (number - 1) * self.step, number * self.step, values
 
     def explored_fraction(self) -> float:
         """Return 1 - mean of e over the ground, in [0, 1]; also over what is closed now."""

@@ -109,13 +109,12 @@ def path_to_ros(positions: FloatArray, header: Header, most: int = 50) -> Path:
 
 def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyGrid:
     """Return prior and e in 2D as a grid: 100 is unseen, 0 explored; nodes are centres of cells."""
-    values = exploration.expected()
-    step = [float(axis[1] - axis[0]) for axis in exploration.axes()]
+    lower, step, values = exploration.shown()
     grid = OccupancyGrid(header=header)
     grid.info.map_load_time = header.stamp
-    grid.info.resolution = step[0]
+    grid.info.resolution = float(step[0])
     grid.info.width, grid.info.height = values.shape[:2]
-    grid.info.origin.position = point_to_ros(exploration.bounds[:, 0] - 0.5 * np.array(step))
+    grid.info.origin.position = point_to_ros(lower - 0.5 * step)
     grid.info.origin.orientation.w = 1.0
     cells = np.rint(100.0 * values.reshape(values.shape[:2]).T).astype(np.int8)
     grid.data = array.array('b', cells.tobytes())

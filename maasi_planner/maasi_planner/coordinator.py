@@ -10,8 +10,8 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
-from maasi_filter.unexplored_map import UnexploredMap, default_spacing
-from maasi_planner.candidates import CandidateSet, half_view
+from maasi_filter.unexplored_map import UnexploredMap
+from maasi_planner.candidates import CandidateSet, half_view, map_spacing
 from maasi_planner.endurance import NOTHING_AFFORDABLE, Endurance
 from maasi_planner.homing import Homing, waits_cut_off
 from maasi_planner.measurement_trigger import MeasurementTrigger
@@ -36,7 +36,12 @@ class Coordinator:
         self.settings = settings
         self.dimension = settings.environment.dimension
         self.area = area or Area(settings.environment)
-        spacing = settings.exploration_spacing or default_spacing(self.area.bounds)
+        sensors = {
+            name: robot.sensor.build(name, self.dimension)
+            for name, robot in sorted(settings.robots.items())
+        }
+        spacing, _ = map_spacing(self.area.bounds, sensors.values())
+        spacing = settings.exploration_spacing or spacing
         self.exploration = UnexploredMap(self.area, spacing)
         self.clusters: list[Cluster] = []
         self.finished: str | None = None
@@ -48,7 +53,7 @@ class Coordinator:
         for name in sorted(settings.robots):
             robot = settings.robots[name]
             motion = make_motion(robot.motion, self.area, robot.radius)
-            sensor = robot.sensor.build(name, self.dimension)
+            sensor = sensors[name]
             self.plans[name] = RobotPlan(
                 motion=motion,
                 sensor=sensor,
@@ -146,7 +151,9 @@ class Coordinator:
         self.homing.update(step, robots, self.settings.step)
         if self.finished is None and not self._closed() and self.homing.exhausted(step, robots):
             explored = 100.0 * self.exploration.explored_fraction()
-            self.finished = f'{NOTHING_AFFORDABLE} ({explored:.1f} % of the environment is explored)'
+            self.finished = (
+                f'{NOTHING_AFFORDABLE} ({explored:.1f} % of the environment is explored)'
+            )
         errands = self.homing.errands(step, robots, self.finished is not None)
         asked = [name for name in self.planning(step, robots) if name not in errands]
         cut_off = [

@@ -6,6 +6,7 @@ from typing import Any
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.unexplored_map import UnexploredMap
+from maasi_planner.candidates import map_spacing
 from maasi_sim.run.report_files import finite, summary, whole_report
 from maasi_sim.run.targets.tally import TargetRecord
 
@@ -53,12 +54,16 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
 
 def explored_after(record: TargetRecord) -> UnexploredMap:
     """Return what is unexplored after all measurements of the robots."""
-    scenario = record.scenario
-    explored = UnexploredMap(Area(scenario.environment), scenario.filter.exploration_spacing)
+    scenario, area = record.scenario, Area(record.scenario.environment)
+    sensors = {
+        name: robot.sensor.build(name, scenario.dimension)
+        for name, robot in scenario.robots.items()
+    }
+    spacing, _ = map_spacing(area.bounds, sensors.values())
+    explored = UnexploredMap(area, scenario.filter.exploration_spacing or spacing)
     for name, poses in record.measured_from.items():
-        detection = scenario.robots[name].sensor.build(name, scenario.dimension).detection
         for pose in poses:
-            explored.update(detection, pose)
+            explored.update(sensors[name].detection, pose)
     return explored
 
 

@@ -69,11 +69,11 @@ def plot_report(record: TargetRecord) -> Figure:
 def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -> None:
     """Shade unexplored places: e and prior, in 3D its mean along the line of sight."""
     hidden = tuple(axis for axis in range(explored.dimension) if axis not in view.plane)
-    shown = explored.expected()
+    lower, step, shown = explored.shown()
     values = shown.mean(axis=hidden) if hidden else shown
     if view.plane[0] < view.plane[1]:
         values = values.T
-    right, up = (explored.axes()[axis] for axis in view.plane)
+    right, up = (lower[axis] + step[axis] * np.arange(shown.shape[axis]) for axis in view.plane)
     shades = LinearSegmentedColormap.from_list('unseen', ['#FFFFFF', UNSEEN])
     view.axes.pcolormesh(
         right, up, values, cmap=shades, vmin=0.0, vmax=1.0, shading='gouraud', zorder=0

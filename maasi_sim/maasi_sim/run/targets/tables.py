@@ -103,11 +103,15 @@ def _explored(record: TargetRecord, origin: OriginSettings) -> Row:
     """Return where less than half is unseen, in 3D of the whole height."""
     explored = explored_after(record)
     unseen = np.atleast_3d(explored.values).mean(axis=2)
-    nodes = explored.nodes().reshape(*unseen.shape, -1, explored.dimension)[:, :, 0, :2]
+    # Cells that follow each other along y are one box: row, first cell, and that behind the last.
+    edges = np.diff(unseen < 0.5, axis=1, prepend=False, append=False)
+    row, ends = (index.reshape(-1, 2) for index in np.nonzero(edges))
     half, (low, high) = 0.5 * explored.step[:2], explored.bounds[:2].T
-    seen = np.clip([nodes[unseen < 0.5] - half, nodes[unseen < 0.5] + half], low, high)
-    # Cells that touch, to a micrometre, become one.
-    cells = shapely.union_all(shapely.box(*seen[0].T, *seen[1].T), grid_size=1e-6)
+    x, y = explored.axes()[:2]
+    first = np.clip(np.stack([x[row[:, 0]], y[ends[:, 0]]], axis=1) - half, low, high)
+    last = np.clip(np.stack([x[row[:, 0]], y[ends[:, 1] - 1]], axis=1) + half, low, high)
+    # Boxes that touch, to a micrometre, become one.
+    cells = shapely.union_all(shapely.box(*first.T, *last.T), grid_size=1e-6)
     share = round(explored.explored_fraction(), 6)
     return _polygon(cells, origin, {'kind': 'explored', 'share': share})
 

@@ -245,8 +245,8 @@ class SearchTrace:
             self._last_maps[space] = time
             explored = coordinator.exploration
             # As coarse as it is shown.
-            ninths = np.rint(9.0 * explored.expected()).astype(np.uint8)
-            grid = explored.bounds[:, 0], explored.step, ninths
+            lower, step, shown = explored.shown()
+            grid = lower, step, np.rint(9.0 * shown).astype(np.uint8)
             self.add(EventMaker.map, time, space, *grid, explored.explored_fraction())
 
     def log(self, name: str = 'search') -> EventLog:
