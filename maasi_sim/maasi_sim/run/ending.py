@@ -36,7 +36,8 @@ def end_of_planners(reason: str, explored: float, meant: bool) -> Ending:
     there. A search that gave up with less than half explored is no success.
     """
     if explored < LEAST_EXPLORED:
-        text = f'{reason}; {explored:.1%} explored, less than half: the search is not complete'
+        percent = f'{100.0 * explored:.1f} % explored'
+        text = f'{reason}; {percent}, less than half: the search is not complete'
         return Ending('planner_done', NOT_ALL_FOUND, text)
     return Ending('planner_done', DONE if meant else NOT_ALL_FOUND, reason)
 

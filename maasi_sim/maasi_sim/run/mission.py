@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     # These need ROS; a search in one process has records, too.
     from maasi_sim.run.node_plan import NodePlan
     from maasi_sim.run.run_options import Options
+    from maasi_sim.scenario.preflight import Preflight
 
 UNAVAILABLE = 5  # goal status of `AgentState`
 
@@ -161,6 +162,9 @@ class Mission(Protocol[Record]):
 
     def plan_nodes(self, options: Options, file: Path) -> list[NodePlan]:
         """Return the nodes to start; `file` is the scenario with all layers."""
+
+    def preflight(self) -> Preflight:
+        """Return what the search will take."""
 
     def warning(self) -> str:
         """Return a warning about the scenario, or an empty text; takes a while."""

@@ -1,5 +1,6 @@
 """The one place where a scenario file becomes a mission."""
 
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from maasi_sim.run.buildings.building_mission import BuildingMission
 from maasi_sim.run.buildings.scenario import NAME, check_cuboid_scenario, is_cuboid_scenario
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.targets.mission import TargetMission
-from maasi_sim.scenario.layering import Key, ScenarioError
+from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning
 from maasi_sim.scenario.loading import check_scenario, find_scenario, read_scenario
 
 
@@ -33,6 +34,16 @@ def load_mission(
                 'targets, for which any other planner is allowed'
             )
     return TargetMission(path.stem, check_scenario(layer, overrides))
+
+
+def checked_mission(
+    path: str | Path, overrides: Mapping[str, tuple[Key, Any]]
+) -> tuple[Mission[Any], list[str]]:
+    """Read a scenario file; return what is hardly meant in it as well."""
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter('always', ScenarioWarning)
+        mission = load_mission(path, overrides)
+    return mission, [str(doubt.message) for doubt in doubts]
 
 
 def send_warning(mission: Mission[Any], send: Callable[[str], None]) -> None:

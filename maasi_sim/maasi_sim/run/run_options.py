@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from maasi_sim.arguments import Parser, positive, whole
 from maasi_sim.run.ending import EXIT_CODES
@@ -17,6 +18,7 @@ LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 # Options that are arguments of a launch as well.
 _LAUNCH_OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'namespace', 'log_level', 'port')
 _LAUNCH_FLAGS = ('lockstep', 'follow_clock', 'view')
+Key = tuple[str | int, ...]  # as of a scenario file
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
 
@@ -43,7 +45,17 @@ class Options:
     namespace: str = ''
     follow_clock: bool = False
     replay: Path | None = None
+    check: bool = False
     view: ViewOptions | None = None
+
+    def overrides(self) -> dict[str, tuple[Key, Any]]:
+        """Return what wins over the values of the scenario file: by option, key and value."""
+        given: dict[str, tuple[Key, Any]] = {
+            '--planner': (('planner', 'name'), self.planner),
+            '--time-limit': (('limits', 'time'), self.time_limit),
+            '--seed': (('seed',), self.seed),
+        }
+        return {name: item for name, item in given.items() if item[1] is not None}
 
     def command(self, seed: int) -> str:
         """Return the command that runs the same again."""
@@ -103,6 +115,12 @@ def build_parser() -> argparse.ArgumentParser:
         action='store_true',
         help='its time is the /clock of another run in the domain --domain-id',
     )
+    add(
+        '--check',
+        action='store_true',
+        help='start nothing: check the scenario, and print what its search takes: area, passes, '
+        'batteries, time, and what no robot reaches',
+    )
     add('--log-level', choices=LOG_LEVELS, help='of the nodes (default: info)')
     add(
         '--replay',
@@ -159,6 +177,8 @@ def parse(arguments: list[str] | None) -> Options:
         parser.error('--port, --control and --no-browser need --view')
     given |= {'namespace': given['namespace'] or '', 'view': view if given['view'] else None}
     options = Options(**given)
+    if options.check and (options.replay is not None or options.view is not None):
+        parser.error('--check: allowed without --replay and --view')
     if options.replay is None and not options.scenario:
         parser.error('give either a scenario or --replay BAG')
     if options.follow_clock and options.domain_id is None:

@@ -5,9 +5,9 @@ import gc
 import os
 import sys
 
-from maasi_sim.run.ending import NOT_WRITTEN, WRONG_INPUT, Interruption
+from maasi_sim.run.ending import DONE, NOT_WRITTEN, WRONG_INPUT, Interruption
 from maasi_sim.run.processes import ProcessError, start_server
-from maasi_sim.run.run_options import parse
+from maasi_sim.run.run_options import Options, parse
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -16,6 +16,8 @@ def main(arguments: list[str] | None = None) -> int:
     # ROS has its logs there.
     os.environ.setdefault('HOME', os.path.abspath(os.path.expanduser('~')))
     options = parse(arguments)
+    if options.check:
+        return check(options)
     # Nodes load what they share while this process loads what is its own.
     try:
         start_server()
@@ -42,10 +44,31 @@ def main(arguments: list[str] | None = None) -> int:
             return replay(options.replay, options.out, options.domain_id, interruption)
         return ScenarioRun(options, interruption).execute()
     except (ScenarioError, DomainError, ProcessError, BagError, ResultsError) as error:
-        with contextlib.suppress(OSError):
-            for line in str(error).splitlines():
-                print(f'error: {line}', file=sys.stderr)
+        _print_errors(error)
         return NOT_WRITTEN if isinstance(error, (ResultsError, BagWriteError)) else WRONG_INPUT
+
+
+def check(options: Options) -> int:
+    """Check the scenario, print what its search takes, and return the exit code."""
+    from maasi_sim.run.missions import checked_mission
+    from maasi_sim.scenario.layering import ScenarioError
+
+    try:
+        mission, doubts = checked_mission(options.scenario, options.overrides())
+    except ScenarioError as error:
+        _print_errors(error)
+        return WRONG_INPUT
+    forecast = mission.preflight()
+    warnings = [*doubts, *forecast.warnings, *mission.warning().splitlines()]
+    with contextlib.suppress(OSError):
+        print('\n'.join([*forecast.lines, *(f'warning: {text}' for text in warnings)]))
+    return DONE
+
+
+def _print_errors(error: Exception) -> None:
+    with contextlib.suppress(OSError):
+        for line in str(error).splitlines():
+            print(f'error: {line}', file=sys.stderr)
 
 
 if __name__ == '__main__':

@@ -5,7 +5,6 @@ import os
 import signal
 import threading
 import time
-import warnings
 from typing import Any
 
 from maasi_sim.run.bag import ENDING_TOPIC, BagError, BagWriter, load_types
@@ -22,7 +21,7 @@ from maasi_sim.run.ending import (
     end_of_planners,
 )
 from maasi_sim.run.mission import RunEnd
-from maasi_sim.run.missions import load_mission, send_warning
+from maasi_sim.run.missions import checked_mission, send_warning
 from maasi_sim.run.processes import beside, stop, wait_for_server
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
@@ -36,7 +35,7 @@ from maasi_sim.run.view.live_view import RunPage
 from maasi_sim.run.view.page_file import REPLAY
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.view_run import send_replay
-from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning, to_yaml
+from maasi_sim.scenario.layering import ScenarioError, to_yaml
 
 # Between two checks of processes and topics; while the nodes start, and while they run [s].
 _START_POLL, _POLL = 0.02, 0.05
@@ -51,17 +50,12 @@ class ScenarioRun:
 
     def __init__(self, options: Options, interruption: Interruption) -> None:
         self.options, self.interruption = options, interruption
-        given: dict[str, tuple[Key, Any]] = {
-            '--planner': (('planner', 'name'), options.planner),
-            '--time-limit': (('limits', 'time'), options.time_limit),
-            '--seed': (('seed',), options.seed),
-        }
-        overrides = {name: item for name, item in given.items() if item[1] is not None}
         self.display = ProgressDisplay()
-        with warnings.catch_warnings(record=True) as doubts:
-            warnings.simplefilter('always', ScenarioWarning)
-            self.mission = load_mission(options.scenario, overrides)
-        self._warn(*(str(doubt.message) for doubt in doubts))
+        self.mission, doubts = checked_mission(options.scenario, options.overrides())
+        forecast = self.mission.preflight()
+        for line in forecast.lines:
+            self.display.say(line)
+        self._warn(*doubts, *forecast.warnings)
         # A node in the namespace of a robot belongs to that robot.
         if options.namespace.rpartition('/')[2] in self.mission.scenario.names():
             raise ScenarioError(

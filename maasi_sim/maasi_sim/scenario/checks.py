@@ -14,6 +14,7 @@ from maasi_filter.area import Area
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.plugins import unknown
 from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_parts
+from maasi_planner.planners.auto import SQUARES
 from maasi_planner.settings import CandidateSettings
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.charger_checks import charger_problems, endurance_doubts
@@ -325,6 +326,8 @@ def never_seen(scenario: Scenario) -> str:
     if any(robot.candidates.ring is not None for robot in scenario.robots.values()):
         return ''  # candidates that move with the robot can reach every place
     area = Area(scenario.environment)
+    if not _uses_candidates(scenario, area):
+        return ''
     margin = scenario.targets.margin if scenario.targets.positions is None else 0.0
     # What is seen from the waypoints need not be checked on the paths between them.
     standing = [_viewer(scenario, name, _FAR) for name in scenario.names()]
@@ -336,6 +339,16 @@ def never_seen(scenario: Scenario) -> str:
         for name, robot in scenario.robots.items()
     ]
     return unseen_parts(area, moving, margin).describe()
+
+
+def _uses_candidates(scenario: Scenario, area: Area) -> bool:
+    """Return whether the planner chooses among the candidates, rather than making its own path."""
+    name = scenario.planner.name
+    if name != 'auto':
+        return name not in ('tour', 'lawnmower')
+    sensors = [robot.sensor.build(n, scenario.dimension) for n, robot in scenario.robots.items()]
+    square = (2.0 * min(map(half_view, sensors))) ** scenario.dimension
+    return area.volume < SQUARES * square
 
 
 def covering_grid(

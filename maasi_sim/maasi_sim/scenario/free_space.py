@@ -10,13 +10,14 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
-from maasi_planner.motion import MotionModel, RobotState, make_motion
+from maasi_planner.keep_out import KeepOut
 from maasi_sim.scenario.schema import RobotSettings
 
 _ROUNDING = 1e-6  # [m]
-_STEP = 0.2  # of the path that is predicted where the geometry leaves it open [s]
 # Share of the clearance that a robot keeps at least, as its motion model does.
 _LEAST = 0.1
+# Parts smaller than this share of its own are passed over, and all beyond so many.
+_SMALL, _MOST_PARTS = 1e-3, 50
 
 
 class FreeSpace:
@@ -42,8 +43,10 @@ class FreeSpace:
         if not others:
             return own
         # Narrow passages may join them.
-        places = [[*part.representative_point().coords[0], self.robot.start[2]] for part in others]
-        reached = [part for part, place in zip(others, places) if self.gets_to(place)]
+        height = self.robot.start[2]
+        large = [part for part in others if part.area > _SMALL * own[0].area][:_MOST_PARTS]
+        places = [[*part.representative_point().coords[0], height] for part in large]
+        reached = [part for part, place in zip(large, places) if self.gets_to(place)]
         return sorted([*own, *reached], key=lambda part: -part.area)
 
     def gap(self, position: ArrayLike) -> float:
@@ -68,14 +71,12 @@ class FreeSpace:
         one, other = (_part_at(self.parts, at) for at in (here, goal))
         if one is not None and other is not None and one is other:
             return True
-        # Joined by a passage that is narrower than its clearance: its own prediction tells.
-        start = RobotState.at_rest(self.robot.start, self.robot.yaw)
-        points = np.asarray(position, dtype=float)[None, :]
-        return bool(self._motion.predict(start, points, _STEP).reached[0])
+        # Joined by a passage that is narrower than its clearance: its own paths tell.
+        return math.isfinite(self._keep_out.path_length(self.robot.start, position))
 
     @cached_property
-    def _motion(self) -> MotionModel:
-        return make_motion(self.robot.motion, self.area, self.robot.radius)
+    def _keep_out(self) -> KeepOut:
+        return KeepOut(self.area, self.robot.radius, self.robot.motion.clearance)
 
     @property
     def _reach(self) -> float:

@@ -19,6 +19,7 @@ from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
 from maasi_sim.run.run_options import Options
+from maasi_sim.scenario.preflight import Preflight
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,6 +32,20 @@ class BuildingMission(Mission[CuboidRecord]):
 
     def __init__(self, name: str, scenario: CuboidScenario) -> None:
         self.name, self.scenario = name, scenario
+
+    def preflight(self) -> Preflight:
+        """See `Mission.preflight`."""
+        scenario = self.scenario
+        sides = (scenario.environment.array() @ [-1.0, 1.0]).tolist()
+        starts = [f'{name}: starts at {robot.start} m' for name, robot in scenario.robots.items()]
+        cuboids = len(scenario.mission().cells)
+        return Preflight(
+            [
+                f'space: {" x ".join(f"{side:g}" for side in sides)} m, {cuboids} cuboids to visit',
+                *starts,
+                f'limit {scenario.limits.time:g} s',
+            ]
+        )
 
     def plan_nodes(self, options: Options, file: Path) -> list[NodePlan]:
         """Return the simulation, and for each robot a planner and a guard: not in lockstep."""

@@ -22,6 +22,7 @@ from maasi_sim.run.targets.tally import TargetRecord
 from maasi_sim.run.topics import BATCH, within
 from maasi_sim.scenario.checks import never_seen
 from maasi_sim.scenario.layering import ScenarioError
+from maasi_sim.scenario.preflight import Preflight, preflight
 from maasi_sim.scenario.schema import RobotSettings, Scenario, planner_settings
 from maasi_sim.simulation.emulators.linked_robots import with_addresses
 
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
 
 _LOCKSTEP_TF_RATE = 4.0  # of the robots' frames in lockstep, where each message counts [Hz]
 # Settings of a robot that its driver has as well.
-_OF_THE_DRIVER = ['start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'battery_unit', 'link']
+_OF_THE_DRIVER = ['start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'link']
+_OF_THE_DRIVER += ['battery_unit', 'battery_minimum']
 
 
 class TargetMission:
@@ -57,6 +59,10 @@ class TargetMission:
         for namespace, names in scenario.namespaces().items():
             plans += _team_plans(namespace, names, scenario, common, state)
         return plans
+
+    def preflight(self) -> Preflight:
+        """See `Mission.preflight`."""
+        return preflight(self.scenario)
 
     def warning(self) -> str:
         """See `Mission.warning`."""
@@ -151,6 +157,7 @@ def _robot_plans(
             **common,
             'environment': scenario.environment,
             **{name: getattr(robot, name) for name in _OF_THE_DRIVER},
+            'chargers': robot.endurance.chargers if robot.endurance else [],
             **({'tf_rate': _LOCKSTEP_TF_RATE} if common['lockstep'] else {}),
             'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,
             'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
