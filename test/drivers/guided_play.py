@@ -17,7 +17,8 @@ from maasi_drivers.links.mavlink.mavlink_robot_link import MavlinkRobotLink
 from maasi_drivers.links.mavlink.vehicle import Vehicle
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.area import Area
-from maasi_filter.geodesy import OriginSettings
+from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geodesy import OriginSettings, geodetic
 from maasi_planner.motion import RobotState
 
 ORIGIN = OriginSettings(latitude=46.6, longitude=9.9)
@@ -73,18 +74,27 @@ class PlainDriver:
 
 
 class GuidedPlay(Play):
-    """A copter, its driver's link and what went over the wire; `go_to` is a goal of the planner."""
+    """A copter, its driver's link and what went over the wire; `go_to` is a goal of the planner.
 
-    def __init__(self, monkeypatch, environment=(), motion=(), parameters=(), **changes):
-        place = FIELD | {'altitude': [0.0, 60.0], 'origin': ORIGIN} | dict(environment)
-        if 'bounds' in place:
-            place.pop('area')
-            place.pop('altitude')
+    environment: of the field, or settings of another one, whose origin is that of the map.
+    """
+
+    def __init__(
+        self, monkeypatch, environment=(), motion=(), parameters=(), start=START, **changes
+    ):
+        if isinstance(environment, EnvironmentSettings):
+            place = environment
+        else:
+            place = FIELD | {'altitude': [0.0, 60.0], 'origin': ORIGIN} | dict(environment)
+            if 'bounds' in place:
+                place.pop('area')
+                place.pop('altitude')
+        self.start = start
         own = {'arm': True} | changes.pop('mavlink', {})
         self.driver_settings = DriverSettings.model_validate(
             {
                 'environment': place,
-                'start': START,
+                'start': start,
                 'radius': 0.5,
                 'motion': MOTION | dict(motion),
                 'link': 'mavlink',
@@ -97,13 +107,15 @@ class GuidedPlay(Play):
         autopilot = COPTER | {'parameters': FENCE | dict(parameters), 'endurance': 1e9}
         super().__init__('arducopter', autopilot, **own)
         self.body.climb = 2.5
-        self.autopilot.fence.home = ORIGIN
+        origin = self.driver_settings.environment.origin
+        latitude, longitude, _ = geodetic(np.array([start]), origin)[0].tolist()
+        self.autopilot.fence.home = OriginSettings(latitude=latitude, longitude=longitude)
         self.speeds = []
 
     def start_driver(self):
         sender = make_sender(self.settings.own_system)
         sender.file = self.to_autopilot
-        self.vehicle = Vehicle(self.settings, START, sender, None)
+        self.vehicle = Vehicle(self.settings, self.start, sender, None)
         self.vehicle.active = self.driver_lives = True
         self.reports = []
         self.driver = PlainDriver(self.driver_settings, MavlinkRobotLink)
@@ -114,7 +126,8 @@ class GuidedPlay(Play):
             failure='',
             finish=lambda ending, _: self.vehicle.finish(ending),
         )
-        self.vehicle.speed = self.driver_settings.motion.speed
+        motion = self.driver_settings.motion
+        self.vehicle.speed, self.vehicle.braking = motion.speed, motion.acceleration
         self.driver.get_clock = lambda: SimpleNamespace(
             now=lambda: SimpleNamespace(nanoseconds=round(1e9 * self.now))
         )
@@ -152,8 +165,8 @@ class GuidedPlay(Play):
 
     @property
     def place(self):
-        """On the map, whose origin is that of the local frame."""
-        return self.body.position + np.array([START[0], START[1], 0.0])
+        """On the map; the local frame begins at the start, on the ground."""
+        return self.body.position + np.array([*self.start[:2], 0.0])
 
     @property
     def fault(self):

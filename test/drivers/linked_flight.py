@@ -51,6 +51,7 @@ class LinkedFlight:
     outside = ([1.7, 0.8, 2.1], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5])
     # Two waypoints, how near it is to them when the next one is sent, and its least speed.
     way, near, least_speed = ([1.0, 0.4, 0.4], [1.0, -0.1, 0.4]), 0.4, 0.1
+    stopping = 1.5  # what it may fly until it stands, at its speed [s]
 
     def __init__(self, context, drone, settings):
         self.context = context
@@ -141,9 +142,9 @@ class LinkedFlight:
         assert result.result().result.reached, result.result().result.reason
 
     def stops(self, since):
-        """Check that it stops soon: set-points lead by a second, then it brakes."""
+        """Check that it stops soon: set-points lead by a second, and by what it needs to brake."""
         self.until(lambda: self.speed < 0.1)
-        assert self.away(since) < 1.5 * self.settings['motion']['speed']
+        assert self.away(since) < self.stopping * self.settings['motion']['speed']
 
     def gives_up(self, result, reason):
         """Check that it stops, its goal ends, the planner hears why, and that it is not sent on."""
@@ -225,6 +226,7 @@ class VehicleFlight(LinkedFlight):
     # Without a geofence it is not sent into the ground.
     outside = ([math.nan, 0.0, 0.8], [0.0, 0.0, math.inf], [0.0, 1.0, -0.1], [0.0, 9.0, 1.0])
     way, near, least_speed = ([1.0, -3.0, 0.8], [3.0, -5.0, 0.8]), 1.5, 0.4
+    stopping = 2.2
 
     def __init__(self, context, autopilot=(), own=(), **changes):
         self.make = MavlinkCameraDriver if 'camera' in changes else MavlinkDriver

@@ -1,11 +1,16 @@
 """How a drone under ArduCopter flies to its goals, leaves zones, and stops, against a fake one."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from guided_play import GuidedPlay
 
 from maasi_drivers.agent.waypoint_follower import GoalStatus
 from maasi_drivers.links.mavlink.vehicle import VehiclePhase
+from maasi_filter.geodesy import geodetic
+from maasi_sim.scenario.loading import load_scenario
 
 
 @pytest.fixture
@@ -199,9 +204,41 @@ def test_at_home_a_drone_that_is_not_charged_lands(guided):
     assert not play.autopilot.armed and play.body.grounded
 
 
-def test_with_the_parameters_of_the_document_it_arms_only_with_a_fence(monkeypatch):
-    play = GuidedPlay(monkeypatch, mavlink={'fence': 'none'}).run(20.0)
+DOCS = Path(__file__).parents[2] / 'docs'
+
+
+@pytest.mark.parametrize('name', ['drone_sitl', 'field_sitl'])
+def test_by_the_words_of_the_document_it_arms_rises_and_flies_in_its_fence(monkeypatch, name):
+    scenario = load_scenario(DOCS / f'{name}.yaml')
+    ((robot_name, robot),) = scenario.robots.items()
+    text = (DOCS / 'robots_mavlink.md').read_text()
+    assert f'docs/{name}.yaml' in text and f'arm --robot {robot_name}' in text
+    block = re.search(r'<!-- not run: a file for ArduPilot -->\n((?:    \w+ \d+\n)+)', text)[1]
+    parameters = {key: float(value) for key, value in map(str.split, block.splitlines())}
+    assert parameters['FENCE_ENABLE'] == 1.0 and parameters['FENCE_TYPE'] == 4.0
+    # The command of the document starts it at the `start` of the scenario.
+    homes = re.findall(r'--home ([-\d.]+),([-\d.]+),', text)
+    home = [[float(north), float(east)] for north, east in homes][name == 'field_sitl']
+    place = geodetic(np.array([robot.start]), scenario.environment.origin)[0, :2]
+    np.testing.assert_allclose(home, place, atol=2e-7)
+    play = GuidedPlay(
+        monkeypatch,
+        environment=scenario.environment,
+        motion=robot.motion.model_dump(),
+        parameters=parameters,
+        start=robot.start,
+        mavlink=robot.mavlink.model_dump() | {'lead': 1.0},
+    ).fly()
+    assert 'fence: uploaded and verified' in play.said and 'FENCE_ENABLE is 1' in play.said
+    assert play.fault == '' and 'less than motion.acceleration' not in play.said
+    x, y, z = robot.start
+    play.go_to(x + 4.0, y + 6.0, z).arrives()
+    assert play.fault == '' and play.phase is VehiclePhase.FLYING
+
+
+def test_what_the_document_says_of_a_fence_that_is_not_there(monkeypatch):
+    play = GuidedPlay(monkeypatch, mavlink={'fence': 'none'}, motion={'acceleration': 3.0})
+    play.run(20.0)
     assert not play.autopilot.armed
     assert 'PreArm: Fences enabled, but none selected' in play.said
-    play = GuidedPlay(monkeypatch).fly()
-    assert 'fence: uploaded and verified, 4 vertices and circles' in play.said
+    assert 'brakes with 2.5 m/s^2, less than motion.acceleration, 3' in play.said

@@ -73,7 +73,8 @@ class MavlinkRobotLink(RobotLink):
         memory = folder / 'maasi' / name
         settings = self.driver.settings
         self._link = VehicleLink(self._mavlink, settings.start, memory)
-        self._link.vehicle.speed = settings.motion.speed
+        vehicle, motion = self._link.vehicle, settings.motion
+        vehicle.speed, vehicle.braking = motion.speed, motion.acceleration
 
     def connect(self) -> None:
         """Open the connection; the vehicle is armed only once the driver is active."""

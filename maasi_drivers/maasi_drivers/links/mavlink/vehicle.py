@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission
 from maasi_drivers.links.mavlink.autopilot import Autopilot
-from maasi_drivers.links.mavlink.firmware import Firmware
+from maasi_drivers.links.mavlink.firmware import FailsafeCheck, Firmware
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, mavlink
 from maasi_drivers.links.mavlink.setpoints import braking_lead
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
@@ -80,6 +80,8 @@ class Vehicle(Autopilot):
         self._yaw: float | None = None
         #: What it is to fly at, at most [m/s]; none: as the autopilot has it.
         self.speed: float | None = None
+        #: What it is planned to brake with [m/s^2]; none: any.
+        self.braking: float | None = None
         self._speed_due = True
         #: The set-point (3,) that the autopilot has just rejected, or None.
         self.rejected: FloatArray | None = None
@@ -380,8 +382,20 @@ class Vehicle(Autopilot):
         estimate = self.estimate
         ready = estimate.telemetry is not None and not estimate.problem(fix_needed=False)
         if self.failsafes.complete and ready:
+            self._compare_limits(self.failsafes)
             self._enter(VehiclePhase.WAITING)
             self._wait(now)
+
+    def _compare_limits(self, failsafes: FailsafeCheck) -> None:
+        """Warn of a vehicle that is planned to be faster than its autopilot lets it be."""
+        most = failsafes.limit('acceleration') if self._firmware.limits else math.inf
+        if self.braking is not None and most < self.braking:
+            name = next(iter(self._firmware.limits['acceleration']))
+            self.log.add(
+                WARNING,
+                f'{name}: the autopilot speeds up and brakes with {most:g} m/s^2, less than '
+                f'motion.acceleration, {self.braking:g}: it comes later than planned',
+            )
 
     def _wait(self, now: float) -> None:
         assert self.failsafes is not None
