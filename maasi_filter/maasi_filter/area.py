@@ -207,7 +207,9 @@ class Area:
         likely, inside = self._cells()
         share = float(inside.mean())
         if not inside.any():
-            inside, share = self._outlined(inside)
+            low, size = self.bounds[:2, 0], self.bounds[:2, 1] - self.bounds[:2, 0]
+            inside = self.outline(low, size / inside.shape, inside.shape)
+            share = self.region.area / float(np.prod(size)) if self.region else 1.0
         likely = _scaled(likely * inside)
         promised = float(likely.sum() / inside.sum())
         if not promised > 0.0:
@@ -215,17 +217,18 @@ class Area:
         floor = self.settings.prior.floor
         return Density((floor + (1.0 - floor) * likely / promised) * inside, share, False)
 
-    def _outlined(self, inside: FloatArray) -> tuple[FloatArray, float]:
-        """Return as inside the cells on the outline of a region narrower than them; its share."""
-        assert self.region is not None
-        low, size = self.bounds[:2, 0], self.bounds[:2, 1] - self.bounds[:2, 0]
-        cell = size / inside.shape
-        outline = shapely.segmentize(self.region.boundary, 0.5 * float(cell.min()))
-        number = ((shapely.get_coordinates(outline) - low) / cell).astype(int)
-        x, y = np.clip(number, 0, np.array(inside.shape) - 1).T
-        marked = np.zeros(inside.shape)
+    def outline(self, low: FloatArray, cell: FloatArray, shape: tuple[int, int]) -> FloatArray:
+        """Return 1 for the cells of a level grid that the border of the region passes, (nx, ny).
+
+        For grids that are too coarse for it: low, cell (2,): the grid's corner, and its cells [m].
+        """
+        region = self.border if self.region is None else self.region
+        border = shapely.segmentize(region.boundary, 0.5 * float(cell.min()))
+        number = np.floor((shapely.get_coordinates(border) - low) / cell).astype(int)
+        x, y = np.clip(number, 0, np.array(shape) - 1).T
+        marked = np.zeros(shape)
         marked[x, y] = 1.0
-        return marked, self.region.area / float(np.prod(size))
+        return marked
 
     def _zones_outside(self) -> list[str]:
         """Return in words which zones and polygons of the prior touch nothing of the area."""

@@ -241,6 +241,10 @@ class UnexploredMap:
             density = area.density(places.reshape(-1, 2)).reshape(*part.shape, *y.shape)
             self.density[first : first + rows, :, 0] = density.mean(axis=(1, 3))
             self._open[first : first + rows, :, 0] = (density > 0.0).mean(axis=(1, 3))
+        if not self.density.any():
+            # Narrower than the samples are apart.
+            low = self._lower[:2] - 0.5 * self._step[:2]
+            self.density = self._open = area.outline(low, self._step[:2], shape)[:, :, None]
         volumes = self._cells.reshape(self._values.shape) * self.density
         self._volumes = volumes.reshape(self.values.shape)
 

@@ -335,7 +335,7 @@ def test_a_keep_out_always_wins_over_the_prior():
         rough = 0.1 * left.length + 0.1
         assert area.volume == pytest.approx(left.area, abs=rough)
         found = UnexploredMap(area, 2.0)
-        assert found.density.max() > 0.0 or left.area < 16.0
+        assert found.density.max() > 0.0 and found.explored_fraction() == 0.0
     assert even >= 5 and refused >= 2
 
 
@@ -349,6 +349,11 @@ def test_slivers_between_the_cells_of_the_density_are_ground():
     assert area.region.area == pytest.approx(0.04, rel=1e-3)
     assert area.volume == pytest.approx(0.04, rel=1e-3)
     assert area.density(np.array([[20.0, 15.0005]])).tolist() == [1.0]
+    unexplored = UnexploredMap(area, 2.0)
+    assert unexplored.density.max() > 0.0 and unexplored.explored_fraction() == 0.0
+    around = BoxDetection([-50.0, -20.0], [50.0, 20.0], 1.0)
+    unexplored.update(around, Pose(np.array([20.0, 15.0])))
+    assert unexplored.explored_fraction() == 1.0
     assert Area(environment(area=[[0, 0], [40, 40], [39.99, 40]])).volume == pytest.approx(0.2)
 
 
