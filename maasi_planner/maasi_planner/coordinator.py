@@ -18,7 +18,8 @@ from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
-from maasi_planner.planners.base import check_decision, explain, keep_apart
+from maasi_planner.planners.base import check_decision, explain
+from maasi_planner.planners.separation import keep_apart
 from maasi_planner.robot_plan import Errand, Member, PresentRobot, RobotPlan
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, stay

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from maasi_planner.endurance import NOTHING_AFFORDABLE, SEARCH_ENDED, Endurance, Phase
-from maasi_planner.planners.base import go_home
+from maasi_planner.planners.way_home import go_home
 from maasi_planner.robot_plan import Errand, PresentRobot, RobotPlan
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
 

@@ -12,7 +12,7 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import CandidateSet
 from maasi_planner.endurance import Endurance
 from maasi_planner.motion import MotionModel, RobotState
-from maasi_planner.planners.base import braking_path
+from maasi_planner.planners.separation import braking_path
 from maasi_planner.team import RobotDecision, RobotView
 
 

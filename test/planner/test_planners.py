@@ -22,9 +22,10 @@ from maasi_planner import (
     make_planner,
 )
 from maasi_planner.endurance import Endurance, EnduranceSettings
-from maasi_planner.planners.base import go_home, keep_apart
 from maasi_planner.planners.lawnmower import lanes
 from maasi_planner.planners.mutual_information import intensity, mutual_information
+from maasi_planner.planners.separation import keep_apart
+from maasi_planner.planners.way_home import go_home
 from maasi_planner.team import Decision, single_choice, stay
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
@@ -332,6 +333,9 @@ def test_robots_keep_apart_on_their_ways(name):
     for seed in range(200):
         rng = np.random.default_rng(seed)
         team = random_team(rng, planning=3, waiting=2, candidates=8, radius=0.04)
+        for view in team.robots.values():
+            if view.remaining_path is not None:
+                view.state = RobotState.at_rest(view.remaining_path[0])
         decision = make_planner(name).decide(team)
         keep_apart(team, decision, {})
         ways = {key: robot.positions for key, robot in decision.robots.items()}

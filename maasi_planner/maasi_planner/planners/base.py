@@ -4,18 +4,20 @@ import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numba import njit
 from pydantic import BaseModel
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.models.pose import Pose
 from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
-from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
+from maasi_planner.motion.base import Trajectories
+from maasi_planner.planners.separation import apart as apart
+from maasi_planner.planners.separation import free_of_robots as free_of_robots
+from maasi_planner.planners.separation import ways_apart
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import (
     BLOCKED,
@@ -25,21 +27,10 @@ from maasi_planner.team import (
     RobotView,
     TeamView,
     UsableCandidates,
-    single_choice,
     stay,
 )
 from maasi_planner.team import (
     CROSSED as CROSSED,
-)
-
-# Steps in which a robot brakes at most, and the speed below which it stands [m/s].
-_BRAKING_STEPS, _STANDS = 400, 1e-3
-# Turn a way in the plane aside, by angles [rad], and halve it: (6, 3, 2).
-_ASIDE = np.array(
-    [
-        0.5 * np.array([[math.cos(t), -math.sin(t)], [math.sin(t), math.cos(t)], [0.0, 0.0]])
-        for t in (0.5, -0.5, 1.0, -1.0, 1.5, -1.5)
-    ]
 )
 
 
@@ -197,19 +188,6 @@ def waiting_places(team: TeamView) -> list[tuple[FloatArray, float]]:
     return places
 
 
-def free_of_robots(
-    points: FloatArray, radius: float, places: list[tuple[FloatArray, float]]
-) -> BoolArray:
-    """Return which waypoints (W, 3) keep the radii away from where others will stand."""
-    free = np.ones(len(points), dtype=bool)
-    for place, other in places:
-        reach = radius + other
-        if reach > 0.0:
-            offset = points - place
-            free &= (offset * offset).sum(axis=1) >= reach * reach
-    return free
-
-
 def options_of(
     team: TeamView,
     name: str,
@@ -242,11 +220,14 @@ def options_of(
 
 
 def usable_options(
-    team: TeamView, decision: Decision, extra: Callable[[str], FloatArray | None] = lambda _: None
+    team: TeamView,
+    decision: Decision,
+    extra: Callable[[str], FloatArray | None] = lambda _: None,
+    kept: Callable[[str, Trajectories], Trajectories] = lambda _, exact: exact,
 ) -> dict[str, UsableCandidates]:
     """Return the candidates of the robots that have some; the others stay in `decision`.
 
-    extra: further waypoints (n, 3) of a robot.
+    extra: further waypoints (n, 3) of a robot; kept: what is kept of its predicted trajectories.
     """
     places = waiting_places(team)
     options = {}
@@ -255,7 +236,7 @@ def usable_options(
         if isinstance(found, str):
             decision.robots[name] = stay(team.robots[name], f'stays: {found}')
         else:
-            options[name] = found
+            options[name] = replace(found, prediction=kept(name, found.prediction))
     return options
 
 
@@ -266,96 +247,6 @@ def centres_of(team: TeamView, view: RobotView, clusters: Sequence[Cluster]) -> 
     for row, cluster in zip(centres, clusters):
         row[: team.dimension] = cluster.position[: team.dimension]
     return centres
-
-
-@njit(cache=True)
-def _gaps(ways: FloatArray, other: FloatArray) -> FloatArray:
-    """Return how near each of the ways (W, K, 3) comes to another (n, 3), also between steps, (W,).
-
-    At their ends robots stand.
-    """
-    out = np.full(ways.shape[0], np.inf)
-    for w in range(ways.shape[0]):
-        dx = dy = dz = 0.0
-        for k in range(max(ways.shape[1], other.shape[0])):
-            here, there = min(k, ways.shape[1] - 1), min(k, other.shape[0] - 1)
-            x = ways[w, here, 0] - other[there, 0]
-            y = ways[w, here, 1] - other[there, 1]
-            z = ways[w, here, 2] - other[there, 2]
-            square = x * x + y * y + z * z
-            if k > 0:
-                # Between two steps both move evenly.
-                mx, my, mz = x - dx, y - dy, z - dz
-                moved = mx * mx + my * my + mz * mz
-                along = -(dx * mx + dy * my + dz * mz)
-                if 0.0 < along < moved:
-                    before = dx * dx + dy * dy + dz * dz
-                    square = min(square, max(before - along * along / moved, 0.0))
-            out[w] = min(out[w], square)
-            dx, dy, dz = x, y, z
-    return np.sqrt(out)
-
-
-def braking_path(motion: MotionModel, state: RobotState, step: float) -> FloatArray:
-    """Return where a robot goes that is commanded to stand, (n, 3), from its present position on.
-
-    It is its position alone where it stands, or drifts by less than a tenth of its tolerance.
-    """
-    path = [np.array(state.pose.position, dtype=float)]
-    if np.linalg.norm(state.velocity) > _STANDS:
-        body = motion.body(state)
-        for _ in range(_BRAKING_STEPS):
-            body.step(np.zeros(4), step)
-            now = body.robot_state()
-            path.append(np.array(now.pose.position))
-            if np.linalg.norm(now.velocity) <= _STANDS:
-                break
-    drift = math.dist(path[0], path[-1])
-    return np.array(path if drift > 0.1 * motion.settings.tolerance else path[:1])
-
-
-def with_braking(motion: MotionModel, robot: RobotDecision, step: float) -> FloatArray:
-    """Return the predicted path (n, 3) of a robot, with what it drifts after it has arrived."""
-    path = robot.positions
-    if len(path) < 2:
-        return path
-    state = RobotState(Pose.from_yaw(path[-1], robot.yaws[-1]), (path[-1] - path[-2]) / step)
-    return np.vstack([path, braking_path(motion, state, step)[1:]])
-
-
-def ways_apart(
-    team: TeamView, name: str, ways: FloatArray, others: Mapping[str, FloatArray]
-) -> BoolArray:
-    """Return which predicted ways (W, K, 3) of a robot keep the radii away from those of others.
-
-    others: ways (n, 3) of robots that have just been decided, by name; the others are where they
-    stand, or on the rest of their ways. A robot that is too near already may not come nearer.
-    """
-    view = team.robots[name]
-    free = np.ones(len(ways), dtype=bool)
-    for path, radius in _paths(team, name, others):
-        if view.radius + radius > 0.0:
-            now = float(np.linalg.norm(view.state.pose.position - path[0]))
-            reach = min(view.radius + radius, now)
-            free &= _gaps(ways, np.ascontiguousarray(path, dtype=float)) >= reach - 1e-9
-    return free
-
-
-def _paths(
-    team: TeamView, name: str, others: Mapping[str, FloatArray]
-) -> list[tuple[FloatArray, float]]:
-    """Return where the others go or stand, (n, 3), and their radii."""
-    paths = [(place[None, :], radius) for place, radius in team.taken]
-    for other in team.names():
-        robot = team.robots[other]
-        if other in others:
-            paths.append((others[other], robot.radius))
-        elif other != name and not robot.planning:
-            path = robot.remaining_path
-            if path is None or not len(path):
-                path = robot.state.pose.position[None, :]
-            paths.append((path, robot.radius))
-    return paths
 
 
 def affordable(
@@ -381,92 +272,6 @@ def held_back(team: TeamView, name: str, prediction: Trajectories, decision: Dec
     if not affordable(team, name, prediction, prediction.reached)[0]:
         return f'stays: {SAVES_BATTERY}'
     return ''
-
-
-def keep_apart(team: TeamView, decision: Decision, left: Mapping[str, FloatArray]) -> None:
-    """Let robots wait whose ways would come too near to each other; the first by name has priority.
-
-    A robot that waits brakes, which may make others wait, too; left: or it is still on the rest
-    (n, 3) of its present path.
-    """
-    ways, rest = {}, dict(left)
-    for name, robot in decision.robots.items():
-        view = team.robots[name]
-        if name not in rest:
-            rest[name] = braking_path(view.motion, view.state, team.step_time)
-        going = rest[name] if robot.stays else with_braking(view.motion, robot, team.step_time)
-        ways[name] = going
-    changed = True
-    while changed:
-        changed = False
-        for name in sorted(ways, reverse=True):
-            others = {key: way for key, way in ways.items() if key != name}
-            chosen = decision.robots[name]
-            if chosen.stays or ways_apart(team, name, ways[name][None], others)[0]:
-                continue
-            decision.robots[name] = stay(team.robots[name], CROSSED)
-            ways[name] = rest[name]
-            changed = True
-
-
-def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> RobotDecision:
-    """Send a robot to a charger past others who are in the way; it waits where all are taken."""
-    view, endurance = team.robots[name], team.robots[name].endurance
-    assert endurance is not None
-    here, keep_out = view.state.pose.position, view.motion.keep_out
-    others = {key: robot.positions for key, robot in decision.robots.items() if key != name}
-    places = [(path[-1], radius) for path, radius in _paths(team, name, others)]
-    chargers = endurance.chargers_within(here)
-    free = [charger for charger in chargers if apart(charger, view.radius, places)]
-    charger = (free or chargers)[0]
-    prediction = view.motion.predict(view.state, charger[None, :], team.step_time)
-    if not free:
-        return _wait_near(team, name, charger, others, reason)
-    if ways_apart(team, name, prediction.positions, others)[0]:
-        return single_choice(charger[None, :], prediction, 0, reason)
-    # Past where they will stand; else aside, until they have passed.
-    aside = here + _ASIDE @ (charger - here)[:2]
-    moved = [keep_out.moved_out(here, point) for point in aside]
-    inside = [place for place in moved if place is not None and team.area.inside(place[None, :])[0]]
-    goals = np.array([keep_out.past(here, charger, places), *inside])
-    prediction = view.motion.predict(view.state, goals, team.step_time)
-    usable = ways_apart(team, name, prediction.positions, others) & prediction.reached
-    return single_choice(goals, prediction, int(np.argmax(usable)), reason)
-
-
-def _wait_near(
-    team: TeamView, name: str, charger: FloatArray, others: Mapping[str, FloatArray], reason: str
-) -> RobotDecision:
-    """Send a robot near a charger that is taken, where it waits; it stays if it is there."""
-    view = team.robots[name]
-    here, motion, taken = view.state.pose.position, view.motion, 'all chargers are taken'
-    places = [(path[-1], radius) for path, radius in _paths(team, name, others)]
-    # Far enough that the robot at the charger can leave it.
-    reach = 3.0 * (view.radius + max(radius for _, radius in places))
-    reach += 2.0 * motion.settings.tolerance
-    if math.dist(here, charger) <= 1.25 * reach:
-        return stay(view, f'waits: {taken}')
-    turns = np.linspace(0.0, 2.0 * math.pi, 8, endpoint=False)
-    turns += math.atan2(here[1] - charger[1], here[0] - charger[0])
-    ring = charger + reach * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
-    free = [
-        bool(team.area.inside(point[None, :])[0] and motion.keep_out.is_free(point))
-        and apart(point, view.radius, places)
-        for point in ring
-    ]
-    if not any(free):
-        return stay(view, f'waits: {taken}')
-    goals = ring[free]
-    prediction = motion.predict(view.state, goals, team.step_time)
-    usable = ways_apart(team, name, prediction.positions, others) & prediction.reached
-    if not usable.any():
-        return stay(view, CROSSED)
-    return single_choice(goals, prediction, int(np.argmax(usable)), f'{reason}; {taken}')
-
-
-def apart(point: FloatArray, radius: float, others: list[tuple[FloatArray, float]]) -> bool:
-    """Return whether a waypoint (3,) keeps the radii away from other places."""
-    return bool(free_of_robots(point[None, :], radius, others)[0])
 
 
 def all_apart(team: TeamView, waypoints: Mapping[str, FloatArray]) -> bool:
