@@ -83,7 +83,7 @@ def make_field(seed: int) -> Field:
         if robots:
             break
     weak = _batteries(rng, robots, ground)
-    limit = float(rng.integers(60, 301))
+    limit = float(round(60.0 + 240.0 * rng.random() ** 2))
     count = int(rng.integers(0, 6))
     environment: dict[str, Any] = {
         'expected_targets': float(rng.choice([0.3, 1.0, 3.0, 8.0])),
@@ -318,14 +318,14 @@ def _candidates(
     west, south, east, north = ground.border.bounds
     if kind in ('bounds', 'holes', 'forest'):
         numbers = [
-            int(np.clip(math.ceil(side / (1.6 * half)), 2, 8))
+            int(np.clip(math.ceil(side / (1.6 * half)), 2, 6))
             for side in (east - west, north - south)
         ]
         spacing = [round((east - west) / numbers[0], 2), round((north - south) / numbers[1], 2)]
         corner = [round(west + 0.5 * spacing[0], 2), round(south + 0.5 * spacing[1], 2)]
         return {'grid': numbers, 'spacing': spacing, 'corner': corner}
     room = ground.free(0.5)
-    number = int(np.clip(room.area / (1.2 * half) ** 2, 6, 45))
+    number = int(np.clip(room.area / (1.2 * half) ** 2, 6, 25))
     return {'points': [[*_inside(rng, room), height] for _ in range(number)]}
 
 
