@@ -31,8 +31,8 @@ LEAST_GAIN = 1e-7
 class Nodes(NamedTuple):
     """L nodes where targets are unseen.
 
-    numbers (nx, ny, nz): which of them a cell is, or -1; lower (3,) and step (3,) of the grid [m]; places (3, L)
-    [m]; unseen (L,), the expected targets of each.
+    numbers (nx, ny, nz): which of them a cell is, or -1; lower (3,) and step (3,) of the grid [m];
+    places (3, L) [m]; unseen (L,), the expected targets of each.
     """
 
     numbers: IndexArray
@@ -191,7 +191,7 @@ def rows_of(
         for i in range(count):
             miss[seen[i]] = 1.0
         counts[g], used = length, used + length
-    return counts, node[:used], row[:used]
+    return counts, node[:used].copy(), row[:used].copy()
 
 
 def starts_of(counts: IntArray) -> IntArray:

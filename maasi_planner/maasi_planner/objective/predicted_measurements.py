@@ -1,7 +1,10 @@
 """Predicted measurements along trajectories, and what they leave unseen."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +20,7 @@ from maasi_filter.models.detection import (
     detection_probability_at,
     fill_probabilities,
 )
+from maasi_planner.motion.base import Trajectories
 from maasi_planner.team import RobotView
 
 NEVER = 1 << 60  # after every measurement [steps]
@@ -48,7 +52,8 @@ class Measurements(NamedTuple):
 class Ways(NamedTuple):
     """Trajectories (W, K + 1) of a robot of `lengths` steps, and when it measures on them.
 
-    First after `phase` steps, then in every period, and with `arrival` at the end.
+    First after `phase` steps, then in every period, and with `arrival` at the end. Positions are
+    `stride` steps apart, of which phase and period are multiples, and at the end.
     """
 
     view: RobotView
@@ -57,6 +62,40 @@ class Ways(NamedTuple):
     lengths: IntArray
     phase: int
     arrival: bool
+    stride: int = 1
+
+
+@dataclass
+class CoarseTrajectories(Trajectories):
+    """Trajectories of which only each `stride`-th position, and the end, is kept."""
+
+    stride: int
+    metres: FloatArray
+
+    @classmethod
+    def of(cls, exact: Trajectories, stride: int) -> CoarseTrajectories:
+        """Return them from all positions."""
+        last = exact.positions.shape[1] - 1
+        steps = np.minimum(np.arange(-(-last // stride) + 1) * stride, last)
+        return cls(
+            exact.positions[:, steps],
+            exact.yaws[:, steps],
+            exact.lengths,
+            exact.control_cost,
+            exact.reached,
+            stride,
+            exact.distances(),
+        )
+
+    def distances(self) -> FloatArray:
+        """See `Trajectories.distances`."""
+        return self.metres
+
+
+def planned_way(view: RobotView, prediction: Trajectories, arrival: bool) -> Ways:
+    """Return the trajectories of a robot that plans, and measures now."""
+    stride = prediction.stride if isinstance(prediction, CoarseTrajectories) else 1
+    return Ways(view, prediction.positions, prediction.yaws, prediction.lengths, 0, arrival, stride)
 
 
 def remaining_way(view: RobotView) -> Ways:
@@ -78,11 +117,11 @@ def _fill(
     positions: FloatArray,
     yaws: FloatArray,
     lengths: IntArray,
-    timing: tuple[int, int, int, bool],
+    timing: tuple[int, int, int, bool, int],
     dimension: int,
 ) -> None:
-    """Fill the rows of a robot from `row` on; timing: phase, period, horizon, arrival."""
-    phase, period, horizon, arrival = timing
+    """Fill the rows of a robot from `row` on; timing: phase, period, horizon, arrival, stride."""
+    phase, period, horizon, arrival, stride = timing
     for g, (path, heading, last) in enumerate(zip(positions, yaws, lengths), row):
         number, t, times = 0, phase, out.times[g]
         while t < last:
@@ -95,7 +134,8 @@ def _fill(
             times[number], number, t = t, number + 1, t + period
         out.number[g] = number
         for i in range(number):
-            k = min(times[i], last)
+            # At the end, or a multiple of the stride.
+            k = (min(times[i], last) + stride - 1) // stride
             out.yaws[g, i] = heading[k]
             for axis in range(dimension):
                 out.places[g, i, axis] = path[k, axis]
@@ -126,7 +166,8 @@ def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurement
     )
     row = 0
     for ways, count in zip(robots, counts):
-        timing = ways.phase, ways.view.period_steps, horizon if extend else -1, ways.arrival
+        until, period = horizon if extend else -1, ways.view.period_steps
+        timing = ways.phase, period, until, ways.arrival, ways.stride
         dimension = ways.view.sensor.dimension
         _fill(out, row, ways.positions, ways.yaws, ways.lengths, timing, dimension)
         row += count

@@ -9,7 +9,7 @@ from maasi_planner.objective.candidate_table import CandidateTable, part_of_tabl
 from maasi_planner.objective.information_terms import InformationTerms, joined, reduced
 from maasi_planner.objective.joint_search import PAIRS_LIMIT
 from maasi_planner.objective.paper_terms import paper_terms
-from maasi_planner.objective.predicted_measurements import Ways, predicted, remaining_way
+from maasi_planner.objective.predicted_measurements import planned_way, predicted, remaining_way
 from maasi_planner.objective.terms import Terms
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import RobotView, TeamView, UsableCandidates
@@ -42,8 +42,8 @@ class TeamObjective:
         self.start = np.array([0, *(len(option.points) for option in choices)]).cumsum()
         views = [team.robots[name] for name in self.names]
         ways = [
-            Ways(view, way.positions, way.yaws, way.lengths, 0, weights.arrival)
-            for view, way in zip(views, (option.prediction for option in choices))
+            planned_way(view, option.prediction, weights.arrival)
+            for view, option in zip(views, choices)
         ]
         rest = [remaining_way(team.robots[name]) for name in team.names() if name not in self.names]
         # The first measurement that counts: the present one does not depend on the choice.

@@ -3,7 +3,9 @@
 from numba import njit
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_planner.objective.joint_search import search
+from maasi_planner.motion.base import Trajectories
+from maasi_planner.objective.joint_search import PAIRS_LIMIT, search
+from maasi_planner.objective.predicted_measurements import CoarseTrajectories
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.objective.terms import Terms
 from maasi_planner.planners.base import Planner, centres_of, explain, usable_options
@@ -29,7 +31,14 @@ class Intermittent(Planner):
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
         decision = Decision(step=team.step)
-        options = usable_options(team, decision, lambda name: self._centres(team, name))
+        # Whole trajectories to all candidates of all robots of a large team need much memory.
+        coarse = len(team.planning()) > PAIRS_LIMIT
+
+        def kept(name: str, exact: Trajectories) -> Trajectories:
+            period = team.robots[name].period_steps
+            return CoarseTrajectories.of(exact, period) if coarse else exact
+
+        options = usable_options(team, decision, lambda name: self._centres(team, name), kept)
         if not options:
             return explain(decision)
         objective, weights = TeamObjective(team, self.settings, options), self.settings.weights()
@@ -54,6 +63,11 @@ class Intermittent(Planner):
                 f'{option.prediction.lengths[best]} steps, the best of {len(option.points)}'
             )
             result = single_choice(option.points, option.prediction, best, reason)
+            if coarse:
+                view, point = team.robots[name], option.points[best : best + 1]
+                exact = view.motion.predict(view.state, point, team.step_time)
+                end = int(exact.lengths[0]) + 1
+                result.positions, result.yaws = exact.positions[0, :end], exact.yaws[0, :end]
             result.target_refinement, result.exploration, result.objective = terms.T
             result.measurements = objective.table.planned.own[first:last]
             decision.robots[name] = result
