@@ -2,17 +2,21 @@
 
 import copy
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
+import yaml
 from small_field import SMALL_FIELD
 
 from maasi_filter.area import Area, level_shape
 from maasi_planner.motion import RobotState, make_motion
+from maasi_sim.scenario.checks import doubts_about
 from maasi_sim.scenario.free_space import FreeSpace
 from maasi_sim.scenario.layering import ScenarioError
-from maasi_sim.scenario.loading import scenario_from_values
+from maasi_sim.scenario.loading import find_scenario, scenario_from_values
+from maasi_sim.simulation.robots import Simulation
 
 # Two halls of 40 m, joined by a door of 6 m.
 HALLS = [[0, 0], [40, 0], [40, 17], [50, 17], [50, 0], [90, 0]]
@@ -112,3 +116,22 @@ def test_random_chargers_are_those_that_the_robot_gets_to():
             assert allowed == bool(motion.predict(start, goal[None], 0.2).reached[0])
             counts[allowed] += 1
     assert min(counts.values()) > 20
+
+
+def test_the_block_of_the_tutorial_names_a_robot_that_is_charged():
+    """As it stands there, in the scenario that it is of."""
+    text = (Path(__file__).parents[2] / 'docs' / 'tutorials' / 'area.md').read_text()
+    (block,) = (
+        item for item in re.findall(r'```yaml\n(.*?)```', text, re.S) if 'endurance' in item
+    )
+    values = yaml.safe_load(find_scenario('field').read_text())
+    values['environment']['area'] = str(find_scenario('field').with_name('field.geojson'))
+    for name, given in yaml.safe_load(block)['robots'].items():
+        values['robots'][name] |= given
+    field = scenario_from_values(values, 'tutorial')
+    assert not list(doubts_about(field))
+    west = Simulation(field, 1).robots['west']
+    west.battery.charge = 0.4
+    for step in range(1, 1001):
+        west.step(step, 1.0)
+    assert west.battery.charge > 0.9
