@@ -2,6 +2,7 @@
 
 import copy
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -126,6 +127,12 @@ def test_the_time_of_work_is_that_of_flights_and_charges_in_turn():
         time, number = effort.working(total)
         assert time == pytest.approx(worked, abs=5.0 + 0.01 * total)
         assert abs(number - charges) <= 1
+
+
+def test_the_tutorial_shows_what_is_printed():
+    text = (Path(__file__).parents[2] / 'docs' / 'tutorials' / 'area.md').read_text()
+    (shown,) = re.findall(r'```text\n(area: .*?)\n```', text, re.S)
+    assert shown == '\n'.join(load_mission('field').preflight().lines)
 
 
 def test_shipped_scenarios_have_no_warnings():
