@@ -14,6 +14,8 @@ def pytest_addoption(parser):
     """Add the option of tests that make random searches."""
     about = 'seeds of random searches, the first and the one after the last'
     parser.addoption('--search-seeds', nargs=2, type=int, default=[0, 4], help=about)
+    about = 'random fields that are searched, the first and the one after the last'
+    parser.addoption('--fields', nargs=2, type=int, default=[0, 12], help=about)
 
 
 def pytest_sessionfinish():

@@ -133,7 +133,9 @@ class FieldSearch(_Search):
                 )
                 ways = motion.predict(state, goal.waypoint[None, :], self.scenario.step).positions
             motion.take_area(area, robot.body.settings.radius)
-            if ways is not None and not all(map(motion.keep_out.is_free, ways[0])):
+            free = [] if ways is None else [motion.keep_out.is_free(place) for place in ways[0]]
+            # The part on which it leaves a zone does not count.
+            if not all(free[free.index(True) if True in free else 0 :]):
                 follower.end(GoalStatus.ABORTED, 'a keep-out lies on its way')
 
 
