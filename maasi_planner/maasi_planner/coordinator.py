@@ -24,6 +24,8 @@ from maasi_planner.robot_plan import Errand, Member, PresentRobot, RobotPlan
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, stay
 
+_ROUNDING = 1e-9  # of shares
+
 
 class Coordinator:
     """Plans for a team of robots step by step.
@@ -69,6 +71,8 @@ class Coordinator:
             )
         self.homing = Homing(self.plans)
         self._ended = False
+        # Robots that have not been planned since ground was opened.
+        self._unasked: set[str] = set()
         self._live = _live(settings.planner)
 
     @property
@@ -79,11 +83,15 @@ class Coordinator:
     def take_area(self, area: Area) -> None:
         """Take another area within the same bounds, as with other keep-outs.
 
-        A search that was finished goes on where that opens something.
+        A search that was finished continues where that opens something.
         """
         self.area = area
-        self.finished, self._ended = None, False
+        before = self._open_share()
         self.exploration.take_area(area)
+        if self._open_share() > before + _ROUNDING:
+            self.finished, self._ended = None, False
+            # What the planner knew of each before says nothing about ground that is opened.
+            self._unasked = set(self.plans)
         # Waypoints in closed zones are dropped at each decision.
         lasting = Area(area.settings.without_keep_outs())
         for name, plan in self.plans.items():
@@ -99,7 +107,7 @@ class Coordinator:
         """Begin a new search with nothing explored; decision indices continue."""
         self.exploration.values[...] = 1.0
         self.clusters = []
-        self.finished, self._ended = None, False
+        self.finished, self._ended, self._unasked = None, False, set()
         self.homing.begin_again()
         self.planner = make_planner(self.settings.planner.name, self.settings.planner)
         self.trigger = MeasurementTrigger(self.settings.planner)
@@ -167,7 +175,7 @@ class Coordinator:
         decision = Decision(step)
         if asked or errands or landed or cut_off:
             views = {
-                name: self.plans[name].view(step, robots[name], name in asked, self.settings.step)
+                name: self.plans[name].view(step, robots[name], name in asked)
                 for name in sorted(robots)
             }
             knowledge = self.clusters, self.exploration
@@ -195,6 +203,11 @@ class Coordinator:
             self._live = live
             self.planner.take_settings(settings)
 
+    def _open_share(self) -> float:
+        """Return the share of the expected targets that is unseen on ground that is open."""
+        exploration = self.exploration
+        return 1.0 - exploration.explored_fraction() - exploration.closed_share()
+
     def _closed(self) -> float:
         """Return how many targets are expected where zones are closed now; 0 if hardly any."""
         share = self.exploration.closed_share()
@@ -209,7 +222,9 @@ class Coordinator:
         decision: Decision,
     ) -> bool:
         """Return whether nothing is left to gain now; then the robots wait, or are finished."""
-        conclusion = self.planner.finished(team)
+        unasked = self._unasked.intersection(asked)
+        self._unasked -= unasked
+        conclusion = None if unasked else self.planner.finished(team)
         if conclusion is None:
             return False
         arrived = [name for name in asked if robots[name].free]

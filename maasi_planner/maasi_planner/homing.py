@@ -6,10 +6,13 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from maasi_planner.endurance import NOTHING_AFFORDABLE, SEARCH_ENDED, Endurance, Phase
-from maasi_planner.planners.way_home import go_home
+from maasi_planner.planners.way_home import go_home, make_room
 from maasi_planner.robot_plan import Errand, PresentRobot, RobotPlan
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
 
+# A robot at a charger makes room for one that waits for it with less than this share of its
+# reserve, and with so much less charge than its own.
+_URGENT, _MORE = 0.5, 0.2
 # Charge of a battery that cannot be charged any further.
 _FULL = 0.999
 TOP = 'charges beyond full'  # in place of the reason of a phase
@@ -89,7 +92,7 @@ class Homing:
     def is_available(self, name: str, robot: PresentRobot) -> bool:
         """Return whether the planner may send a robot."""
         plan = self._plans[name]
-        if not robot.searches or plan.errand is Errand.LEAVE:
+        if not robot.searches or plan.errand in (Errand.LEAVE, Errand.ROOM):
             return False
         endurance = plan.endurance
         return endurance is None or (endurance.phase is Phase.AVAILABLE and not endurance.cut_off)
@@ -117,7 +120,35 @@ class Homing:
             # Where it could not go it tries again after a while.
             if errand is not None and not _waits(plan, robot, step):
                 found[name] = errand
+        # Those with the least charge choose their chargers first.
+        found = dict(sorted(found.items(), key=lambda item: (self._charge(item[0]), item[0])))
+        for name in robots:
+            if self._is_wanted(name, robots):
+                found.setdefault(name, Errand.ROOM)
         return found
+
+    def _charge(self, name: str) -> float:
+        endurance = self._plans[name].endurance
+        return 0.0 if endurance is None or math.isnan(endurance.charge) else endurance.charge
+
+    def _is_wanted(self, name: str, robots: Mapping[str, PresentRobot]) -> bool:
+        """Return whether a robot occupies a charger for which another one waits urgently."""
+        plan, robot = self._plans[name], robots[name]
+        endurance = plan.endurance
+        if endurance is None or not robot.returns or not plan.is_home(robot):
+            return False
+        if endurance.phase is not Phase.CHARGING:
+            return False
+        for other in robots:
+            waiting = self._plans[other]
+            if other == name or not waiting.queues or waiting.endurance is None:
+                continue
+            charge = waiting.endurance.charge
+            urgent = charge < _URGENT * waiting.endurance.settings.reserve
+            near = waiting.endurance.is_home(robot.state.pose.position)
+            if urgent and near and endurance.charge > charge + _MORE:
+                return True
+        return False
 
     def _errand(self, plan: RobotPlan, robot: PresentRobot, finished: bool) -> Errand | None:
         leaving = plan.errand is Errand.LEAVE and not robot.free
@@ -126,7 +157,7 @@ class Homing:
         endurance = plan.endurance
         if endurance is None or endurance.cut_off:
             return None
-        if plan.errand is Errand.HOME and not robot.free and not plan.staying:
+        if plan.errand is not None and not robot.free and not plan.staying:
             return None
         if robot.free and endurance.is_home(robot.state.pose.position):
             return None
@@ -150,6 +181,9 @@ class Homing:
                 assert goal is not None
                 path = view.motion.predict(view.state, goal[None, :], team.step_time)
                 chosen = single_choice(goal[None, :], path, 0, Errand.LEAVE.value)
+            elif errand is Errand.ROOM:
+                self._phases[name] = Phase.RETURNING, ''
+                chosen = make_room(team, name, decision, Errand.ROOM.value)
             else:
                 chosen = self._home(team, name, decision, finished)
             decision.robots[name] = chosen

@@ -12,8 +12,7 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import CandidateSet
 from maasi_planner.endurance import Endurance
 from maasi_planner.motion import MotionModel, RobotState
-from maasi_planner.planners.separation import braking_path
-from maasi_planner.team import RobotDecision, RobotView
+from maasi_planner.team import TAKEN, RobotDecision, RobotView
 
 
 @dataclass
@@ -41,6 +40,7 @@ class Errand(Enum):
 
     LEAVE = 'leaves the closed zone'
     HOME = 'goes home'
+    ROOM = 'makes room at its charger'
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,8 @@ class RobotPlan:
     errand: Errand | None = None
     # Whether its last decision was to stay, as there is nothing to do for it.
     idle: bool = False
+    # Whether it waits until a charger is free, or goes there to wait.
+    queues: bool = False
     # Index on `positions` that it has reached, and at which step.
     progress: int = 0
     progress_at: int = 0
@@ -108,6 +110,7 @@ class RobotPlan:
         self.passed = None
         self.due = False
         self.errand = None
+        self.idle = self.queues = False
 
     def lend(self, step: int) -> None:
         """Note that it follows a goal of another client: it measures without a plan."""
@@ -142,6 +145,7 @@ class RobotPlan:
         self.decision += 1
         self.decided_at = self.progress_at = step
         self.progress, self.errand = 0, None
+        self.queues = TAKEN in chosen.reason
         waits = chosen.blocked or chosen.reason.startswith('waits')
         self.idle = chosen.stays and not waits
         self.positions, self.yaws, self.tour = chosen.positions, chosen.yaws, chosen.tour
@@ -194,7 +198,7 @@ class RobotPlan:
             metres = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
             self.endurance.leg = self.endurance.use(step_time * (len(path) - 1), metres)
 
-    def view(self, step: int, robot: PresentRobot, planning: bool, step_time: float) -> RobotView:
+    def view(self, step: int, robot: PresentRobot, planning: bool) -> RobotView:
         """Return what a planner sees of it."""
         view = RobotView(
             state=robot.state,
@@ -212,10 +216,6 @@ class RobotPlan:
             view.phase = (self.measured_from - step) % self.period
             if len(self.positions):
                 view.remaining_path, view.remaining_yaws = self.left(step)
-        if not planning and view.remaining_path is None:
-            # It may still drift.
-            path = braking_path(self.motion, robot.state, step_time)
-            view.remaining_path = path if len(path) > 1 else None
         return view
 
     def left(self, step: int) -> tuple[FloatArray, FloatArray]:

@@ -17,13 +17,15 @@ from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 # Reasons of robots that stay, by which the coordinator knows why.
 #: It lets others pass.
 CROSSED = 'waits: others are on its way'
+#: It waits for its turn to charge.
+TAKEN = 'all chargers are taken'
 #: Others are in its way, for now.
 BLOCKED = (
     'other robots are on all ways',
     'other robots stand at all candidates',
     'another robot is sent to every candidate',
     'another robot takes its candidates',
-    'all chargers are taken',
+    TAKEN,
 )
 #: Nothing that is left is affordable.
 SAVES_BATTERY = 'it has to save its battery for the path home'

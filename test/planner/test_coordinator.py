@@ -66,7 +66,7 @@ def test_who_arrives_plans_alone_and_starts_its_period_anew():
     coordinator = started()
     robots = there(a=(2.0, 2.0)) | there(free=False, b=(8.5, 8.5))
     # The planner receives the other's destination and its next measurement.
-    view = coordinator.plans['b'].view(5, robots['b'], False, 0.1)
+    view = coordinator.plans['b'].view(5, robots['b'], False)
     assert view.phase == 3
     assert view.remaining_path == pytest.approx(coordinator.plans['b'].positions[5:])
     assert list(coordinator.plan(6, robots).robots) == ['a']

@@ -154,8 +154,9 @@ def paths_of(
             paths.append((others[other], robot.radius))
         elif other != name and not robot.planning:
             path = robot.remaining_path
-            if path is None or not len(path):
-                path = robot.state.pose.position[None, :]
+            if path is None or len(path) < 2:
+                # Where it was commanded to stay it may have drifted on since.
+                path = braking_path(robot.motion, robot.state, team.step_time)
             else:
                 path = from_here(path, robot.state.pose.position)
             # It may stand at once where it arrives, or drift.

@@ -7,7 +7,15 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.planners.separation import apart, paths_of, ways_apart
-from maasi_planner.team import CROSSED, Decision, RobotDecision, TeamView, single_choice, stay
+from maasi_planner.team import (
+    CROSSED,
+    TAKEN,
+    Decision,
+    RobotDecision,
+    TeamView,
+    single_choice,
+    stay,
+)
 
 # Turn a way in the plane aside, by angles [rad], and halve it: (6, 3, 2).
 _ASIDE = np.array(
@@ -30,7 +38,7 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     charger = (free or chargers)[0]
     prediction = view.motion.predict(view.state, charger[None, :], team.step_time)
     if not free:
-        return _wait_near(team, name, charger, others, reason)
+        return _wait_near(team, name, charger, others, f'{reason}; {TAKEN}')
     if ways_apart(team, name, prediction.positions, others)[0]:
         return single_choice(charger[None, :], prediction, 0, reason)
     # Past where they will stand; else aside, until they have passed.
@@ -43,18 +51,32 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     return single_choice(goals, prediction, int(np.argmax(usable)), reason)
 
 
+def make_room(team: TeamView, name: str, decision: Decision, reason: str) -> RobotDecision:
+    """Send a robot away from the charger at which it is, so that another one can come."""
+    view, endurance = team.robots[name], team.robots[name].endurance
+    assert endurance is not None
+    others = {key: robot.positions for key, robot in decision.robots.items() if key != name}
+    charger = endurance.chargers_within(view.state.pose.position)[0]
+    return _wait_near(team, name, charger, others, reason, leaves=True)
+
+
 def _wait_near(
-    team: TeamView, name: str, charger: FloatArray, others: Mapping[str, FloatArray], reason: str
+    team: TeamView,
+    name: str,
+    charger: FloatArray,
+    others: Mapping[str, FloatArray],
+    reason: str,
+    leaves: bool = False,
 ) -> RobotDecision:
-    """Send a robot near a charger that is taken, where it waits; it stays if it is there."""
+    """Send a robot near a charger, where it waits; near it, it stays unless it `leaves`."""
     view = team.robots[name]
-    here, motion, taken = view.state.pose.position, view.motion, 'all chargers are taken'
+    here, motion = view.state.pose.position, view.motion
     places = [(path[-1], radius) for path, radius in paths_of(team, name, others)]
     # Far enough that the robot at the charger can leave it.
     reach = 3.0 * (view.radius + max(radius for _, radius in places))
     reach += 2.0 * motion.settings.tolerance
-    if math.dist(here, charger) <= 1.25 * reach:
-        return stay(view, f'waits: {taken}')
+    if math.dist(here, charger) <= 1.25 * reach and not leaves:
+        return stay(view, f'waits: {TAKEN}')
     turns = np.linspace(0.0, 2.0 * math.pi, 8, endpoint=False)
     turns += math.atan2(here[1] - charger[1], here[0] - charger[0])
     ring = charger + reach * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
@@ -64,10 +86,10 @@ def _wait_near(
         for point in ring
     ]
     if not any(free):
-        return stay(view, f'waits: {taken}')
+        return stay(view, f'waits: {TAKEN}')
     goals = ring[free]
     prediction = motion.predict(view.state, goals, team.step_time)
     usable = ways_apart(team, name, prediction.positions, others) & prediction.reached
     if not usable.any():
         return stay(view, CROSSED)
-    return single_choice(goals, prediction, int(np.argmax(usable)), f'{reason}; {taken}')
+    return single_choice(goals, prediction, int(np.argmax(usable)), reason)
