@@ -16,6 +16,7 @@ from shapely.ops import nearest_points
 
 from maasi_filter.area import Area, edges_of, level_shape
 from maasi_filter.arrays import FloatArray
+from maasi_planner.guidance import head_for, length_to
 from maasi_planner.nearby import nearby_of
 from maasi_planner.obstacles import (
     Surroundings,
@@ -23,10 +24,8 @@ from maasi_planner.obstacles import (
     all_felt,
     beyond_walls,
     clear_vertices,
-    head_for,
     is_clear,
     is_free_at,
-    length_to,
 )
 from maasi_planner.visibility import VisibilityGraph
 
@@ -164,8 +163,9 @@ class KeepOut:
     def path_length(self, position: ArrayLike, goal: ArrayLike) -> float:
         """Return the length of the path between two positions (3,) [m]; inf: there is none."""
         x, y, z = (float(value) for value in np.asarray(position, dtype=float))
-        end = tuple(float(value) for value in np.asarray(goal, dtype=float))
-        return float(length_to((x, y, z), end, self.table(end), self.around))
+        to_x, to_y, to_z = (float(value) for value in np.asarray(goal, dtype=float))
+        to = (to_x, to_y, to_z)
+        return float(length_to((x, y, z), to, self.table(to), self.around))
 
     def past(
         self, robot: FloatArray, goal: FloatArray, others: Sequence[tuple[FloatArray, float]]

@@ -27,7 +27,8 @@ def nearby_of(circles: FloatArray, reach: float, extra: float) -> Nearby:
         lists = np.array([4, 4 + number, 4, 4 + number, *rows])
         walls = (circles[:, 5:] != 0.0).any()
         cells = np.array([[[-math.inf, 2.0 if walls else 0.0]]])
-        return Nearby(np.array([0.0, 0.0, math.inf]), cells, lists)
+        gaps = np.full(len(lists), -math.inf)
+        return Nearby(np.array([0.0, 0.0, math.inf]), cells, lists, gaps)
     extent = float(np.ptp(points, axis=0).max())
     size = max(extent / 200.0, min(0.25 * reach, extent / 50.0))
     listed = max(reach, size + extra) + _HALF * size
@@ -35,7 +36,7 @@ def nearby_of(circles: FloatArray, reach: float, extra: float) -> Nearby:
     counts = np.ceil((points.max(axis=0) + listed - low) / size).astype(np.int64)
     head = np.array([*low, size])
     gaps = np.full(counts, np.inf)
-    pairs = _near(circles, head, listed, gaps)
+    pairs, apart = _near(circles, head, listed, gaps)
     cells = np.zeros((*counts, 2))
     empty = np.isinf(gaps)
     # Where no circle is listed the nearest one lies in a cell that has one.
@@ -43,28 +44,32 @@ def nearby_of(circles: FloatArray, reach: float, extra: float) -> Nearby:
     cells[..., 0] = np.where(empty, lower, gaps)
     by_row = _walls_by_row(circles, head, int(counts[1]))
     number = int(counts.prod())
-    starts, rows = _listed(pairs, number)
-    wall_starts, walls = _listed(by_row, int(counts[1]))
+    starts, rows, apart = _listed(pairs, apart, number)
+    wall_starts, walls, _ = _listed(by_row, np.zeros(len(by_row)), int(counts[1]))
     offset = number + 1 + int(counts[1]) + 1
     lists = np.concatenate([starts + offset, wall_starts + offset + len(rows), rows, walls])
     _mark_rooms(circles, head, cells, wall_starts, walls)
-    return Nearby(head, cells, lists)
+    sorted_gaps = np.concatenate([np.zeros(offset), apart, np.zeros(len(walls))])
+    return Nearby(head, cells, lists, sorted_gaps)
 
 
-def _listed(pairs: IntArray, number: int) -> tuple[IntArray, IntArray]:
-    """Return where the rows of each of a number of lists begin, and all rows, of pairs (p, 2)."""
-    order = np.argsort(pairs[:, 0], kind='stable')
+def _listed(
+    pairs: IntArray, keys: FloatArray, number: int
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return where each of a number of lists begins, and rows and keys, of pairs (p, 2) by key."""
+    order = np.lexsort((keys, pairs[:, 0]))
     starts = np.searchsorted(pairs[order, 0], np.arange(number + 1))
-    return starts.astype(np.int64), pairs[order, 1]
+    return starts.astype(np.int64), pairs[order, 1], keys[order]
 
 
 @njit(cache=True)
-def _near(circles: FloatArray, head: FloatArray, listed: float, gaps: FloatArray) -> IntArray:
-    """Fill how far the circles are from the middle of each cell, and return cells and circles."""
+def _near(
+    circles: FloatArray, head: FloatArray, listed: float, gaps: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Fill how far the circles are from the middle of each cell; return cells, circles and gaps."""
     nx, ny = gaps.shape
-    size = head[2]
-    out = np.empty((64, 2), np.int64)
-    number = 0
+    size, number = head[2], 0
+    out, apart = np.empty((64, 2), np.int64), np.empty(64)
     for i in range(circles.shape[0]):
         margin = circles[i, 3] + listed
         x, y = circles[i, 0] - head[0], circles[i, 1] - head[1]
@@ -81,13 +86,11 @@ def _near(circles: FloatArray, head: FloatArray, listed: float, gaps: FloatArray
                 if gap > listed:
                     continue
                 gaps[u, v] = min(gaps[u, v], gap)
-                if number == out.shape[0]:
-                    longer = np.empty((2 * number, 2), np.int64)
-                    longer[:number] = out
-                    out = longer
-                out[number, 0], out[number, 1] = u * ny + v, i
+                if number == len(apart):
+                    out, apart = np.concatenate((out, out)), np.concatenate((apart, apart))
+                out[number, 0], out[number, 1], apart[number] = u * ny + v, i, gap
                 number += 1
-    return out[:number]
+    return out[:number].copy(), apart[:number].copy()
 
 
 @njit(cache=True)
@@ -103,9 +106,7 @@ def _walls_by_row(circles: FloatArray, head: FloatArray, rows: int) -> IntArray:
         last = min(int(max(y, y + dy) / head[2] + 1e-6), rows - 1)
         for row in range(first, last + 1):
             if number == out.shape[0]:
-                longer = np.empty((2 * number, 2), np.int64)
-                longer[:number] = out
-                out = longer
+                out = np.concatenate((out, out))
             out[number, 0], out[number, 1] = row, i
             number += 1
     return out[:number]

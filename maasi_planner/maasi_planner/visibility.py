@@ -10,7 +10,7 @@ from maasi_planner.obstacles import Surroundings, Vector, is_visible
 
 # Pairs of vertices that are looked at. Among more vertices than allow all pairs each looks at the
 # nearest ones, which makes paths a little longer; robots cut them short where they see further.
-PAIRS = 1_000_000
+PAIRS = 150_000
 
 
 class VisibilityGraph:

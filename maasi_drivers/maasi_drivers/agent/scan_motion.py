@@ -10,10 +10,11 @@ from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.settings.driver import ScanSettings
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_planner.guidance import head_for
 from maasi_planner.motion import RobotState, Unicycle
 from maasi_planner.motion.base import check_waypoint
 from maasi_planner.motion.unicycle import window_command
-from maasi_planner.obstacles import all_felt, head_for, is_clear
+from maasi_planner.obstacles import all_felt, is_clear
 from maasi_planner.settings import MotionSettings
 
 _CELL = 0.03  # size of the cells in which points count as one [m]

@@ -185,8 +185,9 @@ class MotionModel(ABC):
         """Run controller and body against each other to each waypoint, and fill `out`.
 
         Rows are filled up to the length of each trajectory; one that does not arrive gets a length
-        beyond the last column. The models of the suite override this by compiled loops; this one
-        calls `command` and `body`, some ten microseconds per step.
+        beyond the last column, or minus the number of columns that are filled. The models of the
+        suite override this by compiled loops; this one calls `command` and `body`, some ten
+        microseconds per step.
         """
         limit = out.positions.shape[1] - 1
         for w, waypoint in enumerate(waypoints):
@@ -276,8 +277,8 @@ def _trim(positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: B
     """Fill what was reached, cut lengths, extend trajectories; return the longest length."""
     limit = positions.shape[1] - 1
     for w in range(positions.shape[0]):
-        reached[w] = lengths[w] <= limit
-        lengths[w] = min(lengths[w], limit)
+        reached[w] = 0 <= lengths[w] <= limit
+        lengths[w] = min(lengths[w], limit) if lengths[w] >= 0 else -lengths[w] - 1
     longest = lengths.max() if lengths.size else 0
     for w in range(positions.shape[0]):
         last = lengths[w]

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.pose import Pose
+from maasi_planner.guidance import length_to
 from maasi_planner.motion import mambo, quadrotor
 from maasi_planner.motion.base import (
     Body,
@@ -37,11 +38,13 @@ from maasi_planner.motion.steering import (
     with_obstacle_term,
 )
 from maasi_planner.motion.unicycle import K_RHO, drive_among, drive_freely, unicycle_step
-from maasi_planner.obstacles import Surroundings, Vector, dot, norm
+from maasi_planner.obstacles import Surroundings, Vector, dot, is_free_at, norm
 from maasi_planner.settings import MotionSettings
 
 POINT, UNICYCLE, MAMBO, QUADROTOR = range(4)
 APPROACH_RATE = 5.0
+# A path takes so many times as long as at full speed at most, and so long [1, s].
+_SLOWEST, _AT_LEAST = 20.0, 60.0
 
 
 class Kernel(NamedTuple):
@@ -144,7 +147,10 @@ def _close_loop(
     positions: FloatArray,
     yaws: FloatArray,
 ) -> tuple[int, float]:
-    """Run controller and body on `state`; return steps, one too many if not there, and u'u."""
+    """Run controller and body on `state`; return steps, one too many if not there, and u'u.
+
+    positions (K + 1, 3) and yaws (K + 1,): to fill, of K steps at most.
+    """
     kind, steering, obstructed, _, _, parameters, table, tolerance, periods, h = kernel
     cost, vertex = 0.0, -1
     for k in range(yaws.shape[0]):
@@ -202,14 +208,24 @@ def _roll_out(
     steering = kernel.steering
     straight = kernel.kind == POINT and steering.acceleration == np.inf
     straight = straight and not (steering.face_travel or kernel.obstructed)
+    here = (start[0], start[1], start[2])
+    bound = kernel.obstructed and not kernel.term.kind and is_free_at(here, kernel.around)
     for w in range(waypoints.shape[0]):
-        goal = (waypoints[w, 0], waypoints[w, 1], waypoints[w, 2])
+        goal, last = (waypoints[w, 0], waypoints[w, 1], waypoints[w, 2]), yaws.shape[1]
+        if bound:
+            # What cannot be reached is not tried; what is takes so many times as long at most.
+            path = length_to(here, goal, tables[w], kernel.around)
+            seconds = _SLOWEST * path / steering.speed + _AT_LEAST
+            last = int(min(seconds / (kernel.periods * kernel.h), last)) if path < np.inf else 1
         if straight:
             way = _go_straight(kernel, start, goal, positions[w], yaws[w])
         else:
             state = start.copy()
-            way = _close_loop(kernel, state, goal, tables[w], positions[w], yaws[w])
+            row, headings = positions[w, :last], yaws[w, :last]
+            way = _close_loop(kernel, state, goal, tables[w], row, headings)
         lengths[w], control_cost[w] = way
+        if lengths[w] >= last and last < yaws.shape[1]:
+            lengths[w] = -last
         for axis in range(3):
             positions[w, 0, axis] = start[axis]
 
@@ -261,8 +277,10 @@ class CompiledMotion(MotionModel):
         speed, clearance = self.steering.speed, self.settings.clearance
         if self.settings.obstacle_term != 'none':
             return math.inf
-        braking = speed * speed / self.steering.acceleration
-        return max(1.5 * speed / self.steering.barrier, braking, 1.5 * speed + 4.0 * clearance)
+        # Four times what it needs to stop; without a limit, where the barrier begins to act.
+        braking = 2.0 * speed * speed / self.steering.acceleration
+        barrier = 1.5 * speed / self.steering.barrier
+        return max(min(braking, barrier) if braking else barrier, 1.5 * speed + 4.0 * clearance)
 
     def take_area(self, area: Area | None, radius: float) -> None:
         """See `MotionModel.take_area`."""

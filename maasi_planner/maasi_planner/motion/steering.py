@@ -13,18 +13,8 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.obstacles import (
-    Felt,
-    Surroundings,
-    Vector,
-    dot,
-    from_centre,
-    head_for,
-    hold_back,
-    minded,
-    minus,
-    norm,
-)
+from maasi_planner.guidance import head_for, hold_back, minded
+from maasi_planner.obstacles import Felt, Surroundings, Vector, dot, from_centre, minus, norm
 
 # vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
 Command = tuple[float, float, float, float]

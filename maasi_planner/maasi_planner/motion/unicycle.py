@@ -21,16 +21,9 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
+from maasi_planner.guidance import head_for, minded
 from maasi_planner.motion.steering import Command, Steering, wrapped
-from maasi_planner.obstacles import (
-    Felt,
-    Surroundings,
-    Vector,
-    from_centre,
-    head_for,
-    is_far,
-    minded,
-)
+from maasi_planner.obstacles import Felt, Surroundings, Vector, from_centre, is_far
 
 # Seconds until the next command at which the window is taken, and for which arcs are followed.
 WINDOW = 0.2
@@ -48,7 +41,7 @@ def _before_disc(along: float, across: float, radius: float) -> float:
     return np.inf
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: bool) -> float:
     """Return how far straight ahead is free of circles, at most `reach` metres.
 
@@ -59,6 +52,8 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: 
     free, here, circles = reach, (x, y, 0.0), felt.circles
     for n in range(felt.first, felt.last):
         i = felt.rows[n]
+        if felt.gaps[n] > reach + felt.off:
+            break
         wall = circles[i, 5] != 0.0 or circles[i, 6] != 0.0
         if wall and beyond:
             continue
@@ -206,7 +201,7 @@ def drive_freely(state: FloatArray, goal: Vector, steering: Steering) -> Command
     return forward, 0.0, 0.0, turn
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def drive_among(
     state: FloatArray,
     goal: Vector,
@@ -227,5 +222,7 @@ def drive_among(
         forward, turn = window_command(state, target, left, steering, felt, clearance)
         return (forward, 0.0, 0.0, turn), vertex
     forward, turn = _drive(target[0] - x, target[1] - y, left, yaw, steering, clearance)
-    free = way_ahead(x, y, yaw, 4.0 * clearance + steering.speed, felt, beyond)
+    # Farther than where the barrier lets it drive at full speed nothing counts.
+    reach = min(4.0 * clearance + steering.speed, 1.001 * steering.speed / steering.barrier)
+    free = way_ahead(x, y, yaw, reach, felt, beyond)
     return (min(forward, steering.barrier * free), 0.0, 0.0, turn), vertex
