@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from maasi_planner.planners.orienteering import plan_ways
+from maasi_planner.planners.orienteering import MOST, plan_ways
 
 
 def arrivals(points, start, way, end=None):
@@ -120,3 +120,35 @@ def test_of_equal_ways_the_known_ones_are_kept():
         assert way.tolist() == known.tolist()
         (way,) = plan_ways(points, prizes, start, budget, known=[known[:20]])
         assert sorted(way) == list(range(36))
+
+
+def test_only_some_robots_have_to_end_somewhere():
+    """A row of ends that is not a number, and an infinite budget, are no limit for that robot."""
+    for seed in range(12):
+        points, prizes, rng = drawn(seed, 30)
+        starts, end = rng.uniform(0.0, 1.0, (2, 2)), rng.uniform(0.0, 1.0, 2)
+        budget = 1.5 + np.linalg.norm(end - starts[0])
+        ends = np.array([end, [np.nan, np.nan]])
+        mine, other = plan_ways(points, prizes, starts, np.array([budget, np.inf]), ends)
+        assert sorted([*mine, *other]) == list(range(30))
+        assert arrivals(points, starts[0], mine, end)[1] <= budget + 1e-9
+        # Alone with a limit, some are left.
+        limits = np.array([budget, 1.0])
+        mine, other = plan_ways(points, prizes, starts, limits, ends)
+        assert arrivals(points, starts[0], mine, end)[1] <= budget + 1e-9
+        assert arrivals(points, starts[1], other)[1] <= 1.0 + 1e-9
+        assert 4 < len(mine) + len(other) < 30
+
+
+def test_of_many_nodes_the_best_for_their_distance_are_planned():
+    nodes = np.stack(np.meshgrid(*2 * [np.arange(100.0)]), axis=-1).reshape(-1, 2)
+    prizes = np.full(len(nodes), 0.01)
+    prizes[nodes[:, 0] + nodes[:, 1] > 180.0] = 1.0
+    starts = np.array([[0.0, 0.0], [0.0, 99.0]])
+    ways = plan_ways(nodes, prizes, starts, np.full(2, np.inf))
+    visited = np.concatenate(ways)
+    assert len(visited) == len(set(visited.tolist())) == MOST
+    assert set(np.flatnonzero(prizes == 1.0)) <= set(visited.tolist())
+    # Of the others those that are near.
+    gaps = np.linalg.norm(nodes[:, None] - starts, axis=2).min(axis=1)
+    assert gaps[visited][prizes[visited] < 1.0].max() < 60.0

@@ -14,9 +14,10 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
-from maasi_planner.endurance import Endurance, EnduranceSettings
+from maasi_planner.endurance import NOTHING_AFFORDABLE, Endurance, EnduranceSettings, Phase
 from maasi_planner.planners.base import check_decision
 from maasi_planner.planners.lattice import Lattice, passing
+from maasi_planner.team import SAVES_BATTERY
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
@@ -183,4 +184,39 @@ def test_places_that_the_battery_does_not_afford_are_passed_over_then_it_charges
     place = fly(planner, team)
     assert place is not None and np.linalg.norm(place[:2] - 1.0) < 4.0
     view.endurance.hear(0.21)
-    assert fly(planner, team) is None
+    chosen = planner.decide(team).robots['robot0']
+    assert chosen.stays and chosen.unaffordable and SAVES_BATTERY in chosen.reason
+
+
+@pytest.mark.parametrize('charge', [None, np.nan, 0.9])
+def test_each_robot_has_its_own_path_home(charge):
+    """A second robot without a battery, or of unknown or other charge, changes nothing of it."""
+    team, planner = field(starts=((1.0, 1.0, 0.0), (11.0, 11.0, 0.0))), make_planner('tour')
+    view, other = team.robots.values()
+    settings = EnduranceSettings(per_metre=0.01, reserve=0.2)
+    view.endurance = Endurance(settings, view.motion, view.state.pose.position)
+    view.endurance.hear(0.5)
+    if charge is not None:
+        other.endurance = Endurance(settings, other.motion, other.state.pose.position)
+        other.endurance.hear(charge)
+    planner.decide(team)
+    way = planner._ways['robot0']
+    budget, home = view.endurance.range_from(view.state.pose.position)
+    places = [view.state.pose.position[:2], *planner._points[way], home[:2]]
+    length = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+    assert len(way) > 4 and length <= budget + 1e-9 and length > 0.7 * budget
+    # The other one takes what is left.
+    assert len(way) + len(planner._ways['robot1']) == len(planner._chosen)
+
+
+def test_places_of_a_robot_that_is_done_go_to_the_others():
+    team, planner = field(starts=((1.0, 1.0, 0.0), (11.0, 11.0, 0.0))), make_planner('tour')
+    view = team.robots['robot0']
+    view.endurance = Endurance(EnduranceSettings(), view.motion, view.state.pose.position)
+    planner.decide(team)
+    assert planner._ways['robot0']
+    view.endurance.begin(Phase.DONE, NOTHING_AFFORDABLE)
+    view.planning = False
+    while planner.finished(team) is None:
+        assert fly(planner, team, 'robot1') is not None
+    assert team.exploration.explored_fraction() > 0.99 and 'robot0' not in planner._ways

@@ -11,8 +11,10 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_planner.candidates import half_view
 from maasi_planner.planners.base import Planner, explain, held_back
+from maasi_planner.planners.detour import PASSES, others_move, past_standing
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import (
+    CROSSED,
     SAVES_BATTERY,
     Decision,
     RobotDecision,
@@ -178,6 +180,11 @@ class Lawnmower(Planner):
                 if SAVES_BATTERY in held and _is_full(view):
                     self._give_up(name)
                     out_of_reach = held
+                    continue
+                if held == CROSSED and not others_move(team, name, decision):
+                    if detour := past_standing(team, name, point, decision):
+                        self._pending[name].insert(0, target)
+                        return single_choice(*detour, 0, PASSES)
                     continue
                 self._pending[name].insert(0, target)
                 return stay(view, held)

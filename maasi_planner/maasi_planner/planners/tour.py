@@ -14,6 +14,7 @@ from maasi_planner.planners.base import (
     free_of_robots,
     waiting_places,
 )
+from maasi_planner.planners.detour import PASSES, others_move, past_standing
 from maasi_planner.planners.lattice import Lattice, lanes_of
 from maasi_planner.planners.orienteering import plan_ways
 from maasi_planner.settings import PlannerSettings
@@ -207,8 +208,14 @@ class Tour(Planner):
                 self._refused.add(name)
                 continue
             if usable and crossed(team, name, prediction, decision):
-                way.insert(0, index)
-                return stay(view, CROSSED)
+                if others_move(team, name, decision):
+                    way.insert(0, index)
+                    return stay(view, CROSSED)
+                if detour := past_standing(team, name, point[0], decision):
+                    way.insert(0, index)
+                    self._target[name] = detour[0][0, :d]
+                    return single_choice(*detour, 0, PASSES)
+                usable = False
             if not usable or not np.array_equal(point[0], waypoint):
                 squares = [self._chosen[i] for i in passed if i < len(self._chosen)]
                 self._squares(team).trust[squares] *= 0.5

@@ -1,0 +1,43 @@
+"""Past robots that stand on a path, as those that charge or are done: to wait would not help."""
+
+import numpy as np
+
+from maasi_filter.arrays import FloatArray
+from maasi_planner.motion.base import Trajectories
+from maasi_planner.planners.base import affordable, crossed, free_of_robots
+from maasi_planner.team import Decision, TeamView
+
+PASSES = 'passes robots that stand on its path'
+
+
+def others_move(team: TeamView, name: str, decision: Decision) -> bool:
+    """Return whether another robot is on its way, or has just been sent somewhere."""
+    return any(not robot.stays for robot in decision.robots.values()) or any(
+        not view.planning and view.remaining_path is not None and len(view.remaining_path) > 1
+        for other, view in team.robots.items()
+        if other != name
+    )
+
+
+def past_standing(
+    team: TeamView, name: str, waypoint: FloatArray, decision: Decision
+) -> tuple[FloatArray, Trajectories] | None:
+    """Return the next point (1, 3) of a path to a waypoint past the others, and the prediction.
+
+    None if they stand at the waypoint, or leave no path.
+    """
+    view = team.robots[name]
+    here, motion = view.state.pose.position, view.motion
+    places = list(team.taken) + [
+        (np.array(other.state.pose.position), other.radius)
+        for key, other in team.robots.items()
+        if key != name
+    ]
+    if not free_of_robots(waypoint[None], view.radius, places)[0]:
+        return None
+    point = motion.keep_out.past(here, waypoint, places)[None]
+    prediction = motion.predict(view.state, point, team.step_time)
+    usable = prediction.reached & (prediction.lengths > 0) & team.area.inside(point)
+    if not usable[0] or crossed(team, name, prediction, decision):
+        return None
+    return (point, prediction) if affordable(team, name, prediction, usable)[0] else None
