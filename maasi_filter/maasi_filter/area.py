@@ -192,14 +192,19 @@ class Area:
         Round zones are not in it, and the sides of bounds need no distance. closed: whether
         keep-outs count.
         """
-        zones = self.settings.keep_outs if closed else []
-        polygons = _polygons([*self.settings.obstacles, *zones])
-        if self._fence is None and not polygons and not len(self.circles):
+        polygons = self._zone_polygons[closed]
+        if self._fence is None and polygons.is_empty and not len(self.circles):
             return None
         whole = self._fence
         if whole is None:
             whole = self.border.buffer(reach, join_style='mitre')
-        return whole.difference(shapely.union_all(polygons))
+        return whole.difference(polygons)
+
+    @cached_property
+    def _zone_polygons(self) -> dict[bool, BaseGeometry]:
+        """Polygons of obstacles in one shape, and (True) with those of keep-outs."""
+        closed = [*self._solid_polygons, *_polygons(self.settings.keep_outs)]
+        return {False: shapely.union_all(self._solid_polygons), True: shapely.union_all(closed)}
 
     @cached_property
     def _rasterised(self) -> Density:

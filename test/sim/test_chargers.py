@@ -81,7 +81,8 @@ def test_a_start_is_a_charger_where_none_is_named():
     near = [10.0, 0.7, 20.0]
     with pytest.raises(ScenarioError, match=r'drone\.start: .* is its charger, 0\.7 m from the'):
         scenario([], {'start': near, 'motion': {'clearance': 3.0, 'tolerance': 0.1}})
-    assert scenario([[20.0, 10.0, 20.0]], {'start': near})
+    for start in (near, [10.0, 0.2, 20.0]):
+        assert scenario([[20.0, 10.0, 20.0], [60.0, 20.0, 20.0]], {'start': start})
 
 
 def test_full_has_to_be_above_the_reserve():

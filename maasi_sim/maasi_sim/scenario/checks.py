@@ -105,7 +105,7 @@ def _place_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> Pro
             f'at least the radius, {robot.radius:g} m'
         )
     try:
-        if not len(robot_candidates(robot, scenario.environment).at(robot.start)):
+        if not len(robot_candidates(robot, area).at(robot.start)):
             yield 'candidates: leave no waypoint inside the environment'
     except ValueError as error:
         yield f'candidates.{error}'.replace('candidates.candidates: ', 'candidates: ')
@@ -316,9 +316,9 @@ _FAR = 1e9  # farther than any way between two waypoints [m]
 _MOST_CANDIDATES = 400  # of a grid that is chosen for a robot without candidates
 
 
-def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> CandidateSet:
+def robot_candidates(robot: RobotSettings, area: Area | EnvironmentSettings) -> CandidateSet:
     """Return a robot's candidate waypoints; in 2D at the height of its start."""
-    return CandidateSet(robot.candidates, Area(environment), height=robot.start[2])
+    return CandidateSet(robot.candidates, Area.of(area), height=robot.start[2])
 
 
 def never_seen(scenario: Scenario) -> str:

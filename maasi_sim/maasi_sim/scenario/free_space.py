@@ -1,12 +1,13 @@
 """Where a robot may be: the connected parts of its area, and whether it gets to a charger."""
 
 import math
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike
 from shapely.geometry.base import BaseGeometry
+from shapely.ops import nearest_points
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
@@ -33,7 +34,7 @@ class FreeSpace:
     @cached_property
     def parts(self) -> list[BaseGeometry]:
         """Connected parts of what it can be sent to, the largest first."""
-        parts = shapely.get_parts(self._region(self.robot.motion.clearance))
+        parts = _parts(self.area, self._reach, self._reach)
         return sorted((part for part in parts if part.area > 0.0), key=lambda part: -part.area)
 
     @cached_property
@@ -64,15 +65,19 @@ class FreeSpace:
     def gets_to(self, position: ArrayLike) -> bool:
         """Return whether a robot gets to a position (3,) from its start."""
         here, goal = (shapely.Point(np.asarray(at)[:2]) for at in (self.robot.start, position))
-        widest = self._region(_LEAST * self.robot.motion.clearance)
-        one, other = (_part_at(shapely.get_parts(widest), at) for at in (here, goal))
-        if one is None or other is None or not one.equals(other):
+        least = self.robot.radius + _LEAST * self.robot.motion.clearance
+        widest = _parts(self.area, least, self._reach)
+        # A robot that starts too near to a wall moves away from it first.
+        one, other = _part_at(widest, here, self._reach), _part_at(widest, goal)
+        if one is None or other is not one:
             return False
-        one, other = (_part_at(self.parts, at) for at in (here, goal))
-        if one is not None and other is not None and one is other:
+        first = shapely.get_coordinates(nearest_points(one, here)[0])[0]
+        inner = _part_at(self.parts, here)
+        if inner is not None and inner is _part_at(self.parts, goal):
             return True
         # Joined by a passage that is narrower than its clearance: its own paths tell.
-        return math.isfinite(self._keep_out.path_length(self.robot.start, position))
+        start = [*first, self.robot.start[2]]
+        return math.isfinite(self._keep_out.path_length(start, position))
 
     @cached_property
     def _keep_out(self) -> KeepOut:
@@ -90,18 +95,23 @@ class FreeSpace:
         nearest = int(np.argmin(shapely.distance(self.parts, point)))
         return [self.parts[nearest]], [*self.parts[:nearest], *self.parts[nearest + 1 :]]
 
-    def _region(self, clearance: float) -> BaseGeometry:
-        """Return where its centre may be with a clearance."""
-        room = self.area.room(self._reach)
-        apart = self.robot.radius + clearance
-        region = self.area.border
-        if room is not None:
-            region = room.buffer(-apart, join_style='mitre').intersection(region)
-        circles: FloatArray = self.area.circles[self.area.circles[:, 4] < 0.5]
-        discs = shapely.buffer(shapely.points(circles[:, :2]), circles[:, 3] + apart, quad_segs=32)
-        return region.difference(shapely.union_all(discs))
+
+# Robots of one size share it.
+@lru_cache(maxsize=16)
+def _parts(area: Area, apart: float, reach: float) -> list[BaseGeometry]:
+    """Return the parts where a centre is at least so far from everything; reach: as of `room`."""
+    room, region = area.room(reach), area.border
+    if room is not None:
+        region = room.buffer(-apart, join_style='mitre').intersection(region)
+    circles: FloatArray = area.circles[area.circles[:, 4] < 0.5]
+    discs = shapely.buffer(shapely.points(circles[:, :2]), circles[:, 3] + apart, quad_segs=32)
+    return list(shapely.get_parts(region.difference(shapely.union_all(discs))))
 
 
-def _part_at(parts: list[BaseGeometry], point: shapely.Point) -> BaseGeometry | None:
-    """Return the part that a position is in, up to rounding."""
-    return next((part for part in parts if part.distance(point) <= _ROUNDING), None)
+def _part_at(
+    parts: list[BaseGeometry], point: shapely.Point, within: float = _ROUNDING
+) -> BaseGeometry | None:
+    """Return the part that a position is in, or the nearest one within a distance [m]."""
+    gaps = shapely.distance(parts, point) if parts else np.array([math.inf])
+    nearest = int(np.argmin(gaps))
+    return parts[nearest] if gaps[nearest] <= within else None

@@ -6,6 +6,7 @@ All is by settings alone: flights at full speed without turns, so that a search 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -118,7 +119,13 @@ def _visible(scenario: Scenario, space: FreeSpace, ground: BaseGeometry) -> Base
     low, high = space.area.bounds[:2].T
     sensor = space.robot.sensor.build('robot', scenario.dimension)
     view = min(half_view(sensor), float(np.linalg.norm(high - low)))
-    reached = shapely.union_all(space.reachable)
+    return _seen_from(tuple(space.reachable), view, ground)
+
+
+# Robots of one kind share it.
+@lru_cache(maxsize=16)
+def _seen_from(parts: tuple[BaseGeometry, ...], view: float, ground: BaseGeometry) -> BaseGeometry:
+    reached = shapely.union_all(parts)
     return reached.buffer(view, join_style='mitre', mitre_limit=2.0).intersection(ground)
 
 
