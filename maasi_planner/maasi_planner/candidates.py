@@ -85,6 +85,12 @@ class CandidateSet:
         complete[:, : points.shape[1]] = points
         return complete
 
+    def restrict(self, area: Area) -> None:
+        """Take another area within this one: of grids, rings and points those inside are left."""
+        self.area = area
+        if self._fixed is not None:
+            self._fixed = self._fixed[area.inside(self._fixed)]
+
     def at(self, position: ArrayLike) -> FloatArray:
         """Return the candidates at a position (3,), (W, 3); of grids and rings, those inside."""
         if self._fixed is not None:

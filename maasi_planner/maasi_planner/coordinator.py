@@ -92,13 +92,13 @@ class Coordinator:
             self.finished, self._ended = None, False
             # What the planner knew of each before says nothing about ground that is opened.
             self._unasked = set(self.plans)
-        # Waypoints in closed zones are dropped at each decision.
         lasting = Area(area.settings.without_keep_outs())
         for name, plan in self.plans.items():
             plan.motion.take_area(area, plan.radius)
             plan.candidates = CandidateSet(
                 plan.candidates.settings, lasting, self.settings.robots[name].start[2]
             )
+            plan.candidates.restrict(area)
             if plan.exploration is not None:
                 plan.exploration.take_area(area)
         self.homing.take_area()

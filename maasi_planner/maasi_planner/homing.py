@@ -5,7 +5,9 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
+from maasi_filter.arrays import FloatArray
 from maasi_planner.endurance import NOTHING_AFFORDABLE, SEARCH_ENDED, Endurance, Phase
+from maasi_planner.motion import RobotState
 from maasi_planner.planners.way_home import go_home, make_room
 from maasi_planner.robot_plan import Errand, PresentRobot, RobotPlan
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
@@ -108,6 +110,16 @@ class Homing:
         plan = self._plans[name]
         home = plan.endurance is not None and plan.endurance.phase is not Phase.AVAILABLE
         return home or (plan.errand is not None and not plan.staying)
+
+    def may_go(self, name: str, state: RobotState, goal: FloatArray, step_time: float) -> bool:
+        """Return whether the battery of a robot allows it to go to a goal (3,) and then home."""
+        endurance = self._plans[name].endurance
+        if endurance is None or math.isnan(endurance.charge):
+            return True
+        if endurance.is_home(goal):
+            return True  # it goes to a charger
+        path = self._plans[name].motion.predict(state, goal[None, :], step_time)
+        return bool(endurance.affords(path, step_time)[0])
 
     def errands(
         self, step: int, robots: Mapping[str, PresentRobot], finished: bool

@@ -431,7 +431,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 continue
             heard = self._heard[name]
             free = self._orders.is_free(name, heard, step)
-            if free and self._orders.send_home(name, header):
+            if free and self._orders.send_home(name, heard.state, header):
                 free = False
             mode = self.modes.of[name]
             robots[name] = PresentRobot(

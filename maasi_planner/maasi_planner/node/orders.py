@@ -11,6 +11,7 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
 from maasi_planner.coordinator import Coordinator
+from maasi_planner.motion import RobotState
 from maasi_planner.node.search_modes import Mode, SearchModes
 from maasi_planner.node.team_goals import GoalProgress, HeardState, TeamGoals
 from maasi_planner.node_settings import PlannerNodeSettings
@@ -89,14 +90,24 @@ class Orders:
         goal.waypoint.pose.orientation.w = 1.0
         self.goals.send(name, goal)
 
-    def send_home(self, name: str, header: Header) -> bool:
-        """Send a free robot to its start, and return whether it has to go there now."""
-        if name not in self._homing or self._coordinator.homing.occupies(name):
+    def send_home(self, name: str, state: RobotState, header: Header) -> bool:
+        """Send a free robot to its start, and return whether it has to go there now.
+
+        One whose battery does not allow it goes later.
+        """
+        plan, homing = self._coordinator.plans[name], self._coordinator.homing
+        if name not in self._homing or homing.occupies(name):
             return False
-        plan = self._coordinator.plans[name]
+        start, step = np.array(self._node.settings.robots[name].start), self._node.settings.step
+        if not homing.may_go(name, state, start, step):
+            self._node.warn_throttled(
+                f'{name} cannot go home',
+                f'{name}: its battery does not allow the path to its start',
+            )
+            return False
         plan.decision += 1
         number = self._homing[name] = plan.decision + 1
-        self.send(name, number, np.array(self._node.settings.robots[name].start), header)
+        self.send(name, number, start, header)
         return True
 
     def _on_answer(self, name: str, number: int, accepted: bool) -> None:
