@@ -199,14 +199,14 @@ def test_each_robot_has_its_own_path_home(charge):
     if charge is not None:
         other.endurance = Endurance(settings, other.motion, other.state.pose.position)
         other.endurance.hear(charge)
-    planner.decide(team)
+    planner._plan(team)
     way = planner._ways['robot0']
     budget, home = view.endurance.range_from(view.state.pose.position)
     places = [view.state.pose.position[:2], *planner._points[way], home[:2]]
     length = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
     assert len(way) > 4 and length <= budget + 1e-9 and length > 0.7 * budget
     # The other one takes what is left.
-    assert len(way) + len(planner._ways['robot1']) == len(planner._chosen)
+    assert sorted([*way, *planner._ways['robot1']]) == list(range(36))
 
 
 def test_places_of_a_robot_that_is_done_go_to_the_others():
