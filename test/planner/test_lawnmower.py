@@ -6,6 +6,7 @@ import pytest
 from maasi_filter.area import Area
 from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
@@ -49,6 +50,8 @@ def mow(team, planner, most=100):
             view = team.robots[name]
             if not robot.stays:
                 waypoints[name].append(robot.waypoint[:2])
+                for place in robot.positions[::3]:
+                    team.exploration.update(view.sensor.detection, Pose.from_yaw(place, 0.0))
                 view.state = RobotState.at_rest(robot.waypoint)
                 length = np.linalg.norm(np.diff(robot.positions, axis=0), axis=1).sum()
                 if view.endurance is not None:
@@ -97,3 +100,19 @@ def test_a_robot_that_is_not_full_charges_before_it_gives_up_a_lane():
     assert chosen.stays and chosen.unaffordable and planner.finished(team) is None
     team.robots['robot0'].endurance.hear(1.0)
     assert not planner.decide(team).robots['robot0'].stays
+
+
+def test_lanes_below_a_zone_are_done_once_it_is_opened():
+    team, planner = team_of([(1.0, 1.0)], [None]), make_planner('lawnmower')
+    open_area, view = team.area, team.robots['robot0']
+    zone = {'polygon': [[8.0, 3.5], [14.0, 3.5], [14.0, 8.5], [8.0, 8.5]]}
+    values = {'bounds': [[0.0, 20.0], [0.0, 8.0]], 'keep_outs': [zone]}
+    planner.decide(team)
+    for area in (Area(EnvironmentSettings.model_validate(values)), open_area):
+        team.exploration.take_area(area)
+        view.motion.take_area(area, view.radius)
+        assert planner.finished(team) is None
+        mow(team, planner)
+        if area is not open_area:
+            assert team.exploration.closed_share() > 0.1
+    assert team.exploration.explored_fraction() > 0.97

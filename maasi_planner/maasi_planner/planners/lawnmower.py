@@ -4,10 +4,12 @@ Two robots start from the two ends and meet between them; more robots divide the
 two to a block.
 """
 
+import itertools
 import math
 
 import numpy as np
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_planner.candidates import half_view
 from maasi_planner.planners.base import Planner, explain, held_back
@@ -63,7 +65,10 @@ class Lawnmower(Planner):
 
     def __init__(self, settings: PlannerSettings) -> None:
         super().__init__(settings)
+        # Lanes by block: all of them, and those that no robot has begun yet.
+        self._all: list[list[FloatArray]] = []
         self._blocks: list[list[FloatArray]] = []
+        self._area: Area | None = None
         self._side: dict[str, tuple[int, int]] = {}
         self._pending: dict[str, list[FloatArray]] = {}
         # Lanes that some robots cannot afford with a full battery, and these robots.
@@ -96,6 +101,7 @@ class Lawnmower(Planner):
             all_lanes[len(all_lanes) * i // blocks : len(all_lanes) * (i + 1) // blocks]
             for i in range(blocks)
         ]
+        self._all, self._area = [list(members) for members in self._blocks], team.area
         ends = [
             (block, side, members[-side][side])
             for block, members in enumerate(self._blocks)
@@ -111,6 +117,17 @@ class Lawnmower(Planner):
             self._side[name] = (block, side)
             self._pending[name] = []
         self._started = True
+
+    def _open_again(self, team: TeamView) -> None:
+        """Put lanes back that have unexplored ground where zones were closed or opened."""
+        if not self._started or self._area is team.area:
+            return
+        self._area = team.area
+        under_way = [self._lane[name] for name, ends in self._pending.items() if ends]
+        known = [id(lane) for lane in itertools.chain(*self._blocks, under_way)]
+        known += [id(lane) for lane, _ in self._too_far]
+        for block, members in zip(self._blocks, self._all):
+            block += [lane for lane in members if id(lane) not in known and _unseen(team, lane)]
 
     def _next(self, team: TeamView, name: str) -> FloatArray | None:
         if name not in self._side:
@@ -159,6 +176,7 @@ class Lawnmower(Planner):
         decision = Decision(step=team.step)
         if not self._started:
             self._start(team)
+        self._open_again(team)
         for name in team.planning():
             decision.robots[name] = self._decide_one(team, name, decision)
         return explain(decision)
@@ -192,6 +210,7 @@ class Lawnmower(Planner):
 
     def finished(self, team: TeamView) -> str | None:
         """See `Planner.finished`; also when every lane is done that some robot can afford."""
+        self._open_again(team)
         if self._started and not any(self._blocks) and not any(self._pending.values()):
             searching = set(self.searching(team))
             left = [names for _, names in self._too_far if not searching <= names]
@@ -219,3 +238,11 @@ def _is_full(view: RobotView) -> bool:
     return (
         endurance is not None and endurance.topped and endurance.is_home(view.state.pose.position)
     )
+
+
+def _unseen(team: TeamView, lane: FloatArray) -> bool:
+    """Return whether something on a lane is open and mostly unexplored."""
+    number = 2 + int(np.linalg.norm(lane[1] - lane[0]) / team.exploration.step.min())
+    places = lane[0] + np.linspace(0.0, 1.0, number)[:, None] * (lane[1] - lane[0])
+    places = places[team.area.inside(places)]
+    return len(places) > 0 and bool((team.exploration.at(places) > 0.5).any())
