@@ -148,7 +148,10 @@ class GuidedPlay(Play):
 
     def arrives(self, limit=120.0):
         """Run until the goal is reached."""
-        return self.until(lambda: self.status is GoalStatus.REACHED, limit)
+        follower = self.driver.follower
+        self.until(lambda: follower.current is None, limit)
+        assert self.status is GoalStatus.REACHED, self.driver.ended
+        return self
 
     def draw(self, *zones):
         """Close zones while it flies; the fence follows."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from guided_play import GuidedPlay
 
 from maasi_drivers.agent.waypoint_follower import GoalStatus
@@ -147,6 +148,56 @@ def test_bounds_are_an_area_and_it_comes_back_from_outside(guided):
         play.body.position[0] += 0.004
         play.run(0.1)
         assert play.fault == ''
+
+
+def random_zone(generator, centre, size):
+    """Return a circle or a polygon around a place."""
+    x, y = centre
+    if generator.uniform() < 0.5:
+        return f'{x:.1f} {y:.1f} {size:.1f}'
+    angles = np.sort(generator.uniform(0.0, 2.0 * np.pi, 7))
+    reach = size * generator.uniform(0.7, 1.3, 7)
+    ring = np.stack([x + reach * np.cos(angles), y + reach * np.sin(angles)], axis=1)
+    shape = shapely.MultiPoint(ring).convex_hull
+    return shape.wkt
+
+
+@pytest.mark.parametrize('seed', range(900, 903))
+def test_no_setpoint_is_rejected_while_zones_appear_over_it_and_around(guided, seed):
+    """Whatever is drawn: it stops or goes on, leaves when it is sent out, and is never at fault."""
+    generator = np.random.default_rng(seed)
+    play = guided(parameters={'FENCE_ACTION': 0})
+    rejected, take = [], play.autopilot._go_to
+
+    def go_to(place, yaw):
+        if play.autopilot.fence.breach(place, float(place[2])):
+            rejected.append(place)
+        take(place, yaw)
+
+    play.autopilot._go_to = go_to
+    for _ in range(3):
+        play.draw()
+        play.run(3.0)
+        goal = generator.uniform(-120.0, 120.0, 2)
+        if play.away(*goal) > 40.0:
+            play.go_to(*goal, 30.0)
+        play.run(generator.uniform(1.0, 8.0))
+        here = play.place[:2] + generator.uniform(-5.0, 5.0, 2)
+        around = generator.uniform(-60.0, 60.0, (4, 2)) + here
+        zones = [random_zone(generator, here, generator.uniform(6.0, 14.0))]
+        zones += [random_zone(generator, place, generator.uniform(4.0, 10.0)) for place in around]
+        play.draw(*zones).run(3.0)
+        if play.driver.follower.current is None:
+            play.run(10.0)
+            assert play.speed < 0.05
+            keep_out = play.driver.follower.motion.keep_out
+            exit_point = keep_out.exit_from(play.place)
+            if exit_point is not None:
+                play.go_to(*exit_point)
+        if play.driver.follower.current is not None:
+            play.arrives()
+        assert play.driver.follower.exit_from(play.place) is None
+        assert play.fault == '' and not rejected
 
 
 @pytest.mark.parametrize('seed', range(900, 904))

@@ -36,13 +36,12 @@ from maasi_sim.simulation.emulators.mavlink.autopilot_settings import (
 )
 from maasi_sim.simulation.emulators.mavlink.fake_fence import ACTIONS, FakeFence
 from maasi_sim.simulation.emulators.mavlink.flight_model import FlightModel
-from maasi_sim.simulation.emulators.mavlink.guided_flight import GuidedFlight
+from maasi_sim.simulation.emulators.mavlink.guided_flight import GuidedFlight, ReturnFlight
 
 _DISARM_DELAY = 10.0  # ArduCopter disarms on the ground after so long [s]
 # PX4 wants setpoints for so long, and not so long ago, before OFFBOARD [s].
 _OFFBOARD_STREAM, _OFFBOARD_AGE = 1.0, 0.5
 _LANDING, _SURFACING = 0.5, 0.3
-_RTL_HEIGHT = 15.0  # RTL_ALT of the factory [m]
 _POSITION_IGNORED, _VELOCITY_IGNORED, _YAW_IGNORED = 0b111, 0b111 << 3, 1 << 10
 _ONLY_POSITION, _ONLY_VELOCITY = 0xDF8, 0xDC7  # masks of POSITION_TARGET_LOCAL_NED
 _FENCE_PERIOD = 0.1  # between two looks at the fence [s]
@@ -92,8 +91,8 @@ class FakeAutopilot:
         self.height_error = 0.0
         self.origin = np.zeros(3)
         self._sender, self._generator = sender, generator
-        # Place and height at arming, and highest of a return [m].
-        self._armed_place, self._home, self._returns_at = np.zeros(3), 0.0, 0.0
+        self._way_home = ReturnFlight(self.body)
+        self._home = 0.0  # true height at arming [m]
         # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
         self._armed_at = -math.inf
@@ -201,26 +200,14 @@ class FakeAutopilot:
                 if self._guided is not None:
                     self._guided.hold(target)
         elif self.mode_name == 'RTL':
-            self._return(dt)
+            if self._way_home.run(dt):
+                self.disarm('Landed')
         elif self._guided is not None and self.mode == self.firmware.external:
             self._guided.run(self.now, dt)
         elif self._velocity is not None or setpoint is None:
             body.fly(np.zeros(3) if self._velocity is None else self._velocity, dt)
         else:
             body.fly_to(*setpoint, dt)
-
-    def _return(self, dt: float) -> None:
-        """Climb, fly to where it was armed, and land; `ModeRTL`."""
-        body, home = self.body, self._armed_place
-        height = home[2] + max(_RTL_HEIGHT, self._returns_at)
-        if math.hypot(*(body.position - home)[:2]) < 0.5:
-            body.fly(np.array([0.0, 0.0, -_LANDING]), dt)
-            if body.grounded:
-                self.disarm('Landed')
-            return
-        self._returns_at = max(self._returns_at, float(body.position[2] - home[2]))
-        low = body.position[2] < height - 0.5
-        body.fly_to(np.array([*(body.position if low else home)[:2], height]), None, dt)
 
     def disarm(self, text: str) -> None:
         """Turn the motors off, and say why."""
@@ -413,9 +400,8 @@ class FakeAutopilot:
             return int(_FAILED)
         if not self.armed:
             self.armed, self._armed_at = True, self.now
-            self._armed_place = self.body.position.copy()
+            self._way_home = ReturnFlight(self.body)
             self._home = float(self.body.position[2])
-            self._returns_at = 0.0
             self._station_at = min(self._station_at, self.now)
             self.say(6, 'Arming motors')
         return int(_ACCEPTED)

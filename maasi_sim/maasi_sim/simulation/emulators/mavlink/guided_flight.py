@@ -20,6 +20,8 @@ from maasi_sim.simulation.emulators.mavlink.flight_model import FlightModel
 
 Level = tuple[float, float]
 
+_RETURN_HEIGHT, _LANDING = 15.0, -0.5  # RTL_ALT of the factory, and speed of the landing [m, m/s]
+
 
 def square_root_speed(error: float, gain: float, acceleration: float, dt: float) -> float:
     """Return the speed at which a distance can still be braked in time; `sqrt_controller`."""
@@ -171,3 +173,22 @@ class GuidedFlight:
         ax, ay, _ = self._acceleration.tolist()
         step = _within((wish[0] - ax, wish[1] - ay), jerk * dt)
         self._acceleration[:2] += step
+
+
+class ReturnFlight:
+    """The mode RTL: it climbs, flies to where it was armed, and lands (`ModeRTL`)."""
+
+    def __init__(self, body: FlightModel) -> None:
+        self._body, self._home = body, body.position.copy()
+        self._height = float(self._home[2]) + _RETURN_HEIGHT
+
+    def run(self, dt: float) -> bool:
+        """Fly for `dt` seconds; return whether it has landed."""
+        body, home = self._body, self._home
+        if math.hypot(*(body.position - home)[:2]) < 0.5:
+            body.fly(np.array([0.0, 0.0, _LANDING]), dt)
+            return body.grounded
+        self._height = max(self._height, float(body.position[2]))
+        climbs = body.position[2] < self._height - 0.5
+        body.fly_to(np.array([*(body.position if climbs else home)[:2], self._height]), None, dt)
+        return False
