@@ -144,7 +144,7 @@ def test_nobody_runs_dry_and_who_is_charged_comes_back(planner, monkeypatch, req
     assert homes >= 4
 
 
-def test_a_way_is_afforded_if_the_way_home_is_left_with_the_reserve():
+def test_a_way_is_afforded_if_the_path_home_is_left_with_the_reserve():
     """By hand: 10 m/s, 0.01 of the battery each second, nothing for metres."""
     motion = make_motion(MotionSettings(speed=10.0, approach_rate=5.0), Area([[0.0, 500.0]] * 2))
     settings = EnduranceSettings(per_second=0.01, reserve=0.2, chargers=[[0, 0, 0], [400, 0, 0]])
@@ -152,24 +152,64 @@ def test_a_way_is_afforded_if_the_way_home_is_left_with_the_reserve():
     state = RobotState.at_rest([0.0, 0.0, 0.0])
     goals = [[100.0, 0.0, 0.0], [200.0, 0.0, 0.0], [300.0, 0.0, 0.0], [390.0, 0.0, 0.0]]
     ways = motion.predict(state, goals, 0.1)
-    # There 0.1, 0.2, 0.3, 0.39; home 0.11, 0.22, 0.11, 0.01; in use some 0.005 for each stop.
+    # There 0.104, 0.204, 0.304, 0.394, and home 0.104, 0.204, 0.104, 0.014, as each stop takes
+    # 0.4 s longer; the reserve; and 0.004 and 3 % of the path home on top.
     for charge, allowed in (
         (math.nan, [True] * 4),
-        (0.64, [True] * 4),
-        (0.62, [True, False, True, True]),
+        (0.62, [True] * 4),
+        (0.617, [True, False, True, True]),
         (0.45, [True, False, False, False]),
         (0.3, [False] * 4),
     ):
         endurance.hear(charge)
         assert endurance.affords(ways, 0.1).tolist() == allowed, charge
-    endurance.hear(0.3)
-    assert endurance.must_return([200.0, 0.0, 0.0]) and not endurance.must_return([10.0, 0.0, 0.0])
-    endurance.hear(-1.0)
-    assert not endurance.must_return([200.0, 0.0, 0.0])
+    # With a factor for the path home the second needs 0.204 + 1.5 x 0.204 + 0.2 at least.
+    windy = Endurance(settings.model_copy(update={'return_factor': 1.5}), motion, [0.0, 0.0, 0.0])
+    for charge, allowed in ((0.73, True), (0.70, False)):
+        windy.hear(charge)
+        assert windy.affords(ways, 0.1)[1] == allowed
+
+
+def test_a_robot_turns_home_where_the_reserve_would_be_used_and_learns_what_it_uses():
+    motion = make_motion(MotionSettings(speed=10.0, approach_rate=5.0), Area([[0.0, 500.0]] * 2))
+    settings = EnduranceSettings(per_second=0.01, reserve=0.2)
+
+    def at(x, charge, before=None):
+        endurance = Endurance(settings, motion, [0.0, 0.0, 0.0])
+        for step, (place, was) in enumerate([*(before or []), (x, charge)]):
+            endurance.update(step, RobotState.at_rest([place, 0.0, 0.0]), was, False)
+        return endurance
+
+    # Home takes 0.204 from 200 m, and two steps 0.002.
+    assert at(200.0, 0.405).must_return and not at(200.0, 0.407).must_return
+    assert not at(10.0, 0.3).must_return and not at(200.0, math.nan).must_return
+    # It uses a fifth more: after 0.2 of the battery the ratio is known to a hundredth.
+    flown = [(1.0 * k, 1.0 - 0.0012 * k) for k in range(200)]
+    endurance = at(200.0, 0.76, flown)
+    assert 1.17 < endurance.use_ratio <= 1.2
+    assert endurance.use_home([200.0, 0.0, 0.0]) == pytest.approx(0.204 * endurance.use_ratio)
+    # An unknown charge is the last one less the use, as it was learned.
+    for step in range(201, 301):
+        endurance.update(step, RobotState.at_rest([200.0, 0.0, 0.0]), -1.0, False)
+    assert endurance.estimated
+    assert endurance.charge == pytest.approx(0.76 - 0.1 * endurance.use_ratio, abs=0.002)
+    # Paths that take twice the time cost twice as much.
+    endurance = at(200.0, 0.9)
+    for _ in range(600):
+        endurance.note_pace(0.2, 0.1)
+    assert 1.8 < endurance.time_ratio <= 2.0
+    assert endurance.use_home([200.0, 0.0, 0.0]) == pytest.approx(0.204 * endurance.time_ratio)
+
+
+def test_a_charger_on_the_ground_is_home_for_a_drone_above_it_in_2d():
+    motion = make_motion(MotionSettings(speed=10.0), Area([[0.0, 500.0]] * 2))
+    settings = EnduranceSettings(chargers=[[100.0, 100.0, 0.0]])
+    endurance = Endurance(settings, motion, [0.0, 0.0, 20.0])
+    assert endurance.chargers.tolist() == [[100.0, 100.0, 20.0]]
+    assert endurance.is_home([100.0, 100.0, 20.0]) and endurance.is_home([100.0, 100.0, 0.0])
     endurance.begin(Phase.CHARGING)
-    endurance.hear(0.94)
-    assert endurance.charging
-    endurance.hear(0.96)
-    assert not endurance.charging
-    # The way table of each charger is made once.
-    assert motion.table.cache_info().misses == 2
+    for step, (charge, phase) in enumerate(((0.94, Phase.CHARGING), (0.96, Phase.AVAILABLE))):
+        endurance.update(step, RobotState.at_rest([100.0, 100.0, 20.0]), charge, True)
+        assert endurance.phase is phase
+    solid = make_motion(MotionSettings(speed=10.0), Area([[0.0, 500.0]] * 3))
+    assert not Endurance(settings, solid, [0.0, 0.0, 20.0]).is_home([100.0, 100.0, 20.0])

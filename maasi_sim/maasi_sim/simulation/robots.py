@@ -139,7 +139,9 @@ class SimulatedRobot:
                 self._resting = True
         velocity = self.state.velocity
         speed = float(np.sqrt((velocity * velocity).sum()))
-        gaps = np.linalg.norm(self._chargers - self.state.pose.position, axis=1)
+        # In 2D a charger on the ground charges a drone above it, as the planner assumes.
+        offsets = (self._chargers - self.state.pose.position)[:, : self.world.area.dimension]
+        gaps = np.linalg.norm(offsets, axis=1)
         if speed < 0.1 and gaps.min(initial=math.inf) < self._at_charger:
             self.battery.charging(dt)
         elif self._carried:
