@@ -308,9 +308,13 @@ def read_map(path: str) -> Any:
         raise ValueError(f'{path}: is no map of Nav2: {error}') from None
     if yaw != 0.0:
         raise ValueError(f'{path}: origin: got a yaw of {yaw}, allowed is 0')
-    row, column = np.nonzero(occupied)
-    x, y = west + cell * column, south + cell * (len(occupied) - 1 - row)
-    cells = shapely.union_all(shapely.box(x, y, x + cell, y + cell))
+    # A box for each run of cells in a row, as one for each cell takes seconds.
+    ends = np.diff(np.pad(occupied, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, first = np.nonzero(ends == 1)
+    last = np.nonzero(ends == -1)[1]
+    x, y = west + cell * np.array([first, last]), south + cell * (len(occupied) - row)
+    lower = south + cell * (len(occupied) - 1 - row)
+    cells = shapely.union_all(shapely.box(x[0], lower, x[1], y))
     # Slanted walls are stairs of cells; the result covers them.
     return cells.buffer(0.5 * cell, join_style='mitre').simplify(0.5 * cell)
 

@@ -173,6 +173,25 @@ FIELDS = {
 }
 
 
+def test_one_robot_sees_what_the_team_sees():
+    """Also where shapes that are united differ in their last digits."""
+    rng = np.random.default_rng(922)
+    for _ in range(20):
+        zones = [
+            {
+                'centre': rng.uniform(80.0, 420.0, 2).tolist(),
+                'radius': float(rng.uniform(5.0, 40.0)),
+            }
+            for _ in range(15)
+        ]
+        environment = FIELD['environment'] | {'keep_outs': zones}
+        drone = {'east': DRONE | {'battery': {'capacity': 1e9}}}
+        limit = {'limits': {'time': 1e5}}
+        report = preflight(field(environment=environment, robots=drone, **limit))
+        assert report.lines[2].startswith('team: one pass takes ')
+        assert all('no robot gets to' in text for text in report.warnings)
+
+
 def test_the_command_prints_what_a_search_takes_and_starts_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, changes in FIELDS.items():

@@ -208,7 +208,8 @@ def _covered(efforts: Mapping[str, Effort], time: float) -> float:
 
 def _time_of_pass(efforts: Mapping[str, Effort], whole: float) -> float:
     """Return the time in which the robots see a volume once, sharing it as they can [s]."""
-    if _covered(efforts, _LONGEST) < (1.0 - 1e-9) * whole:
+    whole *= 1.0 - 1e-6  # rounding of shapes that are united
+    if _covered(efforts, _LONGEST) < whole:
         return _LONGEST
     low, high = 0.0, _LONGEST
     for _ in range(80):
