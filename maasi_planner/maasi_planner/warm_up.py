@@ -37,6 +37,7 @@ def _decide(team: TeamView) -> None:
     view = team.robots[name]
     trigger = MeasurementTrigger(PlannerSettings(measurement='event'))
     trigger.measures(name, 1, view.sensor, view.state.pose, team.clusters, team.exploration)
+    team.exploration.update(view.sensor.detection, view.state.pose)
 
 
 def warm_up() -> None:
