@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
-from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.detection import BoxDetection, ExponentialDetection, GaussianDetection
+from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.unexplored_map import default_spacing
 from maasi_planner import CandidateSet, CandidateSettings, Viewer, unseen_parts
+from maasi_planner.candidates import map_spacing, swath_of
+from maasi_sim.scenario.loading import load_scenario
 
 FLOOR = np.array([[-0.3, 2.4], [-0.3, 2.4]])
 CUBE = np.array([[0.0, 260.0]] * 3)
@@ -73,3 +77,44 @@ def test_grids_of_the_paper_leave_parts_unseen():
     assert 0.3 < unseen.fraction < 0.6
     assert 'can never be seen' in unseen.describe()
     assert unseen.boxes[0][0] == pytest.approx([-0.3, 2.4], abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ('detection', 'swath'),
+    [
+        (BoxDetection([-8.0, -3.0], [8.0, 5.0]), 8.0),
+        (ExponentialDetection(0.9, [10.0, 10.0]), 4.0 * np.log(2.0) * 10.0),
+        (GaussianDetection(0.9, [10.0, 4.0]), 2.0 * np.sqrt(2.0 * np.log(2.0)) * 4.0),
+    ],
+)
+def test_the_swath_is_as_wide_as_half_of_the_best_detection(detection, swath):
+    sensor = Sensor.ranging('m', detection, np.diag([0.01, 0.01]))
+    assert swath_of(sensor) == pytest.approx(swath)
+    if not isinstance(detection, BoxDetection):
+        edge = [[0.0, 0.5 * swath], [0.0, 0.0]]
+        half, best = detection.probability(edge, Pose(ORIGIN))
+        assert half == pytest.approx(0.5 * best)
+
+
+def test_a_map_that_is_coarser_than_the_swath_is_warned_about():
+    sensors = [
+        Sensor.ranging('m', BoxDetection([-half] * 2, [half] * 2), np.diag([0.01, 0.01]))
+        for half in (8.0, 30.0)
+    ]
+    for size, spacing in ((600.0, 16.0 / 3.0), (200.0, 200.0 / 54.0), (6000.0, 6.0)):
+        assert map_spacing(np.array([[0.0, size]] * 2), sensors) == (pytest.approx(spacing), '')
+    spacing, warning = map_spacing(np.array([[0.0, 1e5]] * 2), sensors)
+    assert spacing == pytest.approx(100.0)
+    assert 'cells of 100 m' in warning and 'a swath of only 16 m' in warning
+
+
+@pytest.mark.parametrize(
+    'name', ['drone_rov', 'field', 'field_batteries', 'mambo_turtlebot', 'ranging_pair_3d']
+)
+def test_maps_of_the_scenarios_are_as_fine_as_before(name):
+    scenario = load_scenario(name)
+    bounds = scenario.environment.array()
+    sensors = [
+        robot.sensor.build(key, scenario.dimension) for key, robot in scenario.robots.items()
+    ]
+    assert map_spacing(bounds, sensors) == (default_spacing(bounds), '')
