@@ -42,7 +42,6 @@ def problems_of(scenario: Scenario) -> Problems:
     yield from _world_problems(scenario)
     yield from name_problems(scenario)
     yield from event_problems(scenario)
-    yield from _overlapping_starts(scenario)
     ports: dict[str, str] = {}
     for name in scenario.names():
         robot = scenario.robots[name]
@@ -125,7 +124,9 @@ def _room_problems(robot: RobotSettings, area: Area) -> Problems:
         yield from charger_problems(space)
 
 
-def _overlapping_starts(scenario: Scenario) -> Problems:
+def problems_of_file(scenario: Scenario) -> Problems:
+    """Yield problems between keys; robots that a program makes may start at one point."""
+    yield from problems_of(scenario)
     for (first, one), (name, robot) in combinations(scenario.robots.items(), 2):
         gap, bodies = math.dist(one.start, robot.start), one.radius + robot.radius
         if gap < bodies:

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from maasi_filter.environment import FILES, EnvironmentSettings
 from maasi_filter.plugins import is_reference, unknown
 from maasi_sim.scenario.base import BaseScenario
-from maasi_sim.scenario.checks import Problems, covering_grid, doubts_about, problems_of
+from maasi_sim.scenario.checks import Problems, covering_grid, doubts_about, problems_of, problems_of_file
 from maasi_sim.scenario.layering import (
     Key,
     Layer,
@@ -130,7 +130,8 @@ def check_scenario(
 ) -> Scenario:
     """Return the scenario of a tree of values with all layers merged."""
     _give_candidates(layer)
-    return checked(Scenario, layer, overrides, problems_of)
+    problems = problems_of_file if layer.folder else problems_of
+    return checked(Scenario, layer, overrides, problems)
 
 
 def checked(
