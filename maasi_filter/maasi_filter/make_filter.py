@@ -12,6 +12,8 @@ from maasi_filter.area import Area
 from maasi_filter.arrays import ByteArray
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.models.pose import Pose
+from maasi_filter.pmb.association import MANY_PAIRS, associate
+from maasi_filter.pmb.component import gaps_of
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.records import AgentMeasurement
 from maasi_filter.search_filter import SearchFilter
@@ -103,3 +105,8 @@ def warm_up(method: str | None = None) -> None:
                         [AgentMeasurement('warm_up', pose, sensor, values, None, step)], 1, step
                     )
                 search.exploration.at(np.full((1, 3), 3.0))
+        if method in (None, 'pmb'):
+            # What only a large scan needs.
+            associate(np.ones((1, MANY_PAIRS + 1)), np.ones(MANY_PAIRS + 1))
+            place, spread = np.zeros((1, dimension)), np.eye(dimension)[None]
+            gaps_of(np.ones((1, 1), np.bool_), place, spread, place, spread)

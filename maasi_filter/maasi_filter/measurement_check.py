@@ -18,6 +18,8 @@ from maasi_filter.settings import FilterSettings
 # Default position error of a robot with a box-shaped field of view, as a share of its half size:
 # the position error blurs the edge.
 POSE_ERROR_OF_BOX = 0.05
+# Most detections of a scan, against unbounded computation times; messages have fewer.
+MOST_VALUES = 1000
 # Reasons that are no faults: a found target took it, or another one of the scan is the same.
 FOUND = 'found'
 REPEATED = 'repeated'
@@ -88,6 +90,8 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
         values = values.reshape(0, d)
     if values.ndim != 2 or values.shape[1] != d:
         raise ValueError(f'{name}: values: got shape {values.shape}, allowed is (m, {d})')
+    if len(values) > MOST_VALUES:
+        raise ValueError(f'{name}: values: got {len(values)}, allowed are {MOST_VALUES}')
     if not np.isfinite(values).all():
         raise ValueError(f'{name}: values: got {values.tolist()}, allowed are finite numbers')
     covariances = np.repeat(sensor.covariance[None], len(values), axis=0)

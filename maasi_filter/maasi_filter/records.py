@@ -148,7 +148,8 @@ class FilterResult:
     dropped : dict
         Detections that were not used: reason to count.
     misfits : dict
-        Warnings that the detections of a robot do not fit its settings, by robot.
+        Warnings that the detections of a robot do not fit its settings, by robot; or that some
+        potential targets were left out.
     """
 
     clusters: list[Cluster] = field(default_factory=list)

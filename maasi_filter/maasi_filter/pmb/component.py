@@ -9,14 +9,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
-from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_filter.pmb.association import MANY_PAIRS
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
 from maasi_filter.pmb.labels import LabelTally
 from maasi_filter.pmb.scan import LEAST_SUPPORT, Scan
 from maasi_filter.records import FoundTarget
 from maasi_filter.search_filter import SAME_TARGET
-from maasi_filter.vector_math import squared_distance
+from maasi_filter.vector_math import normalised, squared_distance
 
 # Shares of the believed pi with which a place may answer.
 RATES = np.array([1.0, 0.7, 0.5, 0.35, 0.2])
@@ -73,6 +74,8 @@ GATE = 6.0  # gate of a detection, in standard deviations and root mean square r
 # Largest squared normalised distance for draws from a detection with too few particles.
 SUPPORT_DISTANCE = 36.0
 SUPPORT_DRAWS = 100
+# Most pairs of a component and a detection of a large scan; the others are too far apart.
+MOST_PAIRS = 12_000
 LEAST_DRAWN_SHARE = 0.05  # association probability above which such draws replace particles
 # Association probabilities and changes of the log density below these are neglected.
 LEAST_SHARE = 1e-4
@@ -85,6 +88,8 @@ MOST_FACTORS = 150
 LEAST_HITS = 1.5
 # Expected joint detections in a scan from which two components are different targets.
 SEEN_BOTH = 1.5
+# Above this distance on an axis, in root mean square radii, two components are different targets.
+REACH = math.sqrt(SAME_TARGET)
 SAME_PLACE = 6.0  # gate on the squared normalised distance for merging components
 
 
@@ -226,7 +231,31 @@ def views(components: Sequence[Component], scan: Scan) -> list[View]:
     means, _, radii = moments(components)
     apart = np.sqrt(np.square(means - scan.pose.position[: means.shape[1]]).sum(axis=1))
     gates = np.abs(scan.ranges - apart[:, None]) < GATE * (scan.deviations + radii[:, None])
+    if gates.size > MANY_PAIRS:
+        gates = _nearest_pairs(gates, components, scan)
     return [item.view(scan, gate.nonzero()[0]) for item, gate in zip(components, gates)]
+
+
+@njit(cache=True, error_model='numpy')
+def gaps_of(gates, means, covariances, others, spreads):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return the squared normalised distances of pairs (n, m), inf where `gates` has none."""
+    out = np.full(gates.shape, np.inf)
+    for i in range(gates.shape[0]):
+        for j in range(gates.shape[1]):
+            if gates[i, j]:
+                total = covariances[i] + spreads[j]
+                out[i, j] = normalised(others[j] - means[i], total)[0]
+    return out
+
+
+def _nearest_pairs(gates: BoolArray, components: Sequence[Component], scan: Scan) -> BoolArray:
+    """Return the pairs (n, m) of a large scan that are near enough, and not too many of them."""
+    means, covariances, _ = moments(components)
+    gaps = gaps_of(gates, means, covariances, scan.means, scan.covariances)
+    near = gaps < SUPPORT_DISTANCE
+    if np.count_nonzero(near) > MOST_PAIRS:
+        near = gaps <= np.partition(gaps[near], MOST_PAIRS)[MOST_PAIRS]
+    return np.asarray(near)
 
 
 def gap(one: Component, other: Component) -> float:
@@ -247,28 +276,48 @@ def merge(components: list[Component]) -> list[Component]:
     means, _, radii = moments(components)
     gaps = np.square(means[:, None] - means[None]).sum(axis=2)
     near = gaps < SAME_PLACE * (radii[:, None] ** 2 + radii[None] ** 2)
+    # No pairs of one scan, and of more than one target: existences only grow.
+    existence, born = (
+        np.array([getattr(item, name) for item in components]) for name in ('existence', 'scan')
+    )
+    near &= (born[:, None] != born) & (existence[:, None] + existence <= 1.0)
     kept: list[int] = []
-    for i in np.argsort([-item.existence for item in components], kind='stable').tolist():
+    order = np.argsort([-item.existence for item in components], kind='stable')
+    near, still = near[np.ix_(order, order)], np.zeros(len(order), np.bool_)
+    for place, i in enumerate(order.tolist()):
         item = components[i]
-        for other in (components[k] for k in kept if near[i, k]):
+        still[place] = True
+        for other in (
+            components[order[k]] for k in np.flatnonzero(near[place, :place] & still[:place])
+        ):
             two = item.scan == other.scan or item.differs(other)
             two |= other.existence + item.existence > 1.0
             if not two and gap(other, item) < SAME_PLACE:
                 other.existence += item.existence
                 other.labels.merge(item.labels)
+                still[place] = False
                 break
         else:
             kept.append(i)
     return [components[i] for i in sorted(kept)]
 
 
-def is_known(i: int, components: Sequence[Component], caused: FloatArray) -> bool:
-    """Return whether component i may be a found one: together, one detection in each scan."""
-    item = components[i]
-    return any(
-        other.target is not None
-        and not item.differs(other)
-        and caused[[i, f]].sum() <= SEEN_BOTH
-        and gap(item, other) < SAME_TARGET
-        for f, other in enumerate(components)
-    )
+def is_known(
+    i: int, components: Sequence[Component], totals: FloatArray, found: Sequence[int]
+) -> bool:
+    """Return whether component i may be one of those found: together, one detection in each scan.
+
+    totals (n,): the expected number of detections that each caused in this one.
+    """
+    item, rows = components[i], np.array(found, np.int64)
+    for f in rows[totals[i] + totals[rows] <= SEEN_BOTH].tolist():
+        other = components[f]
+        reach = REACH * (item.density.radius + other.density.radius)
+        if (
+            abs(item.density.mean[0] - other.density.mean[0]) <= reach
+            and other.target is not None
+            and not item.differs(other)
+            and gap(item, other) < SAME_TARGET
+        ):
+            return True
+    return False

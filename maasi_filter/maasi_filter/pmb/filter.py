@@ -39,6 +39,7 @@ from maasi_filter.search_filter import FoundTargets, SearchFilter, nearest
 from maasi_filter.settings import FilterSettings
 
 LEAST_EXISTENCE = 1e-4
+MOST_POTENTIAL = 1000  # most components that are not found
 LEAST_CLUSTER_MASS = 0.1  # least existence probability of a cluster that is published
 FOUND_RADIUS_DEVIATIONS = 2.0  # default of T_r, in standard deviations of the range
 # Probability of being a reflection below which a target can be found, and above which a found one
@@ -117,7 +118,7 @@ class PmbFilter(SearchFilter):
         for member in members:
             self._correct(member, time, result)
         self._estimate_changed()
-        merged = merge([item for item in self.potential if item.existence >= LEAST_EXISTENCE])
+        merged = merge(self._most_probable(result))
         self.components = [item for item in self.components if item.target is not None] + merged
         self.clusters = self._clusters_of(merged)
         result.clusters = list(self.clusters)
@@ -126,7 +127,7 @@ class PmbFilter(SearchFilter):
         result.found_changed = bool(result.newly_found) or changed
         result.expected_number = self.expected_number
         misfits = {robot: learnt.misfit(robot) for robot, learnt in sorted(self._learnt.items())}
-        result.misfits = {robot: text for robot, text in misfits.items() if text}
+        result.misfits |= {robot: text for robot, text in misfits.items() if text}
         return result
 
     def _correct(self, member: CheckedMeasurement, time: float, result: FilterResult) -> None:
@@ -162,13 +163,16 @@ class PmbFilter(SearchFilter):
         count_unexplained(scan.centres[alone], self.bounds, result.dropped)
         # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
         radius = self._found_radius(blurred)
-        surely = (caused.sum(axis=1) > 0.5).tolist()
+        totals = caused.sum(axis=1)
+        surely = (totals > 0.5).tolist()
+        found = [i for i, item in enumerate(components) if item.target is not None]
         for i, (item, view) in enumerate(zip(components, seen)):
             moved = item.update(view, missed[i], caused[i], scan, self.generator)
             if surely[i] and not item.foreign:
                 item.pose_error, item.found_radius = blurred.pose_error, radius
-            if self._review(item, moved) and not is_known(i, components, caused):
+            if self._review(item, moved) and not is_known(i, components, totals, found):
                 result.newly_found.append(self._find(item, member, time))
+                found.append(i)
         # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
         real = np.where(named, 0.0, scan.intensity / (kappa + scan.intensity))
         self._add_born(blurred, scan, new * real, radius)
@@ -248,6 +252,21 @@ class PmbFilter(SearchFilter):
         self._rates = rate_of_targets(
             [item for item in self.components if item.existence >= LEAST_CLUSTER_MASS]
         )
+
+    def _most_probable(self, result: FilterResult) -> list[Component]:
+        """Return the components that are not found and may exist, at most so many."""
+        items = [item for item in self.potential if item.existence >= LEAST_EXISTENCE]
+        if len(items) <= MOST_POTENTIAL:
+            return items
+        left_out = len(items) - MOST_POTENTIAL
+        least = sorted((item.existence for item in items), reverse=True)[MOST_POTENTIAL]
+        result.misfits['potential targets'] = (
+            f'{len(items)} potential targets, allowed are {MOST_POTENTIAL}: {left_out} that exist '
+            f'with probabilities up to {least:.2g} were left out; sensors show more false '
+            'detections than the filter can follow'
+        )
+        order = sorted(range(len(items)), key=lambda i: -items[i].existence)
+        return [items[i] for i in sorted(order[:MOST_POTENTIAL])]
 
     def _clusters_of(self, components: Sequence[Component]) -> list[Cluster]:
         """Return what may be a target; a place that reflects weighs less."""

@@ -10,7 +10,7 @@ from numba import njit
 from maasi_filter.arrays import FloatArray
 from maasi_filter.measurement_check import CheckedMeasurement
 from maasi_filter.models.sensor import LEAST_PER_SCAN
-from maasi_filter.pmb.association import propagate
+from maasi_filter.pmb.association import MANY_PAIRS, propagate
 from maasi_filter.pmb.component import Component, moments
 from maasi_filter.pmb.factors import MOST_PROBABLE
 from maasi_filter.vector_math import normalised
@@ -25,6 +25,7 @@ LEVELS = np.array([0.0, 0.5, 1.0, 2.0, 4.0])
 PRIOR = np.array([0.96, 0.01, 0.01, 0.01, 0.01])  # their probabilities beforehand
 CHANGE = 0.005  # probability that the error is another one from one scan to the next
 LEAST_EXISTENCE = 0.1  # components below this r are not considered
+LEARNING_PAIRS = 10_000  # pairs with detections that the error of a large scan is learnt from
 GATE = 4.0  # gate on the range, in deviations of the largest error and root mean square radii
 # Share of the weight of earlier detections that each new one leaves.
 MEMORY = 1.0 - 1.0 / 50.0
@@ -128,10 +129,11 @@ class Learnt:
         rows = [i for i in rows if components[i].target and not components[i].foreign]
         if rows:
             means, covariances, _ = moments([components[i] for i in rows])
-            squares = innovations(member, means, covariances)[3]
-            for row, j in np.argwhere(caused[rows] > 0.5).tolist():
-                probability = 0.0 if blurred else float(caused[rows[row], j])
-                self.count_innovation(float(squares[row, j]), means.shape[1], probability)
+            for i, mean, covariance in zip(rows, means, covariances):
+                taken = caused[i] > 0.5
+                squares = innovations(member.only(taken), mean[None], covariance[None])[3]
+                for square, share in zip(squares[0].tolist(), caused[i, taken].tolist()):
+                    self.count_innovation(square, len(mean), 0.0 if blurred else share)
 
     def count_innovation(self, square: float, d: int, probability: float) -> None:
         """Count a squared innovation; for the noise with a probability that it tells of that."""
@@ -160,6 +162,11 @@ class Learnt:
             gaps = np.abs(apart[:, None] - member.values[:, 0]).min(axis=1)
             near = gaps < GATE * unit * LEVELS[-1] + GATE * radii
             items = [item for item, kept in zip(items, near.tolist()) if kept]
+            # In a large scan those that are most certain tell enough.
+            most = LEARNING_PAIRS // len(member.values)
+            if len(items) > max(1, most) and len(items) * len(member.values) > MANY_PAIRS:
+                items.sort(key=lambda item: -item.existence)
+                items = items[: max(1, most)]
         if items and len(member.values):
             logs = _log_likelihoods(member, items, clutter, unseen, unit)
             after = ((1.0 - CHANGE) * self.errors + CHANGE * PRIOR) * np.exp(logs - logs.max())
