@@ -30,6 +30,7 @@ from maasi_planner.obstacles import (
 # Among more vertices than these the one to head for is looked for anew only where it is reached or
 # hidden; a prediction among fewer is the controller's own, to the bit.
 MANY = 100
+_LAST = 1.6  # largest speed towards an obstacle close by, for each metre of distance [1/s]
 _ATTEMPTS = 40  # to satisfy the limits of several circles, one after the other
 
 
@@ -258,19 +259,35 @@ def minded(position: Vector, manner: int, around: Surroundings) -> tuple[Felt, b
     return felt, walls and not inside
 
 
+@njit(cache=True, forceinline=True)
+def approach_limit(room: float, limits: tuple[float, float]) -> float:
+    """Return the largest speed towards an obstacle that is `room` metres away [m/s].
+
+    With a limit on the acceleration half of that stops it in time, but for the last half metre or
+    so, which delays need.
+    """
+    rate, acceleration = limits
+    if acceleration == np.inf or room <= 0.0:
+        return rate * room
+    return max(rate * room, min(math.sqrt(0.5 * acceleration * room), _LAST * room))
+
+
 @njit(cache=True)
-def hold_back(position: Vector, felt: Felt, beyond: bool, rate: float, velocity: Vector) -> Vector:
+def hold_back(
+    position: Vector, felt: Felt, beyond: bool, limits: tuple[float, float], velocity: Vector
+) -> Vector:
     """Return `velocity` with limits on its part that points into circles.
 
-    Towards a circle at distance d at most `rate` * d is left, and inside of one at least that
-    much outwards. It is turned along the circles, or only slowed down where that leads further.
-    Walls do not hold back a robot that is beyond them.
+    Towards a circle at distance d at most `approach_limit` is left, and inside of one at least as
+    much outwards; limits: rate [1/s] and acceleration [m/s^2] of that. It is turned along the
+    circles, or only slowed down where that leads further. Walls do not hold back a robot that is
+    beyond them.
     """
     circles, wanted, slack = felt.circles, velocity, 0.0
     # Of the velocity as it is, and as it has become.
     straight, shrink = 1.0, 1.0
     # Farther ones do not limit it, even if it grows by what others add.
-    enough = 1.5 * norm(velocity) / rate + felt.off
+    enough = 1.5 * norm(velocity) / limits[0] + felt.off
     for attempt in range(_ATTEMPTS + 1):
         changed = False
         if attempt == 8:
@@ -284,7 +301,7 @@ def hold_back(position: Vector, felt: Felt, beyond: bool, rate: float, velocity:
             size = norm(offset)
             if size < 1e-9 or (beyond and (circles[i, 5] != 0.0 or circles[i, 6] != 0.0)):
                 continue
-            least = -rate * (size - circles[i, 3])
+            least = -approach_limit(size - circles[i, 3], limits)
             if attempt == 0:
                 before = dot(wanted, offset) / size
                 if before < least:

@@ -72,7 +72,11 @@ class KeepOut:
         self.clearance = float(clearance)
         apart = radius + clearance
         room = None if area is None else area.room(apart)
-        walls = None if room is None else _simplified(room, _DETAIL * clearance)
+        detail = _DETAIL * self.clearance
+        inflation = radius + 0.1 * self.clearance
+        # At the sides of bounds robots may be on the bounds themselves, but not beyond.
+        held = None if area is None else area.room(inflation)
+        walls = None if held is None else _simplified(held, detail)
         self._round = 0 if area is None else len(area.circles)
         self.circles = self._inflated(np.zeros((0, 5)) if area is None else area.circles, walls)
         # Where waypoints may be; None: anywhere beside round ones.
@@ -80,11 +84,11 @@ class KeepOut:
         if self._places is not None:
             shapely.prepare(self._places)
         outline = self._places
-        if walls is not room and walls is not None:
-            outline = walls.buffer(-apart, join_style='mitre')
+        if walls is not held and room is not None:
+            simple = _simplified(room, detail)
+            outline = simple.buffer(-apart, join_style='mitre')
         nearby = nearby_of(self.circles, reach, 0.5 * self.clearance)
         spheres = bool((self.circles[:, 4] > 0.5).any())
-        inflation = radius + 0.1 * self.clearance
         none = np.zeros((0, 2))
         self.around = Surroundings(
             self.circles, none, self.clearance, nearby, self._solid_circles(), inflation, spheres
@@ -111,7 +115,7 @@ class KeepOut:
         """Return the circles of what is there without keep-outs."""
         if self.area is None or not self.area.settings.keep_outs:
             return self.circles
-        room = self.area.room(self.radius + self.clearance, closed=False)
+        room = self.area.room(self.radius + 0.1 * self.clearance, closed=False)
         return self._inflated(self.area.solid, room)
 
     def _corners(self, outline: BaseGeometry | None) -> FloatArray:

@@ -12,6 +12,9 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
 from maasi_msgs.msg import KeepOuts
 
+# Most zones and corners of their polygons in a request.
+ZONES, CORNERS = 1000, 10_000
+
 
 class KeepOutTopic:
     """The area with the keep-outs that hold now; `keep`: published again, to outlive a sender."""
@@ -53,6 +56,13 @@ class KeepOutTopic:
 
 def with_keep_outs(environment: EnvironmentSettings, zones: Sequence[str]) -> Area:
     """Return the area of an environment with other keep-outs, given as texts."""
+    # Before they are read: so many can be taken in a second.
+    for read, what, most in (
+        (len(zones), 'zones', ZONES),
+        (sum(zone.count(',') for zone in zones), 'corners', CORNERS),
+    ):
+        if read > most:
+            raise ValueError(f'read {read} {what}, allowed are {most}')
     values = environment.model_dump(exclude={'keep_outs'}, exclude_none=True)
     try:
         given = {**values, 'keep_outs': shapes_of_texts(zones)}

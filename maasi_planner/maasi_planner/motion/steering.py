@@ -122,7 +122,8 @@ def fly_among(
         speed = _stoppable(position, way, steering, felt, beyond)
     scale = min(steering.rate * left, speed) / size if size > 0.0 else 0.0
     velocity = (scale * way[0], scale * way[1], scale * way[2])
-    velocity = hold_back(position, felt, beyond, steering.barrier, velocity)
+    limits = steering.barrier, steering.acceleration
+    velocity = hold_back(position, felt, beyond, limits, velocity)
     fastest = norm(velocity)
     share = speed / fastest if fastest > speed else 1.0
     velocity = (velocity[0] * share, velocity[1] * share, velocity[2] * share)
