@@ -12,7 +12,13 @@ from typing import Any, TypeVar
 from maasi_filter.environment import FILES, EnvironmentSettings
 from maasi_filter.plugins import is_reference, unknown
 from maasi_sim.scenario.base import BaseScenario
-from maasi_sim.scenario.checks import Problems, covering_grid, doubts_about, problems_of, problems_of_file
+from maasi_sim.scenario.checks import (
+    Problems,
+    covering_grid,
+    doubts_about,
+    problems_of,
+    problems_of_file,
+)
 from maasi_sim.scenario.layering import (
     Key,
     Layer,
