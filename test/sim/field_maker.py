@@ -83,7 +83,7 @@ def make_field(seed: int) -> Field:
         if robots:
             break
     weak = _batteries(rng, robots, ground)
-    limit = float(round(60.0 + 240.0 * rng.random() ** 2))
+    limit = _limit(rng, ground, robots)
     count = int(rng.integers(0, 6))
     environment: dict[str, Any] = {
         'expected_targets': float(rng.choice([0.3, 1.0, 3.0, 8.0])),
@@ -116,6 +116,16 @@ def make_field(seed: int) -> Field:
     if planner != 'lawnmower' and len(robots) > 1 and rng.random() < 0.1:
         values['planner']['coordination'] = 'independent'
     return Field(seed, kind, planner, values, _changes(rng, limit), weak)
+
+
+def _limit(rng: np.random.Generator, ground: _Ground, robots: dict[str, Any]) -> float:
+    """Return a time that is too short for some searches, and enough for most [s]."""
+    width = [
+        2.0 * robot['sensor']['detection']['upper'][0] * robot['motion']['speed']
+        for robot in robots.values()
+    ]
+    one_pass = ground.border.area / sum(width)
+    return float(round(np.clip(rng.uniform(2.0, 8.0) * one_pass, 60.0, 300.0)))
 
 
 def _changes(rng: np.random.Generator, limit: float) -> list[Change]:
