@@ -10,6 +10,7 @@ from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import RobotState, make_motion
+from maasi_planner.objective.joint_search import PAIRS_LIMIT
 from maasi_planner.planners import make_planner
 from maasi_planner.settings import MotionSettings, PlannerSettings
 from maasi_planner.team import RobotView, TeamView
@@ -66,3 +67,9 @@ def warm_up() -> None:
                 )
             team = TeamView(0, 0.05, robots, clusters, exploration)
             _decide(team)
+            # Large teams have kernels of their own.
+            view = team.robots['0']
+            many = {f'{index}': view for index in range(PAIRS_LIMIT + 1)}
+            for objective in ('paper', 'information'):
+                large = TeamView(0, 0.05, many, clusters, exploration)
+                make_planner('maasi', PlannerSettings(objective=objective)).decide(large)

@@ -1,16 +1,32 @@
 """The clever objective against the plain one, and the joint search against enumeration."""
 
 import itertools
+import time
+import tracemalloc
 
 import numpy as np
 import pytest
 from plain_objective import plain_information_terms, plain_terms
 from planner_helpers import random_team
 
-from maasi_filter.models.detection import BoxDetection
-from maasi_planner import PlannerSettings, make_planner
+from maasi_filter.models.detection import BoxDetection, ExponentialDetection
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap
+from maasi_planner import (
+    CandidateSet,
+    CandidateSettings,
+    MotionSettings,
+    PlannerSettings,
+    RobotState,
+    RobotView,
+    TeamView,
+    make_motion,
+    make_planner,
+)
+from maasi_planner.objective import team_objective
 from maasi_planner.objective.candidate_table import total_value
-from maasi_planner.objective.joint_search import search
+from maasi_planner.objective.joint_search import _search_in_turn, ranking_of, search
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import all_apart, free_of_robots, waiting_places
 from maasi_planner.team import UsableCandidates
@@ -128,6 +144,90 @@ def test_choice_in_turn_is_within_two_percent_of_the_optimum(kind):
         _, value, exact, _ = best_of(team, few)
         assert not exact
         assert best - 0.02 * abs(best) <= value <= best + 1e-12 * abs(best)
+
+
+@pytest.mark.parametrize('kind', ['paper', 'information'])
+def test_large_teams_choose_what_all_values_lead_to(kind):
+    """The choice in turn with the others summed up is that with every value computed anew."""
+    settings = PlannerSettings(objective=kind, enumeration_limit=1)
+    for seed in range(6):
+        rng = np.random.default_rng(4000 + seed)
+        team = random_team(
+            rng, dimension=2 + seed % 2, planning=7, waiting=1, candidates=6, radius=0.02
+        )
+        objective, _ = built(team, settings)
+        chosen, value, exact, _ = search(objective.table, objective.bounds, settings)
+        assert not exact
+        assert value == total_value(objective.table, chosen)
+        ranking = ranking_of(objective.table, objective.bounds)
+        tries = []
+        for backwards in (False, True):
+            plain = np.full(len(chosen), -1, np.int64)
+            total, _ = _search_in_turn(ranking, settings.improvement_rounds, backwards, plain)
+            tries.append((int((plain >= 0).sum()), total))
+        assert value == pytest.approx(max(tries)[1], rel=1e-6)
+
+
+def field_team(number, candidates, kind):
+    """Return ranging drones in one corner of 200 m x 200 m that nobody has seen."""
+    rng = np.random.default_rng(number)
+    bounds = np.array([[0.0, 200.0]] * 2)
+    detection = (
+        BoxDetection([-10.0] * 2, [10.0] * 2, 0.95)
+        if kind == 'box'
+        else ExponentialDetection(0.98, [15.0, 15.0])
+    )
+    grid = CandidateSettings(grid=[candidates] * 2, spacing=200.0 / candidates)
+    motion = make_motion(MotionSettings(speed=5.0, tolerance=0.5))
+    robots = {}
+    for index in range(number):
+        place = np.array([*rng.uniform(0.0, 15.0, 2), 10.0])
+        robots[f'drone{index:02d}'] = RobotView(
+            state=RobotState.at_rest(place),
+            candidates=CandidateSet(grid, bounds, 10.0).at(place),
+            motion=motion,
+            sensor=Sensor.ranging('drone', detection, np.diag([1.0, 0.05]) ** 2),
+            period_steps=10,
+            radius=0.3,
+        )
+    clusters = [Cluster(rng.uniform(0.0, 200.0, 2), 25.0 * np.eye(2), 5.0, 0.8) for _ in range(8)]
+    return TeamView(0, 0.1, robots, clusters, UnexploredMap(bounds, 4.0))
+
+
+@pytest.mark.parametrize('kind', ['box', 'exponential'])
+def test_thirty_robots_decide_jointly_in_bounded_time_and_memory(kind):
+    make_planner('maasi').decide(field_team(7, 4, kind))
+    team = field_team(30, 20, kind)
+    tracemalloc.start()
+    try:
+        decision = make_planner('maasi').decide(team)
+        memory = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert memory < 300e6
+    start = time.process_time()
+    again = make_planner('maasi').decide(team)
+    # About 1 s on an idle core; tests run on busy ones.
+    assert time.process_time() - start < 4.0
+    assert again.objective == decision.objective
+    waypoints = np.array([robot.waypoint for robot in decision.robots.values()])
+    gaps = np.linalg.norm(waypoints[:, None] - waypoints, axis=2)
+    assert gaps[~np.eye(30, dtype=bool)].min() >= 0.6
+    assert not any(robot.stays for robot in decision.robots.values())
+    for robot in decision.robots.values():
+        assert robot.positions.shape == (robot.lengths[robot.chosen] + 1, 3)
+        assert np.linalg.norm(robot.positions[-1] - robot.waypoint) <= 0.5 + 1e-9
+
+
+@pytest.mark.parametrize('kind', ['box', 'exponential'])
+def test_few_candidates_cost_little(kind, monkeypatch):
+    """Where memory limits the candidates of each robot, those that are best alone are enough."""
+    best = make_planner('maasi').decide(field_team(8, 10, kind)).objective
+    monkeypatch.setattr(team_objective, 'MOST_ENTRIES', 100_000)
+    objective, _ = built(field_team(8, 10, kind), PlannerSettings())
+    assert 8 * team_objective.LEAST_KEPT <= objective.kept.sum() < 0.7 * objective.kept.size
+    few = make_planner('maasi').decide(field_team(8, 10, kind)).objective
+    assert few >= 0.97 * best
 
 
 def test_own_measurement_with_certain_view():

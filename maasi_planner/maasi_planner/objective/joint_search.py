@@ -121,6 +121,14 @@ def _improve_in_pairs(
     return total, evaluated
 
 
+def ranking_of(table: CandidateTable, alone: FloatArray) -> Ranking:
+    """Return the admissible candidates of each robot, the best ones first."""
+    order = np.lexsort((-alone, table.planned.robot))
+    order = order[alone[order] > -np.inf]
+    counts = np.bincount(table.planned.robot[order], minlength=len(table.radii))
+    return Ranking(table, order, np.array([0, *counts]).cumsum(), alone)
+
+
 def search(
     table: CandidateTable, alone: FloatArray, settings: PlannerSettings
 ) -> tuple[IntArray, float, bool, int]:
@@ -132,10 +140,8 @@ def search(
     robots = len(table.radii)
     if robots == 1:
         return np.array([alone.argmax()]), float(alone.max()), True, len(alone)
-    order = np.lexsort((-alone, table.planned.robot))
-    order = order[alone[order] > -np.inf]
-    counts = np.bincount(table.planned.robot[order], minlength=robots)
-    ranking = Ranking(table, order, np.array([0, *counts]).cumsum(), alone)
+    ranking = ranking_of(table, alone)
+    counts = np.diff(ranking.start)
     tries = []
     for backwards in (False, True):
         chosen = np.full(robots, -1, np.int64)
