@@ -192,8 +192,9 @@ class KeepOut:
         It is the nearest position clear of all zones that a straight line reaches inside of the
         border and past solid obstacles; around these, the first point of the path there.
         """
-        here = np.asarray(position, dtype=float)
-        x, y, z = here.tolist()
+        if self.is_free(position):
+            return None
+        x, y, z = np.asarray(position, dtype=float).tolist()
         touching = self.circles.copy()
         touching[:, 3] -= 0.1 * self.clearance
         clear = is_clear((x, y, z), (x, y, z), all_felt(touching), 0.0, False)
