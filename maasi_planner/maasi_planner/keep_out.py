@@ -68,7 +68,7 @@ class KeepOut:
     ) -> None:
         if not (math.isfinite(radius) and radius >= 0.0):
             raise ValueError(f'radius: got {radius}, allowed are finite numbers from 0')
-        self.area, self.radius = area, radius
+        self.area, self.radius, self._reach = area, radius, reach
         self.clearance = float(clearance)
         apart = radius + clearance
         room = None if area is None else area.room(apart)
@@ -174,14 +174,14 @@ class KeepOut:
     def past(
         self, robot: FloatArray, goal: FloatArray, others: Sequence[tuple[FloatArray, float]]
     ) -> FloatArray:
-        """Return the next point, (3,), of the way to a goal past others, by places and radii."""
+        """Return the next point, (3,), of the path to a goal past other robots: positions, radii."""
         area = copy(self.area)
         if area is None:
             return goal
         # A quarter wider, for robots that cut corners.
         discs = [[*place, 1.25 * radius + 0.25 * self.radius, 0.0] for place, radius in others]
         area.circles = np.vstack([area.circles, discs])
-        wide = KeepOut(area, self.radius, self.clearance)
+        wide = KeepOut(area, self.radius, self.clearance, self._reach)
         x, y, z = robot.tolist()
         to = (goal[0], goal[1], goal[2])
         return np.array(head_for((x, y, z), to, wide.to_goal(to), wide.around, -1).target)
@@ -214,7 +214,7 @@ class KeepOut:
             else:
                 assert self.area is not None
                 lasting = Area(self.area.settings.without_keep_outs())
-                around = KeepOut(lasting, self.radius, self.clearance)
+                around = KeepOut(lasting, self.radius, self.clearance, self._reach)
                 goal = (near.x, near.y, z)
                 heading = head_for((x, y, z), goal, around.to_goal(goal), around.around, -1)
                 return np.array([*heading.target[:2], z])
