@@ -174,7 +174,7 @@ class KeepOut:
     def past(
         self, robot: FloatArray, goal: FloatArray, others: Sequence[tuple[FloatArray, float]]
     ) -> FloatArray:
-        """Return the next point, (3,), of the path to a goal past other robots: positions, radii."""
+        """Return the next point, (3,), of the path to a goal past others (positions, radii)."""
         area = copy(self.area)
         if area is None:
             return goal
