@@ -13,7 +13,7 @@ from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import CandidateSet, half_view, map_spacing
 from maasi_planner.endurance import NOTHING_AFFORDABLE, Endurance
-from maasi_planner.homing import Homing, waits_cut_off
+from maasi_planner.homing import CUT_OFF, Homing, waits_cut_off
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
@@ -167,7 +167,8 @@ class Coordinator:
         asked = [name for name in self.planning(step, robots) if name not in errands]
         cut_off = [
             name
-            for name in sorted(self.homing.alarms)
+            for name, alarm in sorted(self.homing.alarms.items())
+            if alarm == CUT_OFF
             if robots[name].searches and robots[name].free and self._is_due(name, step, robots)
             if name not in errands
         ]

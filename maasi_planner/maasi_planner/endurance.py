@@ -188,6 +188,12 @@ class Endurance:
         return not self.charge < self.settings.full
 
     @property
+    def short(self) -> bool:
+        """Whether its battery is expected to be empty before it is at any charger."""
+        slack = math.inf if self._slack is None else self._slack
+        return self.must_return and not self.cut_off and slack + self.settings.reserve < 0.0
+
+    @property
     def use_ratio(self) -> float:
         """Real use as a multiple of the use by the settings, as it was learned; 1 at least."""
         return self._use.value

@@ -18,6 +18,7 @@ _URGENT, _MORE = 0.5, 0.2
 # Charge of a battery that cannot be charged any further.
 _FULL = 0.999
 TOP = 'charges beyond full'  # in place of the reason of a phase
+TOO_FAR = 'its battery does not last for the path to any charger'
 CUT_OFF = 'closed zones cut it off from every charger'
 
 
@@ -70,11 +71,13 @@ class Homing:
             endurance = plan.endurance
             if endurance is not None and endurance.done_reason not in ('', before):
                 self.news.append(f'{name}: {endurance.done_reason}')
-        self.alarms = {
-            name: CUT_OFF
-            for name in sorted(robots)
-            if (endurance := self._plans[name].endurance) is not None and endurance.cut_off
-        }
+        self.alarms = {}
+        for name in sorted(robots):
+            if (endurance := self._plans[name].endurance) is not None:
+                if endurance.cut_off:
+                    self.alarms[name] = CUT_OFF
+                elif endurance.short:
+                    self.alarms[name] = TOO_FAR
 
     def estimates(self) -> list[str]:
         """Return the robots whose charge is not reported any more, with what is assumed."""

@@ -494,9 +494,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self.get_logger().warning(text)
         homing.news.clear()
         for name in sorted(homing.alarms.keys() - self._alarms.keys()):
-            self.get_logger().error(f'{name}: {homing.alarms[name]}; it waits where it is')
+            self.get_logger().error(f'{name}: {homing.alarms[name]}')
         for name in sorted(self._alarms.keys() - homing.alarms.keys()):
-            self.get_logger().warning(f'{name}: a path to a charger is open again')
+            self.get_logger().warning(f'{name}: a charger is in its reach again')
         self._alarms = dict(homing.alarms)
         for text in homing.estimates():
             self.warn_throttled(text.partition(':')[0], text)

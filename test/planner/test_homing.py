@@ -9,7 +9,7 @@ from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFoll
 from maasi_filter.ros.keep_outs import with_keep_outs
 from maasi_planner.coordinator import Coordinator
 from maasi_planner.endurance import NOT_CHARGED, NOTHING_AFFORDABLE, Phase
-from maasi_planner.homing import CUT_OFF
+from maasi_planner.homing import CUT_OFF, TOO_FAR
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.robot_plan import PresentRobot
@@ -292,6 +292,16 @@ def test_a_robot_that_a_zone_cuts_off_from_its_charger_waits_with_an_alarm_until
     flight.close()
     assert flight.fly(60.0, lambda: flight.at_home('a'))
     assert not flight.coordinator.homing.alarms
+
+
+def test_a_battery_that_does_not_last_to_any_charger_is_an_alarm():
+    flight = Flight({'a': robot([3.0, 3.0])})
+    flight.put('a', [50.0, 50.0, 10.0])
+    for charge, alarms in ((0.35, {}), (0.1, {'a': TOO_FAR})):
+        flight.charges['a'] = charge
+        flight.fly(0.4)
+        assert flight.coordinator.homing.alarms == alarms
+    assert flight.reasons('a')[0].startswith('goes home to charge')
 
 
 def test_a_search_with_nothing_left_but_closed_ground_waits_for_it_and_goes_on():
