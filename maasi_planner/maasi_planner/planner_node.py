@@ -22,6 +22,7 @@ from maasi_planner import warm_up
 from maasi_planner.conversions import checked_state, decision_to_ros, path_to_ros
 from maasi_planner.coordinator import Coordinator
 from maasi_planner.node.batches import Batches
+from maasi_planner.node.battery_log import BatteryLog
 from maasi_planner.node.filter_guard import FilterGuard, FoundKeeper
 from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
@@ -105,8 +106,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         # Free running: why the robots are held; empty if they are not.
         self._held = ''
         self._planning_time = 0.0
-        # What was logged of robots that zones cut off from their chargers.
-        self._alarms: dict[str, str] = {}
+        self._batteries = BatteryLog(self)
 
     # ---- life cycle --------------------------------------------------------------------------
 
@@ -201,8 +201,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         """Return why the robots are held, or that they take no goals."""
         if self._held:
             return f'robots are held: {self._held}'
-        if self._alarms:
-            return '; '.join(f'{name}: {text}' for name, text in sorted(self._alarms.items()))
+        if alarms := self._batteries.alarms:
+            return '; '.join(f'{name}: {text}' for name, text in sorted(alarms.items()))
         refused = self._orders.refused_for
         return f'no goal accepted for {refused:.0f} s' if refused >= _REFUSAL_PATIENCE else ''
 
@@ -446,7 +446,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         decision = self.coordinator.plan(step, robots, taken) if commanded else None
         if decision is not None:
             self._planning_time = time.perf_counter() - begin
-        self._report_batteries()
+        self._batteries.report(self.coordinator.homing)
         plans = self.coordinator.plans
         self._others.publish(
             header, {name: plans[name].destination(robot.state) for name, robot in robots.items()}
@@ -486,20 +486,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 self._orders.interrupt_homing(name)
             self._orders.send(name, indices[name] + 1, robot.waypoint, header)
             self._path_publishers[name].publish(path_to_ros(robot.positions, header))
-
-    def _report_batteries(self) -> None:
-        """Log what has changed about batteries, and paths home that zones close."""
-        homing = self.coordinator.homing
-        for text in homing.news:
-            self.get_logger().warning(text)
-        homing.news.clear()
-        for name in sorted(homing.alarms.keys() - self._alarms.keys()):
-            self.get_logger().error(f'{name}: {homing.alarms[name]}')
-        for name in sorted(self._alarms.keys() - homing.alarms.keys()):
-            self.get_logger().warning(f'{name}: a charger is in its reach again')
-        self._alarms = dict(homing.alarms)
-        for text in homing.estimates():
-            self.warn_throttled(text.partition(':')[0], text)
 
     def _try_done(self) -> None:
         if (
