@@ -215,7 +215,7 @@ def test_two_that_cause_two_detections_of_a_scan_are_two_targets(caused, known):
     target = FoundTarget(1, density.mean, density.covariance, 'robot', 0, 0.0)
     found = Component(1.0, density, 5.0, 0, 0.0, 1.0, target=target)
     other = Component(1.0, density, 5.0, 1, 0.0, 1.0)
-    assert is_known(1, [found, other], np.diag([caused, caused])) == known
+    assert is_known(1, [found, other], np.array([caused, caused]), [0]) == known
 
 
 def answering(share, targets, scans=80, seed=0, later=None):
