@@ -1,7 +1,5 @@
 """The exploration function: grid, update, interpolation and what is expected unseen."""
 
-import time
-
 import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
@@ -205,16 +203,15 @@ def test_a_fine_map_is_shown_in_blocks():
     assert (small.shown()[2] == small.expected()).all() and (small.shown()[1] == small.step).all()
 
 
-def test_decisions_on_a_million_cells_are_fast():
-    """A limit of ten times what it takes on one core of today."""
+def test_a_measurement_on_a_million_cells_changes_only_what_it_sees():
     area = boxed(6000.0, 6000.0)
     exploration = UnexploredMap(area, spacing_for(area.bounds, 16.0)[0])
     assert exploration.values.size > MOST_CELLS
     box = BoxDetection([-8.0, -8.0], [8.0, 8.0], 0.8)
     exploration.update(box, Pose([10.0, 10.0, 0.0]))
-    began = time.process_time()
     for _ in range(1000):
         exploration.update(box, Pose([3000.0, 3000.0, 0.0]))
-    exploration.explored_fraction()
-    exploration.closed_share()
-    assert time.process_time() - began < 0.2
+    seen = exploration.values < 1.0
+    assert 0 < seen.sum() < 200
+    assert 0.0 < exploration.explored_fraction() < 1e-4
+    assert exploration.closed_share() == 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
@@ -144,6 +144,8 @@ class Judge:
         yield from self._first('solid', index, gaps < -ROUNDING, gaps)
 
     def _apart(self) -> Iterator[Fault]:
+        if self.scenario.planner.coordination == 'independent':
+            return  # robots that plan for themselves exchange destinations, not paths
         for (i, one), (j, other) in combinations(enumerate(self.robots), 2):
             gaps = np.linalg.norm(self.positions[:, i] - self.positions[:, j], axis=1)
             gaps -= one.radius + other.radius
@@ -181,6 +183,8 @@ class Judge:
                         caught.pop(str(zone), None)
                     continue
                 step = first + int(np.flatnonzero(bad)[0])
+                if str(zone) not in caught and self._in_another(index, ground, step, caught):
+                    caught[str(zone)] = step  # zones that overlap are left together
                 if str(zone) not in caught:
                     text = (
                         f'{self.track.names[index]}: {gaps.min():.3f} m at worst, {bad.sum()} steps'
@@ -196,6 +200,14 @@ class Judge:
                 elif gaps[-1] > 0.0:
                     caught.pop(str(zone), None)
             yield from self._leaving(index, ground, first, end, reaction)
+
+    def _in_another(self, index: int, ground: Ground, step: int, caught: Mapping[str, int]) -> bool:
+        """Return whether a robot leaves another zone at a step."""
+        point, radius = self.positions[step - 1, index, None, :2], self.robots[index].radius
+        return any(
+            str(zone) in caught and ground.gaps(number, point)[0] < radius
+            for number, zone in enumerate(ground.zones)
+        )
 
     def _leaving(
         self, index: int, ground: Ground, first: int, end: int, reaction: float
