@@ -361,8 +361,8 @@ class ScenarioRun:
             self._leave_replay()
         self.display.close()
         code = ending.code
-        complete = self._explored >= LEAST_EXPLORED
-        if ending.reason == 'planner_done' and complete and report.get('missed') == 0:
+        none_missed = ending.reason == 'planner_done' and report.get('missed') == 0
+        if none_missed and self._explored >= LEAST_EXPLORED:
             code = DONE
         return NOT_WRITTEN if self.unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
