@@ -31,6 +31,7 @@ LOOK_AHEAD = 1.2
 ARC_STEPS = 8
 FORWARD_SAMPLES = 6
 TURN_SAMPLES = 13
+_TOUCHES = 1e-9  # distance of what a robot touches [m]
 
 
 @njit(cache=True, forceinline=True)
@@ -56,6 +57,12 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: 
             break
         wall = circles[i, 5] != 0.0 or circles[i, 6] != 0.0
         if wall and beyond:
+            continue
+        out_x, out_y, _ = from_centre(here, circles, i)
+        if math.hypot(out_x, out_y) <= circles[i, 3] + _TOUCHES:
+            # Where it touches or is inside, rounding must not hold it: outwards is free.
+            if out_x * cos_yaw + out_y * sin_yaw < 0.0:
+                return 0.0
             continue
         ox = circles[i, 0] - x
         oy = circles[i, 1] - y
