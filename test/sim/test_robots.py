@@ -200,7 +200,8 @@ def test_wind_carries_robots_that_fly(model):
     motion = MotionSettings(model=model, speed=8.0, acceleration=3.0)
     battery = BatterySettings(capacity=1e6, idle_power=0.0, motion_power=1.0)
 
-    def flown(command, wind=(-3.0, 0.0, 0.0), start=Pose.from_yaw([0.0, 0.0, 20.0], 0.0)):
+    def flown(command, wind=(-3.0, 0.0, 0.0), start=None):
+        start = start or Pose.from_yaw([0.0, 0.0, 20.0], 0.0)
         one = robot(model, start, sensor=sensor, motion=motion, battery=battery)
         one.wind[:] = wind
         drive(one, 200, command, dt=0.1)
