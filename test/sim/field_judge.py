@@ -164,20 +164,24 @@ class Judge:
                 motion.yaw_acceleration or 9.0
             )
         caught: dict[str, int] = {}  # zones that it may be in, and since when
+        known = {str(zone) for zone in self.track.grounds[0].zones}
         for ground, first, end in self.track.spans():
             if first >= end:
                 continue
             before = max(first - 1, 0)
             present = {str(zone) for zone in ground.zones}
             caught = {key: since for key, since in caught.items() if key in present}
-            for number, zone in enumerate(ground.zones):
-                gaps = ground.gaps(number, points[before:end]) - robot.radius
+            away = [
+                ground.gaps(number, points[before:end]) - robot.radius
+                for number in range(len(ground.zones))
+            ]
+            at_once = self.speeds[before, index] * (braking / motion.speed + 0.5) + motion.clearance
+            for zone, gaps in zip(ground.zones, away):
+                if str(zone) not in known and gaps[0] < at_once:
+                    caught[str(zone)] = first  # drawn over it, or where it cannot stop before
+            known = present
+            for zone, gaps in zip(ground.zones, away):
                 bad = gaps[first - before :] < -ROUNDING
-                at_once = (
-                    self.speeds[before, index] * (braking / motion.speed + 0.5) + motion.clearance
-                )
-                if ground.step > 0 and gaps[0] < at_once and str(zone) not in caught:
-                    caught[str(zone)] = first
                 if not bad.any():
                     if gaps[-1] > 0.0:
                         caught.pop(str(zone), None)
