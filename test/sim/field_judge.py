@@ -235,7 +235,9 @@ class Judge:
             yield Fault('leaves late', first + begin, f'{text}allowed are {allowed:.1f} s')
         least = np.minimum.accumulate(depth[react:]) if react < len(depth) else np.zeros(0)
         more = depth[react:] - least
-        if straight and more.max(initial=0.0) > 0.1:
+        # The exit is chosen where the zone is drawn; while it brakes another edge may get nearer.
+        braking = motion.speed**2 / (2.0 * (motion.acceleration or 4.0))
+        if straight and more.max(initial=0.0) > 0.1 + braking:
             worst = float(more.max())
             yield Fault('goes deeper', first + react, f'{name}: {worst:.2f} m deeper in a zone')
 
@@ -300,6 +302,8 @@ class Judge:
         changes = [ground.step for ground in self.track.grounds[1:]]
         if (charges <= 0.0).any():
             first = int(np.flatnonzero(charges <= 0.0)[0])
+            if self._barred(index, first):
+                return
             yield Fault('dry', first, f'{name}: empty at {first * step:.0f} s')
             return
         if robot.battery.charging_power <= 0.0:
@@ -316,6 +320,19 @@ class Judge:
                     'reserve', arrival, f'{text}reserve is {100 * robot.endurance.reserve:.0f} %'
                 )
             left_at = arrival
+
+    def _barred(self, index: int, last: int) -> bool:
+        """Return whether zones were drawn across its path home since it was charged."""
+        charged = np.flatnonzero(np.diff(self.charges[:last, index]) > 0.0)
+        left = int(charged[-1]) if len(charged) else 0
+        for ground in self.track.grounds[1:]:
+            if ground.drawn and left <= ground.step <= last:
+                drawn = shapely.union_all(ground.shapes[-ground.drawn :])
+                here = self.positions[ground.step, index, :2]
+                paths = [LineString([here, home[:2]]) for home in self._chargers(index)]
+                if all(drawn.intersects(path) for path in paths):
+                    return True
+        return False
 
     def _home(self, index: int) -> bool:
         robot, here = self.robots[index], self.positions[-1, index, :2]
