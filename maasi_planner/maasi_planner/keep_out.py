@@ -190,7 +190,8 @@ class KeepOut:
         """Return where a robot at a position (3,) leaves a zone that it is in, or None outside.
 
         It is the nearest position clear of all zones that a straight line reaches inside of the
-        border and past solid obstacles; around these, the first point of the path there.
+        border, past solid obstacles and past other zones if it can; where none is reached so, the
+        first point of the path there.
         """
         if self.is_free(position):
             return None
@@ -203,22 +204,35 @@ class KeepOut:
         if self._open.is_empty:
             return None
         point = shapely.Point(x, y)
+        assert self.area is not None
+        # Past zones that it is not in; through them only where there is no other exit.
+        zones = self.area.shapes['keep_out']
+        others = [zone for zone in zones if zone.distance(point) > self.radius]
+        past_others = self._solid.difference(shapely.union_all(others).buffer(self.radius))
+        for allowed in (past_others, self._solid) if others else (self._solid,):
+            near = self._straight_exit(point, allowed)
+            if near is not None:
+                return np.array([near.x, near.y, z])
         near = nearest_points(self._open, point)[0]
-        if not self._solid.covers(shapely.LineString([point, near])):
-            outline = shapely.get_coordinates(self._open.segmentize(0.5 * self._step))
-            lines = shapely.linestrings([[(x, y), corner] for corner in outline.tolist()])
-            straight = shapely.covers(self._solid, lines)
-            if straight.any():
-                rows = np.flatnonzero(straight)
-                near = shapely.Point(outline[rows[np.argmin(shapely.length(lines[rows]))]])
-            else:
-                assert self.area is not None
-                lasting = Area(self.area.settings.without_keep_outs())
-                around = KeepOut(lasting, self.radius, self.clearance, self._reach)
-                goal = (near.x, near.y, z)
-                heading = head_for((x, y, z), goal, around.to_goal(goal), around.around, -1)
-                return np.array([*heading.target[:2], z])
-        return np.array([near.x, near.y, z])
+        lasting = Area(self.area.settings.without_keep_outs())
+        around = KeepOut(lasting, self.radius, self.clearance, self._reach)
+        goal = (near.x, near.y, z)
+        heading = head_for((x, y, z), goal, around.to_goal(goal), around.around, -1)
+        return np.array([*heading.target[:2], z])
+
+    def _straight_exit(self, point: shapely.Point, allowed: BaseGeometry) -> shapely.Point | None:
+        """Return the nearest clear point to which a straight line stays where it may be."""
+        near = nearest_points(self._open, point)[0]
+        shapely.prepare(allowed)
+        if allowed.covers(shapely.LineString([point, near])):
+            return near
+        outline = shapely.get_coordinates(self._open.segmentize(0.5 * self._step))
+        ends = [[(point.x, point.y), corner] for corner in outline.tolist()]
+        lines = shapely.linestrings(ends)
+        rows = np.flatnonzero(shapely.covers(allowed, lines))
+        if not len(rows):
+            return None
+        return shapely.Point(outline[rows[np.argmin(shapely.length(lines[rows]))]])
 
     @cached_property
     def _open(self) -> BaseGeometry:

@@ -147,6 +147,28 @@ def test_a_robot_leaves_a_zone_at_full_speed_by_its_exit(settings):
     assert left >= 12 and slow == 0
 
 
+def test_the_exit_of_a_zone_leads_past_others():
+    """Random zones drawn over a position, with others around: the line to the exit enters none."""
+    rng, found = np.random.default_rng(5), 0
+    for _ in range(40):
+        here = rng.uniform(20.0, 40.0, 2)
+        zones = zones_of(rng, 12)
+        for zone in zones[::2]:
+            centre, near = np.mean(zone, axis=0), here + rng.uniform(-14.0, 14.0, 2)
+            zone[:] = (np.array(zone) + near - centre).tolist()
+        zones.append({'centre': (here + 1.0).tolist(), 'radius': 5.0})
+        area = area_of(bounds=[[0.0, 60.0]] * 2, keep_outs=zones)
+        out = KeepOut(area, 0.5, 1.0).exit_from([*here, 0.0])
+        point = shapely.Point(here)
+        others = [zone for zone in area.shapes['keep_out'] if zone.distance(point) > 0.5]
+        assert out is not None
+        line = shapely.LineString([here, out[:2]])
+        entered = [zone for zone in others if zone.distance(line) < 0.5 - 1e-3]
+        clear = shapely.union_all(area.shapes['keep_out']).distance(shapely.Point(out[:2])) > 1.4
+        found += clear and not entered
+    assert found >= 30
+
+
 def test_too_many_zones_are_refused_in_one_line_before_they_are_read():
     environment = EnvironmentSettings.model_validate({'bounds': [[0.0, 100.0]] * 2})
     zones = ['50 50 1'] * ZONES
