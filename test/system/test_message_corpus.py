@@ -17,6 +17,7 @@ from node_kinds import KINDS
 from rclpy.action import ActionClient
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from scenario_runs import Operator, beside
+from sensor_msgs.msg import BatteryState
 from std_srvs.srv import Trigger
 from waiting import wait_until
 
@@ -323,6 +324,8 @@ def use_driver(world, kind):
 
     def move():
         count[0] += 1
+        # One of the corpus may be empty, which is a fault.
+        world.publish(f'{space}/battery_state', BatteryState(percentage=0.9))
         message.pose.pose.position.x = 1e-6 * count[0]
         world.publish(f'{space}/odom', stamped(message, 1000.0 + count[0] / 20.0, 'odom'))
         if not answers and states and states[-1].header.stamp.sec >= 1000:

@@ -2,6 +2,7 @@
 
 from numba import njit
 
+from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.objective.joint_search import PAIRS_LIMIT, search
@@ -27,6 +28,7 @@ class Intermittent(Planner):
         # and at most until now.
         self._prospects: dict[str, float] = {}
         self._most: dict[str, float] = {}
+        self._area: Area | None = None
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
@@ -90,6 +92,10 @@ class Intermittent(Planner):
         if reason is not None or self.settings.objective == 'paper':
             return reason
         names = self.searching(team)
+        if team.area is not self._area:
+            # What candidates showed before zones were opened or closed says nothing.
+            self._prospects.clear()
+            self._area = team.area
         if not names or not all(name in self._prospects for name in names):
             return None
         least = self.settings.gain_threshold
