@@ -27,7 +27,7 @@ from maasi_planner.obstacles import (
     segment_distance,
 )
 
-# Among more vertices than these the one to head for is looked for anew only where it is reached or
+# Among more vertices than these the one to head for is looked for again only where it is reached or
 # hidden; a prediction among fewer is the controller's own, to the bit.
 MANY = 100
 _LAST = 1.6  # largest speed towards an obstacle close by, for each metre of distance [1/s]
@@ -66,7 +66,7 @@ def _nearest_visible(
 def _same_vertex(
     position: Vector, to_goal: FloatArray, around: Surroundings, before: int
 ) -> tuple[int, float]:
-    """Return the vertex of the step before and the length of its path; -1: look for it anew."""
+    """Return the vertex of the step before and the length of its path; -1: look for it again."""
     vx, vy = around.vertices[before, 0], around.vertices[before, 1]
     away = math.hypot(vx - position[0], vy - position[1])
     if away < 0.5 * around.clearance:
