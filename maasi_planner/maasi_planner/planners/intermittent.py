@@ -32,6 +32,7 @@ class Intermittent(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
+        self._take_area(team)
         decision = Decision(step=team.step)
         # Whole trajectories to all candidates of all robots of a large team need much memory.
         coarse = len(team.planning()) > PAIRS_LIMIT
@@ -75,6 +76,12 @@ class Intermittent(Planner):
             decision.robots[name] = result
         return explain(decision)
 
+    def _take_area(self, team: TeamView) -> None:
+        """Forget what candidates showed before zones were opened or closed."""
+        if team.area is not self._area:
+            self._prospects.clear()
+            self._area = team.area
+
     def _centres(self, team: TeamView, name: str) -> FloatArray | None:
         """Return the cluster centres as further candidates of a robot, if enabled."""
         wanted = self.settings.cluster_candidates
@@ -92,10 +99,7 @@ class Intermittent(Planner):
         if reason is not None or self.settings.objective == 'paper':
             return reason
         names = self.searching(team)
-        if team.area is not self._area:
-            # What candidates showed before zones were opened or closed says nothing.
-            self._prospects.clear()
-            self._area = team.area
+        self._take_area(team)
         if not names or not all(name in self._prospects for name in names):
             return None
         least = self.settings.gain_threshold
