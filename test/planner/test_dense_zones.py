@@ -147,6 +147,25 @@ def test_a_robot_leaves_a_zone_at_full_speed_by_its_exit(settings):
     assert left >= 12 and slow == 0
 
 
+@pytest.mark.parametrize('settings', [DRONE, ROVER, WINDOW])
+def test_an_obstacle_far_away_costs_no_time(settings):
+    """Robots of any speed and acceleration cross open ground as fast as without obstacles."""
+    rng = np.random.default_rng(8)
+    for _ in range(12):
+        speed, length = float(rng.uniform(0.3, 6.0)), float(rng.uniform(20.0, 80.0))
+        limits = {'speed': speed, 'acceleration': float(rng.uniform(0.2, 3.0))}
+        aside = length + 100.0
+        zones = [{'centre': [0.5 * length, aside], 'radius': 2.0}]
+        bounds = [[-aside, 2.0 * aside], [-aside, 2.0 * aside]]
+        steps = []
+        for keep_outs in ([], zones):
+            area = area_of(bounds=bounds, keep_outs=keep_outs)
+            motion = make_motion(MotionSettings(**{**settings, **limits}), area, 0.3)
+            start = RobotState.at_rest([0.0, 0.0, 0.0])
+            steps.append(motion.predict(start, [[length, 0.0, 0.0]], 0.1).lengths[0])
+        assert 0 < steps[1] <= 1.05 * steps[0] + 10
+
+
 def test_the_exit_of_a_zone_leads_past_others():
     """Random zones drawn over a position, with others around: the line to the exit enters none."""
     rng, found = np.random.default_rng(5), 0

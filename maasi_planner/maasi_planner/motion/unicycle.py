@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.guidance import head_for, minded
+from maasi_planner.guidance import approach_limit, head_for, minded
 from maasi_planner.motion.steering import Command, Steering, wrapped
 from maasi_planner.obstacles import Felt, Surroundings, Vector, from_centre, is_far
 
@@ -83,6 +83,17 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: 
                     if hit > 0.0:
                         free = min(free, hit)
     return free
+
+
+@njit(cache=True, forceinline=True)
+def _speed_ahead(
+    position: tuple[float, float], yaw: float, steering: Steering, felt: Felt, beyond: bool
+) -> float:
+    """Return how fast it may drive straight ahead [m/s]; beyond: see `way_ahead`."""
+    # Farther than where it may drive at full speed nothing counts.
+    reach = 1.001 * steering.speed / steering.barrier
+    free = way_ahead(position[0], position[1], yaw, reach, felt, beyond)
+    return approach_limit(free, (steering.barrier, steering.acceleration))
 
 
 @njit(cache=True)
@@ -149,9 +160,7 @@ def window_command(
             score -= 0.01 * abs(w) / steering.yaw_rate
             if score > best:
                 best, best_forward, best_turn = score, v, w
-    # Limit the speed by the free distance straight ahead.
-    ahead = way_ahead(x, y, yaw, 4.0 * clearance + speed, felt, False)
-    return min(best_forward, steering.barrier * ahead), best_turn
+    return min(best_forward, _speed_ahead((x, y), yaw, steering, felt, False)), best_turn
 
 
 K_RHO = 1.5
@@ -229,7 +238,5 @@ def drive_among(
         forward, turn = window_command(state, target, left, steering, felt, clearance)
         return (forward, 0.0, 0.0, turn), vertex
     forward, turn = _drive(target[0] - x, target[1] - y, left, yaw, steering, clearance)
-    # Farther than where the barrier lets it drive at full speed nothing counts.
-    reach = min(4.0 * clearance + steering.speed, 1.001 * steering.speed / steering.barrier)
-    free = way_ahead(x, y, yaw, reach, felt, beyond)
-    return (min(forward, steering.barrier * free), 0.0, 0.0, turn), vertex
+    forward = min(forward, _speed_ahead((x, y), yaw, steering, felt, beyond))
+    return (forward, 0.0, 0.0, turn), vertex
