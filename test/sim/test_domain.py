@@ -147,6 +147,21 @@ def test_what_another_user_put_there_is_left(folder, monkeypatch):
     assert remove_dead(folder=folder / 'missing') == []
 
 
+def test_beyond_the_participants_that_are_found_by_default_peers_are_named(monkeypatch):
+    monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE', raising=False)
+    with Domain() as domain:
+        few, many = (
+            Path(domain.environment(number)['FASTRTPS_DEFAULT_PROFILES_FILE'])
+            for number in (10, 40)
+        )
+        assert '<port>' not in few.read_text()
+        ports = re.findall(r'<port>(\d+)</port>', many.read_text())
+        first = 7400 + 250 * domain.number + 10
+        # Up to those of 40 participants and some more, without a gap after the first 32.
+        assert [int(port) for port in ports] == [first + 2 * n for n in range(28, 49)]
+    assert few.exists() and not many.exists()
+
+
 def test_domains_are_not_shared_with_runs_or_other_nodes(monkeypatch):
     profiles = 'FASTRTPS_DEFAULT_PROFILES_FILE'
     monkeypatch.delenv(profiles, raising=False)

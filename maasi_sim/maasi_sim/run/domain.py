@@ -8,7 +8,9 @@ import re
 import signal
 import socket
 import sys
+import tempfile
 from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 
 from maasi_filter.ros.loopback import loopback_fault
@@ -19,6 +21,11 @@ _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'  # environment variable of the prof
 _NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
 # Ports of the RTPS specification: this many for each domain, from this one.
 FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
+# Fast DDS asks the ports of the first 32 participants of a host; those beyond are named as peers, as
+# are some that are started next to a run (a display, commands of ROS).
+_FOUND, _OTHERS, _LAST = 28, 8, 119
+_PEERS = '<initialPeersList>{}</initialPeersList>'
+_PEER = '<locator><udpv4><address>127.0.0.1</address><port>{}</port></udpv4></locator>'
 # First word of a memory that its creator has made ready (Boost.Interprocess).
 _READY = (2).to_bytes(4, sys.byteorder)
 
@@ -48,6 +55,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
             raise DomainError(fault)
         self._purpose = purpose
         self._locks: list[socket.socket] = []
+        self._files = contextlib.ExitStack()
         if number is not None and number not in DOMAINS:
             raise DomainError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
         for candidate in DOMAINS[1:] if number is None else [number]:
@@ -79,15 +87,31 @@ class Domain(contextlib.AbstractContextManager['Domain']):
                 return words
         return ''
 
-    def environment(self) -> dict[str, str]:
-        """Return variables for nodes of this domain, on this host, with fast discovery."""
+    def environment(self, participants: int = 0) -> dict[str, str]:
+        """Return variables for nodes of this domain, on this host, with fast discovery.
+
+        participants: as many processes of the run find each other, while the domain is held.
+        """
         variables = {
             'ROS_DOMAIN_ID': str(self.number),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         }
         if _PROFILES not in os.environ:
-            variables[_PROFILES] = str(Path(__file__).with_name('discovery.xml'))
+            profiles = Path(__file__).with_name('discovery.xml')
+            last = min(participants + _OTHERS, _LAST)
+            peers = range(_FOUND, last + 1) if participants + _OTHERS > _FOUND else ()
+            variables[_PROFILES] = self._with_peers(profiles, peers) if peers else str(profiles)
         return variables
+
+    def _with_peers(self, profiles: Path, peers: Iterable[int]) -> str:
+        first = FIRST_PORT + PORTS_PER_DOMAIN * self.number + 10
+        listed = ''.join(_PEER.format(first + 2 * peer) for peer in peers)
+        text = profiles.read_text().replace('<builtin>', f'<builtin>{_PEERS.format(listed)}')
+        file = tempfile.NamedTemporaryFile('w', prefix='maasi_', suffix='.xml')
+        self._files.callback(file.close)
+        file.write(text)
+        file.flush()
+        return file.name
 
     def release(self) -> None:
         """Release the domain; what killed nodes left in shared memory goes before."""
@@ -97,6 +121,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
     def _unlock(self) -> None:
         while self._locks:
             self._locks.pop().close()
+        self._files.close()
 
     def __exit__(self, *_: object) -> None:
         self.release()

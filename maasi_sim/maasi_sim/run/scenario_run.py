@@ -85,7 +85,6 @@ class ScenarioRun:
         number, team, shared = options.domain_id, options.namespace, options.follow_clock
         with Domain(number, team=team, shared=shared) as domain, contextlib.ExitStack() as ends:
             self.folder = make_folder(options.out)
-            os.environ.update(domain.environment())
             self.mission.prepare()
             self._scenario = self.mission.scenario
             self._limits = self._scenario.limits
@@ -95,6 +94,7 @@ class ScenarioRun:
             # Nodes start while this process makes what is its own.
             self.supervisor = Supervisor(self.mission, options, self.folder, self.display)
             processes = list(self.supervisor.processes.values())
+            os.environ.update(domain.environment(len(processes) + 1))
             self.display.say(
                 f'{self.mission.name}: seed {self._scenario.seed}, {len(processes)} nodes in ROS '
                 f'domain {domain.number}, results in {short(self.folder)}'
