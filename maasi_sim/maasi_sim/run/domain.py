@@ -21,8 +21,8 @@ _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'  # environment variable of the prof
 _NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
 # Ports of the RTPS specification: this many for each domain, from this one.
 FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
-# Fast DDS asks the ports of the first 32 participants of a host; those beyond are named as peers, as
-# are some that are started next to a run (a display, commands of ROS).
+# Fast DDS asks the ports of the first 32 participants of a host. Those beyond are named as peers,
+# with some that are started next to a run (a display, commands of ROS).
 _FOUND, _OTHERS, _LAST = 28, 8, 119
 _PEERS = '<initialPeersList>{}</initialPeersList>'
 _PEER = '<locator><udpv4><address>127.0.0.1</address><port>{}</port></udpv4></locator>'
@@ -107,8 +107,9 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         first = FIRST_PORT + PORTS_PER_DOMAIN * self.number + 10
         listed = ''.join(_PEER.format(first + 2 * peer) for peer in peers)
         text = profiles.read_text().replace('<builtin>', f'<builtin>{_PEERS.format(listed)}')
-        file = tempfile.NamedTemporaryFile('w', prefix='maasi_', suffix='.xml')
-        self._files.callback(file.close)
+        file = self._files.enter_context(
+            tempfile.NamedTemporaryFile('w', prefix='maasi_', suffix='.xml')
+        )
         file.write(text)
         file.flush()
         return file.name
