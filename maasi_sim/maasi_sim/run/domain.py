@@ -107,11 +107,9 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         first = FIRST_PORT + PORTS_PER_DOMAIN * self.number + 10
         listed = ''.join(_PEER.format(first + 2 * peer) for peer in peers)
         text = profiles.read_text().replace('<builtin>', f'<builtin>{_PEERS.format(listed)}')
-        file = self._files.enter_context(
-            tempfile.NamedTemporaryFile('w', prefix='maasi_', suffix='.xml')
-        )
-        file.write(text)
-        file.flush()
+        with tempfile.NamedTemporaryFile('w', prefix='maasi_', suffix='.xml', delete=False) as file:
+            self._files.callback(Path(file.name).unlink, missing_ok=True)
+            file.write(text)
         return file.name
 
     def release(self) -> None:
