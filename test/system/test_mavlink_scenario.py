@@ -38,7 +38,8 @@ def finds_all(scenario, folder, number):
     run = run_scenario(scenario, folder / 'run', '--seed', 1)
     assert run.code == 0, run.output
     assert run.report['true_found'] == number
-    assert run.report['missed'] == run.report['false_found'] == 0
+    found = (run.folder / 'found_targets.csv').read_text()
+    assert run.report['missed'] == run.report['false_found'] == 0, f'{found}{run.output}'
     return run
 
 

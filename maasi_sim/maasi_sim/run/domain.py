@@ -58,9 +58,10 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         self._files = contextlib.ExitStack()
         if number is not None and number not in DOMAINS:
             raise DomainError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
+        # A requested domain may be in use by other nodes.
+        used = _domains_in_use() if number is None else set()
         for candidate in DOMAINS[1:] if number is None else [number]:
-            # A requested domain may be in use by other nodes.
-            if number is None and _port_used(FIRST_PORT + PORTS_PER_DOMAIN * candidate):
+            if candidate in used:
                 continue
             problem = self._take(candidate, team, shared)
             if not problem:
@@ -126,15 +127,15 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         self.release()
 
 
-def _port_used(port: int) -> bool:
+def _domains_in_use() -> set[int]:
+    """Return the domains of which a port is open; nodes on this host only open no common one."""
+    used = set()
     for table in ('/proc/net/udp', '/proc/net/udp6'):
-        try:
-            lines = Path(table).read_text().splitlines()[1:]
-        except OSError:
-            continue
-        if any(int(line.split()[1].rpartition(':')[2], 16) == port for line in lines):
-            return True
-    return False
+        with contextlib.suppress(OSError):
+            for line in Path(table).read_text().splitlines()[1:]:
+                port = int(line.split()[1].rpartition(':')[2], 16)
+                used.add((port - FIRST_PORT) // PORTS_PER_DOMAIN)
+    return used
 
 
 def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> list[str]:
