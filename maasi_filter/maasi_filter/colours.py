@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 FOUND, POTENTIAL, SEEN, AWAY = '#009E73', '#E69F00', '#CC79A7', '#8B929B'
+KEEP_OUT = '#8F9900'  # of no robot
 # Of robots in the order of their names, and of those that are called by a colour.
 ROBOTS = ('#0072B2', '#B54800', '#6A3D9A', '#7A4A00', '#00707F', '#A02C6D')
 NAMED = {'purple': '#7B3294', 'red': '#D62728', 'green': '#1F7A1F', 'blue': '#0072B2'}

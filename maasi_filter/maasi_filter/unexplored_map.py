@@ -318,27 +318,27 @@ class UnexploredMap:
         """
         return self._volumes
 
-    def expected(self) -> FloatArray:
-        """Return the intensity of unseen targets at the nodes, prior inside e, 1 at most.
-
-        It is e where no prior is given. Of the shape of `values`.
-        """
-        shown = self._values * (self.density / self.density.max())
+    def unseen(self) -> FloatArray:
+        """Return e at the nodes, of the shape of `values`; -1 where no target may be."""
+        shown = np.where(self.density > 0.0, self._values, -1.0)
         return np.asarray(shown.reshape(self.values.shape))
 
-    def shown(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return first node (d,), steps (d,) [m] and `expected`, to be drawn, published or stored.
+    def shown(self, prior: bool = False) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return first node (d,), steps (d,) [m] and `unseen`, to be drawn, published or stored.
 
-        Of a fine map means of blocks of nodes, at most `MOST_SHOWN` along each axis.
+        Of a fine map means of blocks of nodes, at most `MOST_SHOWN` along each axis. prior: the
+        density in place of e.
         """
-        values, number = self.expected(), -(-max(self.values.shape) // MOST_SHOWN)
+        values, number = self.unseen(), -(-max(self.values.shape) // MOST_SHOWN)
+        if prior:
+            values = np.broadcast_to(self.density, self._values.shape).reshape(values.shape)
         if number > 1:
-            counts = np.ones(values.shape)
+            counts = (values >= 0.0).astype(float)
+            values = values * counts
             for axis, size in enumerate(values.shape):
                 begin = np.arange(0, size, number)
-                values = np.add.reduceat(values, begin, axis)
-                counts = np.add.reduceat(counts, begin, axis)
-            values = values / counts
+                values, counts = (np.add.reduceat(part, begin, axis) for part in (values, counts))
+            values = np.where(counts > 0.0, values / np.maximum(counts, 1.0), -1.0)
         return self.bounds[:, 0] + 0.5 * (number - 1) * self.step, number * self.step, values
 
     def explored_fraction(self) -> float:

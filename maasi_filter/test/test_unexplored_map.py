@@ -200,7 +200,7 @@ def test_a_fine_map_is_shown_in_blocks():
     assert shown.mean() == pytest.approx(exploration.values.mean(), abs=0.01)
     assert shown[0, 0] == 0.0 and shown[-1, -1] == 1.0
     small = UnexploredMap([[0.0, 20.0], [0.0, 10.0]], 0.5)
-    assert (small.shown()[2] == small.expected()).all() and (small.shown()[1] == small.step).all()
+    assert (small.shown()[2] == small.unseen()).all() and (small.shown()[1] == small.step).all()
 
 
 def test_a_measurement_on_a_million_cells_changes_only_what_it_sees():

@@ -13,6 +13,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.colours import KEEP_OUT
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
 from maasi_filter.ros.clocks import LAST_STAMP, batch_id_limit
@@ -76,8 +77,11 @@ def decision_to_ros(
     header: Header,
 ) -> PlanDecision:
     """Return a joint decision."""
+    # Choices by the objective explain themselves by its terms.
     reasons = [
-        f'{name}: {robot.reason}' for name, robot in sorted(decision.robots.items()) if robot.stays
+        f'{name}: {robot.reason}'
+        for name, robot in sorted(decision.robots.items())
+        if robot.stays or not robot.objective.any()
     ]
     return PlanDecision(
         header=header,
@@ -108,7 +112,10 @@ def path_to_ros(positions: FloatArray, header: Header, most: int = 50) -> Path:
 
 
 def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyGrid:
-    """Return prior and e in 2D as a grid: 100 is unseen, 0 explored; nodes are centres of cells."""
+    """Return e in 2D as a grid: 100 is unseen, 0 searched, -1 where no target may be.
+
+    Nodes are centres of cells.
+    """
     lower, step, values = exploration.shown()
     grid = OccupancyGrid(header=header)
     grid.info.map_load_time = header.stamp
@@ -116,7 +123,7 @@ def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyG
     grid.info.width, grid.info.height = values.shape[:2]
     grid.info.origin.position = point_to_ros(lower - 0.5 * step)
     grid.info.origin.orientation.w = 1.0
-    cells = np.rint(100.0 * values.reshape(values.shape[:2]).T).astype(np.int8)
+    cells = np.where(values < 0.0, -1.0, np.rint(100.0 * values)).T.astype(np.int8)
     grid.data = array.array('b', cells.tobytes())
     return grid
 
@@ -159,7 +166,7 @@ def planner_markers(
 
 def area_markers(area: Area, header: Header, size: float) -> MarkerArray:
     """Return markers of the rings of area, keep-outs and solid polygons, in the map."""
-    tints = {'area': '#1B1F24', 'keep_out': '#B84A00', 'obstacle': '#59636E'}
+    tints = {'area': '#1B1F24', 'keep_out': KEEP_OUT, 'obstacle': '#59636E'}
     markers: list[Marker] = []
     for kind, shapes in area.shapes.items():
         for ring in shapely.get_rings(shapely.get_parts(shapes)):

@@ -271,9 +271,9 @@ def test_the_map_counts_what_is_expected_only():
     assert explored.cell_volumes().sum() == pytest.approx(1600.0, rel=0.02)
     explored.update(BoxDetection([-10.0, -10.0], [10.0, 10.0], 1.0), Pose(np.array([10.0, 10.0])))
     assert explored.explored_fraction() == pytest.approx(0.9, abs=0.03)
-    assert explored.expected()[-1, -1] == pytest.approx(1.0 / 27.0)
+    assert explored.unseen()[0, 0] == 0.0 and explored.unseen()[-1, -1] == 1.0
     uniform = UnexploredMap([[0.0, 40.0], [0.0, 40.0]], 1.0)
-    assert (uniform.expected() == uniform.values).all()
+    assert (uniform.unseen() == uniform.values).all()
     explored.take_area(uniform.area)
     assert (explored.cell_volumes() == uniform.cell_volumes()).all()
 

@@ -89,7 +89,7 @@ def test_the_belief_is_a_heat_map_that_can_be_switched_on_from_above_and_in_spac
 
 def moving(sensor):
     """Return scene and events of a robot that flies from x = 1 to x = 3 in 2 s and sees."""
-    events = [[0.0, 'map', '', [0, 0, 0], [0.1, 0.1, 0], [41, 41, 1], '9' * 41 * 41, 0.0]]
+    events = [[0.0, 'map', '', [0, 0, 0], [0.1, 0.1, 0], [41, 41, 1], 'z' * 41 * 41, 0.0]]
     for step in range(21):
         where = [1.0 + 0.1 * step, 2.0, 1.0]
         events.append([0.1 * step, 'robot', 'rover', [*where, 0.0], 1.0, 1, ''])
@@ -120,7 +120,7 @@ def test_the_dark_goes_as_the_field_of_view_moves_and_stays_away_where_it_was_me
         # What it measured since the map stays; what it only passed is as the planner has it.
         assert shares[1.5][3] == pytest.approx(0.12, abs=0.01)
         assert shares[2.0] == pytest.approx([1.0, 1.0, 0.2, 0.2, 1.0], abs=0.01)
-        assert tip(shown, *place(shown, 2.0, 2.0)).startswith('unexplored 20 % at (2, 2) m')
+        assert tip(shown, *place(shown, 2.0, 2.0)).startswith('searched 80 %')
         # As dark as what is left.
         here, beside = (colour_at(shown, *place(shown, 1.87, y)) for y in (2.17, 2.87))
         assert sum(here) > sum(beside) + 30
@@ -162,19 +162,19 @@ def test_a_ring_runs_out_from_what_is_found_unless_motion_is_to_be_reduced(chrom
 
 
 def test_cells_say_how_unexplored_they_are_in_perspective(chromium, opened):
-    grid = [0.0, 'map', '', [0, 0, 0], [2, 2, 2], [3, 3, 3], '0' * 13 + '6' + '0' * 13, 0.9]
-    floor = [0.0, 'map', '', [0, 0, 0], [1, 1, 0], [5, 5, 1], '0' * 12 + '9' + '0' * 12, 0.9]
+    grid = [0.0, 'map', '', [0, 0, 0], [2, 2, 2], [3, 3, 3], '0' * 13 + 'n' + '0' * 13, 0.9]
+    floor = [0.0, 'map', '', [0, 0, 0], [1, 1, 0], [5, 5, 1], '0' * 12 + 'z' + '0' * 12, 0.9]
     with chromium() as shown:
         opened(shown, SPACE, grid)
         assert shown.page.evaluate('maasi.camera.spatial')
-        assert tip(shown, *place(shown, 2, 2, 2)) == 'unexplored 67 % at (2, 2, 2) m'
+        assert tip(shown, *place(shown, 2, 2, 2)).startswith('searched 34 %')
         assert tip(shown, *place(shown, 0, 2, 2)) == ''
         opened(shown, PLANE, floor)
         shown.page.click('#space')
         shown.settle()
-        assert tip(shown, *place(shown, 2, 2, 0)).startswith('unexplored 100 % at (2')
+        assert tip(shown, *place(shown, 2, 2, 0)).startswith('searched 0 %')
         where = tip(shown, *place(shown, 3.3, 0.7, 0))
-        assert where.startswith('explored at (')
+        assert where.startswith('searched 100 %')
         numbers = [float(item) for item in where[where.index('(') + 1 : -3].split(', ')]
         assert numbers == pytest.approx([3.3, 0.7], abs=0.02)
 

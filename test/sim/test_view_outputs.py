@@ -41,7 +41,7 @@ def bluish(picture):
 def test_a_video_shows_the_run_move(tmp_path):
     unit = [0.01, 0.0, 0.0, 0.02, 0.0, 0.0]
     events = [
-        [0.0, 'map', '', [0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2, 2, 1], '0949', 0.4],
+        [0.0, 'map', '', [0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2, 2, 1], '0zgz', 0.4],
         [0.0, 'truth', '', [[1.0, 1.0, 0.0]]],
         [0.0, 'robot', 'mambo', [0.0, 0.0, 1.0, 0.0], 1.0, 1, ''],
         [0.0, 'way', 'mambo', [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]],
@@ -226,7 +226,9 @@ def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chrom
             'mambo: on the'
         )
         page.keyboard.press('Escape')
-        assert tip((-0.25, 2.35)) == 'unexplored 100 % at (-0.25, 2.35) m'
+        assert tip((-0.25, 2.35)) == (
+            'searched 0 %, still 1.65 expected targets per m², at (-0.25, 2.35) m'
+        )
         found = next(event for event in log.events if event[1] == 'found' and event[3])
         shown.seek(found[0])
         number, x, y, *_ = found[3][0]
@@ -243,7 +245,7 @@ def test_on_a_phone_in_the_dark_the_legend_is_whole_and_it_plays_by_the_space_ba
         page.evaluate('maasi.select("turtlebot")')
         shown.settle()
         text = page.inner_text('#legend')
-        for entry in ('unexplored', 'planned way', 'way so far', 'waypoint', 'found', 'candidate'):
+        for entry in ('searched', 'planned way', 'way so far', 'waypoint', 'found', 'candidate'):
             assert entry in text
         map_, legend = (page.locator(part).bounding_box() for part in ('#map', '#legend'))
         assert legend['y'] >= map_['y'] + map_['height'] and legend['height'] > 20

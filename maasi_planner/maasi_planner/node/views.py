@@ -51,9 +51,10 @@ class PlannerViews:
         if self._flat:
             self._exploration.publish(exploration_to_ros(exploration, header))
         else:
-            self._exploration.publish(
-                particles_to_ros(exploration.nodes(), np.ravel(exploration.expected()), header)
-            )
+            unseen = np.ravel(exploration.unseen())
+            # Viewers leave out what is no number.
+            unseen[unseen < 0.0] = np.nan
+            self._exploration.publish(particles_to_ros(exploration.nodes(), unseen, header))
         shown = {}
         for name, robot in robots.items():
             plan = coordinator.plans[name]

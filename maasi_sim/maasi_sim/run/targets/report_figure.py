@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
-from maasi_filter.colours import FOUND, robot_colours
+from maasi_filter.colours import FOUND, KEEP_OUT, robot_colours
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
@@ -67,9 +67,10 @@ def plot_report(record: TargetRecord) -> Figure:
 
 
 def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -> None:
-    """Shade unexplored places: e and prior, in 3D its mean along the line of sight."""
+    """Shade what is not searched: e, in 3D its mean along the line of sight."""
     hidden = tuple(axis for axis in range(explored.dimension) if axis not in view.plane)
     lower, step, shown = explored.shown()
+    shown = np.maximum(shown, 0.0)
     values = shown.mean(axis=hidden) if hidden else shown
     if view.plane[0] < view.plane[1]:
         values = values.T
@@ -82,7 +83,7 @@ def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -
     if not explored.area.shapes['area'] or 2 in view.plane:
         frame = Rectangle((low[0], low[1]), *(high - low), fc='none', ec='#B0B0B0', lw=1.0)
         view.axes.add_patch(frame)
-    view.axes.plot([], [], 's', color=UNSEEN, ms=9, label='not explored')
+    view.axes.plot([], [], 's', color=UNSEEN, ms=9, label='not searched')
 
 
 def _draw_obstacles(view: MapView, record: TargetRecord, bounds: FloatArray) -> None:
@@ -90,7 +91,7 @@ def _draw_obstacles(view: MapView, record: TargetRecord, bounds: FloatArray) -> 
     area = Area(record.scenario.environment)
     for kind, shapes in area.shapes.items() if view.plane == (0, 1) else ():
         for ring in shapely.get_rings(shapely.get_parts(shapes)):
-            colour = {'area': '#1B1F24', 'keep_out': '#B84A00', 'obstacle': '#8A8478'}[kind]
+            colour = {'area': '#1B1F24', 'keep_out': KEEP_OUT, 'obstacle': '#8A8478'}[kind]
             label = kind.replace('_', '-')
             view.axes.plot(*shapely.get_coordinates(ring).T, color=colour, lw=1.2, label=label)
     for *centre, radius, is_sphere in area.solid.tolist():

@@ -8,6 +8,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from maasi_filter.arrays import FloatArray
+
 Event = list[Any]
 Scene = dict[str, Any]
 Listener = Callable[[Event], None]
@@ -16,6 +21,24 @@ LARGEST = 4_500_000  # largest packed log: with the page around it a replay stay
 # Shortest time between states of a robot, and between other events that may be thinned [s].
 STATE_PERIOD = 0.1
 _THINNED = ('robot', 'seen', 'filter', 'map', 'way', 'score', 'cuboid', 'picture')
+
+
+# Letters for shares from 0 to 1 in equal steps, and one where none is known.
+_LETTERS = np.frombuffer(b'0123456789abcdefghijklmnopqrstuvwxyz-', np.uint8)
+_SHARES = np.full(128, -1.0)
+_SHARES[_LETTERS[:-1]] = np.linspace(0.0, 1.0, len(_LETTERS) - 1)
+
+
+def shades(values: ArrayLike) -> str:
+    """Return a letter for each share; a share below 0, or that is no number, is not known."""
+    levels = np.rint((len(_LETTERS) - 2) * np.nan_to_num(np.asarray(values, float), nan=-1.0))
+    chosen = np.clip(levels, -1, len(_LETTERS) - 2).astype(int)
+    return _LETTERS[chosen].tobytes().decode()
+
+
+def shares(text: str) -> FloatArray:
+    """Return the shares of `shades`, (n,); -1 is not known."""
+    return _SHARES[np.frombuffer(text.encode(), np.uint8)]
 
 
 def line(event: Event | Scene) -> str:

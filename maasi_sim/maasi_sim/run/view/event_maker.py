@@ -12,7 +12,7 @@ from maasi_filter.records import Cluster, FoundTarget
 from maasi_planner.team import Decision
 from maasi_sim.run.targets.tally import score
 from maasi_sim.run.topics import point
-from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning
+from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning, shades
 
 _NOT_ALLOWED = -1e29  # objectives below this stand for candidates that are not allowed
 # Status of a robot: of AgentState, and what only those who watch know.
@@ -42,15 +42,6 @@ def _upper(covariance: ArrayLike) -> list[float]:
 
 def _words(place: Sequence[float]) -> str:
     return f'({", ".join(f"{value:.3g}" for value in place)})'
-
-
-def _explored(values: FloatArray) -> float:
-    """Return 1 - mean of e; nodes at the ends of an axis stand for half a step."""
-    for count in values.shape:
-        weights = np.ones(count)
-        weights[[0, -1]] = 0.5
-        values = np.average(values, axis=0, weights=weights)
-    return 1.0 - float(values)
 
 
 class EventMaker:
@@ -251,20 +242,44 @@ class EventMaker:
         self,
         time: float,
         space: str,
-        corner: ArrayLike,
-        spacing: ArrayLike,
+        corner: Sequence[float] | FloatArray,
+        spacing: Sequence[float] | FloatArray,
         values: NDArray[Any],
         explored: float | None = None,
     ) -> None:
-        """Add e on a grid of two or three axes, or its ninths as bytes, and the explored share."""
+        """Add e on a grid of two or three axes, below 0 where no target may be, or its `shades`.
+
+        explored: the explored share, where it is known.
+        """
         shape = [*values.shape, 1][:3]
-        ninths = values if values.dtype == np.uint8 else np.clip(np.rint(9.0 * values), 0, 9)
-        text = (ninths.astype(np.uint8) + ord('0')).tobytes().decode('ascii')
+        text = values.tobytes().decode() if values.dtype.kind == 'S' else shades(values)
         steps = [significant(value) for value in padded(spacing)]
         if explored is None:
-            explored = 1.0 - (1.0 - _explored(values)) / self.scene.get('whole', 1.0)
+            explored = 1.0 - self._unexplored(corner, spacing, values)
         share = round(explored, 4)
         self._put(time, 'map', space, self._place(corner), steps, shape, text, share)
+
+    def _unexplored(self, corner: Any, spacing: Any, values: FloatArray) -> float:
+        """Return the mean of e where targets may be, by the prior; ends of axes count half."""
+        weights = (values >= 0.0).astype(float)
+        for axis, count in enumerate(values.shape):
+            ends = np.isin(np.arange(count), (0, count - 1))
+            weights *= np.where(ends, 0.5, 1.0).reshape([-1] + [1] * (values.ndim - 1 - axis))
+        if 'prior' in self.scene:
+            low, step, shape, likely = self.scene['prior']
+            rows, columns = (
+                np.clip(
+                    np.rint(
+                        (corner[axis] + spacing[axis] * np.arange(count) - low[axis]) / step[axis]
+                    ),
+                    0,
+                    shape[axis] - 1,
+                ).astype(int)
+                for axis, count in enumerate(values.shape[:2])
+            )
+            weighted = np.reshape(likely, shape)[np.ix_(rows, columns)]
+            weights *= weighted.reshape(*weighted.shape, *[1] * (values.ndim - 2))
+        return float((weights * np.maximum(values, 0.0)).sum() / max(weights.sum(), 1e-12))
 
     def zones(self, time: float, zones: list[dict[str, Any]]) -> None:
         """Add the zones of the area that hold from now on, see `scene.zones_of`."""

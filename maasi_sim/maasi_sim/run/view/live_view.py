@@ -19,7 +19,7 @@ from maasi_planner.team import Decision
 from maasi_sim.run.bag import load_types
 from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.run.topics import time_at
-from maasi_sim.run.view.event_log import STATE_PERIOD, Event, EventLog, Scene
+from maasi_sim.run.view.event_log import STATE_PERIOD, Event, EventLog, Scene, shades
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.messages import IMAGES, MARKERS, MessageEvents
 from maasi_sim.run.view.page_file import open_browser
@@ -244,10 +244,11 @@ class SearchTrace:
         if time - self._last_maps.get(space, -np.inf) >= _MAP_PERIOD - 1e-9:
             self._last_maps[space] = time
             explored = coordinator.exploration
-            # As coarse as it is shown.
+            # As coarse as it is shown: a byte for each cell.
             lower, step, shown = explored.shown()
-            grid = lower, step, np.rint(9.0 * shown).astype(np.uint8)
-            self.add(EventMaker.map, time, space, *grid, explored.explored_fraction())
+            letters = np.frombuffer(shades(shown).encode(), 'S1').reshape(shown.shape)
+            share = explored.explored_fraction()
+            self.add(EventMaker.map, time, space, lower, step, letters, share)
 
     def log(self, name: str = 'search') -> EventLog:
         """Return the event log of the search."""

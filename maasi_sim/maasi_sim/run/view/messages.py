@@ -287,10 +287,17 @@ class MessageEvents:
     def _take_grid(self, topic: str, message: Any) -> None:
         info = message.info
         values = np.asarray(message.data, dtype=float).reshape(info.height, info.width).T / 100.0
+        values[values < 0.0] = -1.0
         step = float(info.resolution)
-        corner = np.add(point(info.origin.position), (0.5 * step, 0.5 * step, 0.0))
-        self._learn_bounds(corner[:2], corner[:2] + step * (np.array(values.shape) - 1))
-        self.maker.map(self._time(message), _space(topic), corner, [step, step], values)
+        steps = np.array([step, step])
+        corner = np.add(point(info.origin.position)[:2], 0.5 * step)
+        self._learn_bounds(corner, corner + step * (np.array(values.shape) - 1))
+        # A grid has one resolution; nodes of the map are on all bounds.
+        low, high = np.array(self.maker.scene['bounds'])[:2].T
+        exact = (high - low) / np.maximum(np.array(values.shape) - 1, 1)
+        if np.allclose(exact, step, rtol=0.05):
+            corner, steps = low, exact
+        self.maker.map(self._time(message), _space(topic), corner, steps, values)
 
     def _take_cloud(self, topic: str, message: Any) -> None:
         rows = np.frombuffer(bytes(message.data), dtype='<f4').reshape(-1, message.point_step // 4)
@@ -301,7 +308,7 @@ class MessageEvents:
         corner, last = (np.array([axis[end] for axis in axes]) for end in (0, -1))
         self._learn_bounds(corner, last)
         step = (last - corner) / (np.array(shape) - 1)
-        values = rows[:, 3].reshape(shape).astype(float)
+        values = np.nan_to_num(rows[:, 3].reshape(shape).astype(float), nan=-1.0)
         self.maker.map(self._time(message), _space(topic), corner, step, values)
 
     def _learn_bounds(self, lower: FloatArray, upper: FloatArray) -> None:

@@ -15,8 +15,8 @@ FOLDER = Path(__file__).with_name('page')
 REPLAY = 'replay.html'
 # Each uses only what is before it.
 _MODULES = (
-    'run_log camera colours text words shapes labels floor_grid unexplored belief robots buildings '
-    'map why panels pictures legend marks strips tips curve live earth drawing main'
+    'run_log camera colours text icons words shapes labels floor_grid unexplored belief robots '
+    'buildings map why panels pictures legend marks strips earth tips curve live drawing main'
 )
 
 

@@ -43,25 +43,43 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
         return scene | _buildings(scenario)
     assert isinstance(scenario, Scenario)
     area, truth = scenario.world(seed).area, np.asarray(scenario.world(seed).targets, dtype=float)
+    return (
+        scene
+        | _prior(scenario)
+        | {
+            'obstacles': [
+                [*map(float, obstacle.centre), obstacle.radius]
+                for obstacle in scenario.environment.obstacles
+                if obstacle.centre
+            ],
+            'zones': zones_of(area),
+            # What may be searched, seen from above [m^2].
+            'ground': round(area.volume / float(np.prod(np.ptp(area.bounds[2:], axis=1))), 3),
+            'origin': scenario.environment.origin and scenario.environment.origin.model_dump(),
+            'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},
+            'targets': len(truth),
+            'expected_targets': scenario.environment.expected_targets,
+            **_objective(scenario.planner),
+            'scoring_radius': scoring_radius(scenario, truth) if len(truth) else None,
+            'scoring_order': scenario.scoring.order,
+        }
+    )
+
+
+def _prior(scenario: Scenario) -> Scene:
+    """Return how likely targets are where no zone is closed: a grid's corner, step, shape, values.
+
+    Nothing where they are equally likely.
+    """
+    if not (scenario.environment.prior.polygons or scenario.environment.prior.raster):
+        return {}
+    area = Area(scenario.environment.without_keep_outs())
     unseen = UnexploredMap(area, scenario.filter.exploration_spacing)
-    whole = float(unseen.cell_volumes().sum() / np.ptp(area.bounds, axis=1).prod())
-    return scene | {
-        'obstacles': [
-            [*map(float, obstacle.centre), obstacle.radius]
-            for obstacle in scenario.environment.obstacles
-            if obstacle.centre
-        ],
-        'zones': zones_of(area),
-        'origin': scenario.environment.origin and scenario.environment.origin.model_dump(),
-        # Mean over the bounds of what is shown as unexplored, before the search.
-        'whole': round(whole / float(unseen.density.max()), 6),
-        'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},
-        'targets': len(truth),
-        'expected_targets': scenario.environment.expected_targets,
-        **_objective(scenario.planner),
-        'scoring_radius': scoring_radius(scenario, truth) if len(truth) else None,
-        'scoring_order': scenario.scoring.order,
-    }
+    # As coarse as what is unexplored is shown.
+    corner, step, likely = unseen.shown(prior=True)
+    level = likely.reshape(*likely.shape[:2], -1)[:, :, 0]
+    values = [float(f'{value:.3g}') for value in level.ravel()]
+    return {'prior': [rounded(corner[:2]), rounded(step[:2]), [*level.shape], values]}
 
 
 def zones_of(area: Area) -> list[dict[str, Any]]:
@@ -127,6 +145,7 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
         'type': robot.type,
         'description': robot.description,
         'radius': robot.radius,
+        'flies': robot.flies,
         'clearance': robot.motion.clearance,
         'view': view,
         'deviations': [*deviations, 0.0][:3],

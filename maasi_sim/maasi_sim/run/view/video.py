@@ -18,11 +18,11 @@ from matplotlib.path import Path as Outline
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray, ImageArray
-from maasi_filter.colours import AWAY, FOUND, POTENTIAL, SEEN, robot_colours
+from maasi_filter.colours import AWAY, FOUND, KEEP_OUT, POTENTIAL, SEEN, robot_colours
 from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, draw_box
 from maasi_sim.run.report_panels import PALE, UNSEEN
 from maasi_sim.run.run_folder import write_whole
-from maasi_sim.run.view.event_log import Event, EventLog, Scene
+from maasi_sim.run.view.event_log import Event, EventLog, Scene, shares
 from maasi_sim.run.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
 Progress = Callable[[float], object]  # called with the share that is done
@@ -41,12 +41,13 @@ _LEGEND = (
     ('', 'planned way', '--', PALE),
     ('targets', 'waypoint', 's', PALE),
     ('floor', 'field of view', ':', PALE),
-    ('floor', 'not explored', 's', UNSEEN),
+    ('floor', 'not searched', 's', UNSEEN),
     ('targets', 'found, 3 sigma', 'o', FOUND),
     ('targets', 'potential, 2 sigma', 'o', POTENTIAL),
     ('targets', 'detection', '+', SEEN),
     ('targets', 'true target', 'x', '0.2'),
     ('obstacles', 'obstacle', 'o', _SOLID),
+    ('keep_outs', 'keep-out', 's', KEEP_OUT),
     ('fence', 'geofence', '-.', PALE),
     ('cuboids', 'cuboid to visit', 's', OPEN),
     ('cuboids', 'cuboid visited', 's', VISITED),
@@ -247,15 +248,15 @@ class Sheet:
     def _draw_floor(self, now: Moments) -> None:
         for event in list(now.last['map'].values())[:1]:
             (x, y, _), (dx, dy, _), (nx, ny, _), digits = event[3:7]
-            values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
+            values = np.maximum(shares(digits), 0.0).reshape(nx, ny).T
             extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
-            shades: Any = {'origin': 'lower', 'cmap': 'Greys', 'vmin': 0, 'vmax': 24}
+            shades: Any = {'origin': 'lower', 'cmap': 'Greys', 'vmin': 0, 'vmax': 2.7}
             # The frame again, which the map covers.
             image = self._axes.imshow(values, extent=extent, **shades)
             self._drawn += [image, *self._axes.spines.values()]
         changed = now.last['zones'].get('')
         for zone in changed[3] if changed else now.scene.get('zones', []):
-            colour = {'area': '0.1', 'keep_out': AWAY, 'obstacle': _SOLID}[zone['kind']]
+            colour = {'area': '0.1', 'keep_out': KEEP_OUT, 'obstacle': _SOLID}[zone['kind']]
             for ring in zone['rings']:
                 self._line(np.array(ring), '-', color=colour, lw=1.2)
         kept = max((robot.get('clearance', 0.0) for robot in self._robots.values()), default=0.0)
@@ -336,6 +337,7 @@ class Sheet:
         kinds = {'', 'cuboids' if scene.get('cuboids') else 'targets'}
         if self.size == 2:
             kinds |= {'floor', 'obstacles' if scene.get('obstacles') else ''}
+            kinds |= {f'{zone["kind"]}s' for zone in scene.get('zones', [])}
         if any('fence' in robot for robot in self._robots.values()):
             kinds.add('fence')
         robots = [('', name, '>-', colour) for name, colour in self._colours.items()]

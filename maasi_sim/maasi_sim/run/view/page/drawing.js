@@ -1,6 +1,6 @@
 // Drawing an area and keep-outs on the map, and saving them for the next run.
 
-import { themed } from './colours.js';
+import { KEEP_OUT, themed } from './colours.js';
 import { onEarth } from './earth.js';
 import { path } from './shapes.js';
 import { element } from './text.js';
@@ -115,7 +115,7 @@ export class Drawing {
     const open = { kind: this.kind || 'area', rings: [this.corners] };
     context.lineWidth = 2.5;
     for (const { kind, rings } of this.shapes ? [...this.kept, open] : []) {
-      context.strokeStyle = themed(kind === 'area' ? '--accent' : '--fault');
+      context.strokeStyle = kind === 'area' ? themed('--accent') : KEEP_OUT;
       for (const ring of rings) {
         path(context, camera, ring.map(([x, y]) => [x, y, floor]));
         context.stroke();

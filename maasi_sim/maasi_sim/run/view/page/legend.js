@@ -2,13 +2,15 @@
 
 import { FOUND, OPEN, POTENTIAL, SEEN, VISITED, robotColour, scaleColour } from './colours.js';
 import { faceColour, PHOTOGRAPHED } from './buildings.js';
+import { icon } from './icons.js';
 import { element } from './text.js';
 
 const HEAT = 'linear-gradient(90deg, rgba(var(--heat-low), .25), rgba(var(--heat-high), .9))';
 
 // Return the entries: class of the mark, its colour, text, and what else is in the mark.
-function entries(log, time, selected, layers) {
+function entries(log, time, selected, { layers, unexplored }) {
   const isEmpty = !(log.potential.at(time) >= 0.005);
+  const mostLeft = log.knowsExpected && unexplored.most ? `0 to ${unexplored.amount(unexplored.most)}` : 'from least to most likely';
   const robots = Object.values(log.scene.robots);
   const hasZone = (kind) => log.zones(time).some((zone) => zone.kind === kind);
   const hasTour = log.robots().some((name) => ((log.at('decision', name, time) || {}).robot || [])[6]?.length);
@@ -16,8 +18,9 @@ function entries(log, time, selected, layers) {
   const faceGradient = `linear-gradient(90deg, ${faceColour(0)}, ${faceColour(1)})`;
   const of = (...list) => list.filter(Boolean);
   const ways = of(
-    ['text', '', 'robot, in its colour', '➤'],
-    ['text', 'var(--away)', 'robot that left or cannot go on', '➤'],
+    ['icon', '', 'robot, in its colour', 'rover'],
+    robots.some((robot) => robot.flies) && ['icon', '', 'multirotor', 'multirotor'],
+    ['icon', 'var(--away)', 'robot that left or cannot go on', 'rover'],
     ['line', '', 'way so far'],
   );
   if (log.isOfBuildings) {
@@ -34,7 +37,8 @@ function entries(log, time, selected, layers) {
     );
   }
   return of(
-    ['area', 'rgba(var(--unseen), .53)', 'unexplored'],
+    layers.unseen && ['area', 'linear-gradient(90deg, rgba(var(--unseen), .53), transparent)', 'searched: chance that a target there would have been found, 0 to 100 %'],
+    layers.left && ['area', 'linear-gradient(90deg, rgba(var(--left), .05), rgba(var(--left), .65))', `where targets may still be: ${mostLeft}`],
     layers.belief && ['area', HEAT, `belief: potential targets per area, from few to many${isEmpty ? ' (none now)' : ''}`],
     ...ways,
     ['dash', '', 'planned way'],
@@ -43,12 +47,12 @@ function entries(log, time, selected, layers) {
     robots.some((robot) => robot.view) && ['dotbox', '', 'field of view'],
     ['ring', FOUND, 'found (3 sigma)'],
     ['ring', POTENTIAL, 'potential target (its mass)'],
-    ['text', SEEN, 'detection', '✕'],
-    ['text', '', 'true target', '✕'],
+    ['icon', SEEN, 'detection', 'cross'],
+    ['icon', '', 'true target', 'cross'],
     (log.scene.obstacles || []).length && ['area', 'var(--quiet)', 'obstacle'],
     (log.scene.obstacles || []).length && ['dash', 'var(--text)', 'distance kept from it'],
     hasZone('area') && ['line', 'var(--text)', 'border of the area'],
-    hasZone('keep_out') && ['area', 'color-mix(in srgb, var(--fault) 22%, transparent)', 'keep-out'],
+    hasZone('keep_out') && ['area', 'repeating-linear-gradient(45deg, #8f9900 0 2px, rgba(143, 153, 0, .25) 2px 5px)', 'keep-out'],
     robots.some((robot) => robot.fence) && ['dash', '', 'geofence (dash and dot)'],
     selected && ['area', cividis, 'candidate of the selected robot: J from low to high'],
     selected && ['ring', 'var(--text)', 'candidate that is not allowed'],
@@ -67,12 +71,12 @@ function stripEntries(log) {
     ['area', `${colour}4d`, 'waiting'],
     ['area', 'var(--text)', 'cannot go on'],
     ['line', 'var(--away)', 'left, silent or ended'],
-    ['text', SEEN, log.isOfBuildings ? 'snapshot' : 'measurement', '|'],
+    ['icon', SEEN, log.isOfBuildings ? 'snapshot' : 'measurement', 'tick'],
   ];
 }
 
-export function showLegend(parent, log, time, selected, layers) {
-  const shown = [...entries(log, time, selected, layers), ...stripEntries(log)];
+export function showLegend(parent, log, time, selected, map) {
+  const shown = [...entries(log, time, selected, map), ...stripEntries(log)];
   if (log.scene.thinned) shown.push(['text', '', `thinned: one state per ${log.scene.thinned} s`]);
   const key = JSON.stringify(shown);
   if (parent.dataset.key === key) return;
@@ -81,7 +85,8 @@ export function showLegend(parent, log, time, selected, layers) {
     ...shown.map(([kind, colour, text, sign]) => {
       if (kind === 'break') return element('br', '');
       const entry = element('span', '');
-      const mark = element('i', kind, sign);
+      const mark = element('i', kind);
+      if (sign) mark.append(icon(sign));
       mark.setAttribute('aria-hidden', 'true');
       if (kind === 'area') mark.style.background = colour;
       else if (colour) mark.style.color = colour;

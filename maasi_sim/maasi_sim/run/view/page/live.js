@@ -51,6 +51,8 @@ export function showControls(parent, selectedRobot) {
   const token = new URLSearchParams(window.location.search).get('token') || '';
   const answer = element('span', 'quiet', '');
   answer.setAttribute('role', 'status');
+  answer.title = 'Click to hide';
+  answer.onclick = () => answer.replaceChildren();
   const waiting = new Set();
   for (const [command, title] of COMMANDS) {
     const button = element('button', '', title);

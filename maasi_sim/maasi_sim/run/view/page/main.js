@@ -4,6 +4,7 @@ import { Camera } from './camera.js';
 import { Curve } from './curve.js';
 import { Drawing } from './drawing.js';
 import { follow, showControls, updateControls } from './live.js';
+import { icon } from './icons.js';
 import { MapView } from './map.js';
 import { showLegend } from './legend.js';
 import { drawMarks } from './marks.js';
@@ -115,7 +116,7 @@ class Page {
   }
 
   addLayers() {
-    const layers = [['truth', 'Truth'], ['unseen', 'Unexplored'], ['belief', 'Belief'], ['view', 'Field of view'], ['ways', 'Ways'], ['clusters', 'Potential'], ['detections', 'Detections']];
+    const layers = [['truth', 'Truth'], ['unseen', 'Searched'], ['left', 'Where targets may still be'], ['belief', 'Belief'], ['view', 'Field of view'], ['ways', 'Ways'], ['clusters', 'Potential'], ['detections', 'Detections']];
     for (const [name, title] of layers) {
       const button = element('button', '', title);
       button.dataset.layer = name;
@@ -148,6 +149,7 @@ class Page {
   }
 
   listen() {
+    for (const id of ['previous', 'play', 'next']) $(id).append(icon(id));
     $('play').onclick = () => this.setPlaying(!this.playing);
     $('previous').onclick = () => this.step(-1);
     $('next').onclick = () => this.step(1);
@@ -281,7 +283,7 @@ class Page {
     if (playing && this.time >= this.log.duration) this.time = 0;
     if (playing && this.following) this.setFollowing(false);
     this.playing = playing;
-    $('play').textContent = playing ? '⏸' : '▶';
+    $('play').replaceChildren(icon(playing ? 'pause' : 'play'));
     $('play').setAttribute('aria-label', playing ? 'Pause' : 'Play');
     this.request();
   }
@@ -326,10 +328,7 @@ class Page {
       }, wait);
     }
     const shown = hasEnded(log, time) && !this.cardClosed;
-    if ($('card').hidden === shown) {
-      $('card').hidden = !shown;
-      this.fitted = false;
-    }
+    $('card').hidden = !shown;
     if (shown) {
       showCard($('card'), log, time, () => {
         this.cardClosed = true;
@@ -342,8 +341,6 @@ class Page {
   draw() {
     const { log, time } = this;
     this.tell();
-    // It may take room from the map.
-    showLegend($('legend'), log, time, this.selected, this.map.layers);
     const wantsRoom = showStrips($('strips'), log, time, (name, at) => {
       this.select(name);
       this.seek(at);
@@ -363,9 +360,10 @@ class Page {
     // Above a second of a fast replay, too.
     this.map.pulse = reducedMotion.matches ? 0 : Math.max(4, 1.2 * Number($('speed').value));
     this.map.draw(log, time, this.selected);
+    showLegend($('legend'), log, time, this.selected, this.map);
     this.drawing.draw(this.map);
     this.curve.draw(log, time);
-    showNumbers($('numbers'), log, time);
+    showNumbers($('numbers'), $('counts'), log, time, this.map.unexplored);
     showRobots($('robots').tBodies[0], log, time, this.selected, (name) => this.select(name));
     showPictures($('cameras'), log, time, (name) => this.select(name));
     showWhy($('why_body'), log, time, this.selected, this.marked, (row) => this.mark(row));

@@ -1,7 +1,7 @@
 // Draws a search for targets at a time.
 
 import { Belief } from './belief.js';
-import { FOUND, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colours.js';
+import { FOUND, KEEP_OUT, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colours.js';
 import { Labels } from './labels.js';
 import { drawRobot, drawWays } from './robots.js';
 import { LEFT } from './run_log.js';
@@ -20,7 +20,7 @@ export class MapView {
     this.canvas = canvas;
     this.context = canvas.getContext('2d');
     this.camera = camera;
-    this.layers = { truth: true, unseen: true, belief: false, view: true, ways: true, clusters: true, detections: true };
+    this.layers = { truth: true, unseen: true, left: false, belief: false, view: true, ways: true, clusters: true, detections: true };
     this.marked = null;
     // How long a ring runs out from what was found [s of the run].
     this.pulse = 0;
@@ -53,6 +53,7 @@ export class MapView {
     context.fillRect(0, 0, camera.width, camera.height);
     this.drawGround(log);
     this.unexplored.update(log, time);
+    if (this.layers.left) this.unexplored.drawLeft(this);
     if (this.layers.unseen) this.unexplored.draw(this);
     if (this.layers.belief && !log.isOfBuildings) this.belief.draw(this, log, time);
     this.drawZones(log, time);
@@ -110,7 +111,7 @@ export class MapView {
   drawZones(log, time) {
     const { context, camera } = this;
     for (const { kind, rings } of log.zones(time)) {
-      const colour = themed({ area: '--text', keep_out: '--fault', obstacle: '--quiet' }[kind]);
+      const colour = kind === 'keep_out' ? KEEP_OUT : themed({ area: '--text', obstacle: '--quiet' }[kind]);
       const heights = camera.spatial && log.isSpatial ? log.bounds[2] : [this.floor];
       for (const z of heights) {
         context.beginPath();
@@ -120,7 +121,11 @@ export class MapView {
         context.globalAlpha = { area: 0, keep_out: 0.22, obstacle: 0.85 }[kind];
         if (kind !== 'area') context.fill('evenodd');
         context.globalAlpha = 1;
-        context.lineWidth = kind === 'area' ? 2 : 1;
+        if (kind === 'keep_out') {
+          context.fillStyle = this.hatch ||= hatched(context, colour);
+          context.fill('evenodd');
+        }
+        context.lineWidth = { area: 2, keep_out: 1.5, obstacle: 1 }[kind];
         context.stroke();
       }
     }
@@ -319,6 +324,21 @@ export class MapView {
       .sort((a, b) => rank(a) - rank(b) || a.distance - b.distance);
     return near[0];
   }
+}
+
+// Return a pattern of slanted lines.
+function hatched(context, colour) {
+  const tile = document.createElement('canvas');
+  [tile.width, tile.height] = [8, 8];
+  const lines = tile.getContext('2d');
+  lines.strokeStyle = colour;
+  lines.lineWidth = 1.5;
+  for (const shift of [-8, 0, 8]) {
+    lines.moveTo(shift - 1, 9);
+    lines.lineTo(shift + 9, -1);
+  }
+  lines.stroke();
+  return context.createPattern(tile, 'repeat');
 }
 
 function rank(item) {

@@ -1,35 +1,58 @@
 // The panels beside the map: numbers, robots, log.
 
 import { robotColour, themed } from './colours.js';
+import { icon } from './icons.js';
 import { isAway } from './run_log.js';
 import { element, number, pressable } from './text.js';
-import { stateOf } from './words.js';
+import { harvest, hasEnded, stateOf } from './words.js';
 
-const SIGNS = { found: '●', decision: '→', team: '◇', warning: '!', fault: '✖' };
+const SIGNS = ['found', 'decision', 'team', 'warning', 'fault'];
 // Lines of the log that are shown.
 const MOST_LINES = 60;
 
-export function showNumbers(parent, log, time) {
+// Show what a search is about first; scores and counts are in a fold.
+export function showNumbers(parent, fold, log, time, unexplored) {
+  const first = [[log.isOfBuildings ? 'visited' : 'found', harvest(log, time), 'found_count']];
+  const { searched } = unexplored;
+  if (searched !== undefined) first.push(['searched area', `${Math.round(100 * searched)} % of ${area(log.scene.ground || unexplored.ground)}`]);
+  first.push(['time', `${Math.round(time)} s`]);
+  const charges = log.robots().map((name) => [name, log.at('robot', name, time)]).filter(([, event]) => event && event[4] >= 0);
+  if (charges.length) {
+    const [name, event] = charges.reduce((least, item) => (item[1][4] < least[1][4] ? item : least));
+    first.push(['lowest battery', `${Math.round(100 * event[4])} % (${name})`]);
+  }
+  showRows(parent, first);
+  showRows(fold, log.isOfBuildings ? [['snapshots', shots(log, time)]] : counts(log, time));
+}
+
+// Return an area with a unit that suits it.
+function area(ground) {
+  const [unit, name] = [[1, 'm²', 1e4], [1e4, 'ha', 1e6], [1e6, 'km²', Infinity]].find(([, , limit]) => ground < limit);
+  return `${number(ground / unit)} ${name}`;
+}
+
+function counts(log, time) {
   const score = log.at('score', '', time);
   const explored = log.explored.at(time);
-  const total = log.total;
-  const rows = [
-    [log.isOfBuildings ? 'visited' : 'found', `${log.found(time)}${total ? ` of ${total}` : ''}`, 'found_count'],
+  const rows = log.knowsExpected ? [['expected left', number(log.left.at(time))]] : [];
+  rows.push(
+    ['potential', number(log.potential.at(time))],
+    ['measurements', log.measurements(time)],
+    ['decisions', log.decisions.count(time)],
+    ['explored', explored === undefined ? '-' : `${Math.round(100 * explored)} %`],
+  );
+  if (!score) return rows;
+  const [, , , right, missed, wrong, rmse, gospa] = score;
+  return [
+    ...rows,
+    ['true, false', `${right}, ${wrong}`],
+    [hasEnded(log, time) ? 'missed' : 'not found yet', missed],
+    ['RMSE', rmse === null ? '-' : `${number(rmse)} m`],
+    ['GOSPA', `${number(gospa)} m`],
   ];
-  if (log.isOfBuildings) rows.push(['snapshots', shots(log, time)]);
-  else {
-    if (log.knowsExpected) rows.push(['expected left', number(log.left.at(time))]);
-    rows.push(['potential', number(log.potential.at(time))]);
-    rows.push(['measurements', log.measurements(time)]);
-    rows.push(['explored', explored === undefined ? '-' : `${Math.round(100 * explored)} %`]);
-    rows.push(['decisions', log.decisions.count(time)]);
-  }
-  if (score) {
-    rows.push(['true, false', `${score[3]}, ${score[5]}`]);
-    rows.push(['missed', score[4]]);
-    rows.push(['RMSE', score[6] === null ? '-' : `${number(score[6])} m`]);
-    rows.push(['GOSPA', `${number(score[7])} m`]);
-  }
+}
+
+function showRows(parent, rows) {
   parent.replaceChildren(
     ...rows.flatMap(([title, value, id]) => {
       const cell = element('dd', '', String(value));
@@ -95,7 +118,9 @@ export function showLog(list, log, time, onChoose) {
       const line = element('li', level);
       line.dataset.level = level;
       pressable(line, () => onChoose(event));
-      line.append(element('time', '', `${when.toFixed(1)} s`), element('b', '', SIGNS[level] || ''), element('span', '', `${source}: ${text}`));
+      const sign = element('b', '');
+      if (SIGNS.includes(level)) sign.append(icon(level));
+      line.append(element('time', '', `${when.toFixed(1)} s`), sign, element('span', '', `${source}: ${text}`));
       return line;
     }),
   );

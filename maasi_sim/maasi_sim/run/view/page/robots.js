@@ -4,6 +4,14 @@ import { robotColour, themed } from './colours.js';
 import { isAway, LEFT, MOVING } from './run_log.js';
 import { dropLine, ellipse, matrix, path } from './shapes.js';
 
+// Half the length of a robot [px], and outlines of one that points along x.
+const SIZE = 9;
+const ROVER = new Path2D('M1.4 0 L-0.9 0.8 L-0.5 0 L-0.9 -0.8 Z');
+const MULTIROTOR = new Path2D('M1.5 0 L0.9 0.35 L-0.5 0.35 L-0.5 -0.35 L0.9 -0.35 Z');
+for (const [ahead, side] of [[0.8, 0.8], [0.8, -0.8], [-0.8, 0.8], [-0.8, -0.8]]) {
+  MULTIROTOR.moveTo(ahead + 0.55, side);
+  MULTIROTOR.arc(ahead, side, 0.55, 0, 2 * Math.PI);
+}
 // Points of a way that are drawn.
 const MOST_POINTS = 600;
 
@@ -77,20 +85,21 @@ export function drawRobot(view, log, time, name, selected) {
   context.fillStyle = colour;
   if (view.layers.view && robot.view && !isPale) drawFieldOfView(view, robot.view, [x, y, z, yaw], log.isSpatial);
   if (log.isSpatial || z > 0) dropLine(context, camera, [x, y, z], view.floor);
-  const nose = 9 / camera.scale;
-  const size = Math.max(robot.radius || 0, nose);
-  const outline = [[1.4, 0], [-0.9, 0.8], [-0.5, 0], [-0.9, -0.8]].map(([ahead, left]) => [
-    x + size * (ahead * Math.cos(yaw) - left * Math.sin(yaw)),
-    y + size * (ahead * Math.sin(yaw) + left * Math.cos(yaw)),
-    z,
-  ]);
-  path(context, camera, outline, true);
-  context.fill();
-  context.strokeStyle = selected ? themed('--text') : themed('--back');
-  context.lineWidth = selected ? 2.5 : 1;
-  context.stroke();
-  context.lineWidth = 1;
   const [px, py] = camera.project([x, y, z]);
+  // Of one size in each search, and turned as it is seen.
+  const [ahead, side] = [[Math.cos(yaw), Math.sin(yaw)], [-Math.sin(yaw), Math.cos(yaw)]].map(([dx, dy]) => {
+    const step = 1 / camera.scale;
+    const [ex, ey] = camera.project([x + step * dx, y + step * dy, z]);
+    return [ex - px, ey - py];
+  });
+  context.save();
+  context.transform(SIZE * ahead[0], SIZE * ahead[1], SIZE * side[0], SIZE * side[1], px, py);
+  const outline = robot.flies ? MULTIROTOR : ROVER;
+  context.fill(outline);
+  context.strokeStyle = selected ? themed('--text') : themed('--back');
+  context.lineWidth = (selected ? 2.5 : 1) / SIZE;
+  context.stroke(outline);
+  context.restore();
   const text = event[5] === LEFT ? `${name} (left)` : name;
   view.labels.add(text, px, py, { font: '600 12px system-ui, sans-serif', away: 12, needed: true });
   view.targets.push({ x: px, y: py, robot: name });

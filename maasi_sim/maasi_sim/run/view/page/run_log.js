@@ -8,6 +8,11 @@ export const SILENT = 7;
 export const ENDED = 8;
 const AWAY = [5, LEFT, SILENT];
 
+// Return the share that a letter of a map stands for; NaN where no target may be.
+export function shareOf(letter) {
+  return parseInt(letter, 36) / 35;
+}
+
 export function isAway(robotEvent) {
   return AWAY.includes(robotEvent[5]);
 }
@@ -204,7 +209,7 @@ export class RunLog {
     if (!(i >= 0 && j >= 0 && i < shape[0] && j < shape[1])) return undefined;
     const column = digits.substr((i * shape[1] + j) * shape[2], shape[2]);
     const cells = column[k] === undefined || shape[2] === 1 ? [...column] : [column[k]];
-    return cells.reduce((sum, digit) => sum + Number(digit) / 9, 0) / cells.length;
+    return cells.reduce((sum, letter) => sum + (shareOf(letter) || 0), 0) / cells.length;
   }
 
   measurements(time) {

@@ -1,5 +1,6 @@
 // What is at a point of the map, in numbers.
 
+import { onEarth } from './earth.js';
 import { number } from './text.js';
 import { stateOf } from './words.js';
 
@@ -49,9 +50,11 @@ export function tipAt(view, log, time, selected, x, y) {
   if (text) return text;
   const cell = view.unexplored.pick(view, x, y);
   if (!cell) return '';
-  const share = Math.round(100 * cell.share);
   const belief = view.layers.belief && !log.isOfBuildings ? `, ${view.belief.words(cell.place)}` : '';
-  return `${share > 0 ? `unexplored ${share} %` : 'explored'} ${at(cell.place, 3)}${belief}`;
+  const { scene: { origin }, knowsExpected } = log;
+  const left = knowsExpected ? `still ${view.unexplored.amount(cell.left)}` : `${Math.round((100 * cell.left) / view.unexplored.most)} % of the targets of unsearched ground`;
+  const earth = origin ? `, ${onEarth(cell.place, origin).reverse().map((angle) => angle.toFixed(6)).join(', ')}` : '';
+  return `searched ${Math.round(100 - 100 * cell.share)} %, ${left}, ${at(cell.place, 3)}${earth}${belief}`;
 }
 
 // Show a text beside a point of its parent; none hides it.

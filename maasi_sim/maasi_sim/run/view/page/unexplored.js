@@ -1,16 +1,20 @@
-// What is unexplored: the map as it was last published, less what robots have seen since, as the
-// planner reckons it: each look at a place multiplies its e by 1 - pi. So the dark goes as the field
-// of view moves, not once a second.
+// What is not searched: the map as it was last published, less what robots have seen since, as the
+// planner reckons it: each look at a cell multiplies its e by 1 - pi. So the dark goes as the field
+// of view moves, not once a second. Where targets may still be is that times how likely they are.
 
 import { themed } from './colours.js';
 import { FloorGrid } from './floor_grid.js';
-import { isAway } from './run_log.js';
+import { isAway, shareOf } from './run_log.js';
+import { number } from './text.js';
 
 // Where the chance to see something ends, in sizes of a sensor.
 const SIGHT = { exponential: 7, gaussian: 3 };
 // Largest opacity of a cell, up to 255; cells below this e are not drawn in space.
 const DARKEST = 135;
 const FAINTEST = 0.06;
+// Of where targets may still be: shades, and the largest opacity.
+const LEFT_SHADES = 40;
+const DARKEST_LEFT = 165;
 // Most cells that are drawn in space.
 const MOST_CELLS = 3000;
 
@@ -75,6 +79,7 @@ function wipe({ corner, step, shape, values }, { view, place }) {
 export class Unexplored {
   constructor() {
     this.floor = new FloorGrid();
+    this.leftFloor = new FloorGrid();
     // Corner and spacing [m], number of cells on each axis, and e of each at the time that is shown.
     this.cells = null;
   }
@@ -85,10 +90,70 @@ export class Unexplored {
     this.cells = null;
     if (!event) return;
     const [since, , , corner, step, shape, digits] = event;
-    if (this.digits !== digits) Object.assign(this, { digits, published: Float32Array.from(digits, (digit) => digit / 9) });
+    if (this.digits !== digits || this.scene !== log.scene) {
+      const published = Float32Array.from(digits, shareOf);
+      Object.assign(this, { digits, scene: log.scene, open: Uint8Array.from(published, (share) => !Number.isNaN(share)) });
+      this.published = published.map((share) => share || 0);
+      this.expect(log.scene, corner, step, shape);
+    }
     const seen = looks(log, time, space, since);
     this.cells = { corner, step, shape, values: seen.length ? this.published.slice() : this.published };
     for (const look of seen) wipe(this.cells, look);
+  }
+
+  // Reckon how many targets were expected in each column before the search [1/m^2 of ground].
+  expect({ prior, expected_targets: targets }, corner, step, shape) {
+    const [nx, ny, nz] = shape;
+    this.before = new Float32Array(nx * ny);
+    let whole = 0;
+    for (let i = 0; i < nx; i += 1) {
+      for (let j = 0; j < ny; j += 1) {
+        if (!this.open[(i * ny + j) * nz]) continue;
+        let likely = 1;
+        if (prior) {
+          const [low, width, size, values] = prior;
+          const [a, b] = [i, j].map((index, axis) => Math.min(Math.max(Math.round((corner[axis] + index * step[axis] - low[axis]) / width[axis]), 0), size[axis] - 1));
+          likely = values[a * size[1] + b];
+        }
+        this.before[i * ny + j] = likely;
+        whole += likely * (i % (nx - 1) ? 1 : 0.5) * (j % (ny - 1) ? 1 : 0.5);
+      }
+    }
+    const scale = (targets || 1) / (whole * step[0] * step[1] || 1);
+    this.before = this.before.map((likely) => likely * scale);
+    this.most = this.before.reduce((most, value) => Math.max(most, value), 0);
+    // Small numbers are hard to read.
+    const ground = nx * ny * step[0] * step[1];
+    this.unit = [[1, 'm²', 1e3], [1e4, 'ha', 1e8], [1e6, 'km²', Infinity]].find(([, , limit]) => ground < limit);
+  }
+
+  // Return in words how many targets there are of a density [1/m^2].
+  amount(density) {
+    return `${number(density * this.unit[0])} expected targets per ${this.unit[1]}`;
+  }
+
+  // Return the share of the open ground that is searched: the chance to have found a target there.
+  get searched() {
+    if (!this.cells) return undefined;
+    const { shape: [nx, ny, nz], values } = this.cells;
+    let [sum, whole] = [0, 0];
+    for (let index = 0; index < values.length; index += 1) {
+      const [i, j] = [Math.floor(index / (ny * nz)), Math.floor(index / nz) % ny];
+      const weight = this.open[index] * (i % (nx - 1) ? 1 : 0.5) * (j % (ny - 1) ? 1 : 0.5);
+      sum += weight * (1 - values[index]);
+      whole += weight;
+    }
+    return whole ? sum / whole : undefined;
+  }
+
+  // Return the ground that may be searched [m^2].
+  get ground() {
+    const { shape: [nx, ny, nz], step } = this.cells;
+    let whole = 0;
+    for (let index = 0; index < nx * ny; index += 1) {
+      whole += this.open[index * nz] * (Math.floor(index / ny) % (nx - 1) ? 1 : 0.5) * ((index % ny) % (ny - 1) ? 1 : 0.5);
+    }
+    return whole * step[0] * step[1];
   }
 
   // Return the mean e of a column.
@@ -97,6 +162,23 @@ export class Unexplored {
     let sum = 0;
     for (let k = 0; k < nz; k += 1) sum += values[(i * ny + j) * nz + k];
     return sum / nz;
+  }
+
+  // Draw where targets may still be, on the floor.
+  drawLeft(view) {
+    if (!this.cells || !this.most) return;
+    const { shape: [, ny], values } = this.cells;
+    const key = themed('--left');
+    if (this.leftKey !== key) {
+      const colour = key.split(',').map(Number);
+      this.leftColours = Array.from({ length: LEFT_SHADES + 1 }, (_, level) => [...colour, Math.round((DARKEST_LEFT * level) / LEFT_SHADES)]);
+      this.leftKey = key;
+    }
+    if (this.leftOf !== values) {
+      this.leftOf = values;
+      this.leftLevels = Uint8Array.from(this.before, (before, index) => Math.round((LEFT_SHADES * before * this.mean(Math.floor(index / ny), index % ny)) / this.most));
+    }
+    this.leftFloor.draw(view, this.cells, this.leftLevels, this.leftColours);
   }
 
   draw(view) {
@@ -144,7 +226,8 @@ export class Unexplored {
     }
   }
 
-  // Return place and e of the cell at a point of the canvas; in space of the first that is drawn.
+  // Return place, e and expected targets left of the cell at a point of the canvas; in space of the
+  // first that is drawn. Where no target may be there is no cell.
   pick({ camera, floor }, x, y) {
     if (!this.cells) return null;
     const { corner, step, shape } = this.cells;
@@ -154,11 +237,15 @@ export class Unexplored {
         const [px, py, depth] = camera.project(place);
         if (Math.hypot(px - x, py - y) < 5 && !(nearest && nearest.depth < depth)) nearest = { place, share, depth };
       });
-      return nearest;
+      if (!nearest) return null;
+      const [a, b] = [0, 1].map((axis) => Math.round((nearest.place[axis] - corner[axis]) / step[axis]));
+      return { ...nearest, left: this.before[a * shape[1] + b] * this.mean(a, b) };
     }
     const place = camera.ground(x, y, floor);
     const [i, j] = place.map((value, axis) => Math.round((value - corner[axis]) / step[axis]));
     if (!(i >= 0 && j >= 0 && i < shape[0] && j < shape[1])) return null;
-    return { place, share: this.mean(i, j) };
+    const column = i * shape[1] + j;
+    if (!this.open[column * shape[2]]) return null;
+    return { place, share: this.mean(i, j), left: this.before[column] * this.mean(i, j) };
   }
 }

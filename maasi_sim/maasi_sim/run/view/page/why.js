@@ -1,6 +1,7 @@
 // The panel that says why a robot goes where it goes.
 
 import { scaleColour } from './colours.js';
+import { icon } from './icons.js';
 import { LEFT } from './run_log.js';
 import { element, number, pressable } from './text.js';
 
@@ -130,7 +131,8 @@ function showCandidates(parent, log, decision, marked, onMark, isOpen) {
   head.append(element('th', '', '#'));
   const columns = COLUMNS.filter(([title]) => title !== 'z' || candidates.some((item) => item[2] !== candidates[0][2]));
   for (const [title, column, columnUnit] of columns) {
-    const cell = element('th', '', (order === column ? '▾ ' : '') + title);
+    const cell = element('th', '', title);
+    if (order === column) cell.prepend(icon('down'));
     cell.title = [TITLES[title], unit[title] || columnUnit].filter(Boolean).join(' ');
     pressable(cell, () => {
       order = column;

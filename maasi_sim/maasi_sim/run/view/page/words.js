@@ -81,10 +81,15 @@ function intention(log, time) {
   return '';
 }
 
-// Return what was found by a time, of how many.
-function harvest(log, time) {
-  const number = log.total ? `${log.found(time)} of ${log.total}` : `${log.found(time)}`;
-  return log.isOfBuildings ? `${number} cuboids visited` : `${number} found`;
+// Return what was found by a time, of how many: where the truth is known, what of it is true.
+export function harvest(log, time) {
+  const score = log.at('score', '', time);
+  const [count, wrong] = score ? [score[3], score[5]] : [log.found(time), 0];
+  return (log.total ? `${count} of ${log.total}` : `${count}`) + (wrong ? ` (${wrong} false)` : '');
+}
+
+function harvested(log, time) {
+  return `${harvest(log, time)} ${log.isOfBuildings ? 'cuboids visited' : 'found'}`;
 }
 
 function endWords(log, time) {
@@ -100,7 +105,7 @@ function endWords(log, time) {
     return `All ${log.total} ${log.isOfBuildings ? 'cuboids visited' : 'found'} after ${Math.round(when)} s`;
   }
   const why = text.replace(/^\//, '') || reason.replaceAll('_', ' ');
-  return `Ended: ${why ? `${why}; ` : ''}${harvest(log, time)} ${after}`;
+  return `Ended: ${why ? `${why}; ` : ''}${harvested(log, time)} ${after}`;
 }
 
 export function hasEnded(log, time) {
@@ -121,9 +126,9 @@ export function headline(log, time, connection = '') {
   const modes = log.robots().map((name) => modeOf(log, name, time));
   const words = { paused: 'Paused', 'sent home': 'Sent home', stopped: 'Stopped', 'waiting for start': 'Waiting for start' };
   const shared = modes.every((mode) => mode === modes[0]) && words[modes[0]];
-  if (shared) return `${shared}: ${harvest(log, time)}`;
+  if (shared) return `${shared}: ${harvested(log, time)}`;
   const prefix = connection === 'connection lost' ? 'Connection lost' : 'Searching';
-  return [`${prefix}: ${harvest(log, time)}`, intention(log, time)].filter(Boolean).join(', ');
+  return [`${prefix}: ${harvested(log, time)}`, intention(log, time)].filter(Boolean).join(', ');
 }
 
 // Show a headline, and no other one within a second; return the time until it may change [ms].
