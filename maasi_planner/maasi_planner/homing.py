@@ -131,7 +131,7 @@ class Homing:
         found = {}
         for name in sorted(robots):
             plan, robot = self._plans[name], robots[name]
-            errand = self._errand(plan, robot, finished) if robot.returns else None
+            errand = self._errand(plan, robot, finished, step) if robot.returns else None
             # Where it could not go it tries again after a while.
             if errand is not None and not _waits(plan, robot, step):
                 found[name] = errand
@@ -165,10 +165,16 @@ class Homing:
                 return True
         return False
 
-    def _errand(self, plan: RobotPlan, robot: PresentRobot, finished: bool) -> Errand | None:
+    def _errand(
+        self, plan: RobotPlan, robot: PresentRobot, finished: bool, step: int
+    ) -> Errand | None:
         leaving = plan.errand is Errand.LEAVE and not robot.free
-        if leaving or exit_of(plan, robot) is not None:
-            return None if leaving else Errand.LEAVE
+        # It does not follow a line exactly, and zones change: its exit is chosen again as it goes.
+        recent = step - (plan.decided_at or 0) < plan.period
+        if not (leaving and recent) and exit_of(plan, robot) is not None:
+            return Errand.LEAVE
+        if leaving:
+            return None
         endurance = plan.endurance
         if endurance is None or endurance.cut_off:
             return None

@@ -171,6 +171,17 @@ class KeepOut:
         to = (to_x, to_y, to_z)
         return float(length_to((x, y, z), to, self.table(to), self.around))
 
+    def route(self, position: ArrayLike, goal: ArrayLike) -> list[Vector]:
+        """Return the corners of the path between two positions (3,) [m], the last is the goal."""
+        x, y, z = np.asarray(position, dtype=float).tolist()
+        to_x, to_y, to_z = np.asarray(goal, dtype=float).tolist()
+        here, to = (x, y, z), (to_x, to_y, to_z)
+        corners: list[Vector] = []
+        while here != to and len(corners) <= len(self.around.vertices):
+            here = head_for(here, to, self.table(to), self.around, -1).target
+            corners.append(here)
+        return corners
+
     def past(
         self, robot: FloatArray, goal: FloatArray, others: Sequence[tuple[FloatArray, float]]
     ) -> FloatArray:
@@ -209,7 +220,11 @@ class KeepOut:
         zones = self.area.shapes['keep_out']
         others = [zone for zone in zones if zone.distance(point) > self.radius]
         past_others = self._solid.difference(shapely.union_all(others).buffer(self.radius))
-        for allowed in (past_others, self._solid) if others else (self._solid,):
+        # A robot does not follow a line exactly: with a margin if it can.
+        margin = 0.5 * self.clearance
+        ample = past_others.buffer(-margin)
+        allowed_ones = (ample, past_others, self._solid) if others else (ample, self._solid)
+        for allowed in allowed_ones:
             near = self._straight_exit(point, allowed)
             if near is not None:
                 return np.array([near.x, near.y, z])

@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.guidance import approach_limit, head_for, minded
+from maasi_planner.guidance import approach_limit, head_for, hold_back, minded
 from maasi_planner.motion.steering import Command, Steering, wrapped
 from maasi_planner.obstacles import Felt, Surroundings, Vector, from_centre, is_far
 
@@ -31,6 +31,10 @@ LOOK_AHEAD = 1.2
 ARC_STEPS = 8
 FORWARD_SAMPLES = 6
 TURN_SAMPLES = 13
+# A robot that turns by more than _STRAIGHT looks there too, as far as it may turn while it brakes
+# [rad]; one with less than this share of its speed stands.
+_STRAIGHT, _TURNS, _STANDS = 0.05, 0.35, 0.05
+_AWAY = 0.2  # and so much it turns away from what it touches [rad]
 _TOUCHES = 1e-9  # distance of what a robot touches [m]
 
 
@@ -94,6 +98,20 @@ def _speed_ahead(
     reach = 1.001 * steering.speed / steering.barrier
     free = way_ahead(position[0], position[1], yaw, reach, felt, beyond)
     return approach_limit(free, (steering.barrier, steering.acceleration))
+
+
+@njit(cache=True, forceinline=True)
+def _along(
+    here: Vector, way: tuple[float, float], steering: Steering, felt: Felt
+) -> tuple[float, float]:
+    """Return the direction in which a robot gets along what it touches, and a little away."""
+    share = steering.speed / max(math.hypot(way[0], way[1]), 1e-9)
+    limits = steering.barrier, steering.acceleration
+    x, y, _ = hold_back(here, felt, False, limits, (share * way[0], share * way[1], 0.0))
+    if math.hypot(x, y) < _STANDS * steering.speed:
+        return way
+    away = math.copysign(_AWAY, x * way[1] - y * way[0])
+    return x + away * y, y - away * x
 
 
 @njit(cache=True)
@@ -237,6 +255,19 @@ def drive_among(
     if steering.window and not beyond:
         forward, turn = window_command(state, target, left, steering, felt, clearance)
         return (forward, 0.0, 0.0, turn), vertex
-    forward, turn = _drive(target[0] - x, target[1] - y, left, yaw, steering, clearance)
-    forward = min(forward, _speed_ahead((x, y), yaw, steering, felt, beyond))
+    dx, dy = target[0] - x, target[1] - y
+    allowed = _speed_ahead((x, y), yaw, steering, felt, beyond)
+    stands = _STANDS * steering.speed
+    if allowed < stands and not beyond:
+        dx, dy = _along(here, (dx, dy), steering, felt)
+    forward, turn = _drive(dx, dy, left, yaw, steering, clearance)
+    forward = min(forward, allowed)
+    off = wrapped(math.atan2(dy, dx) - yaw)
+    off = min(max(off, -_TURNS), _TURNS)
+    if abs(off) > _STRAIGHT and state[4] > stands:
+        # It brakes before it turns to where it could not stop.
+        aside = _speed_ahead((x, y), yaw + off, steering, felt, beyond)
+        aside = min(aside, _speed_ahead((x, y), yaw + 0.5 * off, steering, felt, beyond))
+        if aside < state[4]:
+            forward, turn = min(forward, aside), 0.0
     return (forward, 0.0, 0.0, turn), vertex
