@@ -6,6 +6,7 @@ import shapely
 
 from maasi_filter.area import Area
 from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.models.pose import Pose
 from maasi_filter.ros.keep_outs import CORNERS, ZONES, with_keep_outs
 from maasi_planner import MotionSettings, RobotState, make_motion
 from maasi_planner.guidance import MANY
@@ -210,3 +211,29 @@ def test_robots_stay_within_bounds_where_a_round_zone_lies_at_the_border():
         assert (level >= -1e-6).all() and (level <= 100.0 + 1e-6).all()
         assert area.region.covers(shapely.points(level)).all()
     assert area.outside_by([121.0, 50.0, 20.0]) == pytest.approx(21.0)
+
+
+def test_a_rover_at_full_speed_touches_no_wall_where_it_turns():
+    """Wherever it is sent while it drives along a corridor, and it arrives."""
+    rng, arrived = np.random.default_rng(15), 0
+    corridor = [[0.0, 0.0], [60.0, 6.0], [60.0, 12.0], [30.0, 9.0], [0.0, 12.0]]
+    area = area_of(area=corridor, obstacles=[{'centre': [25.0, 5.6], 'radius': 0.3}])
+    settings = MotionSettings(**{**ROVER, 'speed': 2.4, 'yaw_rate': 1.2, 'yaw_acceleration': 2.0})
+    motion = make_motion(settings, area, 0.6)
+    for _ in range(90):
+        x, yaw = float(rng.uniform(10.0, 45.0)), float(rng.choice([0.1, 0.1 + np.pi]))
+        heading = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        at = np.array([x, 0.1 * x + rng.uniform(0.9, 2.5), 0.0])
+        goal = np.array([*rng.uniform([2.0, 2.0], [58.0, 11.0]), 0.0])
+        # It can stop where it goes.
+        ahead = [
+            motion.keep_out.is_free(at + reach * heading) for reach in np.linspace(0.0, 3.2, 9)
+        ]
+        if not (all(ahead) and motion.keep_out.is_free(goal)):
+            continue
+        start = RobotState(Pose.from_yaw(at, yaw), 2.4 * heading, np.zeros(3))
+        prediction = motion.predict(start, goal[None], 0.1)
+        gaps = [area.distances(place).min() for place in prediction.positions[0]]
+        assert min(gaps) >= 0.6
+        arrived += bool(prediction.reached[0])
+    assert arrived >= 20
