@@ -40,6 +40,8 @@ SAME = 0.1
 ENOUGH = 3
 # A leg has at most one square, or so many times the distance at which the robot turns.
 LEG = 5.0
+# Places of a tour that are published.
+MOST_DRAWN = 200
 
 
 class Tour(Planner):
@@ -223,12 +225,49 @@ class Tour(Planner):
                 way.insert(0, index)
             if usable:
                 self._target[name] = (place if whole else waypoint)[:d]
-                reason = f'next place of its tour, prize {prizes[index]:.3g}, {len(way)} to follow'
+                reason = self._reason(name, here[:d], index, prizes)
                 chosen = single_choice(point, prediction, 0, reason)
-                chosen.tour = np.tile(place, (len(way), 1))
-                chosen.tour[:, :d] = self._points[way]
+                chosen.tour = self._rest(view, point[0], way)
                 return chosen
         return None
+
+    def _reason(self, name: str, here: FloatArray, index: int, prizes: FloatArray) -> str:
+        """Return what is expected of a robot's next place, what follows, and the alternative."""
+
+        def told(place: int) -> str:
+            numbers = ', '.join(f'{value:.4g}' for value in self._points[place])
+            return f'({numbers}) m'
+
+        def gain(place: int) -> str:
+            potential = 'a potential target of mass ' if place >= len(self._chosen) else ''
+            return f'{potential}{prizes[place]:.2g}' + ('' if potential else ' targets')
+
+        rest = [place for place in self._ways[name] if place != index]
+        reason = f'next on its tour is {told(index)}, where it expects {gain(index)}'
+        if rest:
+            reason += f'; then {told(rest[0])}' + (f' and {len(rest) - 1} more' * (len(rest) > 1))
+        owners = {place: owner for owner, way in self._ways.items() for place in way}
+        others = np.array([place for place in owners if place != index], np.int64)
+        if len(others):
+            gaps = np.linalg.norm(self._points[others] - here, axis=1)
+            best = int(np.argmax(prizes[others] / np.maximum(gaps, 1e-9)))
+            other, gap = int(others[best]), gaps[best]
+            when = 'later' if owners[other] == name else f'left to {owners[other]}'
+            reason += f'; the alternative {told(other)}, {gain(other)}, {gap:.3g} m away, is {when}'
+        return reason
+
+    def _rest(self, view: RobotView, start: FloatArray, way: list[int]) -> FloatArray:
+        """Return a tour after a waypoint as it will be flown, around what is in the way, (n, 3)."""
+        corners: list[tuple[float, float, float]] = []
+        here, keep_out = start, view.motion.keep_out
+        for index in way[:MOST_DRAWN]:
+            place = np.array(start)
+            place[: self._points.shape[1]] = self._points[index]
+            moved = keep_out.moved_out(here, place)
+            if moved is not None:
+                corners += keep_out.route(here, moved)
+                here = moved
+        return np.array(corners).reshape(-1, 3)
 
     def _straight(self, here: FloatArray, index: int, following: int) -> bool:
         """Return whether a place lies on the straight way to another one."""

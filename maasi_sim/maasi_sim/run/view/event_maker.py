@@ -20,7 +20,7 @@ MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
 _ACTIVITIES = ('searching', 'returning', 'recharging')  # of a `CuboidDecision`
 _SILENCE = 3.0  # a robot is silent when others say where they are for so long without it [s]
 _MOST_POINTS = 40  # points of a planned way that are shown
-_MOST_PLACES = 200  # of a tour
+_MOST_PLACES = 400  # of a tour
 
 
 def padded(values: ArrayLike) -> FloatArray:

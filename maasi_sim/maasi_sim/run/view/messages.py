@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import math
+import re
 from collections import defaultdict, deque
 from collections.abc import Callable
 from pathlib import Path
@@ -258,7 +259,7 @@ class MessageEvents:
         self.maker.zones(self._time(message), [*zones, *zones_as('keep_out', shapes)])
 
     def _take_plan(self, topic: str, message: Any) -> None:
-        robots = {}
+        robots, reasons = {}, _reasons(message)
         for item in message.robots:
             columns = {
                 name: np.array([getattr(row, field) for row in item.candidates])
@@ -270,7 +271,14 @@ class MessageEvents:
             # Recordings of earlier versions have no tours.
             tour = np.array([point(place) for place in getattr(item, 'tour', ())]).reshape(-1, 3)
             robots[item.robot] = RobotDecision(
-                int(item.chosen), waypoint, way, way[:, 0], places, **columns, reason='', tour=tour
+                int(item.chosen),
+                waypoint,
+                way,
+                way[:, 0],
+                places,
+                **columns,
+                reason=reasons.get(item.robot, ''),
+                tour=tour,
             )
         indices = {item.robot: int(item.decision) for item in message.robots}
         decision = Decision(message.step, robots, message.objective, reason=message.reason)
@@ -359,6 +367,13 @@ class MessageEvents:
     def _take_end(self, _: str, message: Any) -> None:
         reason, _, text = message.data.partition('\n')
         self.maker.end(reason, text)
+
+
+def _reasons(message: Any) -> dict[str, str]:
+    """Return the reasons of a decision by robot, as `decision_to_ros` joins them."""
+    names = '|'.join(re.escape(item.robot) for item in message.robots)
+    parts = re.split(rf'(?:^|; )({names}): ', message.reason)[1:] if names else []
+    return dict(zip(parts[::2], parts[1::2]))
 
 
 def _space(topic: str) -> str:

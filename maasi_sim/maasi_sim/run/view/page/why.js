@@ -24,7 +24,8 @@ function units(log) {
 export function reasonOf(decision) {
   const { robot, event } = decision;
   const [, , chosen, , candidates, own] = robot;
-  const given = own || event[6];
+  // The planner's words on all robots, where it has none on this one.
+  const given = own || (event[7].length > 1 ? '' : event[6]);
   // The planner's own words have its own digits.
   if (given) return given.replace(/\d*\.\d+(e[-+]?\d+)?/g, (digits) => number(Number(digits)));
   if (chosen < 0) return 'stays: no candidate is worth going to';
@@ -110,6 +111,8 @@ function showCandidates(parent, log, decision, marked, onMark, isOpen) {
     element('p', 'reason', reasonOf(decision)),
     element('p', 'quiet', `${name}, decision ${index} at ${decision.time.toFixed(2)} s: ${chosen < 0 ? 'stays at' : 'goes to'} (${place}) m`),
   );
+  // Of a single one all is told.
+  if (candidates.length < 2) return;
   const fold = element('details', '');
   fold.open = isOpen;
   fold.append(element('summary', '', `All ${candidates.length} candidates in numbers`));

@@ -1,0 +1,91 @@
+"""What the planner `tour` says of its decisions: reasons, and the rest of tours as it is flown."""
+
+import re
+
+import numpy as np
+import pytest
+import shapely
+from std_msgs.msg import Header
+
+from maasi_filter.area import Area
+from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap
+from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
+from maasi_planner.conversions import decision_to_ros
+from maasi_planner.planners.base import check_decision
+from maasi_sim.run.view.event_maker import EventMaker
+from maasi_sim.run.view.messages import MessageEvents
+
+CLEAR = 0.2  # radius of the robots [m]
+
+
+def random_search(seed):
+    """Return a team of two robots in an area with keep-outs of random places and sizes."""
+    rng = np.random.default_rng(seed)
+    zones = []
+    for x, y in rng.uniform(6.0, 18.0, (3, 2)):
+        dx, dy = rng.uniform(1.5, 6.0, 2)
+        zones.append({'polygon': [[x, y], [x + dx, y], [x + dx, y + dy], [x, y + dy]]})
+    bounds = [[0.0, 26.0]] * 2
+    given = {'bounds': bounds, 'keep_outs': zones, 'expected_targets': float(rng.uniform(2, 9))}
+    area = Area(EnvironmentSettings.model_validate(given))
+    sensor = Sensor.ranging(
+        'robot', BoxDetection([-1.5, -1.5], [1.5, 1.5], 0.8, 'world'), 0.01 * np.eye(2)
+    )
+    robots = {
+        name: RobotView(
+            state=RobotState.at_rest(start),
+            candidates=np.zeros((0, 3)),
+            motion=make_motion(MotionSettings(speed=1.0, clearance=0.4), area, CLEAR),
+            sensor=sensor,
+            period_steps=5,
+            radius=CLEAR,
+            arrival_radius=0.0,
+        )
+        for name, start in (('east', (25.0, 1.0, 0.0)), ('west', (1.0, 1.0, 0.0)))
+    }
+    clusters = [Cluster(np.array([4.2, 20.3]), 0.01 * np.eye(2), 0.1, 0.7)] if seed % 2 else []
+    return TeamView(0, 0.1, robots, clusters, UnexploredMap(area, 0.5)), area
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_the_rest_of_a_tour_leads_around_keep_outs(seed):
+    team, area = random_search(seed)
+    planner = make_planner('tour')
+    decision = planner.decide(team)
+    check_decision(planner, team, decision)
+    closed = shapely.union_all(area.shapes['keep_out']).buffer(CLEAR)
+    bent = 0
+    for name, robot in decision.robots.items():
+        drawn = shapely.LineString(np.vstack([robot.waypoint, robot.tour])[:, :2])
+        assert drawn.intersection(closed).length < 1e-6
+        bent += len(robot.tour) > len(planner._ways[name])
+    assert bent
+
+
+@pytest.mark.parametrize('name', ['tour', 'auto'])
+@pytest.mark.parametrize('seed', range(6))
+def test_each_waypoint_has_a_reason_with_numbers_also_in_nodes(name, seed):
+    team, _ = random_search(seed)
+    planner = make_planner(name)
+    decision = planner.decide(team)
+    events = []
+    made = decision_to_ros(decision, dict.fromkeys(decision.robots, 0), name, 0, 0.0, Header())
+    MessageEvents(EventMaker({'robots': {}}, events.append)).take(
+        '/decisions', 'maasi_msgs/msg/PlanDecision', made
+    )
+    (plan,) = [event for event in events if event[1] == 'plan']
+    told = {row[0]: row[5] for row in plan[7]}
+    assert told == {robot: item.reason for robot, item in decision.robots.items()}
+    tour = planner if name == 'tour' else planner._chosen
+    for robot, item in decision.robots.items():
+        text = told[robot]
+        place = re.match(r'next on its tour is \((.*?), (.*?)\) m, where it expects ', text)
+        # Straight runs are one leg, whose end may be moved out of a zone.
+        assert np.linalg.norm([float(word) for word in place.groups()] - item.waypoint[:2]) < 3.0
+        first = tour._points[tour._ways[robot][0]]
+        assert f'; then ({first[0]:.4g}, {first[1]:.4g}) m' in text
+        assert re.search(r'; the alternative \(.*\) m, .* m away, is (later|left to \w+)$', text)
