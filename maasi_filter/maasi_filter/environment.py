@@ -111,6 +111,30 @@ class PriorSettings(Settings):
         return value if value is None else _ascending(value)
 
 
+class BackgroundSettings(Settings):
+    """A picture that is shown under the map; nothing is planned or filtered with it."""
+
+    file: str | None = Field(
+        None, description='GeoTIFF, or an image with a world file or an extent; none: no picture'
+    )
+    extent: list[Vector2] | None = Field(
+        None,
+        min_length=2,
+        max_length=2,
+        description='Lower and upper bound of an image on x and y; none: by its file [m, map]',
+    )
+
+    @model_validator(mode='before')
+    @classmethod
+    def _from_text(cls, value: Any) -> Any:
+        return {'file': value} if isinstance(value, str) else value
+
+    @field_validator('extent')
+    @classmethod
+    def _ordered(cls, value: list[list[float]] | None) -> list[list[float]] | None:
+        return value if value is None else _ascending(value)
+
+
 class EnvironmentSettings(Settings):
     """Where the targets are, and where robots may go: `bounds`, or an `area` with its altitudes."""
 
@@ -140,6 +164,10 @@ class EnvironmentSettings(Settings):
     )
     origin: OriginSettings | None = Field(
         None, description='Of the map on the earth; with GeoJSON, none: amid its area'
+    )
+
+    background: BackgroundSettings = Field(
+        default_factory=BackgroundSettings, description='Picture under the map'
     )
 
     @model_validator(mode='before')

@@ -16,6 +16,7 @@ from maasi_filter.plugins import unknown
 from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_parts
 from maasi_planner.planners.auto import SQUARES
 from maasi_planner.settings import CandidateSettings
+from maasi_sim.scenario.background import background_problems
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.charger_checks import charger_problems, endurance_doubts
 from maasi_sim.scenario.free_space import FreeSpace
@@ -127,6 +128,7 @@ def _room_problems(robot: RobotSettings, area: Area) -> Problems:
 def problems_of_file(scenario: Scenario) -> Problems:
     """Yield problems between keys; robots that a program makes may start at one point."""
     yield from problems_of(scenario)
+    yield from background_problems(scenario.environment)
     for (first, one), (name, robot) in combinations(scenario.robots.items(), 2):
         gap, bodies = math.dist(one.start, robot.start), one.radius + robot.radius
         if gap < bodies:

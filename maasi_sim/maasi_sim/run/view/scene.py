@@ -19,6 +19,7 @@ from maasi_sim.run.buildings.scenario import NAME as BUILDINGS
 from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.run.targets.tally import scoring_radius
 from maasi_sim.run.view.event_log import Scene
+from maasi_sim.scenario.background import background_of
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
@@ -38,6 +39,7 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
         'planner': scenario.planner.name,
         'step': scenario.step,
         'bounds': rounded(scenario.environment.array()),
+        **_background(scenario),
     }
     if isinstance(scenario, CuboidScenario):
         return scene | _buildings(scenario)
@@ -64,6 +66,15 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
             'scoring_order': scenario.scoring.order,
         }
     )
+
+
+def _background(scenario: BaseScenario) -> Scene:
+    """Return the picture under the map; of a recording its file may be missing."""
+    try:
+        picture = background_of(scenario.environment)
+    except ValueError as error:
+        return {'missing': f'no background: {error}'}
+    return {} if picture is None else {'background': [*picture]}
 
 
 def _prior(scenario: Scenario) -> Scene:

@@ -10,7 +10,7 @@ const HEAT = 'linear-gradient(90deg, rgba(var(--heat-low), .25), rgba(var(--heat
 // Return the entries: class of the mark, its colour, text, and what else is in the mark.
 function entries(log, time, selected, { layers, unexplored }) {
   const isEmpty = !(log.potential.at(time) >= 0.005);
-  const mostLeft = log.knowsExpected && unexplored.most ? `0 to ${unexplored.amount(unexplored.most)}` : 'from least to most likely';
+  const mostLeft = log.knowsExpected && unexplored.most ? `0 to ${unexplored.amount(unexplored.most)} (shade: square root)` : 'from least to most likely';
   const robots = Object.values(log.scene.robots);
   const hasZone = (kind) => log.zones(time).some((zone) => zone.kind === kind);
   const hasTour = log.robots().some((name) => ((log.at('decision', name, time) || {}).robot || [])[6]?.length);

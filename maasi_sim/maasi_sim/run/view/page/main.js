@@ -34,7 +34,7 @@ class Page {
     this.marked = null;
     this.drawn = 0;
     this.camera = new Camera();
-    this.map = new MapView($('map'), this.camera);
+    this.map = new MapView($('map'), this.camera, () => this.request());
     this.curve = new Curve($('curve'));
     this.drawing = new Drawing($('tools'), $('drawing'), this);
     this.fitted = false;
@@ -100,12 +100,13 @@ class Page {
     const { seed, planner } = log.scene;
     if (!this.isLive) {
       const facts = [seed === undefined ? '' : `seed ${seed}`, planner ? `planner ${planner}` : ''];
-      facts.push(`replay, ${log.size} events`, log.scene.thinned ? `thinned to ${log.scene.thinned} s` : '');
+      facts.push(log.scene.missing || '', `replay, ${log.size} events`, log.scene.thinned ? `thinned to ${log.scene.thinned} s` : '');
       $('source').textContent = facts.filter(Boolean).join(', ');
     }
     if (log.scene.control && !$('controls').childElementCount) showControls($('controls'), () => this.selected);
     for (const button of $('layers').querySelectorAll('[data-layer]')) {
-      button.hidden = log.isOfBuildings && button.dataset.layer !== 'ways';
+      const { layer } = button.dataset;
+      button.hidden = layer === 'background' ? !log.scene.background : log.isOfBuildings && layer !== 'ways';
     }
     $('tools').hidden = log.isOfBuildings;
     $('curve_title').textContent = log.isOfBuildings ? 'Cuboids visited' : `Found and ${log.knowsExpected ? 'expected' : 'potential'}`;
@@ -116,7 +117,7 @@ class Page {
   }
 
   addLayers() {
-    const layers = [['truth', 'Truth'], ['unseen', 'Searched'], ['left', 'Where targets may still be'], ['belief', 'Belief'], ['view', 'Field of view'], ['ways', 'Ways'], ['clusters', 'Potential'], ['detections', 'Detections']];
+    const layers = [['background', 'Background'], ['truth', 'Truth'], ['unseen', 'Searched'], ['left', 'Where targets may still be'], ['belief', 'Belief'], ['view', 'Field of view'], ['ways', 'Ways'], ['clusters', 'Potential'], ['detections', 'Detections']];
     for (const [name, title] of layers) {
       const button = element('button', '', title);
       button.dataset.layer = name;

@@ -3,6 +3,7 @@
 import { Belief } from './belief.js';
 import { FOUND, KEEP_OUT, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colours.js';
 import { Labels } from './labels.js';
+import { Background, drawNorth, drawScale } from './map_frame.js';
 import { drawRobot, drawWays } from './robots.js';
 import { LEFT } from './run_log.js';
 import { circle, cross, dropLine, ellipse, matrix, path, trace } from './shapes.js';
@@ -16,16 +17,17 @@ const FADE = 1.5;
 const PULSE_REACH = 40;
 
 export class MapView {
-  constructor(canvas, camera) {
+  constructor(canvas, camera, onReady) {
     this.canvas = canvas;
     this.context = canvas.getContext('2d');
     this.camera = camera;
-    this.layers = { truth: true, unseen: true, left: false, belief: false, view: true, ways: true, clusters: true, detections: true };
+    this.layers = { background: true, truth: true, unseen: true, left: false, belief: false, view: true, ways: true, clusters: true, detections: true };
     this.marked = null;
     // How long a ring runs out from what was found [s of the run].
     this.pulse = 0;
     this.unexplored = new Unexplored();
     this.belief = new Belief();
+    this.background = new Background(onReady);
     // Where robots and candidates were drawn, for clicks.
     this.targets = [];
   }
@@ -53,8 +55,8 @@ export class MapView {
     context.fillRect(0, 0, camera.width, camera.height);
     this.drawGround(log);
     this.unexplored.update(log, time);
-    if (this.layers.left) this.unexplored.drawLeft(this);
     if (this.layers.unseen) this.unexplored.draw(this);
+    if (this.layers.left) this.unexplored.drawLeft(this);
     if (this.layers.belief && !log.isOfBuildings) this.belief.draw(this, log, time);
     this.drawZones(log, time);
     this.drawObstacles(log);
@@ -67,6 +69,8 @@ export class MapView {
     if (this.layers.truth) this.drawTruth(log, time);
     if (selected) this.drawCandidates(log, time, selected);
     for (const name of this.names) drawRobot(this, log, time, name, name === selected);
+    drawNorth(this, log.bounds);
+    drawScale(this, this.gridStep);
     this.labels.draw(context, camera.width, camera.height);
   }
 
@@ -80,6 +84,7 @@ export class MapView {
     path(context, camera, corners.map(([x, y]) => [x, y, this.floor]), true);
     context.fill();
     context.stroke();
+    if (this.layers.background) this.background.draw(this, log.scene);
     const step = niceStep(Math.max(right - left, high - low) / 8);
     context.globalAlpha = 0.5;
     for (let x = Math.ceil(left / step) * step; x <= right; x += step) {
@@ -100,11 +105,7 @@ export class MapView {
       path(context, camera, corners.map(([x, y]) => [x, y, top]), true);
       context.stroke();
     }
-    context.fillStyle = themed('--quiet');
-    context.font = '11px system-ui, sans-serif';
-    context.textAlign = 'right';
-    context.fillText(`grid ${Number(step.toPrecision(2))} m`, camera.width - 10, camera.height - 6);
-    context.textAlign = 'left';
+    this.gridStep = step;
   }
 
   // The border of the area, keep-outs and solid polygons.

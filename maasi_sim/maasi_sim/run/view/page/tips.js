@@ -49,12 +49,16 @@ export function tipAt(view, log, time, selected, x, y) {
   const text = hit && tell(log, time, selected, hit);
   if (text) return text;
   const cell = view.unexplored.pick(view, x, y);
-  if (!cell) return '';
-  const belief = view.layers.belief && !log.isOfBuildings ? `, ${view.belief.words(cell.place)}` : '';
+  // Of a search in space only cells have a place; else the floor has one everywhere.
+  if (!cell && (log.isSpatial || log.isOfBuildings)) return '';
   const { scene: { origin }, knowsExpected } = log;
+  const place = cell ? cell.place : view.camera.ground(x, y, view.floor);
+  const earth = origin ? `, latitude ${onEarth(place, origin).reverse().map((angle) => angle.toFixed(6)).join(', longitude ')}` : '';
+  const where = `${at(place, 3)}${earth}`;
+  if (!cell) return view.unexplored.cells ? `no target is expected here, ${where}` : where;
+  const belief = view.layers.belief ? `, ${view.belief.words(place)}` : '';
   const left = knowsExpected ? `still ${view.unexplored.amount(cell.left)}` : `${Math.round((100 * cell.left) / view.unexplored.most)} % of the targets of unsearched ground`;
-  const earth = origin ? `, ${onEarth(cell.place, origin).reverse().map((angle) => angle.toFixed(6)).join(', ')}` : '';
-  return `searched ${Math.round(100 - 100 * cell.share)} %, ${left}, ${at(cell.place, 3)}${earth}${belief}`;
+  return `searched ${Math.round(100 - 100 * cell.share)} %, ${left}, ${where}${belief}`;
 }
 
 // Show a text beside a point of its parent; none hides it.

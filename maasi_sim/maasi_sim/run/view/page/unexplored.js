@@ -176,7 +176,7 @@ export class Unexplored {
     }
     if (this.leftOf !== values) {
       this.leftOf = values;
-      this.leftLevels = Uint8Array.from(this.before, (before, index) => Math.round((LEFT_SHADES * before * this.mean(Math.floor(index / ny), index % ny)) / this.most));
+      this.leftLevels = Uint8Array.from(this.before, (before, index) => Math.round(LEFT_SHADES * Math.sqrt((before * this.mean(Math.floor(index / ny), index % ny)) / this.most)));
     }
     this.leftFloor.draw(view, this.cells, this.leftLevels, this.leftColours);
   }
