@@ -162,7 +162,7 @@ def test_pictures_of_the_cameras_have_circles_around_the_markers(run, tmp_path):
     assert {event[2] for event in pictures} == {'mambo', 'turtlebot'}
     assert all(re.match(r'Camera of \w+ at .* s, \d+ detections?$', text) for text in run.pictures)
     whole = [event for event in pictures if event[5]]
-    for *_, data, size, marks in whole:
+    for *_, data, size, marks, _ in whole:
         image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
         assert image.shape[1::-1] == tuple(size)
         blueness = image.astype(int) @ (2, -1, -1)

@@ -11,11 +11,13 @@ import cv2
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.environment import EnvironmentSettings, check_pixels
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.geodesy import geodetic
 
 # Longest side of what is shown [px], its quality, and the margin around the bounds.
 _SIZE, _QUALITY, _MARGIN = 1100, 70, 0.06
+# Pixels of an image, 400 MB while it is read; and of the longer side of a GeoTIFF that is read.
+_MOST_PIXELS, _LARGEST = 100_000_000, 4000
 _LATTICE = 33  # points along an axis at which coordinates are exact
 _NEEDS = (
     'allowed are a GeoTIFF, an image with a world file (.pgw, .jgw, .wld), or '
@@ -115,6 +117,14 @@ def _between(shares: FloatArray) -> FloatArray:
     return np.stack([np.interp(shares, points, row) for row in np.eye(_LATTICE)], axis=1)
 
 
+def _check_size(rows: int, columns: int) -> None:
+    if rows * columns > _MOST_PIXELS:
+        raise ValueError(
+            f'got {columns} x {rows} pixels, allowed are at most {_MOST_PIXELS} in all: '
+            'scale it down'
+        )
+
+
 def _of_image(path: str, environment: EnvironmentSettings) -> _Picture:
     from PIL import Image
 
@@ -122,7 +132,7 @@ def _of_image(path: str, environment: EnvironmentSettings) -> _Picture:
         # Sizes are checked here.
         warnings.simplefilter('ignore', Image.DecompressionBombWarning)
         with Image.open(path) as image:
-            check_pixels((image.height, image.width))
+            _check_size(image.height, image.width)
             pixels = np.array(image.convert('RGBA'))
     extent, world = environment.background.extent, _world_file(path)
     rows, columns = pixels.shape[:2]
@@ -185,15 +195,18 @@ def _of_geotiff(path: str, environment: EnvironmentSettings) -> _Picture:
     with file:
         if file.crs is None:
             return _of_image(path, environment)
-        check_pixels(file.shape)
         crs, grid = file.crs, np.array(~file.transform).reshape(3, 3)[:2]
-        bands = file.read(masked=False).astype(float)
-        opaque = file.dataset_mask()
+        # Of a large one every so many pixels.
+        size = tuple(-(-number // (1 + max(file.shape) // _LARGEST)) for number in file.shape)
+        grid = np.diag(np.divide(size[::-1], file.shape[::-1])) @ grid
+        chosen = list(range(1, min(file.count, 3) + 1))
+        bands = file.read(chosen, out_shape=(len(chosen), *size)).astype(float)
+        opaque = file.dataset_mask(out_shape=size)
         if file.colorinterp[0] == ColorInterp.palette:
             table = np.zeros((256, 4))
             for index, colour in file.colormap(1).items():
                 table[min(index, 255)] = colour
-            bands, opaque = np.moveaxis(table[bands[0].astype(int)], -1, 0)[:3], opaque
+            bands = np.moveaxis(table[bands[0].astype(int)], -1, 0)[:3]
     if bands.shape[0] < 3:
         bands = np.repeat(bands[:1], 3, axis=0)
     if bands.max(initial=0.0) > 255.0 or bands.min(initial=0.0) < 0.0:

@@ -21,8 +21,9 @@ from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.run.topics import time_at
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, EventLog, Scene, shades
 from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.messages import IMAGES, MARKERS, MessageEvents
+from maasi_sim.run.view.messages import MARKERS, MessageEvents
 from maasi_sim.run.view.page_file import open_browser
+from maasi_sim.run.view.pictures import IMAGES
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.server import Commander, Hub, ViewServer
 from maasi_sim.scenario.schema import Scenario

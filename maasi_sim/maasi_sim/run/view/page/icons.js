@@ -1,6 +1,6 @@
 // Drawn icons: fonts would show some of them as emoji, or not at all.
 
-const SVG = 'http://www.w3.org/2000/svg';
+export const SVG = 'http://www.w3.org/2000/svg';
 // Outlines in a square of 16 by 16; those of a line have no inside.
 const OUTLINES = {
   play: 'M4 2 L14 8 L4 14 Z',

@@ -1,6 +1,7 @@
 // What the cameras saw when their robots last measured, with the detections in it.
 
 import { SEEN, robotColour } from './colours.js';
+import { SVG } from './icons.js';
 import { element } from './text.js';
 
 // A circle around a detection in an image.
@@ -12,6 +13,20 @@ function detectionMark([width, height], [column, row, radius]) {
   mark.style.width = `${(200 * half) / width}%`;
   mark.style.borderColor = SEEN;
   return mark;
+}
+
+// What the sensor counts is outlined; the rest is dim.
+function outlineOf([width, height], corners) {
+  if (!corners.length) return [];
+  const ring = `M${corners.map((corner) => corner.join(' ')).join(' L')} Z`;
+  const [drawn, rest, edge] = ['svg', 'path', 'path'].map((name) => document.createElementNS(SVG, name));
+  drawn.setAttribute('viewBox', `0 0 ${width} ${height}`);
+  rest.setAttribute('d', `M0 0 H${width} V${height} H0 Z ${ring}`);
+  rest.setAttribute('class', 'rest');
+  edge.setAttribute('d', ring);
+  edge.setAttribute('class', 'edge');
+  drawn.append(rest, edge);
+  return [drawn];
 }
 
 function pictureFrame(log, name) {
@@ -28,6 +43,7 @@ function pictureFrame(log, name) {
 export function showPictures(section, log, time, onSelect) {
   const names = log.owners('picture');
   section.hidden = names.length === 0;
+  section.querySelector('p').hidden = !names.some((name) => (log.at('picture', name, time) || [])[6]?.length);
   const list = section.querySelector('div');
   const key = `${log.scene.name} ${names} ${document.documentElement.dataset.theme}`;
   if (list.dataset.key !== key) {
@@ -52,10 +68,10 @@ function fillPicture(figure, event, time) {
   const frame = figure.querySelector('.image');
   frame.replaceChildren();
   if (!event) return;
-  const [when, , robot, data, size] = event;
+  const [when, , robot, data, size, , outline = []] = event;
   const image = element('img');
   [image.width, image.height] = size;
   image.src = `data:image/jpeg;base64,${data}`;
   image.alt = `Camera of ${robot} at ${when.toFixed(1)} s${count}`;
-  frame.append(image, ...(marks || []).map((mark) => detectionMark(size, mark)));
+  frame.append(image, ...outlineOf(size, outline), ...(marks || []).map((mark) => detectionMark(size, mark)));
 }

@@ -1,0 +1,126 @@
+"""What cameras saw as their robots measured: small pictures of the part that counts."""
+
+import base64
+from collections import defaultdict, deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from maasi_filter.arrays import FloatArray
+from maasi_filter.models.pose import Pose
+from maasi_sim.run.bag import COMPRESSED_TYPE, IMAGE_TYPE
+
+if TYPE_CHECKING:
+    from maasi_drivers.vision.camera_model import Camera
+
+# Types of images, and the last parts of their topics' names.
+IMAGES = {IMAGE_TYPE: 'camera/image_raw', COMPRESSED_TYPE: 'camera/image_raw/compressed'}
+# Largest width [px], quality as JPEG, and time from one of a robot to the next [s].
+_WIDTH, _QUALITY, _PERIOD = 240, 60, 0.5
+_KEPT = 16  # images of a camera that are kept until the detections in them come
+# Points along an axis of a sensor's box, and the part of its size that is shown around it.
+_POINTS, _AROUND = 25, 0.06
+
+
+class Pictures:
+    """Keeps the last images of cameras, of which most are never decoded."""
+
+    def __init__(self) -> None:
+        # By namespace of the robot: stamps, and what reads the images.
+        self._images: dict[str, deque[Any]] = defaultdict(lambda: deque(maxlen=_KEPT))
+        self._last: dict[str, float] = {}
+
+    def keep(self, topic: str, stamp: float, read: Callable[[], Any]) -> None:
+        """Keep an image with a stamp [s]; `read` returns its message."""
+        self._images[topic.partition('/camera/')[0]].append((stamp, read))
+
+    def at(self, space: str, stamp: float) -> Any:
+        """Return the message of a robot's image with a stamp [s], if a picture is due, or None."""
+        # A copy: another thread may keep images meanwhile.
+        images = dict(self._images[space].copy())
+        if stamp not in images or abs(stamp - self._last.get(space, -_PERIOD)) < _PERIOD:
+            return None
+        self._last[space] = stamp
+        return images[stamp]()
+
+
+def picture(message: Any, robot: dict[str, Any], pose: Pose, values: ArrayLike) -> list[Any]:
+    """Return the part of an image that counts, as JPEG in base64, and what is in it.
+
+    Its size [px], detections in it (column, row, radius), and the corners of what the sensor sees,
+    the box of its model on the floor; none where all of the image counts. The robot is one of a
+    scene: without its camera, the positions of the detections are not known. Values are range,
+    bearing and elevation of detections, which are on the floor.
+    """
+    # Deferred: they take long to import, and most runs show no picture.
+    import cv2
+
+    from maasi_drivers.settings.camera import CameraSettings
+    from maasi_drivers.vision.camera_model import Camera
+    from maasi_drivers.vision.images import decode_image, image_to_array
+
+    image = image_to_array(message) if hasattr(message, 'encoding') else decode_image(message)
+    camera, corner = robot.get('camera'), np.zeros(2)
+    marks: FloatArray | None = None
+    outline = np.zeros((0, 2))
+    if camera is not None:
+        model = Camera.from_settings(CameraSettings(**camera))
+        marks = _marks(model, 0.5 * camera['marker_diameter'], pose, values)
+        outline = _outline(model, robot.get('view') or {}, pose, image.shape)
+    if len(outline):
+        size = np.ptp(outline, axis=0)
+        limits = np.array(image.shape[1::-1])
+        corner = np.clip(np.floor(outline.min(axis=0) - _AROUND * size), 0, limits - 1)
+        end = np.clip(np.ceil(outline.max(axis=0) + _AROUND * size), corner + 1, limits)
+        (left, top), (right, bottom) = corner.astype(int), end.astype(int)
+        image = image[top:bottom, left:right]
+    height, width = image.shape[:2]
+    shown = min(width, _WIDTH), max(1, round(height * min(1.0, _WIDTH / width)))
+    small = cv2.resize(image[:, :, ::-1], shown, interpolation=cv2.INTER_AREA)
+    data = cv2.imencode('.jpg', small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    rows = None if marks is None else (marks - [*corner, 0.0]).round(1).tolist()
+    text = base64.b64encode(data).decode()
+    return [text, [width, height], rows, (outline - corner).round(1).tolist()]
+
+
+def _marks(model: 'Camera', radius: float, pose: Pose, values: ArrayLike) -> FloatArray:
+    """Return column, row and radius [px] of detections on the floor that are in front."""
+    reach, bearing, elevation = np.reshape(np.asarray(values, dtype=float), (-1, 3)).T
+    level, (x, y, _) = reach * np.cos(elevation), pose.position
+    floor = x + level * np.cos(bearing), y + level * np.sin(bearing), 0.0 * level
+    positions = np.stack(floor, 1)
+    pixels = model.project(positions, pose)
+    edge = model.project(positions + np.array([radius, 0.0, 0.0]), pose)
+    rows = np.column_stack([pixels, np.linalg.norm(edge - pixels, axis=1)])
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
+
+
+def _outline(
+    model: 'Camera', view: dict[str, Any], pose: Pose, shape: tuple[int, ...]
+) -> FloatArray:
+    """Return the corners of a sensor's box on the floor in an image, (n, 2) [px]; none: all."""
+    if view.get('kind') != 'box':
+        return np.zeros((0, 2))
+    import cv2
+
+    x, y = (np.linspace(low, high, _POINTS) for low, high in zip(view['lower'][:2], view['upper']))
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    if view['turns']:
+        cosine, sine = np.cos(pose.yaw), np.sin(pose.yaw)
+        grid = grid @ np.array([[cosine, sine], [-sine, cosine]])
+    floor = np.column_stack([grid + pose.position[:2], np.zeros(len(grid))])
+    pixels = model.project(floor, pose)
+    height, width = shape[:2]
+    # What is far outside tells nothing of the part that is seen.
+    near = (np.abs(pixels - (width / 2, height / 2)) < (width, height)).all(axis=1)
+    if near.sum() < 3:
+        return np.zeros((0, 2))
+    hull = cv2.convexHull(pixels[near].astype(np.float32)).reshape(-1, 2)
+    image = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    # Pixel centres are at whole numbers.
+    area, common = cv2.intersectConvexConvex(hull + 0.5, image)
+    if common is None or area < 4.0 or area > 0.98 * width * height:
+        return np.zeros((0, 2))
+    return np.asarray(common.reshape(-1, 2), dtype=float)
