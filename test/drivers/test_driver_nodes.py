@@ -312,13 +312,24 @@ def test_images_that_cannot_be_used_are_counted_and_the_next_good_one_answers(pl
     info.k = [240.0, 0.0, 159.5, 0.0, 240.0, 119.5, 0.0, 0.0, 1.0]
     team.until(team.calibrations.get_subscription_count)
     team.calibrations.publish(info)
-    team.until(lambda: driver.dropped['calibration'] == 1)
+    # One that cannot be used is a fault, and nothing is measured by another one meanwhile.
+    reason = "camera/camera_info: distortion_model: got 'fisheye', allowed plumb_bob or"
+    team.until(lambda: reason in driver.health.text)
+    team.move()
+    assert (state := team.states[-1]).goal_status == AgentState.UNAVAILABLE
+    assert reason in state.reason
+    before = driver.dropped['image']
+    team.images.publish(image_message(good, team.step * NANOSECONDS))
+    team.ask(team.step * NANOSECONDS)
+    team.until(lambda: driver.dropped['image'] > before)
     assert driver.sensor_input.camera.width == 160
     info.distortion_model = 'plumb_bob'
     # One without a focal length is none.
-    for message in (info, CameraInfo(width=640, height=480)):
+    for message in (CameraInfo(width=640, height=480), info):
         team.calibrations.publish(message)
     team.until(lambda: driver.sensor_input.camera.width == 320)
+    assert not driver.health.text
+    assert 'k is zero' in capfd.readouterr().err
     assert driver.sensor_input.camera.mount == team.settings.camera.mount
 
 

@@ -47,6 +47,65 @@ def test_back_projection_inverts_projection(seed, x, y):
     assert_allclose(view.project([[*position[0], 0.02]], pose), [[x, y]], atol=1e-7)
 
 
+def random_lens(generator):
+    """Return a random lens of each model, some of them strong."""
+    spread = generator.choice([0.01, 0.1, 0.3])
+    model = str(generator.choice(['plumb_bob', 'rational_polynomial', 'equidistant']))
+    k = generator.normal(0.0, spread, 14)
+    if model == 'equidistant':
+        k[1:4] *= 0.1
+    else:
+        k[2:4] *= 0.02  # a lens that is not quite in the middle
+        k[8:] *= 0.01
+    number = generator.choice({'plumb_bob': [4, 5], 'equidistant': [4]}.get(model, [8, 12, 14]))
+    focal = generator.uniform(80.0, 500.0, 2).tolist()
+    return {'distortion': k[:number].tolist(), 'distortion_model': model, 'focal_length': focal}
+
+
+@pytest.mark.parametrize('seed', range(60))
+def test_every_lens_model_is_inverted_where_it_holds(seed):
+    generator = np.random.default_rng([46, seed])
+    view = camera(**random_lens(generator))
+    edge = min(0.97 * view.largest_radius, 6.0 if view.model == 'equidistant' else 1.0)
+    radii, turns = generator.uniform(0.0, edge, 300), generator.uniform(0.0, 2 * np.pi, 300)
+    points = radii[:, None] * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    pixels, slopes = view._distorted(points)
+    assert np.isfinite(pixels).all()
+    # Off-centre terms may fold the image near the end of the radial model.
+    single = np.linalg.det(slopes) > 1e-3 * np.abs(slopes).max(axis=(1, 2)) ** 2
+    rays, jacobians = view.undistort(pixels)
+    assert_allclose(rays[single], points[single], atol=1e-6)
+    assert_allclose(
+        jacobians[single] @ slopes[single], np.tile(np.eye(2), (single.sum(), 1, 1)), atol=1e-5
+    )
+    # Any pixel has a ray that leads back to it, or none at all.
+    anywhere = generator.uniform(-100.0, 260.0, (300, 2))
+    rays, _ = view.undistort(anywhere)
+    known = np.isfinite(rays).all(axis=1)
+    assert_allclose(view._distorted(rays[known])[0], anywhere[known], atol=1e-6)
+    assert (np.hypot(*rays[known].T) < view.largest_radius).all()
+
+
+def test_the_lens_models_are_those_of_the_field():
+    """By the formulas of OpenCV's documents, for a ray that is well off the axis."""
+    k, (x, y) = [0.3, -0.2, 0.01, -0.02, 0.05, 0.25, -0.1, 0.02], (0.4, -0.3)
+    r2 = x * x + y * y
+    ratio = np.polyval([k[4], k[1], k[0], 1.0], r2) / np.polyval([k[7], k[6], k[5], 1.0], r2)
+    rational = [
+        x * ratio + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x),
+        y * ratio + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y,
+    ]
+    angle = np.arctan(np.sqrt(r2))
+    wide = angle * np.polyval([*k[3::-1], 1.0], angle**2) / np.sqrt(r2)
+    for model, number, expected in (
+        ('rational_polynomial', 8, rational),
+        ('equidistant', 4, [x * wide, y * wide]),
+    ):
+        view = camera(distortion=k[:number], distortion_model=model)
+        pixels = np.array([79.5, 59.5]) + 260.0 * np.array(expected)
+        assert_allclose(view._distorted(np.array([[x, y]]))[0][0], pixels, atol=1e-9)
+
+
 def test_the_image_reaches_half_a_pixel_beyond_the_outermost_centres():
     view = camera()
     corners = [[0.0, 0.0], [159.0, 119.0], [159.5, 60.0], [80.0, -1.5]]

@@ -16,6 +16,7 @@ from maasi_sim.simulation.world import TargetSettings, World, noise_stream
 
 IDEAL = ideal()
 DOWN = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
+_RATIONAL = 'rational_polynomial'
 MARKER = [0.08, 0.17, 0.62]
 
 
@@ -45,6 +46,8 @@ def centroid(image):
     [
         {},
         {'distortion': [-0.25, 0.08, 0.003, -0.002, 0.0]},
+        {'distortion': [0.4, -0.3, 0, 0, 0.1, 0.2, 0.1, 0], 'distortion_model': _RATIONAL},
+        {'distortion': [0.1, 0.02, 0, 0], 'distortion_model': 'equidistant'},
         {'mount': {'position': [0.02, 0.01, -0.05], 'rpy': [0.1, 1.3, 0.4]}},
         {'width': 320, 'height': 240, 'focal_length': [500, 520]},
     ],

@@ -128,13 +128,7 @@ class RecordedRobot:
         camera = self.settings.camera
         for _, message in self._messages(self._topic('/camera/camera_info')):
             if message.k[0] != 0.0:
-                camera = camera.with_calibration(
-                    message.width,
-                    message.height,
-                    message.k.tolist(),
-                    message.d.tolist(),
-                    message.distortion_model,
-                )
+                camera = camera.with_camera_info(message)
                 break
         return MarkerDetector(camera, self.settings.environment.dimension)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from maasi_filter.plugins import OwnSettings, PluginGroup
 from maasi_filter.settings import Finite, Settings, Vector3
@@ -15,6 +15,10 @@ from maasi_filter.settings import Finite, Settings, Vector3
 Focal = Annotated[Finite, Field(gt=0.0, le=1e6)]
 Pixel = Annotated[Finite, Field(ge=-1e6, le=1e6)]
 Coefficient = Annotated[Finite, Field(ge=-1e4, le=1e4)]
+
+DistortionModel = Literal['plumb_bob', 'rational_polynomial', 'equidistant']
+# Numbers of coefficients that each model can have, next to none.
+COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}
 
 DETECTORS = PluginGroup(
     'maasi.detectors',
@@ -154,7 +158,13 @@ class CameraSettings(Settings):
     )
     distortion: list[Coefficient] = Field(
         default_factory=list,
-        description='Plumb-bob coefficients k1, k2, p1, p2[, k3]; none: none [-]',
+        description='Coefficients of the distortion model, in the order of OpenCV; default: none '
+        '[-]',
+    )
+    distortion_model: DistortionModel = Field(
+        'plumb_bob',
+        description="'plumb_bob': k1, k2, p1, p2[, k3]; 'rational_polynomial': k1, k2, p1, p2, k3, "
+        "k4, k5, k6[, of thin prism and tilt: 4 or 6]; 'equidistant' (fisheye): k1, k2, k3, k4",
     )
     mount: MountSettings = Field(
         default_factory=MountSettings, description='Where the camera sits on the robot'
@@ -191,12 +201,41 @@ class CameraSettings(Settings):
 
     @model_validator(mode='after')
     def _consistent(self) -> CameraSettings:
-        if len(self.distortion) not in (0, 4, 5):
+        allowed = COEFFICIENTS[self.distortion_model]
+        if len(self.distortion) not in (0, *allowed):
             raise ValueError(
-                f'distortion: got {len(self.distortion)} coefficients, '
-                'allowed 0, 4 or 5 (plumb bob)'
+                f'distortion: got {len(self.distortion)} coefficients, allowed with '
+                f'{self.distortion_model} are {", ".join(map(str, (0, *allowed)))}'
             )
         return self
+
+    @property
+    def least_coefficients(self) -> int:
+        """Number of coefficients of a camera without distortion."""
+        return {'plumb_bob': 5}.get(self.distortion_model, COEFFICIENTS[self.distortion_model][0])
+
+    def with_camera_info(self, info: Any) -> CameraSettings:
+        """Return these settings with the intrinsics of a ``sensor_msgs/CameraInfo``.
+
+        Its calibration is that of the full image, of which the images show the region of interest,
+        with pixels binned.
+        """
+        k, roi, size = [float(value) for value in info.k], info.roi, []
+        for axis, whole, start, length, bins in (
+            (0, info.width, roi.x_offset, roi.width, info.binning_x),
+            (1, info.height, roi.y_offset, roi.height, info.binning_y),
+        ):
+            shown, count = int(length or whole - start), max(int(bins), 1)
+            if start + shown > whole:
+                raise ValueError(
+                    f'roi: got pixels {start} to {start + shown} along {"xy"[axis]}, allowed are '
+                    f'0 to {whole}'
+                )
+            k[4 * axis] /= count
+            # Pixel centres are at whole numbers: that of a binned one is the middle of its bin.
+            k[2 + 3 * axis] = (k[2 + 3 * axis] - start + 0.5) / count - 0.5
+            size.append(shown // count)
+        return self.with_calibration(size[0], size[1], k, list(info.d), str(info.distortion_model))
 
     def with_calibration(
         self,
@@ -206,24 +245,34 @@ class CameraSettings(Settings):
         d: list[float],
         distortion_model: str = 'plumb_bob',
     ) -> CameraSettings:
-        """Return these settings with the intrinsics [px] of a ``sensor_msgs/CameraInfo``."""
-        if distortion_model not in ('plumb_bob', ''):
-            raise ValueError(f"distortion_model: got '{distortion_model}', allowed 'plumb_bob'")
+        """Return these settings with other intrinsics [px], of the images themselves."""
+        model = distortion_model or 'plumb_bob'
+        if model not in COEFFICIENTS:
+            allowed = ' or '.join(COEFFICIENTS)
+            raise ValueError(f"distortion_model: got '{distortion_model}', allowed {allowed}")
         if len(k) != 9:
             raise ValueError(f'k: got {len(k)} numbers, allowed 9')
         matrix = [float(value) for value in k]
         if any(matrix[i] != 0 for i in (1, 3, 6, 7)) or matrix[8] != 1:
             raise ValueError(f'k: got {matrix}, allowed [fx, 0, cx, 0, fy, cy, 0, 0, 1]')
-        return CameraSettings.model_validate(
-            self.model_dump()
-            | {
-                'width': width,
-                'height': height,
-                'focal_length': [matrix[0], matrix[4]],
-                'principal_point': [matrix[2], matrix[5]],
-                'distortion': [float(value) for value in d],
-            }
-        )
+        given = {
+            'width': width,
+            'height': height,
+            'focal_length': [matrix[0], matrix[4]],
+            'principal_point': [matrix[2], matrix[5]],
+            # Some cameras fill unused coefficients with zeros, as many as they like.
+            'distortion': [float(value) for value in d] if any(d) else [],
+            'distortion_model': model,
+        }
+        try:
+            return CameraSettings.model_validate(self.model_dump() | given)
+        except ValidationError as error:
+            # One line, without the type of error and the address that pydantic adds.
+            texts = [
+                ': '.join([*map(str, item['loc']), item['msg'].removeprefix('Value error, ')])
+                for item in error.errors()
+            ]
+            raise ValueError('; '.join(texts)) from None
 
 
 def load_calibration(path: str | Path, settings: CameraSettings) -> CameraSettings:

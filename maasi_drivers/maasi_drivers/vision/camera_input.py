@@ -89,11 +89,14 @@ def _corners(box: Any, size: FloatArray) -> FloatArray:
 Picture = Callable[[], ImageArray | Blobs]
 
 
+CALIBRATION = 'calibration'  # kind of fault
+
+
 class CameraInput(SensorInput[Picture]):
     """A camera that sees markers on the floor.
 
     Calibration: from the file of the parameter `calibration_file`, else from the parameters;
-    a `camera_info` with a focal length replaces either.
+    a `camera_info` with a focal length replaces either. One that cannot be used is a fault.
 
     Images come from a topic, or by the parameter `image_source` from a video (a stream, a device
     or a file), or as blobs that were found on board (measurement feed); with `camera.detections`
@@ -114,6 +117,7 @@ class CameraInput(SensorInput[Picture]):
         # None where images come from a topic.
         self._source: VideoSource | FeedReceiver | None = None
         self._calibration: tuple[object, ...] | None = None
+        self._unusable = ''  # why the calibration cannot be used
         self._checksum: int | None = None
 
     def prepare(self) -> None:
@@ -198,6 +202,8 @@ class CameraInput(SensorInput[Picture]):
 
     def detect(self, data: Picture, pose: StampedPose) -> SensorReading:
         """Decode an image, and return the markers in it."""
+        if self._unusable:
+            raise ValueError(self._unusable)
         picture = data()
         if isinstance(picture, Blobs) and self.camera.detections is not None:
             self._detector.camera = self._placed(picture.frame, pose.stamp)
@@ -267,21 +273,33 @@ class CameraInput(SensorInput[Picture]):
     # ---- image source: topic ------------------------------------------------------------------
 
     def _on_calibration(self, message: CameraInfo) -> None:
-        calibration = (
-            message.width,
-            message.height,
-            message.k.tolist(),
-            list(message.d),
-            message.distortion_model,
-        )
         # Without a focal length the camera has not been calibrated.
-        if calibration == self._calibration or message.k[0] == 0.0:
+        if message.k[0] == 0.0:
+            self.driver.warn_throttled(
+                'calibration',
+                'camera/camera_info: k is zero, the camera is not calibrated: the intrinsics of '
+                'the settings are used',
+            )
             return
-        self._calibration = calibration
+        roi = message.roi
+        calibration = (
+            (message.width, message.height, message.k.tolist(), list(message.d)),
+            (message.distortion_model, message.binning_x, message.binning_y),
+            (roi.x_offset, roi.y_offset, roi.width, roi.height),
+        )
+        if calibration == self._calibration:
+            return
+        self._calibration, health = calibration, self.driver.health
         try:
-            self._use(self.camera.with_calibration(*calibration))
+            self._use(self.camera.with_camera_info(message))
         except (ValueError, np.linalg.LinAlgError) as error:
-            self.driver.drop('calibration', f'camera/camera_info: {error}')
+            # Measurements by other intrinsics would be wrong.
+            self._unusable = f'camera/camera_info: {error}'
+            health.begin(CALIBRATION, self._unusable)
+            self.driver.publish_fault()
+            return
+        self._unusable = ''
+        health.end(CALIBRATION, 'camera/camera_info: a calibration that can be used')
 
     def _on_image(self, message: Image) -> None:
         try:

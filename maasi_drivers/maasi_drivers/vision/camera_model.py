@@ -15,8 +15,7 @@ from maasi_filter.models.pose import Pose
 # From optical axes (x right, y down, z forward) to REP-103 axes (x forward, y left, z up).
 _OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
-# End of the iteration that undoes a distortion: number of steps, error [px].
-_UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-13)
+_STEPS, _EXACT = 60, 1e-11  # of the iteration that undoes a distortion: number, error [px]
 _MISSED = 1e-6  # farther than this from its pixel an undistorted point is none [px]
 
 
@@ -24,9 +23,9 @@ _MISSED = 1e-6  # farther than this from its pixel an undistorted point is none 
 class Camera:
     """A calibrated camera mounted on a robot.
 
-    `matrix` (3, 3) is the left part of C in 001, eq. (18) [px], `distortion` (5,) has the plumb-bob
-    coefficients k1, k2, p1, p2, k3. Centre and rotation of the optical frame are in the robot's
-    [m].
+    `matrix` (3, 3) is the left part of C in 001, eq. (18) [px], `distortion` has the coefficients
+    of the `model` in the order of OpenCV. Centre and rotation of the optical frame are in the
+    robot's [m].
     """
 
     width: int
@@ -36,6 +35,7 @@ class Camera:
     position: FloatArray
     rotation: FloatArray
     largest_radius: float = np.inf
+    model: str = 'plumb_bob'
 
     @classmethod
     def from_settings(cls, settings: CameraSettings) -> Camera:
@@ -46,12 +46,8 @@ class Camera:
         )
         fx, fy = settings.focal_length
         mount = Pose.from_rpy(settings.mount.position, settings.mount.rpy)
-        distortion = np.zeros(5)
+        distortion = np.zeros(max(len(settings.distortion), settings.least_coefficients))
         distortion[: len(settings.distortion)] = settings.distortion
-        k1, k2, _, _, k3 = distortion
-        # Squares of the radii at which the radial model stops growing, so that it has no inverse.
-        ends = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
-        ends = ends.real[(np.abs(ends.imag) < 1e-9) & (ends.real > 0)]
         return cls(
             width=settings.width,
             height=settings.height,
@@ -59,7 +55,8 @@ class Camera:
             distortion=distortion,
             position=mount.position,
             rotation=mount.rotation() @ _OPTICAL_TO_BODY,
-            largest_radius=float(np.sqrt(ends.min(initial=np.inf))),
+            largest_radius=_largest_radius(distortion, settings.distortion_model),
+            model=settings.distortion_model,
         )
 
     def centre(self, pose: Pose) -> FloatArray:
@@ -87,19 +84,37 @@ class Camera:
             return np.empty((0, 2)), np.empty((0, 2, 2))
         still = np.zeros(3)
         rays = cv2.convertPointsToHomogeneous(points)
-        pixels, slopes = cv2.projectPoints(rays, still, still, self.matrix, self.distortion)
+        wide = self.model == 'equidistant'
+        project, first = (cv2.fisheye.projectPoints, 11) if wide else (cv2.projectPoints, 3)
+        pixels, slopes = project(rays, still, still, self.matrix, self.distortion)
         # By the translation along x and y, at a depth of 1.
-        return np.reshape(pixels, (-1, 2)), np.reshape(slopes[:, 3:5], (-1, 2, 2))
+        return np.reshape(pixels, (-1, 2)), np.reshape(slopes[:, first : first + 2], (-1, 2, 2))
 
     def undistort(self, pixels: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return rays (n, 2) of pixels, nan: no inverse; their derivatives (n, 2, 2) [1/px]."""
         given = np.reshape(np.asarray(pixels, float), (-1, 2))
-        points = np.empty((0, 2))
-        if len(given):
-            rays = cv2.undistortPointsIter(
-                given[:, None], self.matrix, self.distortion, np.eye(3), np.eye(3), _UNDISTORTED
-            )
-            points = np.asarray(rays[:, 0], dtype=np.float64)
+        points = (given - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]
+        points *= np.minimum(1.0, 0.9 * self.largest_radius / np.hypot(*points.T).clip(1e-9))[
+            :, None
+        ]
+        # Newton's method, for all models; from a step that leads farther off it goes half of the
+        # distance back.
+        active, step = np.arange(len(given)), np.zeros_like(points)
+        missed, share = np.full(len(given), np.inf), np.ones(len(given))
+        for _ in range(_STEPS):
+            tried = points[active] + share[active, None] * step[active]
+            again, slopes = self._distorted(tried)
+            error = given[active] - again
+            size = np.abs(error).max(axis=1, initial=0.0)
+            better = (size < missed[active]) & (np.linalg.det(slopes) > 0.0)
+            better &= (tried * tried).sum(axis=1) < self.largest_radius**2
+            nearer = active[better]
+            points[nearer], missed[nearer], share[nearer] = tried[better], size[better], 1.0
+            step[nearer] = np.linalg.solve(slopes[better], error[better][..., None])[..., 0]
+            share[active[~better]] *= 0.5
+            active = active[(missed[active] > _EXACT) & (share[active] > 1e-9)]
+            if not len(active):
+                break
         again, slopes = self._distorted(points)
         good = (np.abs(again - given) < _MISSED).all(axis=1) & (np.linalg.det(slopes) > 0.0)
         good &= (points * points).sum(axis=1) < self.largest_radius**2
@@ -152,6 +167,27 @@ class Camera:
         # The image reaches half a pixel beyond the outermost pixel centres.
         margins = np.minimum(pixels, last - pixels).min(axis=1) + 0.5
         return np.where(np.isnan(margins), -np.inf, margins)
+
+
+def _largest_radius(distortion: FloatArray, model: str) -> float:
+    """Return the radius of a normalised point at which a model ends: beyond it has no inverse."""
+    if model == 'equidistant':
+        # Angles from the axis, up to a quarter of a turn.
+        k1, k2, k3, k4 = distortion
+        ends = np.roots([9.0 * k4, 7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+    else:
+        k1, k2, _, _, k3, *below = distortion[:8].tolist()
+        # Polynomials of the squared radius; the radial model stops growing, or divides by zero.
+        top, bottom = np.poly1d([k3, k2, k1, 1.0]), np.poly1d([*below[::-1], 1.0])
+        grows = top * bottom + 2.0 * np.poly1d([1.0, 0.0]) * (
+            top.deriv() * bottom - top * bottom.deriv()
+        )
+        ends = np.concatenate([grows.roots, bottom.roots])
+    ends = np.sqrt(ends.real[(np.abs(ends.imag) < 1e-9) & (ends.real > 0)])
+    end = float(ends.min(initial=np.inf))
+    if model == 'equidistant':
+        end = float(np.tan(end)) if end < 0.5 * np.pi else np.inf
+    return end
 
 
 def box_view_margin(

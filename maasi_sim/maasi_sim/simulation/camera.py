@@ -354,7 +354,8 @@ class CameraRenderer:
             turn,
             camera.matrix,
             camera.distortion,
-            float(camera.largest_radius),
+            # The kernel knows this model only: shapes in view of others may be anywhere.
+            float(camera.largest_radius) if camera.model == 'plumb_bob' else 0.0,
             pose.position,
             np.array(velocity, dtype=float),
             rotation @ np.asarray(angular_velocity, dtype=float),

@@ -165,7 +165,7 @@ def camera_messages(settings: CameraSettings, frame: str) -> tuple[Image, Camera
     info = CameraInfo(
         height=settings.height,
         width=settings.width,
-        distortion_model='plumb_bob',
+        distortion_model=camera.model,
         d=camera.distortion.tolist(),
         k=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
