@@ -56,7 +56,9 @@ class FoundTargets:
             estimates = [(item.position, item.covariance) for item in self.targets]
             f = known.index(True) if any(known) else nearest(target, estimates)
             old = self.targets[f] if f >= 0 else None
-            if old is not None and not any(known) and (old.time, old.robot) <= (target.time, robot):
+            # A target kept from before a restart has its robot, but not its id there.
+            theirs = any(known) or (old is not None and (old.robot, old.origin) == (robot, 0))
+            if old is not None and not theirs and (old.time, old.robot) <= (target.time, robot):
                 continue  # another one found it first
             number = self.next_id() if old is None else old.id
             new = replace(target, id=number, robot=robot, origin=target.id)
@@ -71,6 +73,14 @@ class FoundTargets:
                 self.targets[f] = new
                 changed.append(new)
         return added + changed
+
+    def withdraw(self, robot: str, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
+        """Remove the targets of another filter that it has no longer; return them."""
+        theirs = {target.id for target in targets}
+        gone = [t for t in self.targets if t.origin and t.robot == robot and t.origin not in theirs]
+        ids = {target.id for target in gone}
+        self.targets[:] = [target for target in self.targets if target.id not in ids]
+        return gone
 
     def keep(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets that were found before a restart; return the new ones."""
@@ -187,6 +197,10 @@ class SearchFilter(ABC):
     def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
         """Take found targets into the state, of which some are new or changed."""
 
+    @abstractmethod
+    def remove(self, found: FoundTargets, withdrawn: Sequence[FoundTarget]) -> None:
+        """Take found targets into the state without those that their filter has withdrawn."""
+
     def own_found_targets(self) -> list[FoundTarget]:
         """Return the found targets that this filter found itself."""
         return [target for target in self.found_targets if not target.origin]
@@ -208,6 +222,17 @@ class SearchFilter(ABC):
         taken = found.take_over(robot, targets)
         self.place(found, taken)
         return bool(taken)
+
+    def withdraw(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
+        """Remove found targets that the filter of another robot has withdrawn; return whether any.
+
+        Call it with the same targets as `take_over`, after that of all other robots: what one of
+        them leaves out may belong to another.
+        """
+        found = self.register()
+        gone = found.withdraw(robot, targets)
+        self.remove(found, gone)
+        return bool(gone)
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets found before this filter was created; return those that are new.

@@ -199,6 +199,8 @@ class _Search:
         begin = perf_counter()
         for other in others:
             group.filter.take_over(other.names[0], other.shared)
+        for other in others:
+            group.filter.withdraw(other.names[0], other.shared)
         result = group.filter.step(measurements, gone, self.time)
         self._result.filter_times.append(perf_counter() - begin)
         group.coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)

@@ -1,5 +1,7 @@
 """Filters of several robots that share their found targets (002, section 4)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from searches import FLOOR, FLOOR_LENGTHS, floor_sensor
@@ -104,3 +106,54 @@ def test_bad_targets_are_refused_and_change_nothing(new_filter):
     with pytest.raises(ValueError, match='different ones from 1'):
         search.keep_found([target(), target()])
     assert search.found_targets == []
+
+
+def test_a_target_that_another_one_withdraws_is_not_found_any_more(new_filter, tmp_path):
+    search = new_filter()
+    search.take_over('other', [target(), target([0.0, 2.0], number=2)])
+    search.take_over('third', [target([2.0, 0.0], number=1)])
+    assert search.withdraw('other', [target([0.0, 2.0], number=2)])
+    assert [(item.robot, item.origin) for item in search.found_targets] == [
+        ('other', 2),
+        ('third', 1),
+    ]
+    assert not search.withdraw('other', [target([0.0, 2.0], number=2)])
+    search.save(tmp_path / 'state')
+    for again in (search, load_filter(tmp_path / 'state')):
+        # Neither does it rise from a single detection, nor where nothing is seen.
+        look(again, 'own', 1)
+        look(again, 'own', 20, begin=1, values=np.empty((0, 2)))
+        assert [item.id for item in again.found_targets] == [2, 3]
+        assert again.expected_number < 0.5
+        # Detections of this filter find it again, as a new one.
+        look(again, 'own', 40, begin=21)
+        assert [item.origin for item in again.found_targets] == [2, 1, 0]
+        assert again.found_targets[-1].id == 4
+
+
+def test_a_target_kept_over_a_restart_is_still_that_of_its_filter(new_filter):
+    search = new_filter()
+    kept = replace(target(), id=7)
+    search.keep_found([kept])
+    assert search.take_over('other', [target(PLACE + 0.004)])
+    assert [(item.id, item.origin) for item in search.found_targets] == [(7, 1)]
+    assert search.withdraw('other', []) and search.found_targets == []
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_what_is_known_of_others_is_what_they_published_last(new_filter, seed):
+    draw, search = np.random.default_rng(seed), new_filter()
+    places = [[0.4 * n, 0.2 + 0.5 * k] for k in range(4) for n in range(5)]
+    published = {}
+    for _ in range(12):
+        for k, robot in enumerate('abc'):
+            numbers = np.flatnonzero(draw.random(5) < 0.5)
+            published[robot] = [target(places[5 * k + n], number=int(n) + 1) for n in numbers]
+            search.take_over(robot, published[robot])
+        for robot, targets in published.items():
+            search.withdraw(robot, targets)
+        expected = {(robot, item.id) for robot, items in published.items() for item in items}
+        known = [(item.robot, item.origin) for item in search.found_targets]
+        assert set(known) == expected and len(known) == len(expected)
+        ids = [item.id for item in search.found_targets]
+        assert len(set(ids)) == len(ids)

@@ -406,5 +406,19 @@ def test_found_targets_are_kept_for_a_filter_that_starts_again(team):
     refined = FoundTarget(id=2, measurement=5)
     publisher.publish(FoundTargetArray(batch_id=8, targets=[refined]))
     team.until(lambda: kept[-1].batch_id == 8)
-    # Kept once, kept for good.
-    assert kept[-1].targets == [FoundTarget(id=1), refined]
+    # The filter has withdrawn the other one.
+    assert kept[-1].targets == [refined]
+    # A filter that starts again without its state has withdrawn nothing.
+    team.node.destroy_publisher(publisher)
+    team.until(lambda: not team.tested.count_publishers('/found_targets'))
+    publisher = team.node.create_publisher(FoundTargetArray, 'found_targets', LATCHED)
+    team.until(lambda: publisher.get_subscription_count())
+    for batch, targets, expected in (
+        (9, [], [refined]),
+        (10, [FoundTarget(id=3)], [refined, FoundTarget(id=3)]),
+        (11, [refined], [refined]),
+        (12, [], []),
+    ):
+        publisher.publish(FoundTargetArray(batch_id=batch, targets=targets))
+        team.until(lambda batch=batch: kept[-1].batch_id == batch)
+        assert kept[-1].targets == expected

@@ -239,6 +239,10 @@ class IcPhdFilter(SearchFilter):
             keep = (offset * offset).sum(axis=1) > self._numbers.removal_distance**2
             self.particles, self.weights = self.particles[keep], self.weights[keep]
 
+    def remove(self, found: FoundTargets, withdrawn: Sequence[FoundTarget]) -> None:
+        """Keep the found targets that remain; particles arise from the next detection."""
+        self._found = found
+
 
 def nearest_detection(
     position: FloatArray, members: Sequence[CheckedMeasurement], limit: float

@@ -49,7 +49,7 @@ class SharedFoundTargets:
             handle, raw = subscription.handle, subscription.raw
             while (taken := handle.take_message(FoundTargetArray, raw)) is not None:
                 subscription.callback(taken[0])
-        changed = False
+        changed, newest = False, {}
         for name, waiting in self._waiting.items():
             last = None
             while waiting and stamp_from_ros(waiting[0].header.stamp) < stamp:
@@ -57,14 +57,17 @@ class SharedFoundTargets:
             if last is None:
                 continue
             # Targets that it received itself arrive from the filter that found them.
-            targets = [item for item in last.targets if item.robot == name]
+            own = [item for item in last.targets if item.robot == name]
             dimension = self._node.settings.environment.dimension
             try:
-                changed |= search.take_over(
-                    name, [found_target_from_ros(item, dimension) for item in targets]
-                )
+                targets = [found_target_from_ros(item, dimension) for item in own]
+                changed |= search.take_over(name, targets)
             except ValueError as error:
                 self._node.drop('bad found targets', f'{name}/found_targets: {error}')
+                continue
+            newest[name] = targets
+        for name, targets in newest.items():
+            changed |= search.withdraw(name, targets)
         return changed
 
     def _on_found(self, name: str, message: FoundTargetArray) -> None:

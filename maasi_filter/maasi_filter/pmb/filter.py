@@ -312,3 +312,11 @@ class PmbFilter(SearchFilter):
             item.existence, item.density, item.target = CERTAIN, density, target
             item.pose_error = 0.0
             item.labels = LabelTally.of(target.label)
+
+    def remove(self, found: FoundTargets, withdrawn: Sequence[FoundTarget]) -> None:
+        """Let components of withdrawn targets be potential ones, which only own detections find."""
+        ids = {target.id for target in withdrawn}
+        for item in self.components:
+            if item.target is not None and item.target.id in ids:
+                item.target, item.hits = None, 0.0
+                item.existence = self._numbers.pmb.withdrawn_probability

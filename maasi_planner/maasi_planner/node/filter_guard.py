@@ -98,15 +98,34 @@ class FilterGuard:
 
 
 class FoundKeeper:
-    """Republishes found targets, latched, until a new search, even if the filter has lost them."""
+    """Republishes found targets, latched, until a new search, even if the filter has lost them.
+
+    A target that a filter published and then leaves out is withdrawn; one that a restarted filter
+    has not published yet is kept.
+    """
 
     def __init__(self, node: Node) -> None:
+        self._node = node
         self._targets: dict[int, FoundTarget] = {}
+        self._filters: set[bytes] = set()  # publishers so far, by endpoint
+        self._published: set[int] = set()  # ids in the last message of the newest one
         self._publisher = node.create_publisher(FoundTargetArray, 'found_targets/kept', LATCHED)
         self._publisher.publish(FoundTargetArray())
-        node.create_subscription(FoundTargetArray, 'found_targets', self._on_found, LATCHED)
+        found = node.create_subscription(FoundTargetArray, 'found_targets', self._on_found, LATCHED)
+        self._topic = found.topic_name
 
     def _on_found(self, message: FoundTargetArray) -> None:
+        filters = {
+            bytes(info.endpoint_gid)
+            for info in self._node.get_publishers_info_by_topic(self._topic)
+        }
+        if filters - self._filters:
+            self._published = set()
+        self._filters |= filters
+        ids = {item.id for item in message.targets}
+        for withdrawn in self._published - ids:
+            self._targets.pop(withdrawn, None)
+        self._published = ids
         self._targets.update({item.id: item for item in message.targets})
         self._publisher.publish(
             FoundTargetArray(
@@ -119,4 +138,5 @@ class FoundKeeper:
     def forget(self) -> None:
         """Remove all targets for a new search."""
         self._targets.clear()
+        self._published.clear()
         self._publisher.publish(FoundTargetArray())
