@@ -16,14 +16,10 @@ from shapely.geometry import box
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.environment import (
-    EnvironmentSettings,
-    Zone,
-    check_pixels,
-    read_image,
-    read_shape,
-)
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.environment import EnvironmentSettings, Zone
+from maasi_filter.geodesy import OriginSettings, geodetic, on_ground, to_map
+from maasi_filter.occupancy_map import check_pixels, read_image
+from maasi_filter.shapes import read_shape
 
 _ROUNDING = 1e-6  # of coordinates, also of those that are large [m]
 # Cells of the density along the longer side, and every how many are looked at to check it.
@@ -100,13 +96,8 @@ class Area:
         #: Whether targets are equally likely in all of the bounds.
         self.uniform = self.region is None and not prior.polygons and self._raster is None
         self.doubts = self._zones_outside()
-        # All cells, which take long and not all users need, only where a few promise nothing.
-        suspicious = not self.uniform and not np.prod(self._cells(_CHECKED), axis=0).any()
-        if suspicious and self._rasterised.even:
-            self.doubts.append(
-                'environment.prior: promises nothing inside what is left of the area: targets are '
-                'expected evenly over it'
-            )
+        if not self.uniform:
+            self.doubts += self._prior_doubts()
 
     @classmethod
     def of(cls, area: Area | EnvironmentSettings | ArrayLike) -> Area:
@@ -235,6 +226,25 @@ class Area:
         marked[x, y] = 1.0
         return marked
 
+    def _prior_doubts(self) -> list[str]:
+        """Return in words whether the prior promises nothing, or the same everywhere."""
+        likely, inside = self._cells(_CHECKED)
+        given = bool(self.settings.prior.polygons) or self._raster is not None
+        # All cells, which take long and not all users need, only where a few say so.
+        if not (likely * inside).any() and self._rasterised.even:
+            return [
+                'environment.prior: promises nothing inside what is left of the area: targets are '
+                'expected evenly over it'
+            ]
+        if given and inside.any() and np.ptp(likely[inside > 0.0]) == 0.0:
+            likely, inside = self._cells()
+            if np.ptp(likely[inside > 0.0]) == 0.0:
+                return [
+                    'environment.prior: is the same everywhere in the area: targets are expected '
+                    'evenly over it'
+                ]
+        return []
+
     def _zones_outside(self) -> list[str]:
         """Return in words which zones and polygons of the prior touch nothing of the area."""
         given = self.settings
@@ -247,15 +257,26 @@ class Area:
             zones[f'prior.polygons[{index}]'] = read_shape(part.polygon)
         gaps = shapely.distance(self.border, list(zones.values())) if zones else []
         doubts = []
-        for (key, _), gap in zip(zones.items(), gaps):
+        for key, gap in zip(zones, gaps):
             if gap > 0.0:
-                how_far = f'{gap / 1e3:.3g} km' if gap > 1e3 else f'{gap:.3g} m'
-                question = '; latitude and longitude exchanged?' if gap > _ANOTHER_COUNTRY else ''
+                how_far = f'{gap / 1e3:,.0f} km' if gap > 1e4 else f'{gap:.3g} m'
                 doubts.append(
                     f'environment.{key}: lies {how_far} outside of the area, where it has no '
-                    f'effect{question}'
+                    f'effect{self._exchanged(zones[key], gap)}'
                 )
         return doubts
+
+    def _exchanged(self, zone: BaseGeometry, gap: float) -> str:
+        """Return in words whether a zone would lie at the area with its coordinates exchanged."""
+        origin = self.settings.origin
+        if origin is None or gap < _ANOTHER_COUNTRY:
+            return ''
+        degrees = on_ground(shapely.get_coordinates(zone.centroid), origin)
+        if abs(degrees[0, 1]) > 90.0:
+            return ''
+        place = shapely.Point(to_map(degrees, origin)[0])
+        near = self.border.distance(place) < max(1e-3 * gap, 2.0 * self.border.length)
+        return ': with latitude and longitude exchanged it would lie there' if near else ''
 
     def _cells(self, every: int = 1) -> tuple[FloatArray, FloatArray]:
         """Return prior, and 1 for inside, at the middle of every n-th cell, (nx, ny)."""
@@ -352,10 +373,11 @@ def read_raster(environment: EnvironmentSettings) -> _Raster:
     key = f'environment.prior.raster: {path}'
     try:
         suffix = Path(path).suffix.lower()
+        band = environment.prior.band
         if suffix in ('.tif', '.tiff'):
-            raster = _of_geotiff(path, environment.origin)
+            raster = _of_geotiff(path, environment.origin, band)
         else:
-            values = _read_array(path) if suffix == '.npy' else read_image(path)
+            values = _read_array(path) if suffix == '.npy' else read_image(path, band)
             extent = environment.prior.extent or environment.bounds[:2]
             raster = _over(np.asarray(values, dtype=float), extent)
     except (OSError, ValueError, TypeError, EOFError) as error:
@@ -393,8 +415,8 @@ def _over(values: FloatArray, extent: list[list[float]]) -> _Raster:
     return _Raster(values, cells)
 
 
-def _of_geotiff(path: str, origin: OriginSettings | None) -> _Raster:
-    """Return the first band of a GeoTIFF in its own coordinates; what has no data is 0."""
+def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> _Raster:
+    """Return a band of a GeoTIFF in its own coordinates; what has no data is 0."""
     try:
         import rasterio
         from rasterio.warp import transform
@@ -406,8 +428,12 @@ def _of_geotiff(path: str, origin: OriginSettings | None) -> _Raster:
         if file.crs is None:
             raise ValueError('has no coordinate system')
         check_pixels(file.shape)
+        bands = [str(number) for number in file.indexes]
+        if band not in (None, *bands) or (band is None and len(bands) > 1):
+            read = 'several' if band is None else band
+            raise ValueError(f'band: read {read}, name the one that counts: {", ".join(bands)}')
         crs, grid = file.crs, list(~file.transform)
-        values = file.read(1, masked=True).astype(float).filled(0.0)
+        values = file.read(int(band or 1), masked=True).astype(float).filled(0.0)
 
     def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,16 +15,27 @@ from typing import Any
 import numpy as np
 import shapely
 from pydantic import Field, ValidationError, field_validator, model_validator
-from shapely.geometry import MultiPolygon, Polygon, shape
+from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.geodesy import OriginSettings, to_map
+from maasi_filter.geodesy import OriginSettings
 from maasi_filter.settings import Finite, Positive, Settings, Vector2
+from maasi_filter.shapes import (
+    Feature,
+    centre_of,
+    check_size,
+    features_of,
+    is_geojson,
+    polygons_of,
+    read_shape,
+    short,
+)
 
 _NUMBER = '-+.0123456789'  # with which a number begins
-_MOST_PIXELS = 25_000_000  # of maps and rasters, as 5000 x 5000: 200 MB as numbers
 # Of files that an environment names.
-FILES = ('.geojson', '.json', '.npy', '.png', '.jpg', '.jpeg', '.pgm', '.yaml', '.tif', '.tiff')
+_IMAGES = ('.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff')
+FILES = ('.geojson', '.json', '.yaml', '.yml', *_IMAGES)
+_ROLES = ('area', 'keep_out', 'prior')  # of features of GeoJSON
 
 
 class Zone(Settings):
@@ -90,6 +100,11 @@ class PriorSettings(Settings):
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
         None, description='File of densities: .npy or an image, first row north; or GeoTIFF'
+    )
+    band: str | None = Field(
+        None,
+        description='What of the raster counts: grey, red, green, blue or alpha of an image, or '
+        'the number of a band of a GeoTIFF; none: grey, the first band',
     )
     extent: list[Vector2] | None = Field(
         None,
@@ -240,113 +255,6 @@ def shapes_of_texts(zones: Iterable[str]) -> list[Any]:
     return shapes
 
 
-def read_shape(value: Any, project: Callable[[FloatArray], FloatArray] | None = None) -> Any:
-    """Return the polygons of a value: rings [m], well-known text, GeoJSON, or a file of it.
-
-    project: from longitudes and latitudes (n, 2) [degrees] to the map [m]; ValueError where
-    GeoJSON has to do without it, or what is read is no valid polygon.
-    """
-    if isinstance(value, str) and value.lstrip().upper().startswith(('POLYGON', 'MULTIPOLYGON')):
-        found = shapely.from_wkt(value)
-    elif isinstance(value, str) and value.endswith('.yaml'):
-        found = read_map(value)
-    elif isinstance(value, (list, tuple)):
-        rings = value if value and np.ndim(value[0][0]) else [value]
-        found = Polygon(rings[0], rings[1:])
-    else:
-        features = features_of(value)
-        found = shapely.union_all([_geometry(feature) for feature in features])
-        if not all(_facts(feature).get('unit') == 'm' for feature in features):
-            if project is None:
-                raise ValueError('GeoJSON needs environment.origin')
-            found = shapely.transform(found, project)
-    if not isinstance(found, (Polygon, MultiPolygon)) or found.is_empty:
-        raise ValueError(f'got {str(value)[:60]}, allowed are polygons')
-    if not found.is_valid:
-        raise ValueError(f'got {str(value)[:60]}, {shapely.is_valid_reason(found)}')
-    return found
-
-
-def features_of(value: Any) -> list[dict[str, Any]]:
-    """Return the features of GeoJSON, given as values, as text or as the name of a file."""
-    try:
-        if isinstance(value, str) and value.startswith('{'):
-            value = json.loads(value)
-        elif isinstance(value, str) and _is_geojson(value):
-            value = json.loads(Path(value).read_text(encoding='utf-8'))
-    except OSError as error:
-        raise ValueError(f'{value}: {error.strerror}') from None
-    except ValueError as error:
-        raise ValueError(f'{value[:60]}: is not JSON: {error}') from None
-    if not isinstance(value, Mapping):
-        raise ValueError(f'got {str(value)[:60]}, allowed is GeoJSON')
-    one = value if value.get('type') == 'Feature' else {'type': 'Feature', 'geometry': value}
-    features = value.get('features') if value.get('type') == 'FeatureCollection' else [one]
-    if not isinstance(features, list) or not all(isinstance(one, Mapping) for one in features):
-        raise ValueError(f'features: got {str(features)[:60]}, allowed is a list of features')
-    return features
-
-
-def _facts(feature: Mapping[str, Any]) -> Mapping[str, Any]:
-    return feature.get('properties') or {}
-
-
-def _geometry(feature: Mapping[str, Any]) -> Any:
-    try:
-        return shape(feature['geometry'])
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, shapely.GEOSException):
-        raise ValueError(f'got {str(feature)[:60]}, allowed are features with geometry') from None
-
-
-def read_image(path: str) -> FloatArray:
-    """Return the grey values of an image, 0 to 255 (rows, columns)."""
-    # Deferred: only maps and priors that are images need it.
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            # Sizes are checked here.
-            warnings.simplefilter('ignore', Image.DecompressionBombWarning)
-            with Image.open(path) as image:
-                check_pixels((image.height, image.width))
-                return np.asarray(image.convert('L'), dtype=float)
-    except Image.DecompressionBombError:
-        raise ValueError(f'is larger than {_MOST_PIXELS} pixels: scale it down') from None
-
-
-def check_pixels(shape: Sequence[int]) -> None:
-    """Raise ValueError if a raster has more cells than what needs them can hold."""
-    if math.prod(shape) > _MOST_PIXELS:
-        raise ValueError(
-            f'got {" x ".join(map(str, shape))} cells, allowed are at most {_MOST_PIXELS} in all: '
-            'scale it down'
-        )
-
-
-def read_map(path: str) -> Any:
-    """Return the occupied cells of a map of Nav2 (YAML and PGM or PNG) as polygons [m, map]."""
-    import yaml
-
-    try:
-        facts = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-        cell, (west, south, yaw) = float(facts['resolution']), map(float, facts['origin'])
-        grey = read_image(str(Path(path).parent / facts['image'])) / 255.0
-        occupied = (grey if facts['negate'] else 1.0 - grey) > float(facts['occupied_thresh'])
-    except (OSError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
-        raise ValueError(f'{path}: is no map of Nav2: {error}') from None
-    if yaw != 0.0:
-        raise ValueError(f'{path}: origin: got a yaw of {yaw}, allowed is 0')
-    # A box for each run of cells in a row, as one for each cell takes seconds.
-    ends = np.diff(np.pad(occupied, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    row, first = np.nonzero(ends == 1)
-    last = np.nonzero(ends == -1)[1]
-    x, y = west + cell * np.array([first, last]), south + cell * (len(occupied) - row)
-    lower = south + cell * (len(occupied) - 1 - row)
-    cells = shapely.union_all(shapely.box(x[0], lower, x[1], y))
-    # Slanted walls are stairs of cells; the result covers them.
-    return cells.buffer(0.5 * cell, join_style='mitre').simplify(0.5 * cell)
-
-
 @contextmanager
 def _at(value: Any, *key: str | int) -> Iterator[None]:
     """Make what is wrong with a value an error at its key."""
@@ -366,50 +274,52 @@ def _at(value: Any, *key: str | int) -> Iterator[None]:
 def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of an environment with all shapes as well-known text in the map."""
     values = dict(given)
-    roles: dict[str, list[dict[str, Any]]] = {'area': [], 'keep_out': [], 'prior': []}
+    roles: dict[str, list[Feature]] = {role: [] for role in _ROLES}
     area, origin, prior = values.get('area'), values.get('origin'), values.get('prior')
-    if _is_geojson(area):
+    drawn = is_geojson(area)
+    if drawn:
         with _at(area, 'area'):
             for feature in features_of(area):
-                role = _facts(feature).get('role', 'area')
-                if role not in roles:
-                    raise ValueError(f'got role {role}, allowed are area, keep_out, prior')
-                roles[role].append(feature)
-            facts = [_facts(item) for item in roles['area']]
+                roles[_role(feature)].append(feature)
+            if not roles['area']:
+                raise ValueError(
+                    f'{short(area)}: no polygon has the role area; keep-outs alone belong under '
+                    'environment.keep_outs'
+                )
             # That of the run on whose page it was drawn.
-            said = [item['origin'] for item in facts if item.get('origin')]
-            origin = origin or next(iter(said), None)
-            if not origin and any(item.get('unit') != 'm' for item in facts):
-                whole = shapely.union_all([_geometry(item) for item in roles['area']])
-                west, south, east, north = whole.bounds
-                origin = {'latitude': 0.5 * (south + north), 'longitude': 0.5 * (west + east)}
-        area = {'type': 'FeatureCollection', 'features': roles['area']}
+            said = (item.properties.get('origin') for item in roles['area'])
+            origin = origin or next(filter(None, said), None)
+            if not origin and not all(item.in_metres for item in roles['area']):
+                origin = centre_of(roles['area'])
     if origin:
         with _at(origin, 'origin'):
             values['origin'] = OriginSettings.model_validate(origin)
-
-    def project(degrees: FloatArray) -> FloatArray:
-        return to_map(degrees, values['origin'])
+    on_earth = values['origin'] if origin else None
 
     def text(value: Any, *key: str | int) -> str:
         with _at(value, *key):
-            found = read_shape(value, project if origin else None)
-        rounded = str(shapely.to_wkt(found, rounding_precision=4))
-        if not shapely.from_wkt(rounded).is_valid:
-            # Corners that touch, as those of cells of a map, may cross where they are rounded.
-            rounded = str(shapely.to_wkt(shapely.set_precision(found, 1e-4), rounding_precision=4))
-        return rounded
+            if isinstance(value, Feature):
+                found = polygons_of([value], on_earth)
+            else:
+                found = read_shape(value, on_earth)
+        return _text(found)
 
     def zone(item: Any, *key: str | int) -> Any:
         round_one = isinstance(item, Zone) or (isinstance(item, Mapping) and 'centre' in item)
-        row = isinstance(item, str) and Path(item).suffix not in FILES and item[:1] in _NUMBER
-        if round_one or row:
+        row = isinstance(item, str) and Path(item).suffix.lower() not in FILES
+        if round_one or (row and item[:1] in _NUMBER):
             return item
         inner = item['polygon'] if isinstance(item, Mapping) and 'polygon' in item else item
         return {'polygon': text(inner, *key)}
 
-    if area:
+    if drawn:
+        with _at(area, 'area'):
+            found = polygons_of(roles['area'], on_earth)
+            check_size(found)
+        values['area'] = _text(found)
+    elif area:
         values['area'] = text(area, 'area')
+    if area:
         west, south, east, north = shapely.from_wkt(values['area']).bounds
         values['bounds'] = [[west, east], [south, north]]
         if values.get('altitude') is not None:
@@ -419,33 +329,74 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
             raise ValueError('allowed with area; bounds have the heights themselves')
     for key, role in (('keep_outs', 'keep_out'), ('obstacles', 'obstacle')):
         items, more = values.get(key) or [], roles.get(role, [])
+        if isinstance(items, str) and Path(items).suffix.lower() in FILES:
+            items = [items]
         if isinstance(items, (list, tuple)):
             values[key] = [zone(item, key, index) for index, item in enumerate(items)]
-            values[key] += [zone(item, 'area') for item in more]
-    parts = [('area', item) for item in roles['prior']]
-    if isinstance(prior, list) or _is_geojson(prior):
-        with _at(prior, 'prior'):
-            items = prior if isinstance(prior, list) else [prior]
-            parts += [('prior', part) for item in items for part in features_of(item)]
-        prior = {}
-    elif isinstance(prior, str):
-        prior = {'raster': prior}
-    if isinstance(prior, Mapping) or parts:
-        prior = dict(prior or {})
-        polygons = [
-            {**item, 'polygon': text(item['polygon'], 'prior', 'polygons', index, 'polygon')}
-            if isinstance(item, Mapping) and 'polygon' in item
-            else item
-            for index, item in enumerate(prior.get('polygons') or [])
-        ]
-        for key, item in parts:
-            weight = _facts(item).get('weight', 1.0)
-            polygons.append({'polygon': text(item, key), 'weight': weight})
-        values['prior'] = {**prior, 'polygons': polygons}
+            values[key] += [{'polygon': text(item, 'area')} for item in more]
+    _give_prior(values, prior, roles['prior'], text)
     return values
 
 
-def _is_geojson(value: Any) -> bool:
-    if isinstance(value, str):
-        return Path(value).suffix in ('.json', '.geojson')
-    return isinstance(value, Mapping) and 'type' in value
+def _give_prior(
+    values: dict[str, Any],
+    prior: Any,
+    parts: Sequence[Feature],
+    text: Callable[..., str],
+) -> None:
+    """Give an environment its prior with polygons as text; parts: those in the file of the area."""
+    found = [('area', item) for item in parts]
+    if isinstance(prior, list) or is_geojson(prior):
+        with _at(prior, 'prior'):
+            items = prior if isinstance(prior, list) else [prior]
+            found += [('prior', part) for item in items for part in features_of(item)]
+        prior = {}
+    elif isinstance(prior, str):
+        prior = {'raster': prior}
+    if not isinstance(prior, Mapping) and not found:
+        return
+    prior = dict(prior or {})
+    polygons = [
+        {**item, 'polygon': text(item['polygon'], 'prior', 'polygons', index, 'polygon')}
+        if isinstance(item, Mapping) and 'polygon' in item
+        else item
+        for index, item in enumerate(prior.get('polygons') or [])
+    ]
+    for key, item in found:
+        with _at(item, key):
+            weight = _weight(item)
+        polygons.append({'polygon': text(item, key), 'weight': weight})
+    values['prior'] = {**prior, 'polygons': polygons}
+
+
+def _text(found: BaseGeometry) -> str:
+    """Return polygons as well-known text, to a tenth of a millimetre where that is valid."""
+    rounded = str(shapely.to_wkt(found, rounding_precision=4))
+    exact = not shapely.from_wkt(rounded).is_valid
+    return str(shapely.to_wkt(found, rounding_precision=-1)) if exact else rounded
+
+
+def _role(feature: Feature) -> str:
+    """Return the role of a feature; programs write null or nothing for none."""
+    role = feature.properties.get('role')
+    if role in (None, ''):
+        return 'area'
+    if role not in _ROLES:
+        raise ValueError(f'{feature.name}: role: read {role}, allowed are {", ".join(_ROLES)}')
+    return str(role)
+
+
+def _weight(feature: Feature) -> float:
+    """Return the weight of a polygon of the prior; null or nothing is 1."""
+    weight = feature.properties.get('weight')
+    if weight in (None, ''):
+        return 1.0
+    try:
+        number = float(weight)
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(weight, bool) or not 0.0 <= number < math.inf:
+        raise ValueError(
+            f'{feature.name}: weight: read {short(weight)}, allowed are numbers from 0'
+        )
+    return number

@@ -32,3 +32,15 @@ def to_map(degrees: FloatArray, origin: OriginSettings) -> FloatArray:
     places = degrees[:, 1], degrees[:, 0], np.full(len(degrees), origin.altitude)
     reference = origin.latitude, origin.longitude, origin.altitude
     return np.stack(pymap3d.geodetic2enu(*places, *reference)[:2], axis=1)
+
+
+def on_ground(positions: FloatArray, origin: OriginSettings) -> FloatArray:
+    """Return latitude and longitude (n, 2) [degrees] of places (n, 2) that lie far away on earth.
+
+    Up is what brings them to the origin's altitude, as the earth curves away below the map.
+    """
+    up = np.zeros(len(positions))
+    for _ in range(60):
+        places = geodetic(np.column_stack([positions, up]), origin)
+        up -= 0.5 * (places[:, 2] - origin.altitude)
+    return places[:, :2]

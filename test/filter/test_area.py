@@ -92,14 +92,22 @@ BOW = [[0, 0], [9, 9], [9, 0], [0, 9]]
 PARTS = [feature(RING), feature(BOW, role='keep_out')]
 WRONG = [
     # What is given, the key of the error, and words that it has.
-    ({'area': [[0, 0], [1, 1], [1, 0], [0, 1]]}, 'area', 'Self-intersection'),
-    ({'area': [[0, 0], [1, 1]]}, 'area', 'at least 4'),
+    ({'area': [[0, 0], [1, 1], [1, 0], [0, 1]]}, 'area', r'self-intersection at \(0.50, 0.50\) m'),
+    ({'area': [[0, 0], [1, 1]]}, 'area', 'at least 3 corners'),
     ({'area': 'nowhere.geojson'}, 'area', 'nowhere.geojson: No such file'),
-    ({'area': feature(RING, role='garden')}, 'area', 'got role garden, allowed are area'),
-    ({'area': {'type': 'FeatureCollection', 'features': PARTS}}, 'area', 'Self-intersection'),
+    (
+        {'area': feature(RING, role='garden')},
+        'area',
+        'feature 1: role: read garden, allowed are area',
+    ),
+    (
+        {'area': {'type': 'FeatureCollection', 'features': PARTS}},
+        'area',
+        r'feature 2: self-intersection at longitude 9\.90\d+, latitude 46\.60',
+    ),
     ({'area': {'type': 'FeatureCollection', 'features': [3]}}, 'area', 'allowed is a list of'),
     ({'keep_outs': [SQUARE, feature(SQUARE)]}, 'keep_outs.1', 'origin'),
-    ({'keep_outs': ['circle']}, 'keep_outs.0', 'got circle, allowed'),
+    ({'keep_outs': ['circle']}, 'keep_outs.0', 'read circle, allowed'),
     ({'keep_outs': [{'centre': [1, 2]}]}, 'keep_outs.0', 'centre and radius, or polygon'),
     ({'keep_outs': [{'centre': [1, 2, 3], 'radius': 1}]}, 'keep_outs.0.centre', 'allowed are 2'),
     ({'obstacles': [SQUARE, 'none.yaml']}, 'obstacles.1', 'no map of Nav2'),
@@ -108,7 +116,7 @@ WRONG = [
     (
         {'prior': {'polygons': [{'polygon': 'x', 'weight': 1}]}},
         'prior.polygons.0.polygon',
-        'got x, allowed is GeoJSON',
+        'read x, allowed is GeoJSON',
     ),
     ({'origin': {'latitude': 91, 'longitude': 9}}, 'origin.latitude', 'less than or equal to 90'),
     ({'area': None, 'altitude': [0, 1]}, 'altitude', 'allowed with area'),
@@ -118,7 +126,7 @@ WRONG = [
         'prior.extent',
         r'axis 1: got \[30.0, 0.0\], allowed is \[lower, upper\]',
     ),
-    ({'keep_outs': [[[]]]}, 'keep_outs.0', 'index'),
+    ({'keep_outs': [[[]]]}, 'keep_outs.0', 'allowed are corners'),
 ]
 
 
@@ -137,7 +145,7 @@ def test_a_node_names_the_parameter_of_a_wrong_shape():
         _, problems = check(FilterNodeSettings, {**flat, f'environment.{key}': value})
         text = problems[f'environment.{key}']
         assert (
-            text.startswith(f'parameter environment.{key}: got ') and 'environment' not in problems
+            text.startswith(f'parameter environment.{key}: read ') and 'environment' not in problems
         )
 
 
@@ -195,8 +203,9 @@ def test_a_map_of_nav2_is_obstacles(tmp_path):
     rows = 39 - ((places[:, 1] + 0.5) / 0.05).astype(int)
     gaps = np.array([area.distances(place).min() for place in places])
     assert (gaps[cells[rows, columns] == 0] == 0.0).all()
-    # A pillar of 0.2 m around (0.1, 0.9), and half a cell more.
-    assert area.distances([0.5, 0.9, 0.0]).min() == pytest.approx(0.3 - 0.025, abs=1e-6)
+    assert (gaps[cells[rows, columns] != 0] > 0.0).all()
+    # A pillar of 0.2 m around (0.1, 0.9).
+    assert area.distances([0.5, 0.9, 0.0]).min() == pytest.approx(0.3, abs=1e-6)
     assert area.distances([1.3, 0.0, 0.0]).min() > 0.3
 
 
@@ -365,10 +374,11 @@ def test_zones_and_priors_far_from_the_area_are_doubted_by_name():
     assert area.doubts == [
         'environment.keep_outs[1]: lies 80 m outside of the area, where it has no effect',
         'environment.keep_outs[2]: lies 8 m outside of the area, where it has no effect',
-        'environment.keep_outs[3]: lies 4.72e+03 km outside of the area, where it has no effect; '
-        'latitude and longitude exchanged?',
+        'environment.keep_outs[3]: lies 4,717 km outside of the area, where it has no effect',
         'environment.obstacles[0]: lies 80 m outside of the area, where it has no effect',
         'environment.prior.polygons[1]: lies 80 m outside of the area, where it has no effect',
+        'environment.prior: is the same everywhere in the area: targets are expected evenly over '
+        'it',
     ]
     assert Area(environment(area=RING, keep_outs=[SQUARE])).doubts == []
 

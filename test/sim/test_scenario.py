@@ -130,7 +130,7 @@ WRONG = [
     *(
         ([(f'environment.{key}', value)], f'environment.{key}{inner}', [words])
         for key, value, inner, words in (
-            ('area', [[0, 0], [1, 1]], '', 'at least 4'),
+            ('area', [[0, 0], [1, 1]], '', 'at least 3 corners'),
             ('altitude', [0.0, 1.0], '', 'allowed with area'),
             ('keep_outs', ['circle'], '[0]', 'allowed is GeoJSON'),
             ('keep_outs', [ROUND], '', 'leave nothing'),

@@ -5,11 +5,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from maasi_filter.shapes import InputWarning
 from maasi_sim.run.buildings.building_mission import BuildingMission
 from maasi_sim.run.buildings.scenario import NAME, check_cuboid_scenario, is_cuboid_scenario
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.targets.mission import TargetMission
-from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning
+from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import check_scenario, find_scenario, read_scenario
 
 
@@ -41,9 +42,10 @@ def checked_mission(
 ) -> tuple[Mission[Any], list[str]]:
     """Read a scenario file; return what is hardly meant in it as well."""
     with warnings.catch_warnings(record=True) as doubts:
-        warnings.simplefilter('always', ScenarioWarning)
+        warnings.simplefilter('always', InputWarning)
         mission = load_mission(path, overrides)
-    return mission, [str(doubt.message) for doubt in doubts]
+    # A file with overrides is read twice.
+    return mission, list(dict.fromkeys(str(doubt.message) for doubt in doubts))
 
 
 def send_warning(mission: Mission[Any], send: Callable[[str], None]) -> None:

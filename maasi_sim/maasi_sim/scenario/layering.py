@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from maasi_filter.plugins import own_settings, unknown
 from maasi_filter.ros.parameters import choices
+from maasi_filter.shapes import InputWarning
 
 Key = tuple[str | int, ...]
 Model = TypeVar('Model', bound=BaseModel)
@@ -23,7 +24,7 @@ class ScenarioError(ValueError):
     """Invalid input: names file, key, value and what is allowed."""
 
 
-class ScenarioWarning(UserWarning):
+class ScenarioWarning(InputWarning):
     """Valid input that is hardly meant: names file, key and value."""
 
 

@@ -1,0 +1,319 @@
+"""Polygons from corners, well-known text, maps of Nav2, and GeoJSON as map programs write it."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry.base import BaseGeometry
+
+from maasi_filter.arrays import FloatArray
+from maasi_filter.geodesy import OriginSettings, to_map
+from maasi_filter.occupancy_map import read_map
+
+_GEOJSON, MAPS = ('.json', '.geojson'), ('.yaml', '.yml')
+_LARGEST = 10_000.0  # of an area in degrees [km2]; larger ones are mistakes
+_NAMED = 5  # so many features that are left out are named
+# WGS 84 in degrees, longitude first, as programs call it; GeoJSON of today has no other system.
+_WGS84 = re.compile(
+    r'(CRS:?84h?|EPSG:{1,2}(4326|4979)|(?<!\d)4326|WGS[ _]?(19)?84)$', re.IGNORECASE
+)
+_CONVERT = 'convert it: ogr2ogr -f GeoJSON -t_srs EPSG:4326 wgs84.geojson FILE'
+
+
+class InputWarning(UserWarning):
+    """What was assumed of an input, or left out of it."""
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A feature of GeoJSON with polygons.
+
+    name: as in messages; shape: in degrees or, if it says so, in metres of the map.
+    """
+
+    name: str
+    shape: BaseGeometry
+    properties: Mapping[str, Any]
+
+    @property
+    def in_metres(self) -> bool:
+        """Whether it is in metres of the map, as drawn on the page of a run without an origin."""
+        return bool(self.properties.get('unit') == 'm')
+
+
+def short(value: Any) -> str:
+    """Return the beginning of a value as JSON, for messages."""
+    text = value if isinstance(value, str) else json.dumps(value, default=str)
+    return text if len(text) <= 60 else f'{text[:57]}...'
+
+
+def is_geojson(value: Any) -> bool:
+    """Return whether a value is GeoJSON, or the name of a file of it."""
+    if isinstance(value, str):
+        return Path(value).suffix.lower() in _GEOJSON
+    return isinstance(value, Mapping) and 'type' in value
+
+
+def is_wkt(value: Any) -> bool:
+    """Return whether a value is the well-known text of polygons."""
+    return isinstance(value, str) and value.lstrip().upper().startswith(('POLYGON', 'MULTIPOLYGON'))
+
+
+def read_shape(value: Any, origin: OriginSettings | None = None) -> BaseGeometry:
+    """Return the polygons of a value: rings [m], well-known text, a map of Nav2, or GeoJSON.
+
+    ValueError where GeoJSON in degrees has to do without an origin, or what is read is no polygon.
+    """
+    if is_wkt(value):
+        try:
+            return _sound(shapely.from_wkt(value), f'read {short(value)}')
+        except shapely.GEOSException:
+            raise ValueError(
+                f'read {short(value)}, allowed is text as POLYGON ((0 0, 9 0, 9 9, 0 0))'
+            ) from None
+    if isinstance(value, str) and Path(value).suffix.lower() in MAPS:
+        return read_map(value)
+    if isinstance(value, (list, tuple)):
+        return _sound(_of_rings(value), f'read {short(value)}')
+    return polygons_of(features_of(value), origin)
+
+
+def _of_rings(value: Sequence[Any]) -> Polygon:
+    try:
+        rings = value if np.ndim(value[0][0]) else [value]
+        corners = [np.array([[*row] for row in ring], dtype=float) for ring in rings]
+    except (TypeError, ValueError, LookupError):
+        raise ValueError(f'read {short(value)}, allowed are corners [[x, y], ...]') from None
+    for ring in corners:
+        if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 3:
+            raise ValueError(
+                f'read {short(value)}, allowed are at least 3 corners of two numbers, [[x, y], ...]'
+            )
+        if not np.isfinite(ring).all():
+            raise ValueError(f'read {short(value)}, allowed are finite numbers')
+    return Polygon(corners[0], corners[1:])
+
+
+def _sound(found: BaseGeometry, words: str, unit: str = 'm') -> BaseGeometry:
+    """Return polygons if they are some; words: what was read."""
+    if not isinstance(found, (Polygon, MultiPolygon)) or found.is_empty:
+        raise ValueError(f'{words}, allowed are polygons')
+    if not found.is_valid:
+        reason = str(shapely.is_valid_reason(found))
+        what, place = re.fullmatch(r'([^\[]*)(?:\[(.*)\])?', reason).groups()  # type: ignore[union-attr]
+        where = ''
+        if place:
+            x, y = (float(number) for number in place.split()[:2])
+            named = (f'longitude {x:.6f}, latitude {y:.6f}', f'({x:.2f}, {y:.2f}) m')
+            where = f' at {named[unit == "m"]}'
+        raise ValueError(f'{words}: {what.lower()}{where}; allowed are polygons that are simple')
+    return found
+
+
+def polygons_of(features: Sequence[Feature], origin: OriginSettings | None) -> BaseGeometry:
+    """Return the union of features on the map [m]; ValueError if it needs an origin."""
+    if all(feature.in_metres for feature in features):
+        return shapely.union_all([feature.shape for feature in features])
+    if origin is None:
+        raise ValueError('GeoJSON in degrees needs environment.origin')
+    around = origin.longitude
+    shapes = [_unwrapped(feature.shape, around) for feature in features]
+
+    def project(degrees: FloatArray) -> FloatArray:
+        return to_map(degrees, origin)
+
+    found = shapely.transform(shapely.union_all(shapes), project)
+    if found.is_valid:
+        return found
+    # Where corners lie on edges of others, which the map bends by fractions of a millimetre.
+    parts = shapely.get_parts(shapely.make_valid(found))
+    return shapely.union_all([part for part in parts if isinstance(part, (Polygon, MultiPolygon))])
+
+
+def _unwrapped(shape: BaseGeometry, around: float) -> BaseGeometry:
+    """Return a shape whose longitudes differ from `around` by at most 180 degrees."""
+
+    def turn(degrees: FloatArray) -> FloatArray:
+        turns = np.round((degrees[:, 0].mean() - around) / 360.0)
+        return degrees - [360.0 * turns, 0.0]
+
+    parts = [shapely.transform(part, turn) for part in shapely.get_parts(shape)]
+    return shapely.union_all(parts)
+
+
+def centre_of(features: Sequence[Feature]) -> dict[str, float]:
+    """Return an origin amid features in degrees; halves at 180 degrees are one area."""
+    whole = shapely.union_all([feature.shape for feature in features])
+    west, _, east, _ = whole.bounds
+    if east - west > 180.0:
+        whole = _unwrapped(whole, 180.0)
+    west, south, east, north = whole.bounds
+    longitude = 0.5 * (west + east)
+    longitude -= 360.0 if longitude > 180.0 else 0.0
+    return {'latitude': 0.5 * (south + north), 'longitude': longitude}
+
+
+def check_size(found: BaseGeometry) -> None:
+    """Raise ValueError if an area in degrees is larger than any search."""
+    if found.area > 1e6 * _LARGEST:
+        raise ValueError(
+            f'covers {found.area / 1e6:,.0f} km2, allowed are {_LARGEST:,.0f}: are these metres, '
+            'or is the latitude first? GeoJSON has the longitude first, in degrees'
+        )
+
+
+def features_of(value: Any) -> list[Feature]:
+    """Return the features with polygons of GeoJSON: values, text or the name of a file.
+
+    What is no polygon is left out, with one warning that names it.
+    """
+    named = isinstance(value, str) and is_geojson(value) and not value.lstrip().startswith('{')
+    source = f'{value}: ' if named else ''
+    data = _parsed(value, named)
+    if not isinstance(data, Mapping):
+        raise ValueError(f'{source}read {short(data)}, allowed is GeoJSON')
+    _check_system(data, source)
+    rows: Any = [data]
+    if data.get('type') == 'FeatureCollection':
+        rows = data.get('features')
+    elif data.get('type') != 'Feature':
+        rows = [{'type': 'Feature', 'geometry': data}]
+    if not isinstance(rows, list):
+        raise ValueError(f'{source}features: read {short(rows)}, allowed is a list of features')
+    found, left = [], []
+    for number, row in enumerate(rows, 1):
+        if not isinstance(row, Mapping):
+            raise ValueError(
+                f'{source}feature {number}: read {short(row)}, allowed is a list of features'
+            )
+        feature, rest = _feature(number, row, source)
+        left += rest
+        if feature is not None:
+            found.append(feature)
+    if not found:
+        raise ValueError(f'{source}there is no polygon in it' if source else 'holds no polygon')
+    if left:
+        more = f' and {len(left) - _NAMED} more' if len(left) > _NAMED else ''
+        warnings.warn(
+            f'{source}left out, as these are no polygons: {"; ".join(left[:_NAMED])}{more}',
+            InputWarning,
+            stacklevel=2,
+        )
+    return found
+
+
+def _parsed(value: Any, named: bool) -> Any:
+    if not isinstance(value, str):
+        return value
+    if not named and not value.lstrip().startswith('{'):
+        raise ValueError(f'read {short(value)}, allowed is GeoJSON, or the name of its file')
+    try:
+        # Some programs begin a file with a byte order mark.
+        return json.loads(Path(value).read_text(encoding='utf-8-sig') if named else value)
+    except OSError as error:
+        raise ValueError(f'{value}: {error.strerror}') from None
+    except (ValueError, RecursionError) as error:
+        line = f' in line {error.lineno}' if isinstance(error, json.JSONDecodeError) else ''
+        raise ValueError(f'{short(value)}: is no JSON{line}') from None
+
+
+def _check_system(data: Mapping[str, Any], source: str) -> None:
+    """Raise ValueError if the member `crs` of GeoJSON names another system than WGS 84."""
+    crs = data.get('crs')
+    if crs is None:
+        return
+    properties = crs.get('properties') if isinstance(crs, Mapping) else None
+    name = properties.get('name') if isinstance(properties, Mapping) else crs
+    if not isinstance(name, str) or not _WGS84.search(name.strip()):
+        raise ValueError(
+            f'{source}crs: read {short(name)}, allowed is WGS 84 (EPSG:4326); {_CONVERT}'
+        )
+
+
+def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature | None, list[str]]:
+    """Return a feature, None if it has no polygon, and words about what of it is no polygon."""
+    properties = row.get('properties')
+    if properties is not None and not isinstance(properties, Mapping):
+        raise ValueError(
+            f'{source}feature {number}: properties: read {short(properties)}, allowed is an object'
+        )
+    facts = properties or {}
+    said = [facts.get('name'), facts.get('title'), row.get('id'), facts.get('id')]
+    title = next((str(word) for word in said if word not in (None, '')), '')
+    name = f'feature {number}' + (f' ({title[:40]})' if title else '')
+    where, left, shapes = f'{source}{name}', [], []
+    for kind, coordinates in _parts(row.get('geometry'), where):
+        if kind != 'Polygon' or not coordinates:
+            left.append(f'{name}: {kind}')
+            continue
+        shape = _sound(_polygon(coordinates, where), where, 'degrees')
+        if facts.get('unit') != 'm':
+            _check_degrees(shape, where)
+        shapes.append(shape)
+    if not shapes:
+        return None, left or [f'{name}: empty']
+    return Feature(where, shapely.union_all(shapes), facts), left
+
+
+def _parts(geometry: Any, where: str) -> Iterator[tuple[str, Any]]:
+    """Yield kind and coordinates of the simple parts of a geometry."""
+    if geometry is None:
+        yield 'no geometry', None
+        return
+    if not isinstance(geometry, Mapping) or not isinstance(geometry.get('type'), str):
+        raise ValueError(
+            f'{where}: geometry: read {short(geometry)}, allowed is an object with type'
+        )
+    kind, coordinates = geometry['type'], geometry.get('coordinates')
+    if kind == 'GeometryCollection':
+        for part in geometry.get('geometries') or ():
+            yield from _parts(part, where)
+    elif kind == 'MultiPolygon' and isinstance(coordinates, list):
+        for part in coordinates:
+            yield 'Polygon', part
+    else:
+        yield kind, coordinates
+
+
+def _polygon(coordinates: Any, where: str) -> Polygon:
+    """Return a polygon; of each position, which may have heights and times, the first two."""
+    try:
+        rings = [np.array([row[:2] for row in ring], dtype=float) for ring in coordinates]
+        if any(ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 3 for ring in rings):
+            raise ValueError
+    except (TypeError, ValueError, LookupError):
+        raise ValueError(
+            f'{where}: coordinates: read {short(coordinates)}, allowed are rings of at least 3 '
+            'positions [longitude, latitude]'
+        ) from None
+    if not all(np.isfinite(ring).all() for ring in rings):
+        raise ValueError(f'{where}: coordinates: allowed are finite numbers')
+    return Polygon(rings[0], rings[1:])
+
+
+def _check_degrees(shape: BaseGeometry, where: str) -> None:
+    """Raise ValueError with the likely cause if coordinates are no degrees."""
+    x, y = shapely.get_coordinates(shape).T
+    wrong = np.flatnonzero((np.abs(x) > 180.0) | (np.abs(y) > 90.0))
+    if not len(wrong):
+        return
+    east, north = float(x[wrong[0]]), float(y[wrong[0]])
+    if np.abs([x, y]).max() > 360.0:
+        cause = f'are these metres? {_CONVERT}'
+    elif np.abs(x).max() <= 90.0:
+        cause = 'is the latitude first? GeoJSON has the longitude first'
+    else:
+        cause = 'cut the polygon at 180 degrees, as RFC 7946 says'
+    raise ValueError(
+        f'{where}: read longitude {east:.10g}, latitude {north:.10g}, allowed are 180 and 90 '
+        f'degrees: {cause}'
+    )
