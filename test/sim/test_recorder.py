@@ -3,8 +3,10 @@
 import signal
 import subprocess
 import sys
+import threading
 import time
 
+import numpy as np
 import pytest
 import rclpy
 import yaml
@@ -17,7 +19,8 @@ from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
-from maasi_msgs.msg import AgentState, LockstepStep
+from maasi_msgs.msg import AgentState, BatchMember, DetectionArray, FilterUpdate, LockstepStep
+from maasi_sim.run import recorder_node
 from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.mission import RunEnd
 from maasi_sim.run.missions import load_mission
@@ -174,6 +177,76 @@ def test_a_state_of_the_last_step_counts_also_after_the_end(session):
     session.until(lambda: '/rover/state' in session.recorder.last_seen)
     record = session.recorder.observer.record(RunEnd('time_limit', 10.0, 1.0))
     assert [place[1] for place in record.trajectories['rover']] == pytest.approx([0.3])
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_the_recording_holds_what_the_updates_up_to_the_end_used(session, seed):
+    draw, last = np.random.default_rng(seed), 20
+    steps, updates, seen = (
+        session.node.create_publisher(kind, topic, RELIABLE)
+        for kind, topic in (
+            (LockstepStep, STEP),
+            (FilterUpdate, '/filter_update'),
+            (DetectionArray, '/rover/detections'),
+        )
+    )
+    session.connect(steps, updates, seen)
+    recorder = session.recorder
+    # A robot measures up to four steps after it was asked, and messages overtake each other.
+    asked = np.arange(1, last + 5)
+    measured = asked + draw.integers(0, 5, len(asked))
+    late = measured + draw.integers(0, 3, len(asked))
+    for step in range(1, last + 1):
+        for index in np.flatnonzero(late == step).tolist():
+            publish_detections(seen, index, int(measured[index]))
+        publish_update(updates, step, asked.tolist().index(step))
+        steps.publish(LockstepStep(step=step, robots=['rover'], stamp=stamp_to_ros(step * 10**8)))
+        if draw.random() < 0.5:
+            session.turn()
+    session.until(lambda: recorder.step == last)
+    recorder.observer.end_step = last
+    rest = [index for index in range(len(asked)) if late[index] > last]
+    after = threading.Timer(
+        0.1, lambda: [publish_detections(seen, index, int(measured[index])) for index in rest]
+    )
+    after.start()
+    recorder.finish()
+    after.join()
+    assert recorder.observer.lacking(last) == []
+    recorder.drain()
+    session.bag.close()
+    with Bag(session.path) as bag:
+        held = {item.message.measurement for item in bag.messages(['/rover/detections'])}
+    used = set(np.flatnonzero(asked <= last).tolist())
+    assert used <= held <= used | set(np.flatnonzero(measured <= last).tolist())
+
+
+def publish_detections(publisher, index, step):
+    message = DetectionArray(measurement=index, step=step, robot='rover')
+    message.header.stamp = stamp_to_ros(step * 10**8)
+    message.pose.pose.orientation.w = 1.0
+    publisher.publish(message)
+
+
+def publish_update(publisher, step, index):
+    message = FilterUpdate(batch_id=step, step=step)
+    message.header.stamp = stamp_to_ros(step * 10**8)
+    message.members = [BatchMember(robot='rover', measurement=index)]
+    publisher.publish(message)
+
+
+def test_a_measurement_that_never_arrives_is_a_gap(session, monkeypatch):
+    monkeypatch.setattr(recorder_node, '_LAST_PATIENCE', 0.1)
+    steps = session.node.create_publisher(LockstepStep, STEP, RELIABLE)
+    updates = session.node.create_publisher(FilterUpdate, '/filter_update', RELIABLE)
+    session.connect(steps, updates)
+    publish_update(updates, 1, 7)
+    steps.publish(LockstepStep(step=1, robots=['rover'], stamp=stamp_to_ros(10**8)))
+    session.until(lambda: session.recorder.step == 1)
+    session.until(lambda: '/filter_update' in session.recorder.last_seen)
+    session.recorder.finish()
+    lacks = 'the recording lacks measurement 7 of rover, which an update used'
+    assert lacks in session.recorder.gaps(False, 5.0)
 
 
 PEER = """

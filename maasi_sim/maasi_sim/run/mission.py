@@ -91,6 +91,14 @@ class Observer(ABC):
     def settle(self) -> None:  # noqa: B027 - missions that evaluate at the end need none
         """Evaluate the messages added since the last call."""
 
+    def rests_on(self, topic: str, data: bytes, last_step: int) -> bool:
+        """Return whether an update up to a step used this measurement, which may be later."""
+        return False
+
+    def lacking(self, last_step: int) -> list[str]:
+        """Return in words the measurements of updates up to a step that have not arrived."""
+        return []
+
     @abstractmethod
     def record(self, end: RunEnd) -> Any:
         """Return the record of the run, up to the step at which all was found."""

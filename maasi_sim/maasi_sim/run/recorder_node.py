@@ -39,11 +39,13 @@ _SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)  # topics shared by all teams of a domain
 _SKIPPED = ('/parameter_events', READY)  # not recorded: of no use to readers of the recording
 _KEPT = '/found_targets/kept'  # a copy of the found targets for a restarted filter
 # Topics still recorded during shutdown.
+_MEASURED = '/detections'
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
 # The clock may come after messages of its time: by so much [s], in lockstep by so many steps. A
 # larger lead is of another clock.
 _LARGEST_LEAD, _MOST_STEPS = 1.0, 50
 _ARMING_PERIOD = 2.0  # between two calls to take off [s]
+_LAST_PATIENCE = 5.0  # longest wait for measurements that the last updates used [s]
 _STOP_PATIENCE = 1.0  # longest wait for the acknowledgement of stop commands [s]
 _ACKNOWLEDGED = Duration(seconds=0.1)  # until they are sent again
 
@@ -256,7 +258,7 @@ class Recorder:
             self.time = max(self.time, time_at(data, 4))
         topics = [topic for topic in self._subscriptions if topic not in self._in_order]
         # Detections refer to images of the same stamp.
-        topics.sort(key=lambda topic: topic.endswith('/detections'))
+        topics.sort(key=lambda topic: topic.endswith(_MEASURED))
         others = [item for item in self._take(topics) if self._is_own(*item)]
         if limit is not None and self.step is not None and not self._finished:
             # Messages of the step at the limit may come before that step.
@@ -270,7 +272,7 @@ class Recorder:
         taken = [
             (self._logged(before, topic, data), topic, data)
             for topic, data in clocks + others + updates + steps
-            if self._belongs(topic, data)
+            if topic.endswith(_MEASURED) or self._belongs(topic, data)
         ]
         taken.sort(key=itemgetter(0))
         now = time.monotonic()
@@ -290,6 +292,7 @@ class Recorder:
         if self.observer.end_step is not None and not self._finished:
             self._last_step = self.observer.end_step
             self._end = stamp_of_step(self._last_step, self._step_length)
+        if self._last_step >= 0:
             taken = [item for item in taken if self._belongs(*item[1:])]
         self._record(taken)
 
@@ -351,19 +354,30 @@ class Recorder:
                 gaps.append(f'the recording lacks {topic}')
             elif missed > patience:
                 gaps.append(f'the recording lacks the first {missed:.1f} s of {topic}')
-        return gaps
+        lacking = self.observer.lacking(self._last_step)
+        return gaps + [f'the recording lacks {what}, which an update used' for what in lacking]
 
     def finish(self) -> None:
-        """Keep only messages of the steps so far and of the shutdown from now on."""
-        self._finished = True
+        """Keep only messages of the steps so far, what they rest on, and the shutdown from now on.
+
+        An update may arrive before a measurement that it used: wait for that.
+        """
         if self._last_step < 0 and self.step is not None:
             self._last_step = self.step
+        deadline = time.monotonic() + _LAST_PATIENCE
+        while self.observer.lacking(self._last_step) and time.monotonic() < deadline:
+            time.sleep(0.01)
+            self.drain()
+        self._finished = True
 
     def _belongs(self, topic: str, data: bytes) -> bool:
         if self._last_step < 0:
             return True
         kind = self._subscriptions[topic].msg_type
         if self._finished and topic.rpartition('/')[2] in _AT_THE_END:
+            return True
+        # A robot may answer the last batch with an image of a later step.
+        if self.observer.rests_on(topic, data, self._last_step):
             return True
         if stamp_of(topic, kind, data) > stamp_of_step(self._last_step, self._step_length):
             return False

@@ -198,8 +198,8 @@ class ScenarioRun:
         self.ending = self._wait_until_ready() or self._follow()
         now = time.monotonic()
         self.wall_time = now - (self._begun or now)
-        self._check_recording()
         self.recorder.finish()
+        self._check_recording()
         self.supervisor.stop(self._is_followed())
 
     def _wait_until_ready(self) -> Ending | None:

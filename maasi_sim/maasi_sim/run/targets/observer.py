@@ -43,6 +43,10 @@ class TargetObserver(Observer):
         # Step at which all planners were settled.
         self._ending: int | None = None
         self._explored: dict[str, float] = {}
+        # Robot and index of each measurement that has arrived; of each that an update used, its
+        # step.
+        self._arrived: set[tuple[str, int]] = set()
+        self._used: dict[tuple[str, int], int] = {}
 
     def add(self, topic: str, data: bytes) -> None:
         """See `Observer.add`."""
@@ -63,14 +67,32 @@ class TargetObserver(Observer):
                 self._note_ending(step)
         elif topic in self._detections:
             self._detections[topic].append(data)
+            self._arrived.add(self._key(topic, data))
         elif topic in self._states and self._settled and self.robots is None:
             self._note_ending(int(self.decode(data, 'AgentState').step))
         elif topic in self._updates:
             update = self.decode(data, 'FilterUpdate')
             self._new_updates.append((self._updates[topic], update))
+            for member in update.members:
+                key = member.robot, int(member.measurement)
+                self._used.setdefault(key, int(update.step))
         elif topic in self._arrays:
             array = self.decode(data, 'FoundTargetArray')
             self._new_arrays[self._arrays[topic]].append(array)
+
+    def _key(self, topic: str, data: bytes) -> tuple[str, int]:
+        return topic.split('/')[1], int(self.decode(data, 'DetectionArray').measurement)
+
+    def rests_on(self, topic: str, data: bytes, last_step: int) -> bool:
+        """See `Observer.rests_on`."""
+        if topic not in self._detections:
+            return False
+        return self._used.get(self._key(topic, data), last_step + 1) <= last_step
+
+    def lacking(self, last_step: int) -> list[str]:
+        """See `Observer.lacking`."""
+        used = {key for key, step in self._used.items() if step <= last_step}
+        return [f'measurement {index} of {name}' for name, index in sorted(used - self._arrived)]
 
     def _note_step(self, step: Any) -> None:
         before = self.robots
