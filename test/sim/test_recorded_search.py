@@ -9,8 +9,10 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image
 from test_scenario import PLAIN
 
+from maasi_filter.make_filter import make_filter
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_sim import search as search_module
+from maasi_sim.run import recorded_search
 from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.run_scenario import main
 from maasi_sim.scenario.loading import load_scenario
@@ -145,3 +147,31 @@ def test_a_robot_without_camera_is_refused(searched, capsys):
     folder, _ = searched
     assert main(['ranging_drone_3d', '--replay', str(folder / 'odom')]) == 2
     assert 'camera: got nothing, allowed with --replay' in capsys.readouterr().err
+
+
+def test_area_keep_outs_and_expected_targets_hold(searched, tmp_path, capsys, monkeypatch):
+    folder, result = searched
+    first, *others = (target.position for target in result.found_targets)
+    environment = {
+        **SCENARIO['environment'],
+        'area': [[-0.3, -0.3], [0.9, -0.3], [0.9, 0.9], [-0.3, 0.9]],
+        'keep_outs': [f'{first[0]} {first[1]} 0.06'],
+        'expected_targets': 3.0,
+    }
+    file = tmp_path / 'other.yaml'
+    file.write_text(yaml.safe_dump({**SCENARIO, 'environment': environment}))
+    areas = []
+    monkeypatch.setattr(
+        recorded_search,
+        'make_filter',
+        lambda settings, area, generator: (
+            areas.append(area) or make_filter(settings, area, generator)
+        ),
+    )
+    assert main([str(file), '--replay', str(folder / 'odom'), '--out', str(tmp_path / 'out')]) == 0
+    assert areas[0].settings == load_scenario(file).environment
+    assert areas[0].expected_targets == 3.0
+    rows = np.genfromtxt(tmp_path / 'out/found_targets.csv', delimiter=',', names=True, dtype=None)
+    again = np.stack([rows['x'], rows['y']], axis=1)
+    assert np.linalg.norm(again - first, axis=1).min() > 0.06
+    assert all(np.linalg.norm(again - other, axis=1).min() < 0.015 for other in others)

@@ -9,6 +9,7 @@ from maasi_drivers.calibration.bag_reader import BagError, BagReader
 from maasi_drivers.calibration.recorded_robot import USED, RecordedRobot
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.marker_detector import read_markers
+from maasi_filter.area import Area
 from maasi_filter.make_filter import make_filter
 from maasi_filter.records import AgentMeasurement, FoundTarget
 from maasi_planner.coordinator import Coordinator
@@ -97,7 +98,7 @@ def search_measurements(
     common = {'step': scenario.step, 'seed': scenario.seed, 'lockstep': True}
     coordinator = Coordinator(planner_settings(scenario, scenario.names(), common))
     generator = np.random.default_rng(scenario.seed)
-    search_filter = make_filter(scenario.filter, scenario.environment.array(), generator)
+    search_filter = make_filter(scenario.filter, Area(scenario.environment), generator)
     trace = SearchTrace(scenario, scenario.seed)
     recorded = sorted(recorded, key=lambda item: (item[0].stamp, item[1].robot))
     first, before = recorded[0][0].stamp, 0
