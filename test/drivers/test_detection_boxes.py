@@ -118,6 +118,8 @@ def test_a_box_is_at_its_foot_or_centre_and_a_cut_one_is_less_exact():
         (box((100, 100), (10, 10), theta=math.inf), 'finite theta'),
         (box((100, 100), (10, 10), ('person', 1.5)), 'score'),
         (box((100, 100), (10, 10), ('a' * 101, 0.9)), 'class_id'),
+        (box((0.5, 0.4), (0.1, 0.2)), r'bbox: .*normalised.*pixels of 640 x 480'),
+        (box((0.5, 1.0), (1.0, 0.2)), 'normalised'),
     ],
 )
 def test_a_bad_box_is_named_and_the_others_are_used(item, said):
@@ -126,6 +128,28 @@ def test_a_bad_box_is_named_and_the_others_are_used(item, said):
     blobs, (problem,) = boxes_to_blobs(boxes(good, item, good), settings)
     assert len(blobs) == 2
     assert re.search(said, problem)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_one_bad_hypothesis_costs_no_other_and_rounding_costs_none(seed):
+    generator = np.random.default_rng([46, seed])
+    settings = CameraSettings.model_validate(LEVEL | {'detections': {}})
+    scores = generator.uniform(0.0, 0.9, 6).tolist()
+    scores[generator.integers(6)] = best = float(generator.choice([1.0, 1.0000001, 1.0 + 5e-7]))
+    expected = f'c{scores.index(best)}'
+    item = box((100, 100), (10, 10), None)
+    bad = generator.integers(0, 7)
+    for number, score in enumerate(scores):
+        if number == bad:
+            item.results += box((0, 0), (1, 1), ('broken', math.nan)).results[1:]
+        item.results += box((0, 0), (1, 1), (f'c{number}', score)).results[1:]
+    blobs, problems = boxes_to_blobs(boxes(item), settings)
+    assert [(label.class_id, label.score) for label in blobs.labels] == [(expected, 1.0)]
+    assert len(problems) == (bad < 6) and all('nan' in problem for problem in problems)
+    only = box((100, 100), (10, 10), None)
+    only.results += box((0, 0), (1, 1), ('broken', math.nan)).results[1:]
+    blobs, problems = boxes_to_blobs(boxes(only), settings)
+    assert not len(blobs) and len(problems) == 1
 
 
 def with_boxes(**changes):
@@ -208,6 +232,36 @@ def test_a_camera_that_turns_on_the_robot_is_where_tf_says(searching):
     expected = [0.12, 0.05]
     _, seen = look(expected, view=view)
     assert_allclose(seen[-1:], [expected], atol=4e-3)
+
+
+def test_boxes_of_other_classes_are_reported_with_the_classes_seen(searching, capfd):
+    _, driver, team, _ = searching
+    for labels, said in (
+        ([('0', 0.9), ('Person', 0.8)], "'person'; seen are '0', 'Person', 'dog'"),
+        ([('0', 0.9)], ''),  # said already
+        ([('2', 0.9)], "seen are '0', '2', 'Person', 'dog'"),
+        ([('person', 0.9)], ''),
+        ([('3', 0.9)], ''),  # the classes are right, others may be there
+    ):
+        team.move()
+        message = boxes(*(box((80, 60), (20, 20), label) for label in labels))
+        driver.sensor_input._on_boxes(stamped(message, team.step * NANOSECONDS))
+        warned = capfd.readouterr().err
+        assert (said in warned) if said else ('seen are' not in warned)
+
+
+def test_boxes_in_the_frame_of_the_body_are_refused(searching, capfd):
+    _, driver, team, _ = searching
+    for frame in ('rover/base_link', 'camera_link'):
+        # A body's axes, a little tilted: z is up.
+        turn = Pose.from_rpy([0.1, 0.0, 0.3], [0.0, 0.4, 0.2])
+        if frame == 'camera_link':
+            message = TFMessage(transforms=[transform('rover/base_link', frame, turn)])
+            team.create_publisher(TFMessage, '/tf_static', LATCHED).publish(message)
+            team.until(lambda: 'camera_link' in driver.frames._buffer._edges)
+        stamp = team.step * NANOSECONDS
+        with pytest.raises(ValueError, match=rf'{frame}.*z axis points up.*optical frame'):
+            driver.sensor_input._placed(frame, stamp)
 
 
 def test_without_vision_msgs_boxes_are_refused_and_all_else_works(play, monkeypatch):

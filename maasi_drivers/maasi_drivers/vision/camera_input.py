@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 from zlib import crc32
 
@@ -31,17 +32,17 @@ from maasi_filter.ros.qos import RELIABLE, SENSOR, sensor_reader
 def boxes_to_blobs(message: Any, camera: CameraSettings) -> tuple[Blobs, list[str]]:
     """Return the boxes of a `vision_msgs/Detection2DArray` that are used, and errors of others.
 
-    A box is labelled by its hypothesis with the largest score. The id of a tracker is no identity:
-    it is another one when a target is seen again.
+    A box is labelled by its hypothesis with the largest score; one that is not a number is left
+    out. The id of a tracker is no identity: it is another one when a target is seen again.
     """
     settings, size = camera.detections, np.array([camera.width, camera.height], dtype=float)
     assert settings is not None
     corners, labels, problems = [], [], []
     for item in message.detections:
-        hypotheses = [result.hypothesis for result in item.results] or [UNLABELLED]
-        best = max(hypotheses, key=lambda hypothesis: float(hypothesis.score))
         try:
-            label = Label(best.class_id, best.score)
+            best, unknown = _best(item)
+            problems += [f'score: read {score}, allowed is 0 to 1' for score in unknown]
+            label = Label(best.class_id, _score(best.score))
             if (problem := label_problem(label)) is not None:
                 raise ValueError(problem)
             if not settings.classes or label.class_id in settings.classes:
@@ -69,11 +70,31 @@ def boxes_to_blobs(message: Any, camera: CameraSettings) -> tuple[Blobs, list[st
     return blobs, problems
 
 
+def _best(item: Any) -> tuple[Any, list[float]]:
+    """Return the hypothesis of a box with the largest score, and scores that are not a number."""
+    given = [result.hypothesis for result in item.results]
+    known = [hypothesis for hypothesis in given if not np.isnan(hypothesis.score)]
+    if given and not known:
+        raise ValueError('score: read nan in each hypothesis, allowed is 0 to 1')
+    best = max(known, key=lambda hypothesis: float(hypothesis.score), default=UNLABELLED)
+    return best, [item.score for item in given if np.isnan(item.score)]
+
+
+def _score(score: float) -> float:
+    """Return a score; sums of probabilities may miss 0 or 1 by their rounding."""
+    return float(np.clip(score, 0.0, 1.0)) if -1e-6 <= score <= 1.0 + 1e-6 else score
+
+
 def _corners(box: Any, size: FloatArray) -> FloatArray:
     """Return the least and largest x and y of a box, which may be turned, in the image (2, 2)."""
     place, turn = box.center.position, box.center.theta
     numbers = np.array([place.x, place.y, box.size_x, box.size_y, turn])
     centre, extent = numbers[:2], numbers[2:4]
+    if (numbers[:4] >= 0.0).all() and (numbers[:4] <= 1.0).all() and (extent > 0.0).all():
+        raise ValueError(
+            f'bbox: read centre and size {numbers[:4].tolist()}, which are shares of the image '
+            f'(normalised); allowed are pixels of {size[0]:g} x {size[1]:g}'
+        )
     inside = (centre >= 0.0).all() and (centre <= size).all()
     if not (inside and np.isfinite(numbers).all() and (extent > 0.0).all()):
         raise ValueError(
@@ -117,6 +138,7 @@ class CameraInput(SensorInput[Picture]):
         # None where images come from a topic.
         self._source: VideoSource | FeedReceiver | None = None
         self._calibration: tuple[object, ...] | None = None
+        self._classes: set[str] = set()  # of boxes
         self._unusable = ''  # why the calibration cannot be used
         self._checksum: int | None = None
 
@@ -325,10 +347,28 @@ class CameraInput(SensorInput[Picture]):
 
     def _on_boxes(self, message: Any) -> None:
         blobs, problems = boxes_to_blobs(message, self.camera)
+        self._watch_classes(message)
         if problems:
             self.driver.drop('box', f'camera/detections: {problems[0]}', len(problems))
         stamp = stamp_from_ros(message.header.stamp)
         self.driver.take_frame('camera/detections', stamp, lambda: blobs)
+
+    def _watch_classes(self, message: Any) -> None:
+        """Warn of each new class while there was no box of the classes that are looked for."""
+        settings, number = self.camera.detections, len(self._classes)
+        if settings is None or not settings.classes or self._classes.intersection(settings.classes):
+            return
+        given = (
+            result.hypothesis.class_id for item in message.detections for result in item.results
+        )
+        self._classes.update(islice(given, 100))
+        if not number < len(self._classes) < 100 or self._classes.intersection(settings.classes):
+            return
+        self.driver.get_logger().warning(
+            f'camera/detections: no box has a class of camera.detections.classes, '
+            f'{", ".join(map(repr, settings.classes))}; seen are '
+            f'{", ".join(repr(name[:40]) for name in sorted(self._classes)[:20])}'
+        )
 
     def _placed(self, frame: str, stamp: int) -> Camera:
         """Return the camera, where its optical frame is on the robot at a stamp [ns]."""
@@ -336,6 +376,12 @@ class CameraInput(SensorInput[Picture]):
         if frame in ('', f'{self.driver.robot}/camera_optical'):
             return camera
         pose = self.driver.frames.on_robot(frame, stamp)
+        if pose.rotation()[2, 2] > 0.5:
+            raise ValueError(
+                f'camera/detections.header.frame_id: read {frame[:40]!r}, whose z axis points up, '
+                'as that of a body; allowed is the optical frame of the camera (x right, y down, '
+                'z forward)'
+            )
         return replace(camera, position=pose.position, rotation=pose.rotation())
 
     def _is_repeated(self, data: Any) -> bool:
