@@ -31,9 +31,8 @@ LOOK_AHEAD = 1.2
 ARC_STEPS = 8
 FORWARD_SAMPLES = 6
 TURN_SAMPLES = 13
-# A robot that turns by more than _STRAIGHT looks there too, as far as it may turn while it brakes
-# [rad]; one with less than this share of its speed stands.
-_STRAIGHT, _TURNS, _STANDS = 0.05, 0.35, 0.05
+# How far a robot may turn while it brakes [rad]; one with less than this share of its speed stands.
+_TURNS, _STANDS = 0.35, 0.05
 _AWAY = 0.2  # and so much it turns away from what it touches [rad]
 _TOUCHES = 1e-9  # distance of what a robot touches [m]
 
@@ -262,12 +261,15 @@ def drive_among(
         dx, dy = _along(here, (dx, dy), steering, felt)
     forward, turn = _drive(dx, dy, left, yaw, steering, clearance)
     forward = min(forward, allowed)
-    off = wrapped(math.atan2(dy, dx) - yaw)
-    off = min(max(off, -_TURNS), _TURNS)
-    if abs(off) > _STRAIGHT and state[4] > stands:
-        # It brakes before it turns to where it could not stop.
-        aside = _speed_ahead((x, y), yaw + off, steering, felt, beyond)
-        aside = min(aside, _speed_ahead((x, y), yaw + 0.5 * off, steering, felt, beyond))
+    if state[4] > stands:
+        # It brakes before it turns to where it could not stop, also while its turn ends.
+        ahead = yaw + 0.5 * state[5] * abs(state[5]) / steering.yaw_acceleration
+        off = wrapped(math.atan2(dy, dx) - ahead)
+        off = min(max(off, -_TURNS), _TURNS)
+        aside = np.inf
+        for part in (0.0, 0.5, 1.0):
+            heading = ahead + part * off
+            aside = min(aside, _speed_ahead((x, y), heading, steering, felt, beyond))
         if aside < state[4]:
             forward, turn = min(forward, aside), 0.0
     return (forward, 0.0, 0.0, turn), vertex
