@@ -116,7 +116,7 @@ def report(recorded: RecordedRobot, noise: SensorNoise, given: bool) -> str:
     names = ('range', 'bearing', 'elevation')[: len(noise.bias)]
     units = ('m', 'rad', 'rad')
     place = ' '.join(f'{value:.4f}' for value in noise.target)
-    poses = f'; poses of {recorded.poses}' if recorded.use == 'images' else ''
+    poses = f'; poses of {recorded.pose_source()}' if recorded.use == 'images' else ''
     lines = [
         f'{recorded.robot or "/"}: {noise.used} {recorded.use} used, at {noise.ranges[0]:.2f} to '
         f'{noise.ranges[1]:.2f} m{poses}',

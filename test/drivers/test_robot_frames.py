@@ -195,6 +195,21 @@ def test_odometry_may_be_in_the_map_already(play):
     assert np.linalg.norm(odometry.position - team.start.position) > 0.1
 
 
+@pytest.mark.parametrize('origin', ['zero', 'first'])
+def test_odometry_that_says_that_it_is_in_the_map_is_taken_as_that(play, capfd, origin):
+    driver, team = play(odometry_origin=origin)
+    team.odometry_frame = 'map'
+    team.until(lambda: team.say() or team.states)
+    odometry = pose_from_ros(team.odometry_message().pose.pose)
+    assert_allclose(pose_from_ros(team.state.pose.pose).position, odometry.position, atol=0.02)
+    assert np.linalg.norm(odometry.position - team.start.position) > 0.1
+    assert "odom: header.frame_id is 'map': poses are taken as in the map" in capfd.readouterr().err
+    # It does not mix with odometry from the start.
+    team.odometry_frame = 'odom'
+    team.until(lambda: team.say() or driver.dropped['odometry'] > 3)
+    assert "while messages before were in 'map'" in capfd.readouterr().err
+
+
 def test_a_goal_in_another_frame_is_reached_where_that_is(play):
     driver, team = play()
     static = team.create_publisher(TFMessage, '/tf_static', LATCHED)

@@ -20,6 +20,8 @@ from maasi_sim.scenario.loading import load_scenario
 SEED = 900
 # Stamps of a real robot are those of the wall clock [ns].
 BEGIN = 1_760_000_000_000_000_000
+# Recordings, by where their poses come from, and the namespaces of their topics.
+SPACES = {'odom': '/mambo', 'pose': '', 'in_map': '/mambo'}
 CANDIDATES = {'grid': [4, 4], 'spacing': 0.3, 'corner': [-0.15, -0.15]}
 SCENARIO = PLAIN | {
     'seed': SEED,
@@ -59,6 +61,7 @@ def searched(tmp_path_factory):
         'camera/camera_info': 'sensor_msgs/msg/CameraInfo',
         'odom': 'nav_msgs/msg/Odometry',
         'pose': 'geometry_msgs/msg/PoseStamped',
+        'in_map': 'nav_msgs/msg/Odometry',
     }
     camera = scenario.robots['mambo'].camera
     info = CameraInfo(width=camera.width, height=camera.height, distortion_model='plumb_bob')
@@ -75,18 +78,21 @@ def searched(tmp_path_factory):
             odometry.pose.pose = pose_to_ros(self.body.odometry.pose)
             place.pose = pose_to_ros(self.pose.pose)
             write(bags['odom'], '/mambo/odom', BEGIN + stamp, odometry)
+            odometry.header.frame_id, odometry.pose.pose = 'map', place.pose
+            write(bags['in_map'], '/mambo/odom', BEGIN + stamp, odometry)
             # Of the other one all topics are in the root.
             write(bags['pose'], '/pose', BEGIN + stamp, place)
             if step % round(1.0 / camera.rate / scenario.step) == 0:
                 image = image_message(self.body.image(step, stamp * 1e-9))
-                for kind, space in (('odom', '/mambo'), ('pose', '')):
+                for kind, space in SPACES.items():
                     write(bags[kind], f'{space}/camera/image_raw', BEGIN + stamp, image)
                     write(bags[kind], f'{space}/camera/camera_info', BEGIN + stamp, info)
 
-    bags = {kind: BagWriter(folder / kind, load_types()) for kind in ('odom', 'pose')}
-    for kind, space in (('odom', '/mambo'), ('pose', '')):
+    bags = {kind: BagWriter(folder / kind, load_types()) for kind in SPACES}
+    for kind, space in SPACES.items():
         for topic, name in topics.items():
-            if topic not in ('odom', 'pose') or topic == kind:
+            if topic not in SPACES or topic == kind:
+                topic = 'odom' if topic == 'in_map' else topic
                 bags[kind].add_topic(f'{space}/{topic}', name)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search_module, '_Robot', RecordedRobot)
@@ -98,7 +104,7 @@ def searched(tmp_path_factory):
     return folder, result
 
 
-@pytest.mark.parametrize('kind', ['odom', 'pose'])
+@pytest.mark.parametrize('kind', SPACES)
 def test_the_same_targets_are_found_again(searched, tmp_path, capsys, kind):
     folder, result = searched
     words = [str(folder / 'field.yaml'), '--replay', str(folder / kind), '--out', str(tmp_path)]
@@ -113,7 +119,11 @@ def test_the_same_targets_are_found_again(searched, tmp_path, capsys, kind):
     assert sorted(distances.argmin(axis=1)) == list(range(len(before)))
     assert (tmp_path / 'replay.html').exists()
     said = capsys.readouterr().out
-    topic = {'odom': '/mambo/odom', 'pose': '/pose'}[kind]
+    topic = {
+        'odom': '/mambo/odom,',
+        'pose': '/pose,',
+        'in_map': '/mambo/odom (in the map: start and yaw are not added),',
+    }[kind]
     assert f'poses of {topic}' in said and '4 targets found' in said
 
 

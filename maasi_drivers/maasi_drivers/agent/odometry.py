@@ -95,6 +95,11 @@ class MapOdometry:
         )
 
 
+def is_in_map(frame: str, origin: str, map_frame: str) -> bool:
+    """Return whether odometry is in the map: by its `header.frame_id`, or by `odometry_origin`."""
+    return origin == 'map' or frame.strip('/') == map_frame
+
+
 def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedPose:
     """Return the pose at a stamp between two others: position linear, orientation by slerp."""
     if stamp == first.stamp:

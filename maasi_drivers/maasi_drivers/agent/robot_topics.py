@@ -8,7 +8,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import BatteryState
 
-from maasi_drivers.agent.odometry import MapOdometry, StampedPose
+from maasi_drivers.agent.odometry import MapOdometry, StampedPose, is_in_map
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.settings.driver import BatteryUnit, DriverSettings
 from maasi_filter.models.pose import Pose
@@ -22,6 +22,7 @@ class OdometryTopic:
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
+        self._in_map: bool | None = None  # of the messages so far
         quality = sensor_reader(driver.settings.lockstep)
         driver.create_subscription(Odometry, 'odom', self._on_odometry, quality)
 
@@ -43,21 +44,34 @@ class OdometryTopic:
     def _place(self, stamp: int, message: Odometry) -> StampedPose:
         driver, settings = self._driver, self._driver.settings
         frame = message.header.frame_id.lstrip('/')
-        in_map = settings.odometry_origin == 'map'
-        wanted = settings.odometry_frame or (settings.frame if in_map else '')
+        in_map = is_in_map(frame, settings.odometry_origin, settings.frame)
+        wanted = settings.odometry_frame
+        wanted = wanted or (settings.frame if settings.odometry_origin == 'map' else '')
         space = frame.rpartition('/')[0]
         if (frame != wanted) if wanted else (space not in ('', driver.robot, driver.namespace)):
             raise ValueError(
                 f'header.frame_id: read {frame!r}, allowed is '
                 + (repr(wanted) if wanted else f"'odom' or '{driver.robot}/odom' (odometry_frame)")
             )
+        if self._in_map not in (None, in_map):
+            before = 'in' if self._in_map else 'not in'
+            raise ValueError(
+                f'header.frame_id: read {frame!r}, while messages before were {before} '
+                f'{settings.frame!r}; allowed is one frame'
+            )
         pose = pose_from_ros(message.pose.pose)
         covariance = np.asarray(message.pose.covariance)
         if driver.map_odometry is None:
-            origin = pose if settings.odometry_origin == 'first' else None
+            origin = pose if settings.odometry_origin == 'first' and not in_map else None
             driver.map_odometry = MapOdometry(
                 Pose(np.zeros(3)) if in_map else driver.start_pose, origin
             )
+            if in_map and settings.odometry_origin != 'map':
+                driver.get_logger().warning(
+                    f'odom: header.frame_id is {frame!r}: poses are taken as in the map, start and '
+                    'yaw are not added; odometry_origin: map confirms it'
+                )
+        self._in_map = in_map
         linear, angular = message.twist.twist.linear, message.twist.twist.angular
         bounded('twist.linear', (linear.x, linear.y, linear.z), FASTEST)
         bounded('twist.angular', (angular.x, angular.y, angular.z), FASTEST)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
+from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose, is_in_map
 from maasi_drivers.calibration.bag_reader import BagError, BagReader
 from maasi_drivers.calibration.sensor_calibration import Observation
 from maasi_drivers.settings.driver import DriverSettings
@@ -39,6 +39,7 @@ class RecordedRobot:
     ) -> None:
         self.settings = settings
         self.left_out = 0
+        self.in_map = False  # whether its odometry is, so that its start is not added
         self._bag = bag
         with BagReader(bag) as reader:
             self._types = {topic: reader.types[topic] for topic, n in reader.counts.items() if n}
@@ -77,6 +78,10 @@ class RecordedRobot:
 
     def _topic(self, name: str) -> str:
         return f'/{self.robot}{name}' if self.robot else name
+
+    def pose_source(self) -> str:
+        """Return what its poses are, for messages; once they are read."""
+        return self.poses + (' (in the map: start and yaw are not added)' if self.in_map else '')
 
     def records(self, name: str) -> bool:
         """Return whether it has messages of a topic, named from its namespace."""
@@ -164,9 +169,19 @@ class RecordedRobot:
             if pose is None:
                 continue
             if kind == 'Odometry':
+                frame, origin = message.header.frame_id, settings.odometry_origin
+                in_map = is_in_map(frame, origin, settings.frame)
                 if odometry is None:
-                    first = settings.odometry_origin == 'first'
-                    odometry = MapOdometry(start, pose if first else None)
+                    self.in_map = in_map
+                    initial = Pose(np.zeros(3)) if in_map else start
+                    first = origin == 'first' and not in_map
+                    odometry = MapOdometry(initial, pose if first else None)
+                elif in_map != self.in_map:
+                    raise ValueError(
+                        f'{self._bag}: {self.poses}: header.frame_id: read {frame!r}, while the '
+                        f'first was {"" if self.in_map else "not "}{settings.frame!r}; allowed is '
+                        'one frame'
+                    )
                 covariance = message.pose.covariance
                 known = covariance.any() and covariance[0] >= 0.0
                 stamp = _stamp(message)

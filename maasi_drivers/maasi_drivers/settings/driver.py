@@ -178,7 +178,8 @@ class DriverSettings(NodeSettings):
     odometry_origin: Literal['zero', 'first', 'map'] = Field(
         'zero',
         description='What the odometry shows at the start: zero, or its first message; '
-        'map: it is in the map already, and so is its header.frame_id',
+        'map: it is in the map already, and so is its header.frame_id. Odometry with this '
+        'frame_id is taken as in the map in any case',
     )
     pose_source: Literal['odometry', 'tf', 'pose'] | None = Field(
         None,

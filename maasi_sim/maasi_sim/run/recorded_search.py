@@ -87,7 +87,8 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Meas
             f'{bag}: {name}: none of {recorded.left_out} images can be used, allowed are images '
             f'with stamps between the first and the last of {recorded.poses}'
         )
-    print(f'{name}: {len(found)} images at poses of {recorded.poses}, {recorded.left_out} left out')
+    poses = recorded.pose_source()
+    print(f'{name}: {len(found)} images at poses of {poses}, {recorded.left_out} left out')
     return found
 
 
