@@ -17,11 +17,11 @@ setup(
         'maasi_planner',
         'numba>=0.59',
         'numpy>=1.26,<3',
-        'opencv-python-headless>=4.7',
+        'opencv-python-headless>=4.7.0.72',
         'pydantic>=2.7',
         'PyYAML>=6.0.1',
         'scipy>=1.11.4',
-        'shapely>=2.0',
+        'shapely>=2.0.3',
     ],
     extras_require={
         'calibration': ['rosbags>=0.11.5'],

@@ -18,7 +18,7 @@ setup(
         'numpy>=1.26,<3',
         'pydantic>=2.7',
         'scipy>=1.11.4',
-        'shapely>=2.0',
+        'shapely>=2.0.3',
         'typing_extensions>=4.10',
     ],
     extras_require={'test': ['pytest>=7.4']},

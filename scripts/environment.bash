@@ -1,12 +1,14 @@
 # Sets up what is missing (virtual environment, ROS 2 Jazzy wheels, build of all packages) and
 # exports the environment in which the commands run. Sourced by the commands in this folder.
 #   PYTHON            interpreter to use (3.10 to 3.13)
+#   MAASI_REQUIREMENTS   folder of requirements*.txt (default: the repository)
 #   MAASI_WORKSPACE   where environment and build go (default: .workspace in the repository)
 
 maasi_root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 maasi_workspace="${MAASI_WORKSPACE:-$maasi_root/.workspace}"
 case "$maasi_workspace" in /*) ;; *) maasi_workspace="$PWD/$maasi_workspace" ;; esac
 maasi_venv="$maasi_workspace/venv"
+maasi_requirements="${MAASI_REQUIREMENTS:-$maasi_root}"
 
 maasi_fail() {
   printf 'error: %s\n' "$1" >&2
@@ -36,7 +38,7 @@ maasi_has_jazzy() {
 
 maasi_make_venv() {
   local python="$1" mode="$2" key="$3"
-  local requirements=(-r "$maasi_root/requirements.txt" -r "$maasi_root/requirements-build.txt")
+  local requirements=(-r "$maasi_requirements/requirements.txt" -r "$maasi_requirements/requirements-build.txt")
   local log="$maasi_workspace/setup.log"
   "$python" -c 'import venv, ensurepip' 2> /dev/null \
     || maasi_fail "$python has no venv module" 'install it: sudo apt install python3-venv'
@@ -52,7 +54,7 @@ maasi_make_venv() {
   else
     echo "Setting up: ROS 2 Jazzy and Python packages as wheels (downloads about 250 MB) ..." >&2
     "$python" -m venv "$maasi_venv"
-    requirements+=(-r "$maasi_root/requirements-ros.txt")
+    requirements+=(-r "$maasi_requirements/requirements-ros.txt")
   fi
   if ! "$maasi_venv/bin/python" "$maasi_root/scripts/install.py" "${requirements[@]}" > "$log" 2>&1; then
     tail -n 15 "$log" >&2
@@ -64,14 +66,14 @@ maasi_make_venv() {
 
 # What only the tests and benchmarks (tests), or the API reference (docs) need.
 maasi_install() {
-  local what="$1" requirements="$maasi_root/requirements-test.txt" key
+  local what="$1" requirements="$maasi_requirements/requirements-test.txt" key
   local log="$maasi_workspace/setup_$what.log"
-  [ "$what" = tests ] || requirements="$maasi_root/requirements-$what.txt"
+  [ "$what" = tests ] || requirements="$maasi_requirements/requirements-$what.txt"
   key="$(maasi_hash < "$requirements")"
   [ "$(cat "$maasi_venv/.maasi_${what}_key" 2> /dev/null)" != "$key" ] || return 0
   echo "Setting up: what the $what need, as wheels ..." >&2
   if ! "$maasi_venv/bin/python" "$maasi_root/scripts/install.py" -r "$requirements" \
-      -c "$maasi_root/requirements.txt" > "$log" 2>&1; then
+      -c "$maasi_requirements/requirements.txt" > "$log" 2>&1; then
     tail -n 15 "$log" >&2
     maasi_fail "installing the $what requirements failed; the whole log: $log"
   fi
@@ -155,8 +157,8 @@ maasi_set_up() (
   fi
   exec {maasi_lock}> "$maasi_workspace/lock"
   flock "$maasi_lock"
-  key="$( (cat "$maasi_root"/requirements.txt "$maasi_root"/requirements-build.txt \
-    "$maasi_root"/requirements-ros.txt "$maasi_root/scripts/mend_wheels.py"
+  key="$( (cat "$maasi_requirements"/requirements.txt "$maasi_requirements"/requirements-build.txt \
+    "$maasi_requirements"/requirements-ros.txt "$maasi_root/scripts/mend_wheels.py"
     "$python" -ISc 'import sys; print(sys.version, sys.base_prefix)'; echo "$mode $maasi_venv") | maasi_hash)"
   [ "$(cat "$maasi_venv/.maasi_key" 2> /dev/null)" = "$key" ] \
     || maasi_make_venv "$python" "$mode" "$key"
