@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import yaml
 from ament_index_python.packages import get_package_share_directory
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from waiting import wait_until
 
+from maasi_drivers.calibration.bag_reader import BagReader
 from maasi_sim.run.bag import Bag, BagError, BagWriter, load_types, topic_qos
 
 
@@ -192,3 +194,65 @@ def test_a_recording_holds_its_scenario_and_names_distribution_and_hashes_as_ros
     assert stored == {kind: _installed_hash(kind) for kind in kinds}
     # The reader of rosbag2 takes the distribution from the copy inside the file.
     assert b'ros_distro: jazzy' in (tmp_path / 'bag' / 'bag.mcap').read_bytes()
+
+
+def written_by_rosbags(types, folder, plugin, mode=None, size=0):
+    """Write a recording as `ros2 bag record` does, with its kinds of files."""
+    writer = Writer(folder, version=9, storage_plugin=plugin)
+    if mode is not None:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    string = types.types['std_msgs/msg/String']
+    with writer:
+        connection = writer.add_connection('/text', 'std_msgs/msg/String', typestore=types)
+        for step in range(20):
+            text = f'{step} {np.random.default_rng(step).bytes(size).hex()}'
+            data = types.serialize_cdr(string(data=text), 'std_msgs/msg/String')
+            writer.write(connection, step, data)
+
+
+@pytest.mark.parametrize('metadata', [True, False])
+@pytest.mark.parametrize('mode', [None, CompressionMode.FILE, CompressionMode.MESSAGE])
+@pytest.mark.parametrize('plugin', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_recordings_of_others_are_read_also_without_metadata(
+    types, tmp_path, plugin, mode, metadata
+):
+    folder = tmp_path / 'other'
+    written_by_rosbags(types, folder, plugin, mode)
+    if not metadata:
+        (folder / 'metadata.yaml').unlink()
+    (file,) = (path for path in folder.iterdir() if path.suffix != '.yaml')
+    assert (file.suffix == '.zstd') == (mode == CompressionMode.FILE)
+    for path in (folder, file):
+        with Bag(path) as bag:
+            assert read_steps(bag) == list(range(20))
+            assert bool(bag.recovered) == (path == folder and not metadata)
+
+
+def test_a_compressed_recording_that_is_cut_gives_what_is_before_the_cut(types, tmp_path):
+    written_by_rosbags(types, tmp_path / 'bag', StoragePlugin.MCAP, CompressionMode.FILE, 150000)
+    (packed,) = (tmp_path / 'bag').glob('*.zstd')
+    data, file = packed.read_bytes(), tmp_path / 'cut.mcap.zstd'
+    for share in (0.6, 0.9):
+        file.write_bytes(data[: int(share * len(data))])
+        with Bag(file) as bag:
+            steps = read_steps(bag)
+            assert bag.recovered and 0 < len(steps) < 20 and steps == list(range(len(steps)))
+
+
+def test_topics_are_renamed(types, tmp_path):
+    with BagWriter(tmp_path / 'bag', types) as writer:
+        write_steps(writer, range(5))
+        writer.add_topic('/other', 'std_msgs/msg/String')
+    with BagReader(tmp_path, {'text': '/new/name/'}) as bag:
+        assert bag.counts == {'/new/name': 5, '/other': 0}
+        assert bag.types.keys() == bag.counts.keys()
+        assert [item.topic for item in bag.messages(['/new/name'])] == ['/new/name'] * 5
+        assert list(bag.messages(['/text'])) == []
+    with BagReader(tmp_path, {'/text': '/other', '/other': '/text'}) as bag:
+        assert bag.counts == {'/other': 5, '/text': 0}
+    for old, new, words in (
+        ('/none', '/new', '/none is not recorded; recorded are /other, /text'),
+        ('/text', '/other', '/other is recorded too'),
+    ):
+        with pytest.raises(BagError, match=f'--remap {old}:={new}: {words}'):
+            BagReader(tmp_path, {old: new})

@@ -1,9 +1,11 @@
 """Read recordings (rosbag2), also MCAP files whose end is missing."""
 
 import contextlib
+import importlib
+import io
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +24,11 @@ _LAST_OPCODE = 0x0F
 _END = b'\x0f' + (4).to_bytes(8, 'little') + bytes(4)
 _END += b'\x02' + (20).to_bytes(8, 'little') + bytes(20) + _MAGIC
 _METADATA = 'metadata.yaml'
+_SUFFIXES = ('.mcap', '.db3', '.bag')
+# The module of zstd: of Python 3.14, else what the version of rosbags installs.
+_ZSTD = ('compression.zstd', 'backports.zstd', 'zstandard')
+_PART = 2**16  # a shorter rest is lost with the end of a cut file [bytes]
+_FRAME = b'\x28\xb5\x2f\xfd'  # what a zstd frame begins with, and no message
 
 
 class BagError(RuntimeError):
@@ -80,10 +87,29 @@ def _sealed(path: Path, folder: Path) -> Path:
     return copy
 
 
-class BagReader:
-    """Read a recording, also one whose end is missing (its writer was killed, or the disk full)."""
+def _unpacked(source: Path | io.BytesIO) -> Any:
+    for name in _ZSTD:
+        with contextlib.suppress(ImportError):
+            return importlib.import_module(name).open(source, 'rb')
+    raise BagError(f'is compressed, which needs one of {", ".join(_ZSTD)}')
 
-    def __init__(self, path: Path) -> None:
+
+def _copied(path: Path, folder: Path) -> Path:
+    """Copy a compressed file as it was before; of a cut one what is before the cut."""
+    copy = folder / path.stem
+    with _unpacked(path) as source, copy.open('wb') as target, contextlib.suppress(EOFError):
+        while part := source.read(_PART):
+            target.write(part)
+    return copy
+
+
+class BagReader:
+    """Read a recording, also one whose end is missing (its writer was killed, or the disk full).
+
+    Topics of the keys of `remap` are named by its values.
+    """
+
+    def __init__(self, path: Path, remap: Mapping[str, str] | None = None) -> None:
         path = Path(path)
         if not path.exists():
             raise BagError(f'{path}: there is no such recording')
@@ -100,40 +126,73 @@ class BagReader:
         except Exception as error:
             self._stack.close()
             raise BagError(f'{self.path}: cannot be read: {_words(error)}') from error
+        self._remap = {_absolute(old): _absolute(new) for old, new in (remap or {}).items()}
+        recorded = {item.topic for item in self._reader.connections}
+        for old, new in self._remap.items():
+            if old not in recorded or new in recorded - self._remap.keys():
+                problem = f'{new} is recorded too' if old in recorded else f'{old} is not recorded'
+                self.close()
+                raise BagError(
+                    f'{self.path}: --remap {old}:={new}: {problem}; recorded are '
+                    f'{", ".join(sorted(recorded))}'
+                )
 
     def _readable(self, path: Path) -> list[Path]:
-        files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
-        files = [file for file in files if file.suffix == '.mcap']
-        cut = [file for file in files if not has_end(file)]
-        if path.is_dir() and not (path / _METADATA).exists() and not files:
-            raise BagError(f'has no {_METADATA} and no .mcap file')
-        if not cut and (path.is_file() or (path / _METADATA).exists()):
-            return [path]
+        whole = path.is_file() or (path / _METADATA).exists()
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        names = {file.name for file in files}
+        files = [
+            file
+            for file in files
+            if file.suffix in _SUFFIXES
+            or (
+                (file.suffix == '.zstd' and file.stem not in names)
+                and Path(file.stem).suffix in _SUFFIXES
+            )
+        ]
+        packed = [file for file in files if file.suffix == '.zstd']
+        if not files and not whole:
+            raise BagError(f'has no {_METADATA} and no file {", ".join(_SUFFIXES)}, or such .zstd')
+        if packed and (path.is_file() or not whole):
+            folder = self._folder()
+            files = [_copied(file, folder) if file in packed else file for file in files]
+        cut = [file for file in files if file.suffix == '.mcap' and not has_end(file)]
+        if not cut and whole:
+            return files if path in packed else [path]
         if not cut:
             self.recovered = f'{path}: has no {_METADATA}'
             return files
-        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix='maasi_bag_')))
-        names = ', '.join(file.name for file in cut)
-        self.recovered = f'{path}: the end of {names} is missing; what is before it is read'
+        folder = self._folder()
+        missing = ', '.join(file.name for file in cut)
+        self.recovered = f'{path}: the end of {missing} is missing; what is before it is read'
         return [_sealed(file, folder) if file in cut else file for file in files]
+
+    def _folder(self) -> Path:
+        return Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix='maasi_bag_')))
+
+    def _name(self, topic: str) -> str:
+        return self._remap.get(topic, topic)
 
     @property
     def types(self) -> dict[str, str]:
         """Type name by topic."""
-        return {item.topic: item.msgtype for item in self._reader.connections}
+        return {self._name(item.topic): item.msgtype for item in self._reader.connections}
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of messages by topic."""
         counts: dict[str, int] = {}
         for item in self._reader.connections:
-            counts[item.topic] = counts.get(item.topic, 0) + item.msgcount
+            topic = self._name(item.topic)
+            counts[topic] = counts.get(topic, 0) + item.msgcount
         return counts
 
     def raw(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
         """Yield topic, type, time [ns] and serialised message, in order of time."""
         chosen = [
-            item for item in self._reader.connections if topics is None or item.topic in topics
+            item
+            for item in self._reader.connections
+            if topics is None or self._name(item.topic) in topics
         ]
         # An empty selection would read all topics.
         messages = self._reader.messages(chosen) if chosen else iter(())
@@ -144,7 +203,11 @@ class BagReader:
                 return
             except Exception as error:
                 raise BagError(f'{self.path}: is damaged: {_words(error)}') from error
-            yield connection.topic, connection.msgtype, time, data
+            if data[: len(_FRAME)] == _FRAME:
+                # Each message is compressed, which only the lacking metadata tell.
+                with _unpacked(io.BytesIO(data)) as whole:
+                    data = whole.read()
+            yield self._name(connection.topic), connection.msgtype, time, data
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Yield the messages of `topics` (all if None), in order of time."""
@@ -168,6 +231,12 @@ class BagReader:
         self.close()
 
 
+def _absolute(topic: str) -> str:
+    return f'/{topic.strip("/")}'
+
+
 def _words(error: Exception) -> str:
     text = ' '.join(str(error).split()) or type(error).__name__
+    if 'Profile is not ros2' in text:
+        text = 'is MCAP of another profile than ros2, as of ROS 1: give the .bag file it is made of'
     return text if len(text) <= 300 else f'{text[:297]}...'
