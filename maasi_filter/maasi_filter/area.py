@@ -259,19 +259,18 @@ class Area:
         doubts = []
         for key, gap in zip(zones, gaps):
             if gap > 0.0:
-                how_far = f'{gap / 1e3:,.0f} km' if gap > 1e4 else f'{gap:.3g} m'
                 doubts.append(
-                    f'environment.{key}: lies {how_far} outside of the area, where it has no '
-                    f'effect{self._exchanged(zones[key], gap)}'
+                    f'environment.{key}: lies {how_far(gap)} outside of the area, where it has no '
+                    f'effect{self.exchanged(shapely.get_coordinates(zones[key].centroid)[0], gap)}'
                 )
         return doubts
 
-    def _exchanged(self, zone: BaseGeometry, gap: float) -> str:
-        """Return in words whether a zone would lie at the area with its coordinates exchanged."""
+    def exchanged(self, position: ArrayLike, gap: float) -> str:
+        """Return in words whether a position would lie at the area with latitude for longitude."""
         origin = self.settings.origin
         if origin is None or gap < _ANOTHER_COUNTRY:
             return ''
-        degrees = on_ground(shapely.get_coordinates(zone.centroid), origin)
+        degrees = on_ground(np.asarray(position, dtype=float)[None, :2], origin)
         if abs(degrees[0, 1]) > 90.0:
             return ''
         place = shapely.Point(to_map(degrees, origin)[0])
@@ -296,6 +295,13 @@ class Area:
         if self._raster is not None:
             likely = _scaled(likely) * self._raster.at(x, y)
         return likely, inside
+
+
+def how_far(gap: float) -> str:
+    """Return a distance in words."""
+    if gap > 1e4:
+        return f'{gap / 1e3:,.0f} km'
+    return f'{gap:.0f} m' if gap > 100.0 else f'{gap:.3g} m'
 
 
 def _is_nothing(region: BaseGeometry) -> bool:

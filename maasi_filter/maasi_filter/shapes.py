@@ -21,6 +21,7 @@ from maasi_filter.occupancy_map import read_map
 
 _GEOJSON, MAPS = ('.json', '.geojson'), ('.yaml', '.yml')
 _LARGEST = 10_000.0  # of an area in degrees [km2]; larger ones are mistakes
+POINT_ROLES = ('start', 'home', 'charger')
 _NAMED = 5  # so many features that are left out are named
 # WGS 84 in degrees, longitude first, as programs call it; GeoJSON of today has no other system.
 _WGS84 = re.compile(
@@ -171,24 +172,26 @@ def check_size(found: BaseGeometry) -> None:
         )
 
 
+def points_of(value: Any) -> list[tuple[str, str, list[float]]]:
+    """Return role, robot (or name) and longitude and latitude of points with a role of robots."""
+    found = []
+    for row in _rows(value)[1]:
+        facts = row.get('properties') if isinstance(row, Mapping) else None
+        if isinstance(facts, Mapping) and facts.get('role') in POINT_ROLES:
+            geometry = row.get('geometry')
+            place = geometry.get('coordinates') if isinstance(geometry, Mapping) else None
+            if isinstance(place, list) and len(place) >= 2:
+                owner = facts.get('robot') or facts.get('name') or ''
+                found.append((str(facts['role']), str(owner), [float(axis) for axis in place[:2]]))
+    return found
+
+
 def features_of(value: Any) -> list[Feature]:
     """Return the features with polygons of GeoJSON: values, text or the name of a file.
 
     What is no polygon is left out, with one warning that names it.
     """
-    named = isinstance(value, str) and is_geojson(value) and not value.lstrip().startswith('{')
-    source = f'{value}: ' if named else ''
-    data = _parsed(value, named)
-    if not isinstance(data, Mapping):
-        raise ValueError(f'{source}read {short(data)}, allowed is GeoJSON')
-    _check_system(data, source)
-    rows: Any = [data]
-    if data.get('type') == 'FeatureCollection':
-        rows = data.get('features')
-    elif data.get('type') != 'Feature':
-        rows = [{'type': 'Feature', 'geometry': data}]
-    if not isinstance(rows, list):
-        raise ValueError(f'{source}features: read {short(rows)}, allowed is a list of features')
+    source, rows = _rows(value)
     found, left = [], []
     for number, row in enumerate(rows, 1):
         if not isinstance(row, Mapping):
@@ -209,6 +212,24 @@ def features_of(value: Any) -> list[Feature]:
             stacklevel=2,
         )
     return found
+
+
+def _rows(value: Any) -> tuple[str, list[Any]]:
+    """Return where GeoJSON comes from, for messages, and its features as they are."""
+    named = isinstance(value, str) and is_geojson(value) and not value.lstrip().startswith('{')
+    source = f'{value}: ' if named else ''
+    data = _parsed(value, named)
+    if not isinstance(data, Mapping):
+        raise ValueError(f'{source}read {short(data)}, allowed is GeoJSON')
+    _check_system(data, source)
+    rows: Any = [data]
+    if data.get('type') == 'FeatureCollection':
+        rows = data.get('features')
+    elif data.get('type') != 'Feature':
+        rows = [{'type': 'Feature', 'geometry': data}]
+    if not isinstance(rows, list):
+        raise ValueError(f'{source}features: read {short(rows)}, allowed is a list of features')
+    return source, rows
 
 
 def _parsed(value: Any, named: bool) -> Any:
@@ -251,7 +272,10 @@ def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature 
     title = next((str(word) for word in said if word not in (None, '')), '')
     name = f'feature {number}' + (f' ({title[:40]})' if title else '')
     where, left, shapes = f'{source}{name}', [], []
-    for kind, coordinates in _parts(row.get('geometry'), where):
+    parts = list(_parts(row.get('geometry'), where)) or [('empty', None)]
+    for kind, coordinates in parts:
+        if kind == 'Point' and facts.get('role') in POINT_ROLES:
+            continue
         if kind != 'Polygon' or not coordinates:
             left.append(f'{name}: {kind}')
             continue
@@ -260,7 +284,7 @@ def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature 
             _check_degrees(shape, where)
         shapes.append(shape)
     if not shapes:
-        return None, left or [f'{name}: empty']
+        return None, left
     return Feature(where, shapely.union_all(shapes), facts), left
 
 

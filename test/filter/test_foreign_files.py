@@ -281,3 +281,29 @@ def test_a_prior_that_is_the_same_everywhere_is_doubted(tmp_path):
     assert area.doubts == [
         'environment.prior: is the same everywhere in the area: targets are expected evenly over it'
     ]
+
+
+def test_a_file_under_a_key_gives_what_belongs_there():
+    """One file of a map program may hold area, keep-outs and prior, each with its role."""
+    whole = collection(polygon(role='area'), polygon(ZONE, role='keep_out'))
+    for zones in (whole, [whole], [{'polygon': whole}]):
+        with pytest.warns(InputWarning, match='keep_outs: left out, .* feature 1: role area$'):
+            (zone,) = area_of(area=polygon(), keep_outs=zones).shapes['keep_out']
+        assert zone.area == pytest.approx(6800.0, rel=0.01)
+    words = refusal(area=polygon(), keep_outs=[polygon(role='area')])
+    assert words.endswith(
+        'role area; allowed under environment.keep_outs is role keep_out, or none'
+    )
+    words = refusal(area=polygon(), prior=polygon(ZONE, role='keep_out'))
+    assert words.endswith('role keep_out; allowed under environment.prior is role prior, or none')
+    # What the role is of another program says nothing here.
+    hazard = area_of(area=polygon(), keep_outs=[polygon(ZONE, role='hazard')])
+    assert len(hazard.shapes['keep_out']) == 1
+
+
+def test_an_origin_is_near_the_area_and_not_any_property_of_that_name():
+    assert area_of(area=polygon(origin='GPS')).settings.origin.latitude == pytest.approx(46.6)
+    near = area_of(area=polygon(), origin={'latitude': 46.5, 'longitude': 9.9})
+    assert near.border.area == pytest.approx(40000, rel=0.02)
+    words = refusal(area=polygon(), origin={'latitude': 9.9, 'longitude': 46.6})
+    assert 'lies 4,737 km from environment.origin, allowed are 100' in words

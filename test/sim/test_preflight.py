@@ -208,7 +208,7 @@ def test_the_command_prints_what_a_search_takes_and_starts_nothing(tmp_path, cap
     wrong['robots']['east']['start'] = [505.0, 20.0, 20.0]
     (tmp_path / 'field.yaml').write_text(yaml.safe_dump(wrong))
     assert run_scenario.main(['--check', 'field.yaml']) == 2
-    assert 'robots.east.start: read [505.0, 20.0, 20.0]' in capsys.readouterr().err
+    assert 'robots.east.start: read 505 20 20 m' in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ['field.yaml']
 
 

@@ -20,6 +20,7 @@ from maasi_sim.scenario.background import background_problems
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.charger_checks import charger_problems, endurance_doubts
 from maasi_sim.scenario.free_space import FreeSpace
+from maasi_sim.scenario.on_earth import outside_text, place_text
 from maasi_sim.scenario.schema import RobotSettings, Scenario, SimulatedSettings
 
 Problems = Iterator[str]  # each is `key: text`
@@ -95,8 +96,9 @@ def _place_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> Pro
     """Yield problems of where it starts and may be sent."""
     if not area.inside([robot.start])[0]:
         yield (
-            f'start: read {robot.start}, allowed is what lies inside environment.bounds, or the '
-            f'area, and outside of keep_outs; bounds are {area.bounds.tolist()}'
+            f'start: read {place_text(robot.start, area.settings.origin)}'
+            f'{outside_text(robot.start, area)}; allowed is what lies inside environment.bounds, '
+            f'or the area, and outside of keep_outs; bounds are {area.bounds.tolist()}'
         )
     gap = area.distances(robot.start).min(initial=math.inf)
     if gap < robot.radius:

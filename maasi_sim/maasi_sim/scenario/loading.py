@@ -29,6 +29,7 @@ from maasi_sim.scenario.layering import (
     under,
     validate,
 )
+from maasi_sim.scenario.on_earth import put_on_map
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
 AnyScenario = TypeVar('AnyScenario', bound=BaseScenario)
@@ -135,6 +136,7 @@ def check_scenario(
     layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None = None
 ) -> Scenario:
     """Return the scenario of a tree of values with all layers merged."""
+    put_on_map(layer, _robots(layer))
     _give_candidates(layer)
     problems = problems_of_file if layer.folder else problems_of
     return checked(Scenario, layer, overrides, problems)

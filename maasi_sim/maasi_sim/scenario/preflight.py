@@ -13,9 +13,10 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.area import Area, level_shape
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.geodesy import OriginSettings
 from maasi_planner.candidates import half_view, map_spacing, swath_of
 from maasi_sim.scenario.free_space import FreeSpace
+from maasi_sim.scenario.on_earth import place_text
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
 # Of the area: parts out of reach that are smaller than this are rounding, or corners.
@@ -259,7 +260,7 @@ def _add_parts(report: Preflight, missed: BaseGeometry, whole: float) -> None:
 
 def _places_of(robot: RobotSettings, effort: Effort, origin: OriginSettings | None) -> str:
     """Return in words where a robot starts and is charged."""
-    text = f'starts at {_place(robot.start, origin)}'
+    text = f'starts at {place_text(robot.start, origin)}'
     if robot.endurance is None:
         return text
     if not robot.battery.chargeable:
@@ -269,7 +270,7 @@ def _places_of(robot: RobotSettings, effort: Effort, origin: OriginSettings | No
         )
     if not robot.endurance.chargers:
         return f'{text}, its charger'
-    chargers = '; '.join(_place(charger, origin) for charger in robot.endurance.chargers)
+    chargers = '; '.join(place_text(charger, origin) for charger in robot.endurance.chargers)
     return f'{text}, chargers at {chargers}'
 
 
@@ -282,14 +283,6 @@ def _battery_warnings(robot: RobotSettings, effort: Effort, limit: float, team: 
             'endurance: it will be empty on its way'
         )
     return found
-
-
-def _place(position: list[float], origin: OriginSettings | None) -> str:
-    text = ' '.join(f'{value:.4g}' for value in position)
-    if origin is None:
-        return f'{text} m'
-    latitude, longitude = geodetic(np.array([position]), origin)[0, :2].tolist()
-    return f'{text} m ({latitude:.6f}, {longitude:.6f})'
 
 
 def _area(size: float) -> str:
