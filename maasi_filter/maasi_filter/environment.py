@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +23,7 @@ from maasi_filter.geodesy import OriginSettings
 from maasi_filter.settings import Finite, Positive, Settings, Vector2
 from maasi_filter.shapes import (
     Feature,
+    InputWarning,
     centre_of,
     check_size,
     features_of,
@@ -36,6 +38,8 @@ _NUMBER = '-+.0123456789'  # with which a number begins
 _IMAGES = ('.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff')
 FILES = ('.geojson', '.json', '.yaml', '.yml', *_IMAGES)
 _ROLES = ('area', 'keep_out', 'prior')  # of features of GeoJSON
+_ROLE_OF = {'keep_outs': 'keep_out', 'obstacles': 'keep_out', 'prior': 'prior'}  # by key
+_FARTHEST = 100e3  # of an area from the origin of its map, which is flat [m]
 
 
 class Zone(Settings):
@@ -288,7 +292,9 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
                 )
             # That of the run on whose page it was drawn.
             said = (item.properties.get('origin') for item in roles['area'])
-            origin = origin or next(filter(None, said), None)
+            # Other programs have other things under that name.
+            drawn_at = (item for item in said if isinstance(item, Mapping) and 'latitude' in item)
+            origin = origin or next(drawn_at, None)
             if not origin and not all(item.in_metres for item in roles['area']):
                 origin = centre_of(roles['area'])
     if origin:
@@ -300,6 +306,8 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
         with _at(value, *key):
             if isinstance(value, Feature):
                 found = polygons_of([value], on_earth)
+            elif is_geojson(value) and key[0] in _ROLE_OF:
+                found = polygons_of(_belonging(features_of(value), str(key[0])), on_earth)
             else:
                 found = read_shape(value, on_earth)
         return _text(found)
@@ -315,6 +323,7 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     if drawn:
         with _at(area, 'area'):
             found = polygons_of(roles['area'], on_earth)
+            _check_distance(found, given.get('origin'))
             check_size(found)
         values['area'] = _text(found)
     elif area:
@@ -329,7 +338,7 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
             raise ValueError('allowed with area; bounds have the heights themselves')
     for key, role in (('keep_outs', 'keep_out'), ('obstacles', 'obstacle')):
         items, more = values.get(key) or [], roles.get(role, [])
-        if isinstance(items, str) and Path(items).suffix.lower() in FILES:
+        if is_geojson(items) or (isinstance(items, str) and Path(items).suffix.lower() in FILES):
             items = [items]
         if isinstance(items, (list, tuple)):
             values[key] = [zone(item, key, index) for index, item in enumerate(items)]
@@ -349,7 +358,8 @@ def _give_prior(
     if isinstance(prior, list) or is_geojson(prior):
         with _at(prior, 'prior'):
             items = prior if isinstance(prior, list) else [prior]
-            found += [('prior', part) for item in items for part in features_of(item)]
+            parts_of = (_belonging(features_of(item), 'prior') for item in items)
+            found += [('prior', part) for some in parts_of for part in some]
         prior = {}
     elif isinstance(prior, str):
         prior = {'raster': prior}
@@ -374,6 +384,33 @@ def _text(found: BaseGeometry) -> str:
     rounded = str(shapely.to_wkt(found, rounding_precision=4))
     exact = not shapely.from_wkt(rounded).is_valid
     return str(shapely.to_wkt(found, rounding_precision=-1)) if exact else rounded
+
+
+def _check_distance(area: BaseGeometry, origin: Any) -> None:
+    """Raise ValueError if an origin that was given lies far from an area [m]."""
+    gap = area.distance(shapely.Point(0.0, 0.0))
+    if origin and gap > _FARTHEST:
+        raise ValueError(
+            f'lies {gap / 1e3:,.0f} km from environment.origin, allowed are {_FARTHEST / 1e3:g}: '
+            'is the latitude first in one of them? GeoJSON has the longitude first'
+        )
+
+
+def _belonging(features: Sequence[Feature], key: str) -> list[Feature]:
+    """Return those of a file under a key; a role that belongs elsewhere is left out, by name."""
+    wanted = _ROLE_OF[key]
+    others = [item for item in features if item.properties.get('role') in _ROLES]
+    others = [item for item in others if item.properties['role'] != wanted]
+    words = '; '.join(f'{item.name}: role {item.properties["role"]}' for item in others[:5])
+    if len(others) == len(features):
+        raise ValueError(f'{words}; allowed under environment.{key} is role {wanted}, or none')
+    if others:
+        warnings.warn(
+            f'environment.{key}: left out, as these have another role: {words}',
+            InputWarning,
+            stacklevel=2,
+        )
+    return [item for item in features if item not in others]
 
 
 def _role(feature: Feature) -> str:
