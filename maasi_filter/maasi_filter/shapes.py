@@ -22,10 +22,12 @@ from maasi_filter.occupancy_map import read_map
 _GEOJSON, MAPS = ('.json', '.geojson'), ('.yaml', '.yml')
 _LARGEST = 10_000.0  # of an area in degrees [km2]; larger ones are mistakes
 POINT_ROLES = ('start', 'home', 'charger')
+_SIMPLE = ('Point', 'LineString', 'Polygon')
+_KINDS = (*_SIMPLE, *(f'Multi{kind}' for kind in _SIMPLE), 'GeometryCollection')
 _NAMED = 5  # so many features that are left out are named
 # WGS 84 in degrees, longitude first, as programs call it; GeoJSON of today has no other system.
 _WGS84 = re.compile(
-    r'(CRS:?84h?|EPSG:{1,2}(4326|4979)|(?<!\d)4326|WGS[ _]?(19)?84)$', re.IGNORECASE
+    r'(CRS:?84h?|EPSG:{1,2}(4326|4979)|(?<!\d)4326|WGS[ _]?(19)?84)\)?$', re.IGNORECASE
 )
 _CONVERT = 'convert it: ogr2ogr -f GeoJSON -t_srs EPSG:4326 wgs84.geojson FILE'
 
@@ -179,10 +181,10 @@ def points_of(value: Any) -> list[tuple[str, str, list[float]]]:
         facts = row.get('properties') if isinstance(row, Mapping) else None
         if isinstance(facts, Mapping) and facts.get('role') in POINT_ROLES:
             geometry = row.get('geometry')
-            place = geometry.get('coordinates') if isinstance(geometry, Mapping) else None
-            if isinstance(place, list) and len(place) >= 2:
+            if isinstance(geometry, Mapping) and geometry.get('type') == 'Point':
+                (place,) = _position(geometry.get('coordinates'), 'a point').tolist()
                 owner = facts.get('robot') or facts.get('name') or ''
-                found.append((str(facts['role']), str(owner), [float(axis) for axis in place[:2]]))
+                found.append((str(facts['role']), str(owner), place))
     return found
 
 
@@ -226,6 +228,11 @@ def _rows(value: Any) -> tuple[str, list[Any]]:
     if data.get('type') == 'FeatureCollection':
         rows = data.get('features')
     elif data.get('type') != 'Feature':
+        if data.get('type') not in _KINDS:
+            raise ValueError(
+                f'{source}type: read {short(data.get("type"))}, allowed are FeatureCollection, '
+                'Feature and Polygon: this is no GeoJSON'
+            )
         rows = [{'type': 'Feature', 'geometry': data}]
     if not isinstance(rows, list):
         raise ValueError(f'{source}features: read {short(rows)}, allowed is a list of features')
@@ -242,6 +249,8 @@ def _parsed(value: Any, named: bool) -> Any:
         return json.loads(Path(value).read_text(encoding='utf-8-sig') if named else value)
     except OSError as error:
         raise ValueError(f'{value}: {error.strerror}') from None
+    except UnicodeDecodeError:
+        raise ValueError(f'{value}: is no text in UTF-8') from None
     except (ValueError, RecursionError) as error:
         line = f' in line {error.lineno}' if isinstance(error, json.JSONDecodeError) else ''
         raise ValueError(f'{short(value)}: is no JSON{line}') from None
@@ -253,7 +262,9 @@ def _check_system(data: Mapping[str, Any], source: str) -> None:
     if crs is None:
         return
     properties = crs.get('properties') if isinstance(crs, Mapping) else None
-    name = properties.get('name') if isinstance(properties, Mapping) else crs
+    facts = properties if isinstance(properties, Mapping) else {'name': crs}
+    # Of old files: {type: EPSG, properties: {code: 4326}}.
+    name = facts.get('name', f'EPSG:{facts["code"]}' if 'code' in facts else None)
     if not isinstance(name, str) or not _WGS84.search(name.strip()):
         raise ValueError(
             f'{source}crs: read {short(name)}, allowed is WGS 84 (EPSG:4326); {_CONVERT}'
@@ -275,14 +286,16 @@ def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature 
     parts = list(_parts(row.get('geometry'), where)) or [('empty', None)]
     for kind, coordinates in parts:
         if kind == 'Point' and facts.get('role') in POINT_ROLES:
+            _check_degrees(_position(coordinates, where), where)
             continue
         if kind != 'Polygon' or not coordinates:
             left.append(f'{name}: {kind}')
             continue
-        shape = _sound(_polygon(coordinates, where), where, 'degrees')
+        rings = _rings(coordinates, where)
         if facts.get('unit') != 'm':
-            _check_degrees(shape, where)
-        shapes.append(shape)
+            _check_degrees(np.concatenate(rings), where)
+            rings = _short_way(rings, where)
+        shapes.append(_sound(Polygon(rings[0], rings[1:]), where, 'degrees'))
     if not shapes:
         return None, left
     return Feature(where, shapely.union_all(shapes), facts), left
@@ -308,8 +321,21 @@ def _parts(geometry: Any, where: str) -> Iterator[tuple[str, Any]]:
         yield kind, coordinates
 
 
-def _polygon(coordinates: Any, where: str) -> Polygon:
-    """Return a polygon; of each position, which may have heights and times, the first two."""
+def _position(coordinates: Any, where: str) -> FloatArray:
+    """Return the position of a point, (1, 2)."""
+    try:
+        place = np.array([coordinates[:2]], dtype=float)
+    except (TypeError, ValueError):
+        place = np.empty(0)
+    if place.shape != (1, 2) or not np.isfinite(place).all():
+        raise ValueError(
+            f'{where}: coordinates: read {short(coordinates)}, allowed are longitude and latitude'
+        )
+    return place
+
+
+def _rings(coordinates: Any, where: str) -> list[FloatArray]:
+    """Return the rings of a polygon; of positions, which may have heights, the first two."""
     try:
         rings = [np.array([row[:2] for row in ring], dtype=float) for ring in coordinates]
         if any(ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 3 for ring in rings):
@@ -321,12 +347,27 @@ def _polygon(coordinates: Any, where: str) -> Polygon:
         ) from None
     if not all(np.isfinite(ring).all() for ring in rings):
         raise ValueError(f'{where}: coordinates: allowed are finite numbers')
-    return Polygon(rings[0], rings[1:])
+    return rings
 
 
-def _check_degrees(shape: BaseGeometry, where: str) -> None:
+def _short_way(rings: Sequence[FloatArray], where: str) -> list[FloatArray]:
+    """Return rings [degrees] whose edges take the short way round, and warn if some did not."""
+    if not any((np.abs(np.diff(ring[:, 0])) > 180.0).any() for ring in rings):
+        return list(rings)
+    warnings.warn(
+        f'{where}: has edges longer than 180 degrees: taken as an area across 180 degrees',
+        InputWarning,
+        stacklevel=2,
+    )
+    east = [np.unwrap(ring[:, 0], period=360.0) for ring in rings]
+    turns = [np.round((axis.mean() - east[0].mean()) / 360.0) for axis in east]
+    columns = zip(east, turns, rings)
+    return [np.column_stack([x - 360.0 * turn, ring[:, 1]]) for x, turn, ring in columns]
+
+
+def _check_degrees(degrees: FloatArray, where: str) -> None:
     """Raise ValueError with the likely cause if coordinates are no degrees."""
-    x, y = shapely.get_coordinates(shape).T
+    x, y = degrees.T
     wrong = np.flatnonzero((np.abs(x) > 180.0) | (np.abs(y) > 90.0))
     if not len(wrong):
         return

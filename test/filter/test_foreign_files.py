@@ -307,3 +307,52 @@ def test_an_origin_is_near_the_area_and_not_any_property_of_that_name():
     assert near.border.area == pytest.approx(40000, rel=0.02)
     words = refusal(area=polygon(), origin={'latitude': 9.9, 'longitude': 46.6})
     assert 'lies 4,737 km from environment.origin, allowed are 100' in words
+
+
+def test_polygons_across_180_degrees_that_are_not_cut_are_the_same_area():
+    """As programs draw them, with a hole and a keep-out beyond; a warning says what is assumed."""
+    ring = [[179.99, -16.6], [-179.99, -16.6], [-179.99, -16.59], [179.99, -16.59]]
+    hole = [[-179.998, -16.596], [-179.997, -16.596], [-179.997, -16.594], [-179.998, -16.596]]
+    zone = polygon([[-179.996, -16.596], [-179.995, -16.596], [-179.995, -16.594]], role='keep_out')
+    whole = polygon(ring)
+    whole['geometry']['coordinates'].append(hole)
+    with pytest.warns(InputWarning, match='feature 1: has edges longer than 180 degrees: taken as'):
+        area = area_of(area=collection(whole, zone))
+    assert abs(area.settings.origin.longitude) == pytest.approx(180.0) and area.doubts == []
+    assert area.border.area == pytest.approx(2.36e6 - 11800.0, rel=1e-3)
+    assert area.region.area == pytest.approx(area.border.area - 11800.0, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    'crs, allowed',
+    [
+        ({'type': 'EPSG', 'properties': {'code': 4326}}, True),
+        ({'type': 'name', 'properties': {'name': 'WGS 84 (EPSG:4326)'}}, True),
+        ({'type': 'EPSG', 'properties': {'code': 3857}}, False),
+        ({'type': 'name', 'properties': {'name': 'WGS 84 / UTM zone 32N'}}, False),
+    ],
+)
+def test_other_forms_of_the_coordinate_system_are_known(crs, allowed):
+    if allowed:
+        assert area_of(area=collection(polygon(), crs=crs)).border.area > 0.0
+    else:
+        words = refusal(area=collection(polygon(), crs=crs))
+        assert 'read EPSG:3857,' in words or 'read WGS 84 / UTM zone 32N,' in words
+
+
+def test_what_is_another_format_or_encoding_is_refused_as_such(tmp_path):
+    file = tmp_path / 'area.json'
+    file.write_text(json.dumps({'geometryType': 'esriGeometryPolygon', 'features': []}))
+    assert refusal(area=str(file)).endswith(
+        'allowed are FeatureCollection, Feature and Polygon: this is no GeoJSON'
+    )
+    file.write_text(json.dumps(polygon(name='Süd'), ensure_ascii=False), encoding='latin-1')
+    assert refusal(area=str(file)).endswith('area.json: is no text in UTF-8')
+    for place, cause in (
+        (None, 'read null, allowed are longitude and latitude'),
+        ([9.9, 'north'], 'read [9.9, "north"], allowed are longitude and latitude'),
+        ([46.6, 99.0], 'is the latitude first'),
+    ):
+        start = {'type': 'Feature', 'geometry': {'type': 'Point', 'coordinates': place}}
+        start['properties'] = {'role': 'start'}
+        assert cause in refusal(area=collection(polygon(), start))
