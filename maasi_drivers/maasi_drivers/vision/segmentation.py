@@ -109,7 +109,7 @@ def _weigh(excess, own, floor, x, y):  # type: ignore[no-untyped-def]
     for column, row in zip(x, y):
         near[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = True
     rows, columns = np.nonzero(near)
-    weights = (excess[rows, columns] - background) / contrast
+    weights = (excess.ravel()[near.ravel()] - background) / contrast
     area = weights.sum()
     scale = noise / (contrast * area) ** 2
     spread_x, spread_y = ((columns - x.mean()) ** 2).sum(), ((rows - y.mean()) ** 2).sum()
