@@ -153,6 +153,24 @@ def test_a_topic_that_lacks_is_named(searched, tmp_path, capsys, lacking, words)
     assert all(word in said for word in words), said
 
 
+@pytest.mark.parametrize(
+    ('words', 'said'),
+    [
+        (['--remap', '/none:=/pose'], '/none is not recorded; recorded are /mambo/camera'),
+        (['--remap', '/mambo/odom:=/mambo/track'], '/mambo/odom is not recorded, allowed are'),
+        (['--remap', '/mambo/odom'], "read '/mambo/odom', allowed is FROM:=TO"),
+    ],
+)
+def test_topics_are_renamed_or_the_wrong_one_is_named(searched, capsys, words, said):
+    folder, _ = searched
+    try:
+        code = main([str(folder / 'field.yaml'), '--replay', str(folder / 'odom'), *words])
+    except SystemExit as error:
+        code = error.code
+    assert code == 2
+    assert said in capsys.readouterr().err
+
+
 def test_a_robot_without_camera_is_refused(searched, capsys):
     folder, _ = searched
     assert main(['ranging_drone_3d', '--replay', str(folder / 'odom')]) == 2

@@ -1,8 +1,10 @@
 """A robot in a recording: where it was, and its images or detections."""
 
 import sys
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from maasi_drivers.calibration.sensor_calibration import Observation
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.images import decode_image, image_to_array
 from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_filter.arrays import ImageArray
+from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.models.pose import Pose
 
 # Topics of a robot that show targets.
@@ -22,8 +24,12 @@ USED = {
     'detections': ('/detections',),
 }
 # The driver's own poses come first: its detections are relative to them.
-_POSES = ('/state', '/pose', '/odom')
-_POSE_TYPES = ('AgentState', 'Odometry', 'PoseStamped')
+_POSES = ('/state', '/pose', '/odom', '/amcl_pose')
+_POSE_TYPES = ('AgentState', 'Odometry', 'PoseStamped', 'PoseWithCovarianceStamped')
+# Where none of those is: the transforms from the map to the robot's frame, in no namespace.
+_TRANSFORMS, _FIXED = '/tf', '/tf_static'
+_TRANSFORM_TYPES = ('TFMessage', 'tfMessage')
+_IMAGES = {'Image': image_to_array, 'CompressedImage': decode_image}
 
 
 class RecordedRobot:
@@ -36,12 +42,14 @@ class RecordedRobot:
         robot: str | None = None,
         use: str | None = None,
         poses: str | None = None,
+        remap: Mapping[str, str] | None = None,
     ) -> None:
         self.settings = settings
-        self.left_out = 0
+        #: Images and detections that are not used, by reason.
+        self.reasons: Counter[str] = Counter()
         self.in_map = False  # whether its odometry is, so that its start is not added
-        self._bag = bag
-        with BagReader(bag) as reader:
+        self._bag, self._remap = bag, remap
+        with BagReader(bag, remap) as reader:
             self._types = {topic: reader.types[topic] for topic, n in reader.counts.items() if n}
             self.recovered = reader.recovered
         kinds = (use,) if use else (*USED,)
@@ -65,16 +73,27 @@ class RecordedRobot:
                 f'{" or ".join(ends)}, allowed is one; recorded are {there}'
             )
         self.robot, self.use = robots.pop(), kind
-        places = list(map(self._topic, _POSES))
+        places = [*map(self._topic, _POSES), _TRANSFORMS]
         recorded = [topic for topic in places if topic in self._types]
-        self.poses = poses or (recorded or places[-1:])[0]
+        self.poses = poses or (recorded or [self._topic('/odom')])[0]
         known = self._types.get(self.poses, 'not recorded')
         self._pose_type = known.rpartition('/')[2]
-        if self._pose_type not in _POSE_TYPES:
+        allowed = _POSE_TYPES + _TRANSFORM_TYPES
+        if self._pose_type not in allowed:
             raise ValueError(
-                f'{bag}: poses: {self.poses} is {known}, allowed are {", ".join(_POSE_TYPES)}; '
+                f'{bag}: poses: {self.poses} is {known}, allowed are {", ".join(allowed)}; '
                 f'looked for are {", ".join(places)}'
             )
+
+    @property
+    def left_out(self) -> int:
+        """Number of images or detections that are not used."""
+        return self.reasons.total()
+
+    @property
+    def why(self) -> str:
+        """How many are not used, for which reason."""
+        return '; '.join(f'{reason} ({number})' for reason, number in self.reasons.most_common())
 
     def _topic(self, name: str) -> str:
         return f'/{self.robot}{name}' if self.robot else name
@@ -88,23 +107,24 @@ class RecordedRobot:
         return self._topic(name) in self._types
 
     def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
-        with BagReader(self._bag) as reader:
+        with BagReader(self._bag, self._remap) as reader:
             try:
                 for item in reader.messages(topics):
-                    yield item.topic, item.message
+                    yield item.type.rpartition('/')[2], item.message
             except BagError as error:
                 # Messages before the damage are used.
                 self.recovered = f'{error}; what is before it is read'
 
     def observations(self) -> list[Observation]:
         """Return what it saw, each with where it was then."""
-        if self.use == 'detections':
-            return list(self._published())
-        if self.settings.camera is None:
+        if self.use == 'images' and self.settings.camera is None:
             raise ValueError(
                 'parameter camera: got nothing, allowed with images are the settings of a camera'
             )
-        return list(self._segmented())
+        seen = list(self._published() if self.use == 'detections' else self._segmented())
+        if self.reasons and not seen:
+            raise ValueError(f'{self._bag}: {self.use}: none can be used: {self.why}')
+        return seen
 
     def _published(self) -> Iterator[Observation]:
         dimension = self.settings.environment.dimension
@@ -113,7 +133,7 @@ class RecordedRobot:
             array = np.reshape(np.array(values, dtype=float), (-1, 3))[:, :dimension]
             pose = _pose(message.pose.pose)
             if pose is None or not np.isfinite(array).all():
-                self.left_out += 1
+                self.reasons['a number is not finite'] += 1
             else:
                 yield Observation(pose, array)
 
@@ -122,8 +142,8 @@ class RecordedRobot:
         for placed, image in self.images():
             try:
                 seen = detector.detect(image, placed.pose)
-            except ValueError:
-                self.left_out += 1
+            except ValueError as error:
+                self.reasons[str(error)] += 1
                 continue
             yield Observation(placed.pose, seen.values)
 
@@ -132,6 +152,9 @@ class RecordedRobot:
         assert self.settings.camera is not None
         camera = self.settings.camera
         for _, message in self._messages(self._topic('/camera/camera_info')):
+            if hasattr(message, 'K'):
+                # The fields of ROS 1 have capital letters.
+                message = SimpleNamespace(**{k.lower(): v for k, v in vars(message).items()})
             if message.k[0] != 0.0:
                 camera = camera.with_camera_info(message)
                 break
@@ -142,18 +165,20 @@ class RecordedRobot:
         assert self.settings.camera is not None
         history, due = self._history(), 0
         offset, gap = round(self.settings.camera.stamp_offset * 1e9), round(period * 1e9)
-        for topic, message in self._messages(*map(self._topic, USED['images'])):
+        for kind, message in self._messages(*map(self._topic, USED['images'])):
+            if kind not in _IMAGES:
+                self.reasons[f'image: read {kind}, allowed are {", ".join(_IMAGES)}'] += 1
+                continue
             stamp = _stamp(message)
             if stamp < due:
                 continue
             placed = history.at(stamp + offset)
             try:
+                image = _IMAGES[kind](message)
                 if placed is None:
-                    raise ValueError
-                decode = decode_image if topic.endswith('/compressed') else image_to_array
-                image = decode(message)
-            except ValueError:
-                self.left_out += 1
+                    raise ValueError(f'{self.poses} has no pose before and after its stamp')
+            except ValueError as error:
+                self.reasons[str(error)] += 1
                 continue
             if gap:
                 due = stamp + gap if due == 0 else due + gap * ((stamp - due) // gap + 1)
@@ -162,7 +187,11 @@ class RecordedRobot:
     def _history(self) -> PoseHistory:
         settings, kind = self.settings, self._pose_type
         history = PoseHistory(sys.maxsize)
-        odometry: MapOdometry | None = None
+        if kind in _TRANSFORM_TYPES:
+            for placed in self._transformed():
+                history.add(placed)
+            return history
+        unmoved, odometry = MapOdometry(Pose(np.zeros(3))), None
         start = Pose.from_yaw(settings.start, settings.yaw)
         for _, message in self._messages(self.poses):
             pose = _pose(message.pose if kind == 'PoseStamped' else message.pose.pose)
@@ -182,13 +211,45 @@ class RecordedRobot:
                         f'first was {"" if self.in_map else "not "}{settings.frame!r}; allowed is '
                         'one frame'
                     )
-                covariance = message.pose.covariance
-                known = covariance.any() and covariance[0] >= 0.0
-                stamp = _stamp(message)
-                history.add(odometry.apply(stamp, pose, covariance if known else None))
+                history.add(odometry.apply(_stamp(message), pose, _covariance(message)))
+            elif kind == 'PoseWithCovarianceStamped':
+                history.add(unmoved.apply(_stamp(message), pose, _covariance(message)))
             else:
                 history.add(StampedPose(_stamp(message), pose))
         return history
+
+    def _transformed(self) -> Iterator[StampedPose]:
+        """Yield the poses of the robot's frame in the map that the transforms tell."""
+        # It needs ROS, which other poses do not.
+        from maasi_drivers.agent.transform_buffer import TransformBuffer, TransformError
+
+        buffer, problem, last = TransformBuffer(), 'there is none', -1
+        base = self.settings.base_frame.strip('/') or f'{self.robot}/base_link'.strip('/')
+        wanted, children = self.settings.frame, set()
+        for topic in (_FIXED, self.poses):
+            for _, message in self._messages(topic):
+                for item in message.transforms:
+                    child, parent = item.child_frame_id.strip('/'), item.header.frame_id.strip('/')
+                    if (pose := _pose(item.transform)) is not None:
+                        children.add(child)
+                        buffer.add(parent, child, pose, _stamp(item), static=topic == _FIXED)
+                try:
+                    stamp = buffer.latest(wanted, base)
+                    if stamp is not None and stamp > last:
+                        yield StampedPose(stamp, buffer.pose(wanted, base, stamp))
+                        last = stamp
+                except TransformError as error:
+                    problem = str(error)
+        if last < 0:
+            raise ValueError(
+                f'{self._bag}: poses: {self.poses}: no transform of {base!r} in {wanted!r}: '
+                f'{problem}; recorded are {", ".join(sorted(children))} (parameter base_frame)'
+            )
+
+
+def _covariance(message: Any) -> FloatArray | None:
+    covariance = np.asarray(message.pose.covariance, dtype=float)
+    return covariance if covariance.any() and covariance[0] >= 0.0 else None
 
 
 def _stamp(message: Any) -> int:
@@ -197,7 +258,11 @@ def _stamp(message: Any) -> int:
 
 
 def _pose(message: Any) -> Pose | None:
-    point, turn = message.position, message.orientation
+    """Return a pose, or a transform as one; None if its numbers are none."""
+    if hasattr(message, 'rotation'):
+        point, turn = message.translation, message.rotation
+    else:
+        point, turn = message.position, message.orientation
     try:
         return Pose(
             np.array([point.x, point.y, point.z]), np.array([turn.w, turn.x, turn.y, turn.z])

@@ -1,5 +1,6 @@
 """Search a recording of robots' cameras and poses; each measures once a sensor period."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from maasi_filter.records import AgentMeasurement, FoundTarget
 from maasi_planner.coordinator import Coordinator
 from maasi_sim.run.ending import DONE
 from maasi_sim.run.run_folder import make_folder, write_text
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.tables import csv_text, found_rows
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.live_view import SearchTrace
@@ -26,15 +28,17 @@ from maasi_sim.scenario.schema import Scenario, planner_settings
 Measured = tuple[StampedPose, AgentMeasurement]  # where a robot was, and what it saw there
 
 
-def search_recording(scenario: str, bag: Path, out: Path | None, seed: int | None) -> int:
+def search_recording(options: Options) -> int:
     """Search a recording, print and write what is found, and return the exit code."""
+    assert options.replay is not None
+    seed, bag, topics = options.seed, options.replay, dict(options.remap)
     overrides: dict[str, tuple[Key, object]] = {} if seed is None else {'--seed': (('seed',), seed)}
-    loaded = load_scenario(scenario, overrides)
+    loaded = load_scenario(options.scenario, overrides)
     recorded = [
-        item for name in loaded.names() for item in recorded_measurements(loaded, name, bag)
+        item for name in loaded.names() for item in recorded_measurements(loaded, name, bag, topics)
     ]
     found, explored, trace = search_measurements(loaded, recorded)
-    folder = make_folder(out, '_replay')
+    folder = make_folder(options.out, '_replay')
     origin = loaded.environment.origin
     rows = found_rows(found, np.zeros((0, loaded.dimension)), [], origin)
     write_text(folder / 'found_targets.csv', csv_text(rows, loaded.dimension, origin))
@@ -49,7 +53,9 @@ def search_recording(scenario: str, bag: Path, out: Path | None, seed: int | Non
     return DONE
 
 
-def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Measured]:
+def recorded_measurements(
+    scenario: Scenario, name: str, bag: Path, remap: Mapping[str, str]
+) -> list[Measured]:
     """Return the measurements of a robot by its recorded images, by the steps of its driver."""
     robot = scenario.robots[name]
     if robot.camera is None:
@@ -63,12 +69,12 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Meas
         sensor=robot.sensor,
         camera=robot.camera,
     )
-    with BagReader(bag) as reader:
+    with BagReader(bag, remap) as reader:
         there = any(reader.counts.get(f'/{name}{image}') for image in USED['images'])
     # A robot that is alone in its scenario may have any namespace, or none.
     space = name if there or len(scenario.robots) > 1 else None
     try:
-        recorded = RecordedRobot(bag, settings, space, 'images')
+        recorded = RecordedRobot(bag, settings, space, 'images', remap=remap)
         if not recorded.records('/camera/camera_info'):
             print(f'{name}: no camera_info is recorded, its camera is that of the scenario')
         detector, sensor = recorded.detector(), robot.sensor.build(name, scenario.dimension)
@@ -84,11 +90,12 @@ def recorded_measurements(scenario: Scenario, name: str, bag: Path) -> list[Meas
         print(f'warning: {recorded.recovered}')
     if not found:
         raise BagError(
-            f'{bag}: {name}: none of {recorded.left_out} images can be used, allowed are images '
-            f'with stamps between the first and the last of {recorded.poses}'
+            f'{bag}: {name}: none of {recorded.left_out} images can be used: {recorded.why}'
         )
     poses = recorded.pose_source()
     print(f'{name}: {len(found)} images at poses of {poses}, {recorded.left_out} left out')
+    if recorded.left_out:
+        print(f'{name}: left out: {recorded.why}')
     return found
 
 

@@ -45,6 +45,7 @@ class Options:
     namespace: str = ''
     follow_clock: bool = False
     replay: Path | None = None
+    remap: tuple[tuple[str, str], ...] = ()
     check: bool = False
     view: ViewOptions | None = None
 
@@ -129,6 +130,14 @@ def build_parser() -> argparse.ArgumentParser:
         help='feed the filter the recorded measurements, and compare what it finds; with a '
         'scenario: search a recording of cameras and poses, which needs nothing else of this suite',
     )
+    add(
+        '--remap',
+        type=_remapping,
+        action='append',
+        default=[],
+        metavar='FROM:=TO',
+        help='with FILE and --replay: the recorded topic FROM is taken as TO',
+    )
     add_view_options(parser)
     add('--view', action='store_true', help='show the run in a browser')
     return parser
@@ -168,6 +177,13 @@ def _namespace(text: str) -> str:
     return name
 
 
+def _remapping(text: str) -> tuple[str, str]:
+    old, sign, new = text.partition(':=')
+    if not (old.strip('/') and sign and new.strip('/')):
+        raise argparse.ArgumentTypeError(f"read '{text[:80]}', allowed is FROM:=TO, two topics")
+    return old, new
+
+
 def parse(arguments: list[str] | None) -> Options:
     """Return the options of a command line; a wrong one ends the process with 2."""
     parser = build_parser()
@@ -175,10 +191,13 @@ def parse(arguments: list[str] | None) -> Options:
     view = ViewOptions(*(given.pop(field.name) for field in fields(ViewOptions)))
     if not given['view'] and (view.port is not None or view.control or not view.browser):
         parser.error('--port, --control and --no-browser need --view')
+    given['remap'] = tuple(given['remap'])
     given |= {'namespace': given['namespace'] or '', 'view': view if given['view'] else None}
     options = Options(**given)
     if options.check and (options.replay is not None or options.view is not None):
         parser.error('--check: allowed without --replay and --view')
+    if options.remap and not (options.replay and options.scenario):
+        parser.error('--remap: allowed with a scenario and --replay BAG')
     if options.replay is None and not options.scenario:
         parser.error('give either a scenario or --replay BAG')
     if options.follow_clock and options.domain_id is None:

@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.replay is not None and options.scenario:
             from maasi_sim.run.recorded_search import search_recording
 
-            return search_recording(options.scenario, options.replay, options.out, options.seed)
+            return search_recording(options)
         if options.replay is not None:
             return replay(options.replay, options.out, options.domain_id, interruption)
         return ScenarioRun(options, interruption).execute()
