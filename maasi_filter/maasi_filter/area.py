@@ -26,7 +26,6 @@ _ROUNDING = 1e-6  # of coordinates, also of those that are large [m]
 _CELLS, _CHECKED = 512, 16
 # Ground narrower than this is rounding, not area; twice as far as shapes are rounded [m].
 _NARROWEST = 2e-4
-_ANOTHER_COUNTRY = 100e3  # a zone as far as this from the area is hardly meant [m]
 
 
 class Density(NamedTuple):
@@ -255,26 +254,38 @@ class Area:
         }
         for index, part in enumerate(given.prior.polygons):
             zones[f'prior.polygons[{index}]'] = read_shape(part.polygon)
-        gaps = shapely.distance(self.border, list(zones.values())) if zones else []
+        if given.prior.raster and given.prior.extent:
+            (west, east), (south, north) = given.prior.extent
+            zones['prior.extent'] = box(west, south, east, north)
         doubts = []
-        for key, gap in zip(zones, gaps):
-            if gap > 0.0:
-                doubts.append(
-                    f'environment.{key}: lies {how_far(gap)} outside of the area, where it has no '
-                    f'effect{self.exchanged(shapely.get_coordinates(zones[key].centroid)[0], gap)}'
-                )
+        for key, zone in zones.items():
+            parts = shapely.get_parts(zone)
+            gaps = shapely.distance(self.border, parts)
+            away = np.count_nonzero(gaps > 0.0)
+            # Maps of Nav2 may well be larger than an area, but what is drawn is drawn for it.
+            if not away or (away < len(parts) and key.startswith('obstacles')):
+                continue
+            place = shapely.get_coordinates(parts[gaps.argmax()].centroid)[0]
+            hint = self.exchanged(place, gaps.max())
+            lies, where = f'lies {how_far(gaps.min())}', 'where it has no effect'
+            if away < len(parts):
+                lies = f'{away} of its {len(parts)} polygons lie up to {how_far(gaps.max())}'
+                where = 'where they have no effect'
+            doubts.append(f'environment.{key}: {lies} outside of the area, {where}{hint}')
         return doubts
 
     def exchanged(self, position: ArrayLike, gap: float) -> str:
         """Return in words whether a position would lie at the area with latitude for longitude."""
         origin = self.settings.origin
-        if origin is None or gap < _ANOTHER_COUNTRY:
+        if origin is None or gap < self.border.length:
             return ''
         degrees = on_ground(np.asarray(position, dtype=float)[None, :2], origin)
         if abs(degrees[0, 1]) > 90.0:
             return ''
         place = shapely.Point(to_map(degrees, origin)[0])
-        near = self.border.distance(place) < max(1e-3 * gap, 2.0 * self.border.length)
+        near = self.border.distance(place) < min(
+            max(1e-3 * gap, 2.0 * self.border.length), 0.1 * gap
+        )
         return ': with latitude and longitude exchanged it would lie there' if near else ''
 
     def _cells(self, every: int = 1) -> tuple[FloatArray, FloatArray]:

@@ -342,7 +342,16 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
             items = [items]
         if isinstance(items, (list, tuple)):
             values[key] = [zone(item, key, index) for index, item in enumerate(items)]
-            values[key] += [{'polygon': text(item, 'area')} for item in more]
+            for item in more:
+                values[key].append({'polygon': text(item, 'area')})
+                if found.disjoint(shapely.from_wkt(values[key][-1]['polygon'])):
+                    index = len(values[key]) - 1
+                    warnings.warn(
+                        f'{item.name}: role {role}: as environment.{key}[{index}] it touches '
+                        'nothing of the area',
+                        InputWarning,
+                        stacklevel=2,
+                    )
     _give_prior(values, prior, roles['prior'], text)
     return values
 

@@ -356,3 +356,36 @@ def test_what_is_another_format_or_encoding_is_refused_as_such(tmp_path):
         start = {'type': 'Feature', 'geometry': {'type': 'Point', 'coordinates': place}}
         start['properties'] = {'role': 'start'}
         assert cause in refusal(area=collection(polygon(), start))
+
+
+def test_each_polygon_of_a_zone_that_lies_elsewhere_is_counted_and_its_feature_named():
+    exchanged = polygon([corner[::-1] for corner in ZONE], name='pond')
+    file = collection(polygon(ZONE), exchanged)
+    (doubt,) = area_of(area=polygon(), keep_outs=[file]).doubts
+    assert doubt == (
+        'environment.keep_outs[0]: 1 of its 2 polygons lie up to 4,739 km outside of the area, '
+        'where they have no effect: with latitude and longitude exchanged it would lie there'
+    )
+    pond = polygon(exchanged['geometry']['coordinates'][0][:-1], name='pond', role='keep_out')
+    with pytest.warns(
+        InputWarning, match=r'feature 2 \(pond\): role keep_out: as .*keep_outs\[0\]'
+    ):
+        assert len(area_of(area=collection(polygon(), pond)).doubts) == 1
+
+
+def test_an_exchange_is_seen_where_latitude_and_longitude_are_nearly_the_same():
+    ring = [[10.0, 10.1], [10.002, 10.1], [10.002, 10.102], [10.0, 10.102]]
+    zone = polygon([[y, x] for x, y in ring[:3]])
+    (doubt,) = area_of(area=polygon(ring), keep_outs=[zone]).doubts
+    assert 'lies 15 km outside' in doubt and 'exchanged' in doubt
+    away = polygon([[x + 0.1, y] for x, y in ring[:3]])
+    (doubt,) = area_of(area=polygon(ring), keep_outs=[away]).doubts
+    assert 'exchanged' not in doubt
+
+
+def test_a_raster_over_other_ground_is_told_with_its_distance(tmp_path):
+    Image.fromarray(np.array([[20, 200]], np.uint8)).save(tmp_path / 'heat.png')
+    prior = {'raster': str(tmp_path / 'heat.png'), 'extent': [[1100, 1200], [0, 100]]}
+    first, second = area_of(bounds=[[0.0, 100.0]] * 2, prior=prior).doubts
+    assert first.startswith('environment.prior.extent: lies 1000 m outside of the area')
+    assert 'promises nothing' in second
