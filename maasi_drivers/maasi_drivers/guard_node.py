@@ -105,7 +105,10 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             self._begin_stop()
 
     def _begin_stop(self) -> None:
-        self.get_logger().warning('the driver is dead or hangs: zeros on cmd_vel')
+        if self.ending:
+            self.get_logger().info('the driver has ended: zeros on cmd_vel')
+        else:
+            self.get_logger().warning('the driver is dead or hangs: zeros on cmd_vel')
         self._stop_timer = self.create_wall_timer(_STOP_PERIOD, self._command_zeros)
         self._refresh()
         self._command_zeros()

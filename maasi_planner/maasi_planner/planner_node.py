@@ -338,7 +338,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self.get_logger().info(f'{name} takes part')
 
     def _leave(self, name: str, reason: str) -> None:
-        if name in self._away:
+        if name in self._away or self.ending:
             return
         self._away.add(name)
         self._orders.leave(name)
@@ -346,7 +346,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     def _check_team(self) -> None:
         """Remove silent robots from planning; check filter and action."""
-        if not self.active:
+        if not self.active or self.ending:
             return
         now = time.monotonic()
         if not self.settings.lockstep:

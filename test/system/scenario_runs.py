@@ -64,6 +64,12 @@ class Run:
         return list(processes_of(f'{self.folder}/{file}'))
 
     @property
+    def warnings(self):
+        """Lines of its nodes that are no information."""
+        lines = [line for log in self.folder.glob('*.log') for line in log.open()]
+        return [line for line in lines if re.match(r'\[(WARN|ERROR|FATAL)\]', line)]
+
+    @property
     def report(self):
         return check_report(json.loads((self.folder / 'report.json').read_text()))
 

@@ -151,6 +151,7 @@ def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(tmp_path)
             run.finish()
     assert run.code == 0, run.output
     assert run.processes() == []
+    assert run.warnings == []
 
 
 def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path, monkeypatch):

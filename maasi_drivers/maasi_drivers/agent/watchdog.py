@@ -111,9 +111,9 @@ class Watchdog:
         health, silence = driver.health, driver.silence
         age, timeout = silence.length, driver.settings.odometry_timeout
         if driver.history.latest is None and ODOMETRY not in health:
-            wall = silence.wall
-            if wall > _PATIENCE and self._link.expects_pose():
-                driver.warn_throttled('no odometry', f'no {driver.pose_name} yet, for {wall:.0f} s')
+            # Before a simulation begins there is none.
+            if age > _PATIENCE and self._link.expects_pose():
+                driver.warn_throttled('no odometry', f'no {driver.pose_name} yet, for {age:.0f} s')
         elif age > timeout or ODOMETRY in health:
             if health.begin(ODOMETRY, f'no {driver.pose_name} for {age:.1f} s'):
                 self._checks = 0

@@ -57,6 +57,8 @@ class CommandPublisher:
             self._use(kind)
         if not wanted:
             return f'{self.topic}: no subscription; is the robot running?'
+        if any(_TYPES.get(name) is self._kind for name in wanted):
+            return ''  # known, and not connected yet
         return (
             f'{self.topic}: no subscription of this type; the robot wants {", ".join(wanted)}, '
             'see the parameter command_type'
@@ -147,7 +149,7 @@ class TopicLink(RobotLink):
             self._guarded = any(item.node_name == 'guard' for item in readers)
             self._was_guarded |= self._guarded
         self._polls += 1
-        if self._was_guarded and not self._guarded:
+        if self._was_guarded and not self._guarded and not self.driver.ending:
             self.driver.warn_throttled(
                 'guard', 'the guard has gone: nobody stops the robot if this driver dies'
             )

@@ -65,6 +65,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._prepared = False
         self.configured = False
         self.active = False
+        self.ending = False  #: whether it is asked to end, as the others may be too
         self.step = -1
         self._warned: dict[str, float] = {}
         self._peers: list[Callable[[], bool]] = []

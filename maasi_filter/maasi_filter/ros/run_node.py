@@ -73,6 +73,8 @@ def run(
         if asked:
             raise KeyboardInterrupt
         asked = True
+        if node is not None:
+            node.ending = True
 
     node: LockstepLifecycleNode[Any] | None = None
     try:

@@ -149,13 +149,14 @@ class Supervisor:
         # does not, and may send a command until it is killed: stop the robots before and after.
         self._display.update('stopping the nodes', quiet=True)
         recorder.stop_robots(robots)
-        stubborn = stop(self.nodes('driver', 'guard'))
+        # The others end with them: to a planner that continues, drivers that end are lost.
+        stubborn = stop(self.nodes('driver', 'guard', 'other'))
         # Their last commands come before it, also in the recording.
         recorder.drain()
         recorder.stop_robots(robots)
         time.sleep(_LAST_MESSAGES)
         recorder.drain()
-        stubborn += stop(self.nodes('other') if keep_clock else self.nodes('other', 'clock'))
+        stubborn += stop([] if keep_clock else self.nodes('clock'))
         recorder.drain()
         if stubborn:
             self._display.say(f'had to be killed: {", ".join(stubborn)}')
