@@ -394,6 +394,33 @@ def test_keep_outs_are_taken_by_service_published_and_checked(team):
     assert not heard[-1].zones and coordinator.area.region is None
 
 
+def zones_of(team):
+    return [str(zone) for zone in team.tested.coordinator.area.settings.keep_outs]
+
+
+@pytest.mark.parametrize('version', [1, 5])
+def test_keep_outs_of_before_a_restart_do_not_win_over_newer_ones(team, version):
+    """Of a planner that started again the versions begin again; the filter has the old ones."""
+    heard = team.hear(KeepOuts, 'keep_outs', LATCHED_ALL)
+    client = team.node.create_client(SetKeepOuts, 'search/keep_outs')
+    team.until(client.service_is_ready)
+    answer = client.call_async(SetKeepOuts.Request(zones=['0.2 0.2 0.1']))
+    team.until(answer.done)
+    filter_ = team.node.create_publisher(KeepOuts, 'keep_outs', LATCHED)
+    team.until(lambda: filter_.get_subscription_count() == 2 and heard)
+    old = KeepOuts(version=version, zones=['0.9 0.9 0.1'])
+    filter_.publish(old)
+    team.until(lambda: heard[-1].version == version + 1)
+    assert list(heard[-1].zones) == ['0.2 0.2 0.1'] == zones_of(team)
+    # Another planner changes them later.
+    new = KeepOuts(version=version + 2, zones=['0.8 0.8 0.1'])
+    new.header.stamp = heard[-1].header.stamp
+    new.header.stamp.sec += 1
+    filter_.publish(new)
+    team.until(lambda: zones_of(team) == ['0.8 0.8 0.1'])
+    team.until(lambda: heard[-1].version == version + 2)
+
+
 def test_found_targets_are_kept_for_a_filter_that_starts_again(team):
     kept = team.hear(FoundTargetArray, 'found_targets/kept', LATCHED)
     team.until(lambda: kept)

@@ -8,6 +8,7 @@ from std_msgs.msg import Header
 
 from maasi_filter.area import Area
 from maasi_filter.environment import EnvironmentSettings, shapes_of_texts
+from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
 from maasi_msgs.msg import KeepOuts
@@ -24,6 +25,7 @@ class KeepOutTopic:
     ) -> None:
         self._node, self._on_change = node, on_change
         self._latest = KeepOuts()
+        self._asked = False  # whether `change` of this node made the latest ones
         topic = node.team_topic('keep_outs')
         self._publisher = node.create_publisher(KeepOuts, topic, LATCHED) if keep else None
         node.create_subscription(KeepOuts, topic, self._take, LATCHED_ALL)
@@ -33,10 +35,17 @@ class KeepOutTopic:
         frame, version = self._node.settings.frame, self._latest.version + 1
         header = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=frame)
         self._adopt(KeepOuts(header=header, version=version, zones=list(zones)))
+        self._asked = True
 
     def _take(self, message: KeepOuts) -> None:
-        if message.version <= self._latest.version:
+        latest = self._latest
+        if self._asked and message.version >= latest.version and _stamp(message) < _stamp(latest):
+            # A node that started again has changed them before it received those of before.
+            latest.version = message.version + 1
+            self._adopt(latest)
+        if message.version <= latest.version:
             return
+        self._asked = False
         try:
             self._adopt(message)
         except ValueError as error:
@@ -52,6 +61,10 @@ class KeepOutTopic:
         if self._publisher is not None:
             self._publisher.publish(message)
         self._on_change(area)
+
+
+def _stamp(message: KeepOuts) -> int:
+    return stamp_from_ros(message.header.stamp)
 
 
 def with_keep_outs(environment: EnvironmentSettings, zones: Sequence[str]) -> Area:
