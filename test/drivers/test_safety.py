@@ -394,6 +394,21 @@ def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(start_gua
     is_stopped(team)
 
 
+def test_a_guard_that_ends_with_its_driver_gives_zeros_and_no_warning(
+    start_guard, process, team, capfd
+):
+    guard, driver = start_guard(), process()
+    team.connect()
+    team.awaken()
+    team.until(lambda: guard._heard)
+    guard.ending = True  # as by the signal that both receive
+    driver.send_signal(signal.SIGINT)
+    team.until(lambda: guard.status()['stopping'])
+    is_stopped(team)
+    said = capfd.readouterr().err
+    assert 'the driver has ended' in said and 'WARN' not in said
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_driver_that_is_told_to_end_leaves_zeros(process, team, number):
     driver = process()
