@@ -39,6 +39,7 @@ _IMAGES = ('.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff')
 FILES = ('.geojson', '.json', '.yaml', '.yml', *_IMAGES)
 _ROLES = ('area', 'keep_out', 'prior')  # of features of GeoJSON
 _ROLE_OF = {'keep_outs': 'keep_out', 'obstacles': 'keep_out', 'prior': 'prior'}  # by key
+_DEGREES = 0.1  # an area that is shorter is not in metres, but in degrees [m]
 _FARTHEST = 100e3  # of an area from the origin of its map, which is flat [m]
 
 
@@ -328,6 +329,8 @@ def _in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
         values['area'] = _text(found)
     elif area:
         values['area'] = text(area, 'area')
+        with _at(area, 'area'):
+            _check_metres(shapely.from_wkt(values['area']))
     if area:
         west, south, east, north = shapely.from_wkt(values['area']).bounds
         values['bounds'] = [[west, east], [south, north]]
@@ -402,6 +405,16 @@ def _check_distance(area: BaseGeometry, origin: Any) -> None:
         raise ValueError(
             f'lies {gap / 1e3:,.0f} km from environment.origin, allowed are {_FARTHEST / 1e3:g}: '
             'is the latitude first in one of them? GeoJSON has the longitude first'
+        )
+
+
+def _check_metres(area: BaseGeometry) -> None:
+    """Raise ValueError if an area in metres is so small that it is in degrees."""
+    west, south, east, north = area.bounds
+    if max(east - west, north - south) < _DEGREES:
+        raise ValueError(
+            f'is {max(east - west, north - south):.2g} m long, and corners are in metres of the '
+            'map: are these degrees? Write them as GeoJSON'
         )
 
 

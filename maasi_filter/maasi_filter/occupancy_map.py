@@ -133,9 +133,11 @@ def _occupied(facts: Mapping[str, Any], folder: Path) -> BoolArray:
     mode, image = facts.get('mode', 'trinary'), facts.get('image')
     if mode not in _MODES:
         raise ValueError(f'mode: read {mode}, allowed are {", ".join(_MODES)}')
-    if not isinstance(image, str):
+    if not isinstance(image, str) or not image:
         raise ValueError(f'image: read {image}, allowed is the name of a file')
     threshold = _number(facts, 'occupied_thresh')
+    if not 0.0 <= threshold <= 1.0:
+        raise ValueError(f'occupied_thresh: read {threshold:g}, allowed are numbers from 0 to 1')
     try:
         channels = read_channels(str(folder / image)) / 255.0
     except ValueError as error:

@@ -115,6 +115,8 @@ def test_maps_are_read_in_the_modes_of_nav2(tmp_path):
         ({'image': None}, 'image: read None, allowed is the name of a file'),
         ({'image': 'gone.pgm'}, r'gone\.pgm: No such file or directory'),
         ({'image': 'room.yaml'}, r'room\.yaml: is no image'),
+        ({'image': ''}, 'image: read , allowed is the name of a file'),
+        ({'occupied_thresh': 65}, 'occupied_thresh: read 65, allowed are numbers from 0 to 1'),
         ({'occupied_thresh': None}, 'occupied_thresh: read None, allowed is a number'),
     ],
 )
@@ -389,3 +391,12 @@ def test_a_raster_over_other_ground_is_told_with_its_distance(tmp_path):
     first, second = area_of(bounds=[[0.0, 100.0]] * 2, prior=prior).doubts
     assert first.startswith('environment.prior.extent: lies 1000 m outside of the area')
     assert 'promises nothing' in second
+
+
+def test_corners_in_degrees_are_not_an_area_of_millimetres():
+    ring = ', '.join(f'{x} {y}' for x, y in [*RING, RING[0]])
+    for corners in (RING, f'POLYGON (({ring}))'):
+        assert refusal(area=corners) == (
+            'Value error, is 0.0026 m long, and corners are in metres of the map: are these '
+            'degrees? Write them as GeoJSON'
+        )
