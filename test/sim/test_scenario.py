@@ -150,6 +150,11 @@ WRONG = [
     ([('targets.margin', 1.5)], 'targets.margin', ['at most half']),
     ([('targets.count', 500)], 'targets.separation', ['not 500']),
     ([('targets', {'positions': [[0.5, 3.0]]})], 'targets.positions[0]', ['the bounds']),
+    (
+        [('targets', {'positions': [[0.5, 0.5], [0.2, 0.2], [0.5, 0.5]]})],
+        'targets.positions[2]',
+        ['targets.positions[0] is as well', 'one target at each position'],
+    ),
     ([('targets', {})], 'targets', ['count or positions']),
     ([('targets', {'count': 2, 'classes': ['a', '']})], 'targets.classes[1]', ['at least 1 char']),
     ([('targets.count', 0)], 'stop', ['planner_done']),

@@ -137,6 +137,13 @@ class World:
                         f'the bounds {bounds.tolist()}'
                     )
                 positions[index] = row
+                same = (positions[:index] == positions[index]).all(axis=1).nonzero()[0]
+                if len(same):
+                    raise ValueError(
+                        f'targets.positions[{index}]: got {row}, which '
+                        f'targets.positions[{same[0]}] is as well; allowed is one target '
+                        'at each position'
+                    )
         else:
             positions = draw_targets(targets, area, noise_stream(seed, purpose='targets'))
         labels = tuple(

@@ -112,7 +112,9 @@ class VehicleLink:
                     while (message := self._connection.recv_msg()) is not None:
                         self.vehicle.handle(message, time.monotonic())
                     self.vehicle.tick(time.monotonic())
-            except OSError as error:
-                # A device that was pulled out may come back.
-                self.failure = f'mavlink.url: {self.settings.url}: {error}'
+            except Exception as error:
+                # A device that was pulled out may come back; a message that cannot be handled must
+                # not end the thread, which nobody would notice: the link is lost meanwhile.
+                words = str(error) if isinstance(error, OSError) else repr(error)
+                self.failure = f'mavlink.url: {self.settings.url}: {words}'
                 self._shut()

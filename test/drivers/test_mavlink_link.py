@@ -1,0 +1,63 @@
+"""The thread of a MAVLink link: it goes on after whatever happens in it."""
+
+import pytest
+from waiting import wait_until
+
+from maasi_drivers.links.mavlink import link as link_module
+from maasi_drivers.settings.vehicles import MavlinkSettings
+
+
+class Wire:
+    """A connection that gives a message each time."""
+
+    def __init__(self):
+        self.closed = False
+
+    def select(self, period):
+        pass
+
+    def recv_msg(self):
+        return object()
+
+    def close(self):
+        self.closed = True
+
+    def write(self, data):
+        pass
+
+
+@pytest.mark.parametrize(
+    ('error', 'words'),
+    [
+        (OSError('unplugged'), 'unplugged'),
+        (ValueError('no number'), "ValueError('no number')"),
+        (KeyError('field'), "KeyError('field')"),
+        (ZeroDivisionError(), 'ZeroDivisionError()'),
+    ],
+)
+def test_an_exception_in_its_thread_is_a_lost_link_that_is_opened_again(
+    tmp_path, monkeypatch, error, words
+):
+    wires, failures = [], []
+    monkeypatch.setattr(link_module, '_RETRY', 0.01)
+    monkeypatch.setattr(
+        link_module, 'open_connection', lambda *_: wires.append(Wire()) or wires[-1]
+    )
+    settings = MavlinkSettings(url='udpin:127.0.0.1:0')
+    link = link_module.VehicleLink(settings, [0.0, 0.0, 1.0], tmp_path)
+
+    def handle(message, now):
+        if len(wires) < 3:
+            raise error
+        link._end.set()
+        raise StopIteration
+
+    monkeypatch.setattr(link.vehicle, 'handle', handle)
+    shut = link._shut
+    monkeypatch.setattr(link, '_shut', lambda: failures.append(link.failure) or shut())
+    link.open()
+    wait_until(lambda: not link._thread.is_alive())
+    assert len(wires) == 3 and all(wire.closed for wire in wires)
+    assert [words in failure for failure in failures[:2]] == [True, True]
+    assert failures[0].startswith('mavlink.url: udpin:127.0.0.1:0: ')
+    link.close()
