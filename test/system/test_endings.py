@@ -18,6 +18,7 @@ from maasi_sim.run.bag import Bag
 from maasi_sim.run.ending import DONE, NOT_WRITTEN, Ending
 from maasi_sim.run.run_folder import make_folder
 from maasi_sim.run.run_options import Options, parse
+from maasi_sim.run.run_scenario import main, middleware_problem
 from maasi_sim.run.scenario_run import ScenarioRun
 from maasi_sim.scenario.layering import ScenarioError
 
@@ -175,6 +176,18 @@ def test_wrong_input_is_told_before_anything_starts(tmp_path):
     assert run.code == 2
     assert 'wrong.yaml' in run.output and "did you mean 'stop'" in run.output
     assert not run.folder.exists()
+
+
+def test_a_middleware_that_is_not_there_is_named(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_none_cpp')
+    assert main(['mambo', '--out', str(tmp_path / 'run')]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: RMW_IMPLEMENTATION: read 'rmw_none_cpp', which is not installed")
+    assert 'allowed is rmw_fastrtps_cpp' in said or ', rmw_fastrtps_cpp' in said
+    assert not (tmp_path / 'run').exists()
+    for name in ('', 'rmw_fastrtps_cpp'):
+        monkeypatch.setenv('RMW_IMPLEMENTATION', name)
+        assert middleware_problem() == ''
 
 
 @pytest.mark.parametrize(

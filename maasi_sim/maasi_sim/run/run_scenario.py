@@ -9,6 +9,8 @@ from maasi_sim.run.ending import DONE, NOT_WRITTEN, WRONG_INPUT, Interruption
 from maasi_sim.run.processes import ProcessError, start_server
 from maasi_sim.run.run_options import Options, parse
 
+_MIDDLEWARE = 'RMW_IMPLEMENTATION'
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
@@ -18,6 +20,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse(arguments)
     if options.check:
         return check(options)
+    if problem := middleware_problem():
+        print(f'error: {problem}', file=sys.stderr)
+        return WRONG_INPUT
     # Nodes load what they share while this process loads what is its own.
     try:
         start_server()
@@ -46,6 +51,19 @@ def main(arguments: list[str] | None = None) -> int:
     except (ScenarioError, DomainError, ProcessError, BagError, ResultsError) as error:
         _print_errors(error)
         return NOT_WRITTEN if isinstance(error, (ResultsError, BagWriteError)) else WRONG_INPUT
+
+
+def middleware_problem() -> str:
+    """Return why the middleware of the environment cannot be used: rcl would end the process."""
+    from ament_index_python import get_resources
+
+    name = os.environ.get(_MIDDLEWARE)
+    installed = sorted(get_resources('rmw_typesupport').keys() - {'rmw_implementation'})
+    if not name or name in installed:
+        return ''
+    return (
+        f"{_MIDDLEWARE}: read '{name}', which is not installed; allowed is {', '.join(installed)}"
+    )
 
 
 def check(options: Options) -> int:
