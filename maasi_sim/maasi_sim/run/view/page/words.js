@@ -93,10 +93,10 @@ function harvested(log, time) {
 }
 
 function endWords(log, time) {
-  const [, , , reason = '', text = ''] = log.at('end', '', time) || [];
+  const [ended = time, , , reason = '', text = ''] = log.at('end', '', time) || [];
   const score = log.at('score', '', time);
   const complete = reason === 'all_found' || (score ? score[4] === 0 : log.found(time) >= log.total);
-  const after = `after ${Math.round(time)} s`;
+  const after = `after ${Math.round(Math.min(ended, time))} s`;
   if (log.total && complete) {
     // A planner may search on after the last one.
     const { totals, visits } = log;
