@@ -61,3 +61,34 @@ def test_an_exception_in_its_thread_is_a_lost_link_that_is_opened_again(
     assert [words in failure for failure in failures[:2]] == [True, True]
     assert failures[0].startswith('mavlink.url: udpin:127.0.0.1:0: ')
     link.close()
+
+
+def test_a_wire_that_cannot_be_closed_or_opened_again_does_not_end_its_thread(
+    tmp_path, monkeypatch
+):
+    tries = []
+
+    class Broken(Wire):
+        def select(self, period):
+            raise OSError('unplugged')
+
+        def close(self):
+            raise OSError('no such device')
+
+    def open_connection(*_):
+        tries.append(link.failure)
+        if len(tries) == 2:
+            raise RuntimeError('no driver')
+        if len(tries) == 4:
+            link._end.set()
+        return Broken()
+
+    monkeypatch.setattr(link_module, '_RETRY', 0.01)
+    monkeypatch.setattr(link_module, 'open_connection', open_connection)
+    settings = MavlinkSettings(url='udpin:127.0.0.1:0')
+    link = link_module.VehicleLink(settings, [0.0, 0.0, 1.0], tmp_path)
+    link.open()
+    wait_until(lambda: not link._thread.is_alive())
+    failures = [text.removeprefix('mavlink.url: udpin:127.0.0.1:0: ') for text in tries]
+    assert failures == ['', 'unplugged', "RuntimeError('no driver')", 'unplugged']
+    link.close()

@@ -3,6 +3,7 @@
 import random
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,17 +97,19 @@ class VehicleLink:
         self.failure = ''
 
     def _shut(self) -> None:
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
+        connection, self._connection = self._connection, None
+        # What a broken wire says as it is closed adds nothing to its failure.
+        with suppress(Exception):
+            if connection is not None:
+                connection.close()
 
     def _run(self) -> None:
         while not self._end.is_set():
-            if self._connection is None:
-                self._end.wait(_RETRY)
-                self._open()
-                continue
             try:
+                if self._connection is None:
+                    self._end.wait(_RETRY)
+                    self._open()
+                    continue
                 self._connection.select(_PERIOD)
                 with self.lock:
                     while (message := self._connection.recv_msg()) is not None:
