@@ -94,7 +94,7 @@ def preflight(scenario: Scenario) -> Preflight:
     together = shapely.union_all(seen)
     report = Preflight()
     closed = area.border.area - ground.area
-    without = f', without {_area(closed)} of keep-outs and obstacles' if closed > 0.0 else ''
+    without = f', without {_area(closed)} of keep-outs and obstacles' if closed >= 1e-6 * area.border.area else ''
     depth = f', {height:.3g} m high' if area.dimension == 3 else ''
     report.lines.append(f'area: {_area(ground.area)}{without}{depth}')
     for name, effort in efforts.items():
