@@ -22,6 +22,7 @@ from maasi_filter.occupancy_map import read_map
 _GEOJSON, MAPS = ('.json', '.geojson'), ('.yaml', '.yml')
 _LARGEST = 10_000.0  # of an area in degrees [km2]; larger ones are mistakes
 POINT_ROLES = ('start', 'home', 'charger')
+_BEYOND = 10.0  # degrees by which areas across 180 degrees, as drawn on the page, go on
 _SIMPLE = ('Point', 'LineString', 'Polygon')
 _KINDS = (*_SIMPLE, *(f'Multi{kind}' for kind in _SIMPLE), 'GeometryCollection')
 _NAMED = 5  # so many features that are left out are named
@@ -368,7 +369,7 @@ def _short_way(rings: Sequence[FloatArray], where: str) -> list[FloatArray]:
 def _check_degrees(degrees: FloatArray, where: str) -> None:
     """Raise ValueError with the likely cause if coordinates are no degrees."""
     x, y = degrees.T
-    wrong = np.flatnonzero((np.abs(x) > 180.0) | (np.abs(y) > 90.0))
+    wrong = np.flatnonzero((np.abs(x) > 180.0 + _BEYOND) | (np.abs(y) > 90.0))
     if not len(wrong):
         return
     east, north = float(x[wrong[0]]), float(y[wrong[0]])

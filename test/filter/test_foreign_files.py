@@ -188,7 +188,7 @@ def test_another_coordinate_system_is_refused_by_its_name(name, allowed):
     [
         ([[568900, 5160900], [569100, 5160900], [569100, 5161100]], 'are these metres'),
         ([[46.6, 100.0], [46.7, 100.0], [46.7, 100.1]], 'is the latitude first'),
-        ([[179.9, 1.0], [180.1, 1.0], [180.1, 1.1]], 'cut the polygon at 180 degrees'),
+        ([[199.9, 1.0], [200.1, 1.0], [200.1, 1.1]], 'cut the polygon at 180 degrees'),
         ([[0, 0], [40, 0], [40, 30], [0, 30]], 'km2, allowed are 10,000'),
     ],
 )
@@ -320,6 +320,9 @@ def test_polygons_across_180_degrees_that_are_not_cut_are_the_same_area():
     whole['geometry']['coordinates'].append(hole)
     with pytest.warns(InputWarning, match='feature 1: has edges longer than 180 degrees: taken as'):
         area = area_of(area=collection(whole, zone))
+    # Programs also count on beyond 180 degrees.
+    beyond = polygon([[x % 360.0, y] for x, y in ring])
+    assert area_of(area=beyond).border.area == pytest.approx(2.36e6, rel=1e-3)
     assert abs(area.settings.origin.longitude) == pytest.approx(180.0) and area.doubts == []
     assert area.border.area == pytest.approx(2.36e6 - 11800.0, rel=1e-3)
     assert area.region.area == pytest.approx(area.border.area - 11800.0, rel=1e-3)
