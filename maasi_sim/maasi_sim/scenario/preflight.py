@@ -93,8 +93,10 @@ def preflight(scenario: Scenario) -> Preflight:
         efforts[name] = _effort(scenario, name, visible.area * height)
     together = shapely.union_all(seen)
     report = Preflight()
-    closed = area.border.area - ground.area
-    without = f', without {_area(closed)} of keep-outs and obstacles' if closed >= 1e-6 * area.border.area else ''
+    whole = area.border.area
+    closed = whole - ground.area
+    told = closed >= 1e-6 * whole  # less is rounding
+    without = f', without {_area(closed)} of keep-outs and obstacles' if told else ''
     depth = f', {height:.3g} m high' if area.dimension == 3 else ''
     report.lines.append(f'area: {_area(ground.area)}{without}{depth}')
     for name, effort in efforts.items():
