@@ -17,7 +17,7 @@ from node_kinds import KINDS
 from rclpy.action import ActionClient
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from scenario_runs import Operator, beside
-from sensor_msgs.msg import BatteryState
+from sensor_msgs.msg import BatteryState, CameraInfo
 from std_srvs.srv import Trigger
 from waiting import wait_until
 
@@ -309,6 +309,15 @@ def bad_request(corpus, service, type_name, stamp):
 # ---- what the nodes are for ----------------------------------------------------------------
 
 
+CAMERA = CameraInfo(
+    width=320,
+    height=240,
+    distortion_model='plumb_bob',
+    d=[0.0] * 5,
+    k=[120.0, 0.0, 159.5, 0.0, 120.0, 119.5, 0.0, 0.0, 1.0],
+)
+
+
 def use_driver(world, kind):
     """Odometry comes: the state is published, a goal is taken and the robot moves towards it."""
     space = world.space(kind)
@@ -324,8 +333,9 @@ def use_driver(world, kind):
 
     def move():
         count[0] += 1
-        # One of the corpus may be empty, which is a fault.
+        # One of the corpus may be empty, which is a fault, as is a camera that is none.
         world.publish(f'{space}/battery_state', BatteryState(percentage=0.9))
+        world.publish(f'{space}/camera/camera_info', CAMERA)
         message.pose.pose.position.x = 1e-6 * count[0]
         world.publish(f'{space}/odom', stamped(message, 1000.0 + count[0] / 20.0, 'odom'))
         if not answers and states and states[-1].header.stamp.sec >= 1000:

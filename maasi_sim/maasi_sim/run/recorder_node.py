@@ -286,7 +286,9 @@ class Recorder:
                     self._note_planner(status)
             # Also those of the last step that arrive after the end.
             self.observer.add(topic, data)
-            if self.listener is not None and topic in self._shown:
+            # Measurements of later steps are for the observer only.
+            later = topic.endswith(_MEASURED) and not self._belongs(topic, data)
+            if self.listener is not None and topic in self._shown and not later:
                 self.listener(topic, self._shown[topic], data)
         self.observer.settle()
         if self.observer.end_step is not None and not self._finished:
