@@ -335,7 +335,8 @@ def use_driver(world, kind):
         count[0] += 1
         # One of the corpus may be empty, which is a fault, as is a camera that is none.
         world.publish(f'{space}/battery_state', BatteryState(percentage=0.9))
-        world.publish(f'{space}/camera/camera_info', CAMERA)
+        if world.node.count_subscribers(f'{space}/camera/camera_info'):
+            world.publish(f'{space}/camera/camera_info', CAMERA)
         message.pose.pose.position.x = 1e-6 * count[0]
         world.publish(f'{space}/odom', stamped(message, 1000.0 + count[0] / 20.0, 'odom'))
         if not answers and states and states[-1].header.stamp.sec >= 1000:
