@@ -155,7 +155,7 @@ def _unwrapped(shape: BaseGeometry, around: float) -> BaseGeometry:
 
 
 def centre_of(features: Sequence[Feature]) -> dict[str, float]:
-    """Return an origin amid features in degrees; halves at 180 degrees are one area."""
+    """Return an origin in the middle of features in degrees; halves at 180 degrees are one area."""
     whole = shapely.union_all([feature.shape for feature in features])
     west, _, east, _ = whole.bounds
     if east - west > 180.0:
@@ -176,7 +176,10 @@ def check_size(found: BaseGeometry) -> None:
 
 
 def points_of(value: Any) -> list[tuple[str, str, list[float]]]:
-    """Return role, robot (or name) and longitude and latitude of points with a role of robots."""
+    """Return role, robot, and longitude and latitude of points with a role of robots.
+
+    The name of a start is that of its robot where it has no property robot.
+    """
     found = []
     for row in _rows(value)[1]:
         facts = row.get('properties') if isinstance(row, Mapping) else None
@@ -184,8 +187,10 @@ def points_of(value: Any) -> list[tuple[str, str, list[float]]]:
             geometry = row.get('geometry')
             if isinstance(geometry, Mapping) and geometry.get('type') == 'Point':
                 (place,) = _position(geometry.get('coordinates'), 'a point').tolist()
-                owner = facts.get('robot') or facts.get('name') or ''
-                found.append((str(facts['role']), str(owner), place))
+                role, owner = str(facts['role']), facts.get('robot')
+                if not owner and role == 'start':
+                    owner = facts.get('name')
+                found.append((role, str(owner or ''), place))
     return found
 
 

@@ -1,4 +1,4 @@
-"""The thread of a MAVLink link: it goes on after whatever happens in it."""
+"""The thread of a MAVLink link: it continues after whatever happens in it."""
 
 import pytest
 from waiting import wait_until

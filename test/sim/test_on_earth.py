@@ -62,10 +62,16 @@ def test_points_of_the_area_are_starts_and_chargers(tmp_path):
         point('start', [9.9005, 46.6004], robot='two', name='base'),
         point('home', [9.9002, 46.6001], name='tent'),
         point('start', [9.9002, 46.6001], name='three'),
+        point('charger', [9.9002, 46.6001], robot='on'),
     ]
     robots = {'one': deepcopy(DRONE), 'two': {**deepcopy(DRONE), 'start': [5.0, 6.0, 0.0]}}
-    with pytest.warns(InputWarning, match='role start, as its robot is three; allowed .* one, two'):
+    with pytest.warns(InputWarning) as told:
         made = scenario(tmp_path, robots, *points).robots
+    left = [str(item.message) for item in told if 'left out: a point' in str(item.message)]
+    assert [text.partition('role ')[2] for text in left] == [
+        'start, as its robot is three; allowed as its robot: one, two',
+        'charger, as its robot is on; allowed as its robot: one, two',
+    ]
     assert made['one'].start[:2] == pytest.approx(on_map(9.8995, 46.6002), abs=1e-3)
     # What a scenario says itself wins.
     assert made['two'].start == [5.0, 6.0, 0.0]

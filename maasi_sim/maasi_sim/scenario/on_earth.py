@@ -123,21 +123,21 @@ def _give_points(
     for role, owner, degrees in points:
         east, north = to_map(np.array([degrees]), origin)[0]
         place = [round(float(east), 4), round(float(north), 4), 0.0]
-        if role != 'start':
-            chargers.append((owner, place))
-        elif owner in robots:
+        if role == 'start' and owner in robots:
             robots[owner].setdefault('start', place)
+        elif role != 'start' and owner in ('', *robots):
+            chargers.append((owner, place))
         else:
             whose = f'its robot is {owner}' if owner else 'it names no robot'
             warnings.warn(
-                f'environment.area: left out: a point with role start, as {whose}; allowed as '
-                f'its robot or name: {", ".join(robots)}',
+                f'environment.area: left out: a point with role {role}, as {whose}; allowed as '
+                f'its robot: {", ".join(robots)}',
                 InputWarning,
                 stacklevel=2,
             )
     for name, values in robots.items():
         own = [place for owner, place in chargers if owner == name]
-        common = [place for owner, place in chargers if owner not in robots]
+        common = [place for owner, place in chargers if not owner]
         endurance = values.get('endurance')
         if isinstance(endurance, dict) and (own or common):
             endurance.setdefault('chargers', own or common)
