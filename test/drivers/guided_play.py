@@ -128,9 +128,7 @@ class GuidedPlay(Play):
         )
         motion = self.driver_settings.motion
         self.vehicle.speed, self.vehicle.braking = motion.speed, motion.acceleration
-        self.driver.get_clock = lambda: SimpleNamespace(
-            now=lambda: SimpleNamespace(nanoseconds=round(1e9 * self.now))
-        )
+        self.driver.arrivals = SimpleNamespace(stamp=lambda instant: round(1e9 * instant))
 
     def turn(self):
         super().turn()

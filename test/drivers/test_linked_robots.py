@@ -9,7 +9,6 @@ import time
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -19,7 +18,6 @@ from fake_bluepy import BluetoothMambo
 from linked_flight import KINDS, YAW, LinkedFlight, mambo_firmware
 from marker_view import one_image
 from numpy.testing import assert_allclose
-from rclpy.duration import Duration
 from robot_team import LATEST, MAMBO, parameters_of, rendered, stamped
 from waiting import wait_until
 
@@ -114,9 +112,10 @@ def test_it_goes_where_it_is_sent_and_lands_at_the_end(fly, monkeypatch, kind):
     assert_allclose(pose_from_ros(team.state.pose.pose).position, flight.where, atol=0.06)
     # A clock that jumps back stops it until the next goal.
     _, result = flight.on_its_way()
-    clock, behind = flight.driver.get_clock(), Duration(seconds=1000.0)
-    late = SimpleNamespace(now=lambda: clock.now() - behind)
-    monkeypatch.setattr(flight.driver, 'get_clock', lambda: late)
+    stamp = flight.driver.arrivals.stamp
+    monkeypatch.setattr(
+        flight.driver.arrivals, 'stamp', lambda instant: stamp(instant) - 1_000_000_000_000
+    )
     assert team.aborted(result) == 'the time jumped back'
     flight.until(lambda: flight.speed < 0.1)
     flight.ready().reaches(last)

@@ -1,7 +1,6 @@
 """The node of one robot, as its link, its sensor and the parts of its driver see it."""
 
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from std_srvs.srv import Trigger
 
+from maasi_drivers.agent.arrival_clock import ArrivalClock
 from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
 from maasi_drivers.agent.robot_frames import RobotFrames
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
@@ -17,37 +17,6 @@ from maasi_filter.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.clocks import JUMP, Silence, StampGate
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
-
-
-class ArrivalClock:
-    """The node's time at any instant of the steady clock, by its largest recent lead over that."""
-
-    def __init__(self) -> None:
-        # Instants of the last 2 s [s] and leads of the node's time [ns], with falling leads.
-        self._leads: deque[tuple[float, int]] = deque()
-
-    def observe(self, now: float, time: int) -> None:
-        """Note the node's time [ns] at an instant of the steady clock [s]; 0: it has not begun."""
-        leads = self._leads
-        if time <= 0:
-            leads.clear()
-            return
-        lead = time - round(now * 1e9)
-        if leads and lead < leads[-1][1] - JUMP:
-            leads.clear()
-        while leads and leads[-1][1] <= lead:
-            leads.pop()
-        leads.append((now, lead))
-        while leads[0][0] < now - 2.0:
-            leads.popleft()
-
-    def stamp(self, instant: float) -> int | None:
-        """Return the node's time [ns] at an instant [s]; None while it has not begun."""
-        if not self._leads:
-            return None
-        time = round(instant * 1e9) + self._leads[0][1]
-        return time if time > 0 else None
-
 
 # Kinds of faults that every robot can have.
 ODOMETRY, FROZEN_POSE, SENSOR = 'odometry', 'frozen pose', 'sensor'
@@ -101,7 +70,7 @@ class FeedPeer:
 class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
     """Where link, sensor and parts of a driver meet: the state they share, what they report to.
 
-    All of it is made anew in *configure*.
+    All of it but `arrivals` is made anew in *configure*.
 
     Attributes
     ----------
@@ -136,6 +105,12 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         super().__init__('driver', DriverSettings, in_robot=True, **options)
         self.namespace = self.get_namespace().strip('/')
         self.robot = self.namespace.rpartition('/')[2]
+        self.arrivals = ArrivalClock(self.get_clock())
+
+    def destroy_node(self) -> None:
+        """Destroy the entities of the node."""
+        self.arrivals.close()
+        super().destroy_node()
 
     def prepare(self) -> None:
         """Make the shared state."""
@@ -148,7 +123,6 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         self.history = PoseHistory()
         self.health = Health(self.get_logger(), self._on_fault)
         self.silence = Silence(self)
-        self.arrivals = ArrivalClock()
         self.map_odometry: MapOdometry | None = None
         self.pose_name = 'pose on tf' if settings.poses == 'tf' else settings.poses
         self.feed_peer: FeedPeer | None = None

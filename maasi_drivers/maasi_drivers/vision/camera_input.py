@@ -1,6 +1,5 @@
 """A camera as a robot's sensor: image source, decoding, detection; or boxes of another detector."""
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
@@ -255,7 +254,6 @@ class CameraInput(SensorInput[Picture]):
         return FeedReceiver(settings.feed_port, settings.feed_address, sender, drop)
 
     def _poll_source(self) -> None:
-        self.driver.arrivals.observe(time.monotonic(), self.driver.get_clock().now().nanoseconds)
         if isinstance(self._source, VideoSource):
             self._take_video(self._source)
         elif self._source is not None:

@@ -139,7 +139,6 @@ class MamboRobotLink(RobotLink):
         driver = self.driver
         now, pilot, link = time.monotonic(), self._pilot, self._link
         link.keep_alive()
-        driver.arrivals.observe(now, driver.get_clock().now().nanoseconds)
         if not driver.active:
             return
         pilot.update(now)

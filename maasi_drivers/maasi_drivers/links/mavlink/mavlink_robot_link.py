@@ -12,7 +12,7 @@ import numpy as np
 from maasi_drivers.agent.flight_rules import MARGIN, HomeLanding, make_fence
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
-from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, ArrivalClock, RobotNode
+from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
 from maasi_drivers.links.mavlink.estimate import Telemetry
 from maasi_drivers.links.mavlink.fence import fence_items
@@ -53,7 +53,6 @@ class MavlinkRobotLink(RobotLink):
         self._local_poses = PoseHistory()
         self._charge_reports = 0
         # Not the one of the driver: telemetry and images have different delays.
-        self._arrivals = ArrivalClock()
         place = [*settings.start[:2], self._mavlink.ground]
         self._map_from_local = Pose.from_yaw(place, -self._mavlink.map_yaw)
         self._local_origin = np.zeros(3)
@@ -233,7 +232,6 @@ class MavlinkRobotLink(RobotLink):
         if self._fenced is not driver.area:
             self._upload_fence()
         self._log_reports()
-        self._arrivals.observe(time.monotonic(), driver.get_clock().now().nanoseconds)
         if not driver.active:
             return
         before = driver.health.get(_VEHICLE)
@@ -309,7 +307,7 @@ class MavlinkRobotLink(RobotLink):
 
     def _take_telemetry(self, telemetry: Telemetry) -> None:
         driver = self.driver
-        stamp = self._arrivals.stamp(telemetry.arrival - self._mavlink.latency)
+        stamp = driver.arrivals.stamp(telemetry.arrival - self._mavlink.latency)
         if stamp is None:
             # A simulated time has not begun: nothing is late.
             driver.silence.end()
