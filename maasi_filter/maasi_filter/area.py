@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+from numba import njit
 from numpy.typing import ArrayLike
 from shapely.geometry import box
 from shapely.geometry.base import BaseGeometry
@@ -26,6 +28,23 @@ _ROUNDING = 1e-6  # of coordinates, also of those that are large [m]
 _CELLS, _CHECKED = 512, 16
 # Ground narrower than this is rounding, not area; twice as far as shapes are rounded [m].
 _NARROWEST = 2e-4
+
+
+@njit(cache=True, error_model='numpy')
+def density_at(cells, low, high, x, y):  # type: ignore[no-untyped-def]
+    """Return the value of cells (nx, ny) between corners at a position, moved between them."""
+    columns, rows = cells.shape
+    i = math.floor((x - low[0]) / (high[0] - low[0]) * columns)
+    j = math.floor((y - low[1]) / (high[1] - low[1]) * rows)
+    return cells[min(max(i, 0), columns - 1), min(max(j, 0), rows - 1)]
+
+
+@njit(cache=True, error_model='numpy')
+def _densities(cells, low, high, points):  # type: ignore[no-untyped-def]
+    out = np.empty(len(points))
+    for i in range(len(points)):
+        out[i] = density_at(cells, low, high, points[i, 0], points[i, 1])
+    return out
 
 
 class Density(NamedTuple):
@@ -134,14 +153,13 @@ class Area:
 
         Relative to evenly over the region: its mean there is 1.
         """
-        if self.uniform:
-            return np.ones(len(points))
-        low, high = self.bounds[:2].T
-        values = self._rasterised.values
-        shape_of = np.array(values.shape)
-        cell = np.floor((points[:, :2] - low) / (high - low) * shape_of).astype(int)
-        cell = np.clip(cell, 0, shape_of - 1)
-        return np.asarray(values[cell[:, 0], cell[:, 1]])
+        low, high = self.bounds[:2].T.copy()
+        return _densities(self.cells, low, high, np.ascontiguousarray(points[:, :2], dtype=float))
+
+    @cached_property
+    def cells(self) -> FloatArray:
+        """Density in cells (nx, ny) that fill the bounds, for `density_at`; one if uniform."""
+        return np.ones((1, 1)) if self.uniform else self._rasterised.values
 
     def draw(
         self,

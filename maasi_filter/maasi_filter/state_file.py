@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, PlainValidator
 
 FORMAT = 'maasi_filter_state'
-VERSION = 5
+VERSION = 6
 
 
 class StateFileError(ValueError):

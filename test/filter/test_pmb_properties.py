@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 from searches import (
     CUBE,
     PLANE,
+    checked,
     cube_sensor,
     measured,
     observe,
@@ -16,11 +18,15 @@ from searches import (
     same,
     wander,
 )
+from shapely import wkt
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, wrap_angle
+from maasi_filter.environment import EnvironmentSettings
 from maasi_filter.make_filter import make_filter
 from maasi_filter.metrics import match_targets
+from maasi_filter.pmb.density import NO_PRIOR
 from maasi_filter.pmb.filter import PmbFilter
+from maasi_filter.pmb.scan import make_scan
 from maasi_filter.records import Label
 from maasi_filter.vector_math import squared_distance
 
@@ -172,3 +178,29 @@ def test_covariances_and_existence_are_as_they_say():
         inside = (existence >= low) & (existence < high)
         assert inside.sum() > 100
         assert true[inside].mean() == pytest.approx(existence[inside].mean(), abs=0.08), low
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_births_and_factors_see_the_same_prior_at_borders(seed):
+    """Where targets may be and what is unexplored, for a detection that lies across a border."""
+    rng = np.random.default_rng(seed)
+    corners = np.array([[0, 0], [90, 10], [70, 90], [10, 80]]) + rng.uniform(-9.0, 9.0, (4, 2))
+    zone = {'centre': rng.uniform(30.0, 60.0, 2).tolist(), 'radius': 15.0}
+    environment = EnvironmentSettings.model_validate(
+        {'area': wkt.dumps(shapely.Polygon(corners)), 'keep_outs': [zone]}
+    )
+    search = PmbFilter(FilterSettings(method='pmb'), environment, rng)
+    exploration, sensor = search.exploration, plane_sensor(range_noise=3.0)
+    exploration.update(sensor.detection, Pose([*rng.uniform(0.0, 80.0, 2), 0.0]))
+    border = exploration.area.region.boundary.interpolate(rng.random(), normalized=True)
+    target, bearing = np.array([[border.x, border.y]]), rng.uniform(-3.0, 3.0)
+    pose = Pose([*(target[0] + 20.0 * np.array([np.cos(bearing), np.sin(bearing)])), 0.0])
+    member = checked(measured(sensor, pose.position[:2], sensor.measurement.measure(target, pose)))
+    scan = make_scan(member, 1.0, exploration, search.settings.resolved(), rng)
+    prior = exploration.kernel()[0], exploration.area.cells
+    ((_, born),) = scan.born(np.ones(1, bool), prior, search._frame)
+    known = scan.volume[0] > 0.0
+    draws, expected = scan.draws[0, known], scan.weights[0, known] / scan.volume[0, known]
+    factors = born.log_at(draws) - replace(born, prior=NO_PRIOR).log_at(draws)
+    np.testing.assert_allclose(np.exp(factors), expected, rtol=1e-9)
+    assert 0.1 < (expected > 0.0).mean() < 0.9

@@ -101,7 +101,7 @@ def test_damage_is_noticed_wherever_it_is(tmp_path):
         (lambda content: b'[1]\n' + content, 'not a state'),
         (
             lambda content: content.replace(b'"version": 5', b'"version": 99', 1),
-            'version: got 99, allowed is 5',
+            'version: got 99, allowed is 6',
         ),
         (None, 'cannot be read'),
     ],

@@ -27,6 +27,7 @@ LEAST_STEP = 1.0 / 64.0  # smallest part of a factor that is taken in at a time
 LEAST_EIGENVALUE = 1e-9  # of the mean variance, what each axis has at least
 # Moves end when as many are accepted as there are particles, or after so many sweeps.
 MOST_SWEEPS = 8
+NO_PRIOR = np.empty((0, 0, 0)), np.empty((0, 0))
 
 
 @njit(cache=True, error_model='numpy')
@@ -68,7 +69,7 @@ def _systematic(weights: FloatArray, number: int, start: float) -> IntArray:
 
 
 @njit(cache=True, error_model='numpy')
-def _sweep(heads, terms, grid, frame, exponent, particles, products, last, draws):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _sweep(heads, terms, prior, frame, exponent, particles, products, last, draws):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Propose moves by differences of two particles of the other half; return how many succeed."""
     number, d = particles.shape
     half = number // 2
@@ -84,7 +85,7 @@ def _sweep(heads, terms, grid, frame, exponent, particles, products, last, draws
                 places[i - start, k] = particles[i, k] + scale * (particles[a, k] - particles[b, k])
         product = np.empty(end - start)
         newest = np.empty(end - start)
-        log_products(heads, terms, grid, frame, places, product, newest)
+        log_products(heads, terms, prior, frame, places, product, newest)
         for i in range(start, end):
             j = i - start
             gain = product[j] - products[i] + exponent * (newest[j] - last[i])
@@ -128,7 +129,8 @@ class Density:
     weights: FloatArray  # (n,): They sum to 1
     heads: FloatArray  # (k, HEAD): Of the factors, at least one
     terms: FloatArray  # (l, TERM): Of all factors
-    grid: FloatArray  # (nx, ny, nz): prior e at birth, a factor too, not written to; or empty
+    #: Factors too, not written to: e at birth (nx, ny, nz), or empty, and the area's `cells`.
+    prior: tuple[FloatArray, FloatArray]
     frame: FloatArray  # (3, 3): Lower and upper bounds of the environment, and the step of the grid
     mean: FloatArray = field(init=False)  # (d,): Of the particles
     covariance: FloatArray = field(init=False)  # (d, d)
@@ -158,7 +160,7 @@ class Density:
         particles = np.clip(particles, frame[0, :d], frame[1, :d])
         head, terms = gaussian_factor(mean, root @ root.T)
         weights = np.full(number, 1.0 / number)
-        return cls(particles, weights, head[None], terms, np.empty((0, 0, 0)), frame)
+        return cls(particles, weights, head[None], terms, NO_PRIOR, frame)
 
     def log_at(self, positions: FloatArray) -> FloatArray:
         """Return the log density at positions (n, d); its constant is that of the factors."""
@@ -222,7 +224,7 @@ class Density:
         """Replace all factors by a normal density with the particles' moments."""
         head, self.terms = gaussian_factor(self.mean, self.covariance)
         self.heads = head[None]
-        self.grid = np.empty((0, 0, 0))
+        self.prior = NO_PRIOR
 
     def _append(self, head: FloatArray, terms: FloatArray) -> None:
         head[FIRST], head[TERMS] = len(self.terms), len(terms)
@@ -232,7 +234,7 @@ class Density:
 
     def _logs(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         products, last = np.empty(len(positions)), np.empty(len(positions))
-        log_products(self.heads, self.terms, self.grid, self.frame, positions, products, last)
+        log_products(self.heads, self.terms, self.prior, self.frame, positions, products, last)
         return products, last
 
     def _temper(self, generator: np.random.Generator) -> None:
@@ -265,7 +267,7 @@ class Density:
             accepted += _sweep(
                 self.heads,
                 self.terms,
-                self.grid,
+                self.prior,
                 self.frame,
                 exponent,
                 self.particles,

@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
+from maasi_filter.area import density_at
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.models.detection import PARAMETERS, fill_probabilities
 from maasi_filter.models.measurement import TWO_PI
@@ -144,11 +145,13 @@ def add_log_factors(heads, terms, first, last, positions, out):  # type: ignore[
 
 
 @njit(cache=True, error_model='numpy')
-def log_products(heads, terms, grid, frame, positions, products, last):  # type: ignore[no-untyped-def]
+def log_products(heads, terms, prior, frame, positions, products, last):  # type: ignore[no-untyped-def]
     """Fill the log of the prior and of all factors but the last, and that of the last.
 
-    `grid` is e at birth, or empty; `frame` has lower and upper bounds and the grid's step.
+    `prior` is e at birth, or empty, and the density of `density_at`; `frame` has lower and upper
+    bounds and the step of e.
     """
+    grid, cells = prior
     number, d = positions.shape
     for i in range(number):
         products[i] = 0.0
@@ -159,7 +162,8 @@ def log_products(heads, terms, grid, frame, positions, products, last):  # type:
         if grid.shape[0]:
             z = positions[i, 2] if d == 3 else 0.0
             unseen = interpolate_at(grid, frame[0], frame[2], positions[i, 0], positions[i, 1], z)
-            products[i] += math.log(max(unseen, LEAST_UNEXPLORED))
+            density = density_at(cells, frame[0], frame[1], positions[i, 0], positions[i, 1])
+            products[i] += math.log(max(unseen, LEAST_UNEXPLORED) * density)
     count = heads.shape[0] - 1
     add_log_factors(heads, terms, 0, count, positions, products)
     add_log_factors(heads, terms, count, count + 1, positions, last)

@@ -185,8 +185,8 @@ class PmbFilter(SearchFilter):
         """Add a component of r = `existence` (m,) for each detection."""
         error, robot = member.pose_error, member.robot
         # A copy: e changes.
-        grid = self.exploration.kernel()[0] * self.exploration.density
-        for j, density in scan.born(existence >= LEAST_EXISTENCE, grid, self._frame):
+        prior = self.exploration.kernel()[0].copy(), self.exploration.area.cells
+        for j, density in scan.born(existence >= LEAST_EXISTENCE, prior, self._frame):
             item = Component(float(existence[j]), density, 1.0, self._scans, error, radius, robot)
             if member.labels:
                 item.labels = LabelTally.of(member.labels[j])

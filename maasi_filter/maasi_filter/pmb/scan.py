@@ -59,7 +59,7 @@ class Scan:
     intensity: FloatArray
 
     def born(
-        self, wanted: BoolArray, grid: FloatArray, frame: FloatArray
+        self, wanted: BoolArray, prior: tuple[FloatArray, FloatArray], frame: FloatArray
     ) -> list[tuple[int, Density]]:
         """Return the density prior e pi g_j of each wanted detection with enough draws inside."""
         total, squares = self.weights.sum(axis=1), np.square(self.weights).sum(axis=1)
@@ -71,7 +71,7 @@ class Scan:
             terms = self.terms[j : j + 1].copy()
             terms[0, SCALE] -= math.log(self.weights[j].mean())
             draws, weights = self.draws[j].copy(), self.weights[j] / total[j]
-            density = Density(draws, weights, head[None].copy(), terms, grid, frame)
+            density = Density(draws, weights, head[None].copy(), terms, prior, frame)
             densities.append((j, density))
         return densities
 
