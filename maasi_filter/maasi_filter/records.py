@@ -8,6 +8,11 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 
 
+def rounded_score(score: float) -> float:
+    """Return a score; sums of probabilities may miss 0 or 1 by their rounding."""
+    return float(min(max(score, 0.0), 1.0)) if -1e-6 <= score <= 1.0 + 1e-6 else score
+
+
 @dataclass(frozen=True)
 class Label:
     """Class and identity of a detection or a found target.

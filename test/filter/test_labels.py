@@ -8,6 +8,8 @@ from maasi_filter import AgentMeasurement, FilterSettings, Pose
 from maasi_filter.ic_phd.filter import IcPhdFilter, nearest_detection
 from maasi_filter.pmb.labels import MISREAD, LabelTally, associate_by_identity
 from maasi_filter.records import Label
+from maasi_filter.ros.conversions import label_problem, labels_of
+from maasi_msgs.msg import Detection, RangeMeasurement
 
 PAIR = np.array([[50.0, 50.0], [51.0, 50.0]])
 NAMES = ('left', 'right')
@@ -95,6 +97,16 @@ def test_an_identity_belongs_to_one_even_if_a_scan_has_it_twice():
 def test_scores_are_refused_that_are_no_probability(score):
     with pytest.raises(ValueError, match=r'score: got .*allowed is 0 to 1'):
         Label('cup', score)
+
+
+@pytest.mark.parametrize('kind', [Detection, RangeMeasurement])
+@pytest.mark.parametrize('score', [-5e-7, 0.0, 0.3, 1.0, 1.0000001])
+def test_scores_of_messages_may_miss_their_limits_by_rounding(kind, score):
+    message = kind(class_id='cup', score=score)
+    assert label_problem(message) is None
+    (label,) = labels_of([message])
+    assert label.score == pytest.approx(min(max(score, 0.0), 1.0), abs=1e-7)
+    assert 'score: read' in label_problem(kind(class_id='cup', score=score + 2.0))
 
 
 @pytest.mark.parametrize(

@@ -164,6 +164,8 @@ def test_report_of_a_complete_run(run, tmp_path):
     run.declare(0.9, [1.0, 1.51])
     run.update(0.9, ['mambo'])
     assert run.observer.completed.step == 18
+    # Of those that are true, as on the page.
+    assert (run.observer.found, run.observer.false_found) == (3, 1)
     report = write(run.record('all_found', 1.0, 0.3), tmp_path)
     assert json.loads((tmp_path / 'report.json').read_text()) == report
     picture = cv2.imread(str(tmp_path / 'report.png')).astype(int)

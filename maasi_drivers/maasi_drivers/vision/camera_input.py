@@ -22,7 +22,7 @@ from maasi_drivers.vision.measurement_feed import FeedReceiver
 from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.pose import Pose
-from maasi_filter.records import UNLABELLED, Label
+from maasi_filter.records import UNLABELLED, Label, rounded_score
 from maasi_filter.ros.conversions import label_problem, stamp_from_ros
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.qos import RELIABLE, SENSOR, sensor_reader
@@ -41,7 +41,7 @@ def boxes_to_blobs(message: Any, camera: CameraSettings) -> tuple[Blobs, list[st
         try:
             best, unknown = _best(item)
             problems += [f'score: read {score}, allowed is 0 to 1' for score in unknown]
-            label = Label(best.class_id, _score(best.score))
+            label = Label(best.class_id, rounded_score(best.score))
             if (problem := label_problem(label)) is not None:
                 raise ValueError(problem)
             if not settings.classes or label.class_id in settings.classes:
@@ -77,11 +77,6 @@ def _best(item: Any) -> tuple[Any, list[float]]:
         raise ValueError('score: read nan in each hypothesis, allowed is 0 to 1')
     best = max(known, key=lambda hypothesis: float(hypothesis.score), default=UNLABELLED)
     return best, [item.score for item in given if np.isnan(item.score)]
-
-
-def _score(score: float) -> float:
-    """Return a score; sums of probabilities may miss 0 or 1 by their rounding."""
-    return float(np.clip(score, 0.0, 1.0)) if -1e-6 <= score <= 1.0 + 1e-6 else score
 
 
 def _corners(box: Any, size: FloatArray) -> FloatArray:

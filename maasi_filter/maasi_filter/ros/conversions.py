@@ -17,7 +17,14 @@ from maasi_filter.colours import FOUND, POTENTIAL
 from maasi_filter.geodesy import OriginSettings, geodetic
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor, is_covariance
-from maasi_filter.records import UNLABELLED, AgentMeasurement, Cluster, FoundTarget, Label
+from maasi_filter.records import (
+    UNLABELLED,
+    AgentMeasurement,
+    Cluster,
+    FoundTarget,
+    Label,
+    rounded_score,
+)
 from maasi_msgs.msg import Cluster as ClusterMessage
 from maasi_msgs.msg import Detection, DetectionArray, FoundFixArray, RangeMeasurement
 from maasi_msgs.msg import FoundTarget as FoundTargetMessage
@@ -147,7 +154,7 @@ def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundT
         robot=message.robot,
         measurement=int(message.measurement),
         time=stamp_from_ros(message.stamp) * 1e-9,
-        label=Label(message.class_id, message.score, message.identity),
+        label=label_from_ros(message),
     )
 
 
@@ -191,15 +198,20 @@ def detections_to_ros(
     ]
 
 
+def label_from_ros(message: Detection | RangeMeasurement | FoundTargetMessage) -> Label:
+    """Return the label of a message; its score may miss 0 or 1 by rounding."""
+    return Label(message.class_id, rounded_score(message.score), message.identity)
+
+
 def labels_of(messages: Sequence[Detection] | Sequence[RangeMeasurement]) -> tuple[Label, ...]:
     """Return their labels; empty if none has one."""
-    labels = tuple(Label(item.class_id, item.score, item.identity) for item in messages)
+    labels = tuple(map(label_from_ros, messages))
     return labels if any(label != UNLABELLED for label in labels) else ()
 
 
 def label_problem(message: Detection | RangeMeasurement | Label) -> str | None:
     """Return the error of a class, score or identity: field, what was read, what is allowed."""
-    if not 0.0 <= message.score <= 1.0:
+    if not 0.0 <= rounded_score(message.score) <= 1.0:
         return f'score: read {message.score}, allowed is 0 to 1'
     for name in ('class_id', 'identity'):
         text = getattr(message, name)

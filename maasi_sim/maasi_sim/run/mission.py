@@ -54,8 +54,8 @@ class Observer(ABC):
 
     #: Of the needed `topics`, filter updates: added after the messages they refer to.
     update_topics: Sequence[str] = ()
-    #: Targets or cuboids there are, and found so far; measurements so far, of all robots.
-    total = found = measurements = 0
+    #: Targets or cuboids there are; true and false ones found so far; measurements of all robots.
+    total = found = false_found = measurements = 0
     explored = 0.0  #: share of the environment explored
     news = False  #: whether something was found since the caller last reset it
     completed: Any = None  #: time and step at which all was found, where the scenario stops then

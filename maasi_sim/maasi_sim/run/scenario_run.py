@@ -305,6 +305,7 @@ class ScenarioRun:
         seconds = self.recorder.elapsed
         wall = time.monotonic() - (self._begun or time.monotonic())
         targets = f' of {observer.total}' if observer.total else ''
+        targets += f' ({observer.false_found} false)' if observer.false_found else ''
         self.display.show(
             f'{seconds:7.1f} s   {observer.measurements:4d} measurements   '
             f'{observer.found} {self.mission.found_word}{targets}   '

@@ -116,8 +116,9 @@ class TargetObserver(Observer):
             if several:
                 self._history.append((space, update, found))
             self.news = self._tally.take(space, update, found) or self.news
-            self.found = self._tally.progress[-1].found
-            self.measurements = self._tally.progress[-1].measurements
+            now = self._tally.progress[-1]
+            self.found, self.false_found = now.true_found, now.found - now.true_found
+            self.measurements = now.measurements
             self.completed = self._tally.completed
             if self.completed is not None:
                 self.end_step = self.completed.step
