@@ -11,12 +11,15 @@ from typing import Any
 _OF_EXTRAS = ('distributed', 'matplotlib', 'setproctitle')
 
 
-def _run(target: str) -> Any:
+def _run(target: str, ros: bool = True) -> Any:
     """Import a function, `module:name`, and return its result, the exit code."""
     # Nothing has been created yet, so there is nothing to clean up. A node, and whatever has
     # to clean up, sets its own handler in `main`.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
+        # To import rclpy would end the process.
+        if ros and resolve_name('maasi_filter.ros.middleware:is_missing')():
+            return 2
         return resolve_name(target)()
     except ModuleNotFoundError as error:
         missing = error.name or ''
@@ -42,20 +45,20 @@ mambo_driver = partial(_run, 'maasi_drivers.drivers:mambo_driver')
 turtlebot_driver = partial(_run, 'maasi_drivers.drivers:turtlebot_driver')
 plugin_driver = partial(_run, 'maasi_drivers.plugin_driver:main')
 ranging_driver = partial(_run, 'maasi_drivers.drivers:ranging_driver')
-measurement_feed_sender = partial(_run, 'maasi_drivers.measurement_feed_sender:main')
+measurement_feed_sender = partial(_run, 'maasi_drivers.measurement_feed_sender:main', ros=False)
 mavlink_driver = partial(_run, 'maasi_drivers.drivers:mavlink_driver')
 mavlink_camera_driver = partial(_run, 'maasi_drivers.drivers:mavlink_camera_driver')
 calibrate_sensor = partial(_run, 'maasi_drivers.calibrate_sensor:main')
 mambo_onboard_driver = partial(_run, 'maasi_drivers.drivers:mambo_onboard_driver')
 robot_command = partial(_run, 'maasi_drivers.robot_command:main')
-measure_mambo = partial(_run, 'maasi_drivers.measure_mambo:main')
+measure_mambo = partial(_run, 'maasi_drivers.measure_mambo:main', ros=False)
 guard_node = partial(_run, 'maasi_drivers.guard_node:main')
 cuboid_sim_node = partial(_run, 'maasi_sim.run.buildings.cuboid_sim_node:main')
 sim_node = partial(_run, 'maasi_sim.simulation.sim_node:main')
-fake_mambo = partial(_run, 'maasi_sim.simulation.emulators.mambo.fake_mambo:main')
+fake_mambo = partial(_run, 'maasi_sim.simulation.emulators.mambo.fake_mambo:main', ros=False)
 fake_mavlink_vehicle = partial(
-    _run, 'maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle:main'
+    _run, 'maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle:main', ros=False
 )
 view_node = partial(_run, 'maasi_sim.run.view.view_node:main')
-compare = partial(_run, 'maasi_sim.experiments.compare:main')
-run_scenario = partial(_run, 'maasi_sim.run.run_scenario:main')
+compare = partial(_run, 'maasi_sim.experiments.compare:main', ros=False)
+run_scenario = partial(_run, 'maasi_sim.run.run_scenario:main', ros=False)  # it looks itself

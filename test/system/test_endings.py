@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+import subprocess
 import sys
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -13,12 +14,13 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from scenario_runs import beside, command, run_scenario, start, started, wait_for, write_scenario
 
+from maasi_filter.ros import middleware
 from maasi_sim.run import scenario_run
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.ending import DONE, NOT_WRITTEN, Ending
 from maasi_sim.run.run_folder import make_folder
 from maasi_sim.run.run_options import Options, parse
-from maasi_sim.run.run_scenario import main, middleware_problem
+from maasi_sim.run.run_scenario import main
 from maasi_sim.run.scenario_run import ScenarioRun
 from maasi_sim.scenario.layering import ScenarioError
 
@@ -187,7 +189,19 @@ def test_a_middleware_that_is_not_there_is_named(monkeypatch, tmp_path, capsys):
     assert not (tmp_path / 'run').exists()
     for name in ('', 'rmw_fastrtps_cpp'):
         monkeypatch.setenv('RMW_IMPLEMENTATION', name)
-        assert middleware_problem() == ''
+        assert not middleware.is_missing()
+
+
+@pytest.mark.parametrize(
+    'command',
+    ['filter_node', 'planner_node', 'sim_node', 'turtlebot_driver', 'view_node', 'search_command'],
+)
+def test_a_node_or_command_without_its_middleware_says_so(command):
+    environment = os.environ | {'RMW_IMPLEMENTATION': 'rmw_none_cpp'}
+    run = subprocess.run([command], env=environment, capture_output=True, text=True)
+    assert run.returncode == 2
+    (line,) = run.stderr.splitlines()
+    assert line.startswith("error: RMW_IMPLEMENTATION: read 'rmw_none_cpp', which is not installed")
 
 
 @pytest.mark.parametrize(

@@ -8,14 +8,13 @@ from typing import Any
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from std_srvs.srv import Trigger
 
-from maasi_drivers.agent.arrival_clock import ArrivalClock
 from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
 from maasi_drivers.agent.robot_frames import RobotFrames
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.area import Area
 from maasi_filter.models.pose import Pose
-from maasi_filter.ros.clocks import JUMP, Silence, StampGate
+from maasi_filter.ros.clocks import JUMP, ArrivalClock, Silence, StampGate
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 
 # Kinds of faults that every robot can have.

@@ -5,11 +5,10 @@ import gc
 import os
 import sys
 
+from maasi_filter.ros import middleware
 from maasi_sim.run.ending import DONE, NOT_WRITTEN, WRONG_INPUT, Interruption
 from maasi_sim.run.processes import ProcessError, start_server
 from maasi_sim.run.run_options import Options, parse
-
-_MIDDLEWARE = 'RMW_IMPLEMENTATION'
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -20,8 +19,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse(arguments)
     if options.check:
         return check(options)
-    if problem := middleware_problem():
-        print(f'error: {problem}', file=sys.stderr)
+    if middleware.is_missing():
         return WRONG_INPUT
     # Nodes load what they share while this process loads what is its own.
     try:
@@ -51,19 +49,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (ScenarioError, DomainError, ProcessError, BagError, ResultsError) as error:
         _print_errors(error)
         return NOT_WRITTEN if isinstance(error, (ResultsError, BagWriteError)) else WRONG_INPUT
-
-
-def middleware_problem() -> str:
-    """Return why the middleware of the environment cannot be used: rcl would end the process."""
-    from ament_index_python import get_resources
-
-    name = os.environ.get(_MIDDLEWARE)
-    installed = sorted(get_resources('rmw_typesupport').keys() - {'rmw_implementation'})
-    if not name or name in installed:
-        return ''
-    return (
-        f"{_MIDDLEWARE}: read '{name}', which is not installed; allowed is {', '.join(installed)}"
-    )
 
 
 def check(options: Options) -> int:

@@ -7,8 +7,8 @@ import pytest
 from rclpy.clock import ROSClock
 from rclpy.time import Time
 
-from maasi_drivers.agent import arrival_clock
-from maasi_drivers.agent.arrival_clock import ArrivalClock
+from maasi_filter.ros import clocks
+from maasi_filter.ros.clocks import ArrivalClock
 
 
 class Simulated:
@@ -16,7 +16,7 @@ class Simulated:
 
     def __init__(self, monkeypatch):
         self.steady = 0.0
-        monkeypatch.setattr(arrival_clock.time, 'monotonic', lambda: self.steady)
+        monkeypatch.setattr(clocks.time, 'monotonic', lambda: self.steady)
         self.clock = ROSClock()
         self.clock._set_ros_time_is_active(True)
         self.arrivals = ArrivalClock(self.clock)
@@ -47,7 +47,7 @@ def test_before_the_time_begins_there_is_no_stamp(simulated):
 
 def test_without_a_simulated_time_it_is_that_of_the_host():
     arrivals = ArrivalClock(ROSClock())
-    before, now = ROSClock().now().nanoseconds, arrival_clock.time.monotonic()
+    before, now = ROSClock().now().nanoseconds, clocks.time.monotonic()
     assert abs(arrivals.stamp(now - 3.0) - before + 3_000_000_000) < 100_000_000
     arrivals.close()
 
