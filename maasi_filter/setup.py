@@ -23,7 +23,7 @@ setup(
         'shapely>=2.0.3',
         'typing_extensions>=4.10',
     ],
-    extras_require={'geo': ['rasterio>=1.4'], 'test': ['hypothesis>=6.117', 'pytest>=7.4']},
+    extras_require={'geo': ['rasterio>=1.4'], 'test': ['hypothesis>=6.98', 'pytest>=7.4']},
     zip_safe=True,
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',

@@ -4,10 +4,16 @@ import gc
 import signal
 from functools import partial
 
+import hypothesis
 import pytest
 
 # Workers of pytest-xdist ignore SIGINT, and so would the processes that their tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+try:
+    hypothesis.settings.get_profile('ci')
+except hypothesis.errors.InvalidArgument:  # before hypothesis 6.117
+    hypothesis.settings.register_profile('ci', derandomize=True, deadline=None, database=None)
 
 
 def pytest_addoption(parser):
