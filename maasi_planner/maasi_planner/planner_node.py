@@ -21,6 +21,7 @@ from maasi_msgs.srv import SetKeepOuts
 from maasi_planner import warm_up
 from maasi_planner.conversions import checked_state, decision_to_ros, path_to_ros
 from maasi_planner.coordinator import Coordinator
+from maasi_planner.homing import CUT_OFF
 from maasi_planner.node.batches import Batches
 from maasi_planner.node.battery_log import BatteryLog
 from maasi_planner.node.filter_guard import FilterGuard, FoundKeeper
@@ -479,7 +480,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         for name in sorted(decision.robots):
             robot = decision.robots[name]
             if robot.stays:
-                self.warn_throttled(f'{name} stays', f'{name} stays: {robot.reason}')
+                # Only of a robot that cannot come home somebody has to know.
+                log = self.warn_throttled if CUT_OFF in robot.reason else self.tell_throttled
+                log(f'{name} stays', f'{name} {robot.reason}')
                 continue
             if self.coordinator.plans[name].errand is not None:
                 self.get_logger().info(f'{name} {robot.reason}')

@@ -168,9 +168,9 @@ def test_a_guard_that_has_gone_is_reported(play, start_guard, capfd):
     driver, team = play()
     guard = start_guard()
     team.until(lambda: team.move() or driver.link.status() == {'guard': 'is there'})
-    assert 'guard' not in driver._warned
+    assert 'guard' not in driver._logged
     guard.destroy_node()
-    team.until(lambda: team.move() or 'guard' in driver._warned)
+    team.until(lambda: team.move() or 'guard' in driver._logged)
     assert 'the guard has gone' in capfd.readouterr().err
 
 
@@ -180,7 +180,7 @@ def test_a_battery_is_read_in_its_unit_and_a_low_one_ends_the_way(play, capfd, m
     if unit == 'percent':
         monkeypatch.setattr('maasi_drivers.agent.watchdog._CHARGE_PATIENCE', 0.3)
     driver, team = play(battery_minimum=0.2, battery_unit=unit)
-    team.until(lambda: team.move() or 'battery' in driver._warned or unit == 'fraction')
+    team.until(lambda: team.move() or 'battery' in driver._logged or unit == 'fraction')
     full = 100.0 if unit == 'percent' else 1.0
 
     def read(percentage, expected):

@@ -29,7 +29,7 @@ from maasi_msgs.msg import LockstepDone
 # Period of the check for peers [s].
 _PEERS_PERIOD = 0.02
 _DIAGNOSTICS_PERIOD = 1.0
-_WARNING_PERIOD = 2.0
+_LOG_PERIOD = 2.0
 _NOTICE_DELAY = 3.0  # from activation until a node says what it waits for [s]
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
@@ -67,7 +67,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.active = False
         self.ending = False  #: whether it is asked to end, as the others may be too
         self.step = -1
-        self._warned: dict[str, float] = {}
+        self._logged: dict[str, float] = {}
         self._peers: list[Callable[[], bool]] = []
         self._peers_timer: Any = None
         # When to say what nobody publishes [s of wall time].
@@ -340,10 +340,20 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
 
     def warn_throttled(self, key: str, text: str) -> None:
         """Warn at most every two seconds under one key."""
-        now = time.monotonic()
-        if now - self._warned.get(key, -1e9) >= _WARNING_PERIOD:
-            self._warned[key] = now
+        if self._is_due(key):
             self.get_logger().warning(text)
+
+    def tell_throttled(self, key: str, text: str) -> None:
+        """Log information at most every two seconds under one key."""
+        if self._is_due(key):
+            self.get_logger().info(text)
+
+    def _is_due(self, key: str) -> bool:
+        now = time.monotonic()
+        due = now - self._logged.get(key, -1e9) >= _LOG_PERIOD
+        if due:
+            self._logged[key] = now
+        return due
 
     def status(self) -> dict[str, Any]:
         """Return further values for the diagnostics."""

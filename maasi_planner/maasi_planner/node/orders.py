@@ -128,7 +128,8 @@ class Orders:
     def is_free(self, name: str, heard: HeardState, step: int) -> bool:
         """Return whether a robot can take a goal: it has none, from any client."""
         plan, logger = self._coordinator.plans[name], self._node.get_logger()
-        if not plan.staying:
+        # Without one, the last has ended and the search is over: no other follows.
+        if not plan.staying and self.goals.has(name):
             number = plan.decision + 1
             if heard.goal == number:
                 self._refused_since, self.refused_for = None, 0.0

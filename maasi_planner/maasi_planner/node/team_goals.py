@@ -116,6 +116,10 @@ class TeamGoals:
         """Discard the goal of a robot without cancelling it."""
         self._sent.pop(name, None)
 
+    def has(self, name: str) -> bool:
+        """Return whether a robot has a goal of ours that has not been seen to end."""
+        return name in self._sent
+
     def course(self, name: str, number: int, heard: HeardState) -> GoalProgress:
         """Return the progress of goal `number` of a robot, by its last received state."""
         sent = self._sent.get(name)

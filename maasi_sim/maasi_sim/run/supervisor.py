@@ -145,12 +145,16 @@ class Supervisor:
     def stop(self, keep_clock: bool) -> None:
         """Stop the robots, then the nodes, and record their last messages."""
         recorder, robots = self.recorder, self._scenario.names()
+        stubborn = []
+        if self._options.lockstep and not keep_clock:
+            # Robots stand still between steps: no further one follows.
+            stubborn = stop(self.nodes('clock'))
         # Drivers stop their robots while the simulation, or the robot, still runs. One that hangs
         # does not, and may send a command until it is killed: stop the robots before and after.
         self._display.update('stopping the nodes', quiet=True)
         recorder.stop_robots(robots)
         # The others end with them: to a planner that continues, drivers that end are lost.
-        stubborn = stop(self.nodes('driver', 'guard', 'other'))
+        stubborn += stop(self.nodes('driver', 'guard', 'other'))
         # Their last commands come before it, also in the recording.
         recorder.drain()
         recorder.stop_robots(robots)
