@@ -163,7 +163,7 @@ def test_bad_plugin_is_named(folder, file, name, message):
     ('before', 'after', 'message'),
     [
         ('stride: 3', 'stride: 0', 'stride: read 0, allowed is greater than or equal to 1'),
-        ('stride: 3', "stride: '3'", "stride: read '3', allowed is a valid integer"),
+        ('stride: 3', "stride: '3'", "stride: read '3', allowed is a whole number"),
         ('stride: 3', 'strid: 3', "strid: unknown key 'strid' .*known are stride"),
         ('one_by_one:OneByOne', 'lawnmower', "planner 'lawnmower' has no settings of"),
     ],

@@ -191,6 +191,16 @@ def _key(item: Any, data: Any) -> Key:
     return (*key, item['loc'][-1]) if item['type'] == 'missing' else tuple(key)
 
 
+# Names of types in pydantic's messages.
+_PLAIN = {
+    'boolean': 'true or false',
+    'string': 'text',
+    'integer': 'a whole number',
+    'number': 'a number',
+    'list': 'a list',
+}
+
+
 def _explain(item: Any, key: Key, model: type[BaseModel], data: Any) -> str:
     kind, context = item['type'], item.get('ctx', {})
     if kind == 'extra_forbidden':
@@ -204,6 +214,8 @@ def _explain(item: Any, key: Key, model: type[BaseModel], data: Any) -> str:
         return str(context['error'])
     text = item['msg'].replace('Input should be', 'allowed is').replace(' after validation', '')
     text = re.sub(r'a valid dictionary( or .*)?', 'a mapping of keys', text)
+    for name, plain in _PLAIN.items():
+        text = text.replace(f'a valid {name}', plain)
     return f'read {_show(item["input"])}, {text[0].lower()}{text[1:]}'
 
 
