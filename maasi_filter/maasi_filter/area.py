@@ -275,6 +275,8 @@ class Area:
         if given.prior.raster and given.prior.extent:
             (west, east), (south, north) = given.prior.extent
             zones['prior.extent'] = box(west, south, east, north)
+        if self._raster is not None and self._raster.corners is not None:
+            zones['prior.raster'] = shapely.Polygon(self._raster.corners)
         doubts = []
         for key, zone in zones.items():
             parts = shapely.get_parts(zone)
@@ -382,12 +384,19 @@ def _polygons(zones: Iterable[Zone]) -> list[BaseGeometry]:
     return [read_shape(zone.polygon) for zone in zones if zone.polygon is not None]
 
 
+_CORNERS = (0, 0), (1, 0), (1, 1), (0, 1)
+
+
 @dataclass(frozen=True)
 class _Raster:
-    """Densities: values (rows, columns), and how x, y [m, map] become columns and rows."""
+    """Densities: values (rows, columns), and how x, y [m, map] become columns and rows.
+
+    corners (4, 2): where its file says that it lies [m, map].
+    """
 
     values: FloatArray
     cells: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+    corners: FloatArray | None = None
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the values at places, 0 outside."""
@@ -468,6 +477,8 @@ def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> _
             read = 'several' if band is None else band
             raise ValueError(f'band: read {read}, name the one that counts: {", ".join(bands)}')
         crs, grid = file.crs, list(~file.transform)
+        ends = [file.transform * (u * file.width, v * file.height) for u, v in _CORNERS]
+        corners = to_map(np.array(transform(crs, 'EPSG:4326', *zip(*ends))).T, origin)
         values = file.read(int(band or 1), masked=True).astype(float).filled(0.0)
 
     def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -477,4 +488,4 @@ def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> _
         a, b, c, d, e, f = grid[:6]
         return a * east + b * north + c, d * east + e * north + f
 
-    return _Raster(values, cells)
+    return _Raster(values, cells, corners)

@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+import rasterio
 import shapely
 import yaml
 from hypothesis import given, settings
@@ -393,6 +394,24 @@ def test_a_raster_over_other_ground_is_told_with_its_distance(tmp_path):
     prior = {'raster': str(tmp_path / 'heat.png'), 'extent': [[1100, 1200], [0, 100]]}
     first, second = area_of(bounds=[[0.0, 100.0]] * 2, prior=prior).doubts
     assert first.startswith('environment.prior.extent: lies 1000 m outside of the area')
+    assert 'promises nothing' in second
+
+
+@pytest.mark.parametrize('exchanged', [False, True])
+def test_a_geotiff_of_other_ground_is_told_with_its_distance(tmp_path, exchanged):
+    west, north = (46.6, 9.902) if exchanged else (9.95, 46.602)
+    grid = rasterio.transform.from_origin(west, north, 1e-3, 1e-3)
+    facts = {'driver': 'GTiff', 'width': 2, 'height': 2, 'count': 1, 'dtype': 'uint8'}
+    with rasterio.open(
+        tmp_path / 'heat.tif', 'w', crs='EPSG:4326', transform=grid, **facts
+    ) as file:
+        file.write(np.array([[20, 200], [0, 7]], np.uint8), 1)
+    origin = {'latitude': 46.6, 'longitude': 9.9}
+    bounds, prior = [[0.0, 100.0]] * 2, str(tmp_path / 'heat.tif')
+    first, second = area_of(bounds=bounds, origin=origin, prior=prior).doubts
+    gap = '4,739 km' if exchanged else '3731 m'
+    assert first.startswith(f'environment.prior.raster: lies {gap} outside of the area')
+    assert ('latitude and longitude exchanged it would' in first) == exchanged
     assert 'promises nothing' in second
 
 
