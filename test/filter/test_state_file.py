@@ -8,7 +8,7 @@ from searches import CUBE, cube_sensor, observe, play, same, wander
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, StateFileError, load_filter
 from maasi_filter.make_filter import make_filter
 from maasi_filter.records import Label
-from maasi_filter.state_file import SavedGenerator, read_state, write_state
+from maasi_filter.state_file import VERSION, SavedGenerator, read_state, write_state
 
 PHD = FilterSettings()
 PMB = FilterSettings(method='pmb', found_radius=4.0, pmb={'particles': 100})
@@ -100,8 +100,8 @@ def test_damage_is_noticed_wherever_it_is(tmp_path):
         (lambda content: b'{}\n' + content, 'not a state'),
         (lambda content: b'[1]\n' + content, 'not a state'),
         (
-            lambda content: content.replace(b'"version": 5', b'"version": 99', 1),
-            'version: got 99, allowed is 6',
+            lambda content: content.replace(b'"version": %d' % VERSION, b'"version": 99', 1),
+            f'version: got 99, allowed is {VERSION}',
         ),
         (None, 'cannot be read'),
     ],

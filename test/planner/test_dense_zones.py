@@ -94,7 +94,8 @@ def test_paths_among_many_zones_are_little_longer_than_the_shortest():
     from scipy.sparse.csgraph import dijkstra
 
     lengths = shapely.length(lines)[seen]
-    graph = csr_array((lengths, (first[seen], second[seen])), (len(points),) * 2)
+    ends = first[seen].astype(np.int32), second[seen].astype(np.int32)  # as SciPy 1.11 has to have
+    graph = csr_array((lengths, ends), (len(points),) * 2)
     shortest = dijkstra(graph, directed=False, indices=range(6))[:, :6]
     for i in range(6):
         for j in range(i):

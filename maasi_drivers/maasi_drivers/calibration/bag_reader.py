@@ -123,6 +123,7 @@ class BagReader:
                 self._readable(path), default_typestore=get_typestore(Stores.ROS2_JAZZY)
             )
             self._reader.open()
+            self._stack.callback(self._reader.close)
         except Exception as error:
             self._stack.close()
             raise BagError(f'{self.path}: cannot be read: {_words(error)}') from error
@@ -220,8 +221,6 @@ class BagReader:
 
     def close(self) -> None:
         """Close the files."""
-        if self._reader.stack is not None:
-            self._reader.close()
         self._stack.close()
 
     def __enter__(self: Reader) -> Reader:
