@@ -477,8 +477,10 @@ def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> _
             read = 'several' if band is None else band
             raise ValueError(f'band: read {read}, name the one that counts: {", ".join(bands)}')
         crs, grid = file.crs, list(~file.transform)
-        ends = [file.transform * (u * file.width, v * file.height) for u, v in _CORNERS]
-        corners = to_map(np.array(transform(crs, 'EPSG:4326', *zip(*ends))).T, origin)
+        a, b, c, d, e, f = list(file.transform)[:6]
+        u, v = np.transpose(_CORNERS) * [[file.width], [file.height]]
+        ends = a * u + b * v + c, d * u + e * v + f
+        corners = to_map(np.array(transform(crs, 'EPSG:4326', *ends)).T, origin)
         values = file.read(int(band or 1), masked=True).astype(float).filled(0.0)
 
     def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
