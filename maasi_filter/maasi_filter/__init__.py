@@ -12,12 +12,7 @@ from maasi_filter.models.detection import (
     GaussianDetection,
     detection_probability_at,
 )
-from maasi_filter.models.measurement import (
-    MeasurementModel,
-    RangeBearing,
-    RangeBearingElevation,
-    wrap_angle,
-)
+from maasi_filter.models.measurement import RangeAndAngles, wrap_angle
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.pmb.filter import PmbFilter
@@ -43,12 +38,10 @@ __all__ = [
     'Gospa',
     'IcPhdFilter',
     'Match',
-    'MeasurementModel',
     'NoiseSettings',
     'PmbFilter',
     'Pose',
-    'RangeBearing',
-    'RangeBearingElevation',
+    'RangeAndAngles',
     'SearchFilter',
     'Sensor',
     'SensorSettings',

@@ -163,8 +163,8 @@ class SensorSettings(Settings):
         if dimension not in (2, 3):
             raise ValueError(f'dimension: got {dimension}, allowed are 2 and 3')
         detection, covariance = self.detection.build(dimension), self.noise.covariance(dimension)
-        return Sensor.ranging(
-            name, detection, covariance, self.clutter, self.period, self.resolution
+        return Sensor(
+            name, detection, covariance, self.clutter, self.period, resolution=self.resolution
         )
 
 

@@ -11,8 +11,7 @@ from maasi_filter import (
     GaussianDetection,
     NoiseSettings,
     Pose,
-    RangeBearing,
-    RangeBearingElevation,
+    RangeAndAngles,
     Sensor,
     compose,
     detection_probability_at,
@@ -48,7 +47,7 @@ def test_composition_adds_yaws(first, yaw, second, turn):
 
 # Measurements.
 
-MODELS = [RangeBearing(), RangeBearingElevation()]
+MODELS = [RangeAndAngles(2), RangeAndAngles(3)]
 
 
 @pytest.mark.parametrize('model', MODELS)
@@ -70,12 +69,12 @@ def test_inverse_undoes_measure_and_the_jacobian_is_its_derivative(model):
 
 def test_values_by_hand():
     pose = Pose.from_yaw([1.0, 1.0, 1.0], 2.0)
-    z = RangeBearingElevation().measure([[1.0, 4.0, 5.0]], pose)[0]
+    z = RangeAndAngles(3).measure([[1.0, 4.0, 5.0]], pose)[0]
     np.testing.assert_allclose(z, [5.0, np.pi / 2, np.arcsin(4.0 / 5.0)])
-    z = RangeBearing().measure([[1.0, 4.0]], pose)[0]
+    z = RangeAndAngles(2).measure([[1.0, 4.0]], pose)[0]
     np.testing.assert_allclose(z, [3.0, np.pi / 2])
     # Across pi.
-    residual = RangeBearing().residual([1.0, np.pi - 0.01], [1.0, -np.pi + 0.01])
+    residual = RangeAndAngles(2).residual([1.0, np.pi - 0.01], [1.0, -np.pi + 0.01])
     np.testing.assert_allclose(residual, [0.0, -0.02])
 
 
@@ -85,7 +84,7 @@ def test_poles_have_finite_answers():
         at_robot = pose.position[None, : model.dimension]
         np.testing.assert_array_equal(model.measure(at_robot, pose), 0.0)
         np.testing.assert_array_equal(model.jacobian(at_robot, pose), 0.0)
-    solid = RangeBearingElevation()
+    solid = RangeAndAngles(3)
     above = np.array([[1.0, 2.0, 10.0]])
     np.testing.assert_allclose(solid.measure(above, pose)[0], [7.0, 0.0, np.pi / 2])
     jacobian = solid.jacobian(above, pose)[0]
@@ -174,8 +173,8 @@ def test_the_kernel_agrees_with_the_model(model):
         (lambda: GaussianDetection(1.5, [25.0, 25.0]), 'probability'),
         (lambda: BoxDetection([0.2, -0.2], [-0.2, 0.2]), 'lower, upper'),
         (lambda: BoxDetection([-0.2, -0.2], [0.2, 0.2], frame='camera'), 'frame'),
-        (lambda: Sensor('bad', BOX, RangeBearing(), np.zeros((2, 2))), 'positive definite'),
-        (lambda: Sensor('bad', BOX, RangeBearing(), np.eye(2), clutter=np.nan), 'clutter'),
+        (lambda: Sensor('bad', BOX, np.zeros((2, 2))), 'positive definite'),
+        (lambda: Sensor('bad', BOX, np.eye(2), clutter=np.nan), 'clutter'),
         (lambda: Pose([np.nan, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]), 'position'),
         (lambda: Pose([0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]), 'position'),
         (lambda: Pose([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]), 'orientation'),

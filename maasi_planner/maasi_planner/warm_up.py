@@ -62,7 +62,7 @@ def warm_up() -> None:
                     state=state,
                     candidates=np.array([[0.5, 1.5, 0.3], [1.5, 0.5, 0.3]]),
                     motion=motion,
-                    sensor=Sensor.ranging('warm', detection, noise),
+                    sensor=Sensor('warm', detection, noise),
                     period_steps=5,
                 )
             team = TeamView(0, 0.05, robots, clusters, exploration)

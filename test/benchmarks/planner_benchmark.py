@@ -38,7 +38,7 @@ def robot(place, bounds, grid, motion, size, noise, period=10, radius=0.1):
         state=RobotState.at_rest(place),
         candidates=CandidateSet(settings, bounds, place[2]).at(np.array(place)),
         motion=make_motion(MotionSettings(**motion)),
-        sensor=Sensor.ranging('robot', detection, np.diag(noise) ** 2),
+        sensor=Sensor('robot', detection, np.diag(noise) ** 2),
         period_steps=period,
         radius=radius,
     )
@@ -91,7 +91,7 @@ def field(batteries):
     robots = {
         f'drone{n}': replace(
             robot([300.0 * n + 150.0, 1.0, 30.0], bounds, grid, motion, [25.0] * 2, [1.0] * 2),
-            sensor=Sensor.ranging('robot', BoxDetection([-10.0] * 2, [10.0] * 2, 0.98), np.eye(2)),
+            sensor=Sensor('robot', BoxDetection([-10.0] * 2, [10.0] * 2, 0.98), np.eye(2)),
         )
         for n in range(3)
     }

@@ -71,7 +71,7 @@ def field(number, side, candidates, corner=None, clusters=8, kind=None):
             state=RobotState.at_rest(place),
             candidates=CandidateSet(grid, bounds, 10.0).at(place),
             motion=motion,
-            sensor=Sensor.ranging(
+            sensor=Sensor(
                 'drone',
                 kind or BoxDetection([-10.0] * 2, [10.0] * 2, 0.95),
                 np.diag([1.0, 0.05]) ** 2,

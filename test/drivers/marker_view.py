@@ -11,7 +11,7 @@ from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.environment import EnvironmentSettings
-from maasi_filter.models.measurement import RangeBearing
+from maasi_filter.models.measurement import RangeAndAngles
 from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_sim.simulation.camera import CameraRenderer
 from maasi_sim.simulation.floor import RenderSettings, scene_of
@@ -19,7 +19,7 @@ from maasi_sim.simulation.world import TargetSettings, World
 
 DISTORTION = [-0.21, 0.06, 0.002, -0.003, 0.01]
 BOX, GATE = 0.2, 0.03
-MODEL = RangeBearing()
+MODEL = RangeAndAngles(2)
 
 
 class Score(NamedTuple):

@@ -21,7 +21,7 @@ from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.camera_input import boxes_to_blobs
 from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_filter.models.measurement import RangeBearing
+from maasi_filter.models.measurement import RangeAndAngles
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.qos import LATCHED
 
@@ -52,7 +52,7 @@ def test_covariance_covers_the_noise_of_box_and_pose(point, sides):
     settings = CameraSettings.model_validate(
         LEVEL | {'detections': {'point': point, 'error': error}}
     )
-    detector, model = MarkerDetector(settings), RangeBearing()
+    detector, model = MarkerDetector(settings), RangeAndAngles(2)
     generator = np.random.default_rng(901)
     pose_covariance = np.diag([0.03, 0.03, 0.02, 0.004, 0.004, 0.01]) ** 2
     true = Pose.from_yaw([2.0, -1.0, 0.0], 0.7)

@@ -12,7 +12,7 @@ from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera, box_view_margin
 from maasi_drivers.vision.detector import blobs_at
 from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
+from maasi_filter.models.measurement import RangeAndAngles
 from maasi_filter.models.pose import Pose
 
 DOWN = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
@@ -160,13 +160,13 @@ def test_covariance_covers_the_noise_of_pixels_and_pose():
         pixel = detector.camera.project(point, true) + generator.normal(0.0, 0.8, (1, 2))
         believed = turned(true, root @ generator.standard_normal(6))
         seen = detector.detect(blobs_at(pixel, 0.0), believed, pose_covariance)
-        expected = RangeBearing().measure(point[:, :2], believed)[0]
-        offset = RangeBearing().residual(seen.values[0], expected)
+        expected = RangeAndAngles(2).measure(point[:, :2], believed)[0]
+        offset = RangeAndAngles(2).residual(seen.values[0], expected)
         nees.append(offset @ np.linalg.solve(seen.covariances[0], offset))
     assert 1.75 < np.mean(nees) < 2.25
 
 
-@pytest.mark.parametrize('model', [RangeBearing(), RangeBearingElevation()])
+@pytest.mark.parametrize('model', [RangeAndAngles(2), RangeAndAngles(3)])
 @pytest.mark.parametrize('offset', [0.0, 1e-9, 1e-4, 1e-3, 1e-2])
 def test_right_over_a_target_the_bearing_says_nothing(model, offset):
     places = np.array([[offset, 0.0, 0.0]])[:, : model.dimension]

@@ -18,7 +18,7 @@ NOISE = {2: np.diag([2.0, 0.02]), 3: np.diag([2.0, 0.02, 0.03])}
 
 
 def sensor_of(dimension):
-    return Sensor.ranging('any', ExponentialDetection(0.9, [20.0] * dimension), NOISE[dimension])
+    return Sensor('any', ExponentialDetection(0.9, [20.0] * dimension), NOISE[dimension])
 
 
 @pytest.mark.parametrize('dimension', [2, 3])
@@ -56,7 +56,7 @@ def test_gaussian_births_stand_for_a_constant_intensity():
 @pytest.mark.parametrize('dimension', [2, 3])
 def test_noise_in_space_is_that_of_drawn_measurements(dimension):
     sensor = sensor_of(dimension)
-    precise = Sensor.ranging('any', sensor.detection, 1e-4 * NOISE[dimension])
+    precise = Sensor('any', sensor.detection, 1e-4 * NOISE[dimension])
     z = np.array([[25.0, 0.6, 0.3][:dimension]])
     root = np.linalg.cholesky(precise.covariance)
     drawn = z + np.random.default_rng(0).standard_normal((20_000, dimension)) @ root.T
@@ -73,7 +73,7 @@ def test_the_corrector_is_equation_13(dimension, detections):
     generator = np.random.default_rng(0)
     root = generator.normal(0.0, 0.1, (dimension, dimension)) + 0.4 * np.eye(dimension)
     detection = ExponentialDetection(0.9, [10.0] * dimension)
-    sensor = Sensor.ranging('any', detection, root @ root.T)
+    sensor = Sensor('any', detection, root @ root.T)
     pose = Pose.from_yaw(generator.normal(0.0, 3.0, 3), 0.5)
     positions = generator.normal(0.0, 10.0, (5000, dimension))
     weights = generator.random(5000) * 0.01

@@ -106,7 +106,7 @@ def test_a_saved_filter_goes_on_in_another_process(method, monkeypatch, tmp_path
     """Addresses of functions hold in one process only: they are looked up anew."""
     settings = FilterSettings(method=method, found_radius=1e-6)
     search = make_filter(settings, BOUNDS[2], np.random.default_rng(1))
-    sensor = Sensor.ranging('a', Compiled(Width(width=4.0), 0.9, 2), np.diag([0.01, 0.01]))
+    sensor = Sensor('a', Compiled(Width(width=4.0), 0.9, 2), np.diag([0.01, 0.01]))
     for number in range(3):
         step(search, sensor, number)
     search.save(tmp_path / 'state')
@@ -118,7 +118,7 @@ def test_a_saved_filter_goes_on_in_another_process(method, monkeypatch, tmp_path
     if method == 'pmb':
         with pytest.raises(StateFileError, match='make the sensors'):
             load_filter(tmp_path / 'state')
-    again = Sensor.ranging('a', Compiled(Width(width=4.0), 0.9, 2), np.diag([0.01, 0.01]))
+    again = Sensor('a', Compiled(Width(width=4.0), 0.9, 2), np.diag([0.01, 0.01]))
     assert again.detection.kernel()[1][detection.VALUES] != before
     found = step(load_filter(tmp_path / 'state'), again, 3).clusters
     assert [item.mass for item in found] == [item.mass for item in wanted]

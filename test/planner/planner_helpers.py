@@ -69,7 +69,7 @@ def random_team(
             state=state,
             candidates=places(candidates),
             motion=motion,
-            sensor=Sensor.ranging(f'r{index}', detection, noise),
+            sensor=Sensor(f'r{index}', detection, noise),
             period_steps=int(rng.integers(1, 7)),
             radius=radius * size,
         )

@@ -69,7 +69,7 @@ def test_bad_settings_are_refused(settings, word):
 
 def test_grids_of_the_paper_leave_parts_unseen():
     """000, section 5.2: 3 x 3 with spacing 0.6 from 0.1 sees 0.1 - 0.2 to 1.3 + 0.2 at most."""
-    sensor = Sensor.ranging('m', BoxDetection([-0.2, -0.2], [0.2, 0.2]), np.diag([0.01, 0.01]))
+    sensor = Sensor('m', BoxDetection([-0.2, -0.2], [0.2, 0.2]), np.diag([0.01, 0.01]))
     settings = CandidateSettings(grid=[3, 3], spacing=0.6, corner=[0.1, 0.1])
     start = np.array([1.9, 1.9, 1.0])
     viewer = Viewer(CandidateSet(settings, FLOOR, 1.0).at(start), start, sensor, 0.05, 0.0)
@@ -88,7 +88,7 @@ def test_grids_of_the_paper_leave_parts_unseen():
     ],
 )
 def test_the_swath_is_as_wide_as_half_of_the_best_detection(detection, swath):
-    sensor = Sensor.ranging('m', detection, np.diag([0.01, 0.01]))
+    sensor = Sensor('m', detection, np.diag([0.01, 0.01]))
     assert swath_of(sensor) == pytest.approx(swath)
     if not isinstance(detection, BoxDetection):
         edge = [[0.0, 0.5 * swath], [0.0, 0.0]]
@@ -98,7 +98,7 @@ def test_the_swath_is_as_wide_as_half_of_the_best_detection(detection, swath):
 
 def test_a_map_that_is_coarser_than_the_swath_is_warned_about():
     sensors = [
-        Sensor.ranging('m', BoxDetection([-half] * 2, [half] * 2), np.diag([0.01, 0.01]))
+        Sensor('m', BoxDetection([-half] * 2, [half] * 2), np.diag([0.01, 0.01]))
         for half in (8.0, 30.0)
     ]
     for size, spacing in ((600.0, 16.0 / 3.0), (200.0, 200.0 / 54.0), (6000.0, 6.0)):

@@ -25,7 +25,7 @@ def team_of(starts, per_metre):
             state=RobotState.at_rest([*start, 0.0]),
             candidates=np.zeros((0, 3)),
             motion=motion,
-            sensor=Sensor.ranging(f'robot{number}', BOX, np.diag([0.1, 0.1]) ** 2),
+            sensor=Sensor(f'robot{number}', BOX, np.diag([0.1, 0.1]) ** 2),
             period_steps=5,
             radius=0.1,
         )

@@ -190,7 +190,7 @@ def field_team(number, candidates, kind):
             state=RobotState.at_rest(place),
             candidates=CandidateSet(grid, bounds, 10.0).at(place),
             motion=motion,
-            sensor=Sensor.ranging('drone', detection, np.diag([1.0, 0.05]) ** 2),
+            sensor=Sensor('drone', detection, np.diag([1.0, 0.05]) ** 2),
             period_steps=10,
             radius=0.3,
         )

@@ -34,7 +34,7 @@ def team_of(area, detections, starts, candidates, spacing=None):
     """Return a team that plans; candidates: settings of them all."""
     robots = {}
     for number, (detection, start) in enumerate(zip(detections, starts)):
-        sensor = Sensor.ranging(f'robot{number}', detection, np.diag([0.1, 0.1]) ** 2)
+        sensor = Sensor(f'robot{number}', detection, np.diag([0.1, 0.1]) ** 2)
         speed = min(0.5 * swath_of(sensor), 100.0)
         motion = make_motion(MotionSettings(speed=speed), area, 0.05)
         robots[f'robot{number}'] = RobotView(

@@ -31,7 +31,7 @@ def field(detection=BOX, starts=((1.0, 1.0, 0.0),), size=12.0, obstacles=None, a
             state=RobotState.at_rest(start),
             candidates=np.zeros((0, 3)),
             motion=make_motion(MotionSettings(speed=1.0), obstacles, 0.1),
-            sensor=Sensor.ranging('robot', detection, np.diag([0.1, 0.1]) ** 2),
+            sensor=Sensor('robot', detection, np.diag([0.1, 0.1]) ** 2),
             period_steps=5,
             radius=0.1,
             arrival_radius=arrival,

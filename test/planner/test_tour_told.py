@@ -32,9 +32,7 @@ def random_search(seed):
     bounds = [[0.0, 26.0]] * 2
     given = {'bounds': bounds, 'keep_outs': zones, 'expected_targets': float(rng.uniform(2, 9))}
     area = Area(EnvironmentSettings.model_validate(given))
-    sensor = Sensor.ranging(
-        'robot', BoxDetection([-1.5, -1.5], [1.5, 1.5], 0.8, 'world'), 0.01 * np.eye(2)
-    )
+    sensor = Sensor('robot', BoxDetection([-1.5, -1.5], [1.5, 1.5], 0.8, 'world'), 0.01 * np.eye(2))
     robots = {
         name: RobotView(
             state=RobotState.at_rest(start),

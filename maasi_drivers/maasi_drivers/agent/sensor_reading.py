@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.models.measurement import MeasurementModel
+from maasi_filter.models.measurement import RangeAndAngles
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Label
@@ -26,7 +26,7 @@ _ANY_ANGLE = np.pi**2 / 3.0
 
 
 def measured(
-    model: MeasurementModel, positions: FloatArray, covariances: FloatArray, pose: Pose
+    model: RangeAndAngles, positions: FloatArray, covariances: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray]:
     """Return range and angles of targets (n, d) [m, map], and their covariances, to first order.
 

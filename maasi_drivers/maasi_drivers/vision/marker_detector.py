@@ -9,7 +9,7 @@ from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.detector import Blobs, Detector
 from maasi_drivers.vision.segmentation import segment
 from maasi_filter.arrays import FloatArray, ImageArray
-from maasi_filter.models.measurement import MeasurementModel, RangeBearing, RangeBearingElevation
+from maasi_filter.models.measurement import RangeAndAngles
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 
@@ -23,9 +23,7 @@ class MarkerDetector:
     def __init__(self, settings: CameraSettings, dimension: int = 2) -> None:
         self.settings = settings
         self.camera = Camera.from_settings(settings)
-        self._model: MeasurementModel = (
-            RangeBearing() if dimension == 2 else RangeBearingElevation()
-        )
+        self._model = RangeAndAngles(dimension)
         rule = settings.segmentation.rule
         self._own: Detector | None = None
         if rule not in DETECTORS.own:

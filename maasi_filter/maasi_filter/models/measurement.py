@@ -1,10 +1,11 @@
-"""Measurements of a target from a robot: g(x, q), its inverse and Jacobian.
+"""A sensor measures range and angles of a target: g(x, q), its inverse and Jacobian.
 
 Range, bearing and, in 3D, elevation (000, eq. (6) to (9)). Bearings are in the map's axes, not
 relative to the robot's heading. In 2D the range is horizontal.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -33,8 +34,9 @@ def wrap_angle(angle: ArrayLike) -> FloatArray:
     return np.where((array >= -math.pi) & (array < math.pi), array, wrapped)
 
 
-class MeasurementModel:
-    """Range and angles of a target seen from a robot."""
+@dataclass(frozen=True)
+class RangeAndAngles:
+    """Horizontal range and bearing in 2D; range, bearing and elevation in 3D."""
 
     dimension: int
 
@@ -108,15 +110,3 @@ class MeasurementModel:
         if array.ndim != 2 or array.shape[1] != self.dimension:
             raise ValueError(f'{name}: got shape {array.shape}, allowed is (n, {self.dimension})')
         return array
-
-
-class RangeBearing(MeasurementModel):
-    """Horizontal range and bearing, 2D."""
-
-    dimension = 2
-
-
-class RangeBearingElevation(MeasurementModel):
-    """Range, bearing and elevation, 3D."""
-
-    dimension = 3

@@ -1,7 +1,5 @@
 """A robot's sensor: probability of detection, and measurement noise."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 
@@ -9,7 +7,7 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import BoxDetection, DetectionModel
-from maasi_filter.models.measurement import MeasurementModel, RangeBearing, RangeBearingElevation
+from maasi_filter.models.measurement import RangeAndAngles
 
 # Lower bound of the expected false detections in a scan: without it, a few stray particles
 # suffice to explain a false detection as a target.
@@ -30,7 +28,7 @@ def is_covariance(covariance: FloatArray) -> bool:
 
 @dataclass
 class Sensor:
-    """Sensor of a robot.
+    """Sensor of a robot: it measures range and angles.
 
     Parameters
     ----------
@@ -38,10 +36,8 @@ class Sensor:
         For messages.
     detection : DetectionModel
         pi(x, q).
-    measurement : MeasurementModel
-        g(x, q): range and bearing in 2D; range, bearing and elevation in 3D.
     covariance : (d, d) array
-        R, of a measurement; m and rad, squared.
+        R, of a measurement; m and rad, squared. d is 2 or 3.
     clutter : float
         Intensity of false detections, per unit of measurement space (m rad in 2D, m rad^2 in 3D).
     period : float
@@ -51,6 +47,11 @@ class Sensor:
     resolution : float
         Detections of one scan that are closer are of one target, in deviations of the noise.
 
+    Attributes
+    ----------
+    measurement : RangeAndAngles
+        g(x, q), of the dimension of `covariance`.
+
     Raises
     ------
     ValueError
@@ -59,20 +60,21 @@ class Sensor:
 
     name: str
     detection: DetectionModel
-    measurement: MeasurementModel
     covariance: FloatArray
     clutter: float = 0.0
     period: float = 0.0
     maximum_range: float = field(default=math.inf)
     resolution: float = 1.0
+    measurement: RangeAndAngles = field(init=False)
 
     def __post_init__(self) -> None:
         self.covariance = np.array(self.covariance, dtype=float)
-        d = self.measurement.dimension
-        if self.covariance.shape != (d, d):
+        if self.covariance.shape not in ((2, 2), (3, 3)):
             raise ValueError(
-                f'{self.name}: covariance: got shape {self.covariance.shape}, allowed is ({d}, {d})'
+                f'{self.name}: covariance: got shape {self.covariance.shape}, allowed are (2, 2) '
+                'and (3, 3)'
             )
+        self.measurement = RangeAndAngles(len(self.covariance))
         if not is_covariance(self.covariance):
             raise ValueError(
                 f'{self.name}: covariance: got {self.covariance.tolist()}, allowed is a symmetric '
@@ -105,18 +107,3 @@ class Sensor:
             if len(corner) == len(bounds):
                 reach = min(reach, math.sqrt(float((corner * corner).sum())))
         return reach * 2.0 * math.pi * (math.pi if len(bounds) == 3 else 1.0)
-
-    @classmethod
-    def ranging(
-        cls,
-        name: str,
-        detection: DetectionModel,
-        covariance: FloatArray,
-        clutter: float = 0.0,
-        period: float = 0.0,
-        resolution: float = 1.0,
-    ) -> Sensor:
-        """Return a sensor of range and angles whose dimension is that of `covariance`."""
-        dimension = len(np.atleast_2d(covariance))
-        model: MeasurementModel = RangeBearing() if dimension == 2 else RangeBearingElevation()
-        return cls(name, detection, model, covariance, clutter, period, resolution=resolution)
