@@ -72,12 +72,23 @@ def test_a_robot_with_a_sensor_of_its_own_finds_targets(kind, method):
     assert result.rmse < 0.1
 
 
+@pytest.mark.parametrize('seed', [1, 2])
+def test_a_filter_of_ones_own_finds_targets(seed):
+    result = search(load_scenario(EXAMPLES / 'own_filter' / 'search.yaml'), seed)
+    assert (result.missed, result.false_found) == (0, 0), result.end_reason
+    assert result.rmse < 0.1
+
+
+OWN = ('planner', 'filter', 'sensor')
+
+
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
-    """Return a run with a planner and a sensor of one's own."""
+    """Return a run with a planner, a filter and a sensor of one's own."""
     folder = tmp_path_factory.mktemp('examples')
     content = yaml.safe_load((EXAMPLES / 'own_sensor' / 'search.yaml').read_text())
-    content['plugin_path'] = [str(EXAMPLES / name) for name in ('own_planner', 'own_sensor')]
+    content['plugin_path'] = [str(EXAMPLES / f'own_{part}') for part in OWN]
+    content['filter'] = {'method': 'hit_counter:HitCounter', 'settings': {'gate': 0.4}}
     content['planner'] = {'name': 'random_planner:RandomPlanner', 'settings': {'seed': 5}}
     content['limits'] = {'time': 12.0}
     (folder / 'robots').symlink_to(EXAMPLES / 'robots')
@@ -86,7 +97,7 @@ def run(tmp_path_factory):
     return done
 
 
-def test_nodes_run_planner_and_sensor_as_one_process_does(run):
+def test_nodes_run_the_own_classes_as_one_process_does(run):
     result = search(load_scenario(run.folder.parent / 'search.yaml'), seed=1)
     assert result.total_measurements > 20 and run.report['measurements'] == result.measurements
     found = [item['position'] for item in run.report['found']]

@@ -10,10 +10,10 @@ from test_code_blocks import BLOCKS
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_filter import plugins
-from maasi_filter.models.pose import Pose
+from maasi_filter import AgentMeasurement, FilterSettings, Pose, load_filter, make_filter, plugins
 from maasi_filter.plugins import PluginError
 from maasi_filter.ros.parameters import flatten, parameter_fields, unflatten
+from maasi_filter.settings import unused_settings
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
 from maasi_planner.settings import PLANNERS, PlannerSettings
@@ -209,6 +209,47 @@ def test_parameters_of_a_plugin(folder):
     with pytest.raises(PluginError):
         PLANNERS.load('one_by_one:Nothing')
     assert PlannerSettings(name='one_by_one:OneByOne').settings.stride == 1
+
+
+def test_filter_of_ones_own(folder):
+    shutil.copy(ROBOTS.parent / 'own_filter' / 'hit_counter.py', folder / 'hit_counter.py')
+    change(folder, '{method: pmb}', '{method: hit_counter:HitCounter, settings: {gate: 0.3}}')
+    scenario = load_scenario(folder / 'search.yaml')
+    assert (scenario.filter.settings.gate, scenario.filter.settings.hits) == (0.3, 4.0)
+    plans = TargetMission('search', scenario).plan_nodes(Options(), folder / 'search.yaml')
+    (parameters,) = [plan.parameters for plan in plans if plan.name == 'filter_node']
+    assert parameters['filter.settings.gate'] == 0.3
+    # A saved one continues as the one that was saved.
+    target, sensor = np.array([[1.2, 1.5]]), scenario.robots['rover'].sensor.build('rover', 2)
+    pose, generator = Pose.from_yaw([1.0, 1.0, 0.0], 0.0), np.random.default_rng(1)
+    filters = [make_filter(scenario.filter, scenario.environment.array(), generator)]
+    for step in range(4):
+        values = sensor.measurement.measure(target, pose)
+        measured = [AgentMeasurement('rover', pose, sensor, values, index=step)]
+        results = [item.step(measured, 1, float(step)) for item in filters]
+        assert len({repr(result) for result in results}) == 1
+        filters[-1].save(folder / 'state')
+        filters.append(load_filter(folder / 'state'))
+    (found,) = filters[-1].found_targets
+    np.testing.assert_allclose(found.position, target[0], atol=1e-9)
+    # Another one has not its settings.
+    pmb = load_scenario(folder / 'search.yaml', {'--filters': (('filter', 'method'), 'pmb')})
+    assert pmb.filter.settings is None
+    with pytest.raises(ValueError, match=r"filter 'pmb' has no settings of its own"):
+        FilterSettings(method='pmb', settings={'gate': 0.3})
+    # What only the others use, and what is not its own.
+    other = FilterSettings(method='hit_counter:HitCounter', births='uniform', pmb={'walk': 0.1})
+    assert unused_settings(other).splitlines() == [
+        'filter: births: of method ic_phd; hit_counter:HitCounter does not use them',
+        'filter: pmb: of method pmb; hit_counter:HitCounter does not use them',
+    ]
+    for key, value, message in (
+        ('settings', {'gate': -1.0}, r'filter\.settings\.gate: read -1'),
+        ('method', 'pbm', r"unknown filter 'pbm' \(did you mean 'pmb'\?\), known are ic_phd, pmb"),
+        ('method', 'hit_counter:Candidate', r'is no subclass of maasi_filter\.search_filter'),
+    ):
+        with pytest.raises(ScenarioError, match=message):
+            load_scenario(folder / 'search.yaml', {key: (('filter', key), value)})
 
 
 def documented(name):

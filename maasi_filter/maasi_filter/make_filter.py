@@ -10,15 +10,20 @@ from pydantic import TypeAdapter
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import ByteArray
-from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.association import MANY_PAIRS, associate
 from maasi_filter.pmb.component import gaps_of
-from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.records import AgentMeasurement
 from maasi_filter.search_filter import SearchFilter
-from maasi_filter.settings import DetectionSettings, FilterSettings, NoiseSettings, SensorSettings
+from maasi_filter.settings import (
+    FILTERS,
+    DetectionSettings,
+    FilterSettings,
+    NoiseSettings,
+    SensorSettings,
+)
 from maasi_filter.state_file import StateFileError, read_state
+from maasi_filter.unexplored_map import UnexploredMap
 
 
 def make_filter(
@@ -38,9 +43,8 @@ def make_filter(
     ValueError
         If the bounds or the spacing of the exploration grid are not usable.
     """
-    if settings.method == 'pmb':
-        return PmbFilter(settings, area, generator)
-    return IcPhdFilter(settings, area, generator)
+    kind: type[SearchFilter] = FILTERS.load(settings.method)
+    return kind(settings, area, generator)
 
 
 @dataclass
@@ -73,15 +77,16 @@ def load_state(path: str | os.PathLike[str]) -> tuple[SearchFilter, Progress | N
     """Return the saved filter as `load_filter`, and the progress of its run, if it was saved."""
     saved = read_state(path)
     try:
-        kind = PmbFilter if PmbFilter.method in saved else IcPhdFilter
-        progress = TypeAdapter[Any](Progress | None).validate_python(saved.get('progress'))
-        return kind.of(saved[kind.method]), progress
+        progress = TypeAdapter[Any](Progress | None).validate_python(saved.pop('progress', None))
+        ((method, state),) = saved.items()
+        kind: type[SearchFilter] = FILTERS.load(method)
+        return kind.of(state), progress
     except (ValueError, KeyError) as error:
         raise StateFileError(f'{path}: does not hold a usable state: {error}') from None
 
 
 def warm_up(method: str | None = None) -> None:
-    """Compile, or load from the cache, every kernel that a step uses; of one method, or of all."""
+    """Compile, or load from the cache, every kernel that a step uses; of one method, or of both."""
     for dimension in (2, 3):
         bounds = np.array([[0.0, 10.0]] * dimension)
         for detection in (
@@ -104,7 +109,10 @@ def warm_up(method: str | None = None) -> None:
                     search.step(
                         [AgentMeasurement('warm_up', pose, sensor, values, None, step)], 1, step
                     )
-                search.exploration.at(np.full((1, 3), 3.0))
+            # All that a filter of a plugin shares with them.
+            exploration = UnexploredMap(bounds)
+            exploration.update(sensor.detection, Pose.from_yaw([3.0, 3.0, 3.0], 0.1))
+            exploration.at(np.full((1, 3), 3.0))
         if method in (None, 'pmb'):
             # What only a large scan needs.
             associate(np.ones((1, MANY_PAIRS + 1)), np.ones(MANY_PAIRS + 1))

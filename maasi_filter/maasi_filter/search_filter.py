@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import TypeAdapter
+from pydantic import BaseModel, TypeAdapter
 from typing_extensions import Self
 
 from maasi_filter.area import Area
@@ -112,6 +112,10 @@ _SAVED: dict[str, Any] = {
 class SearchFilter(ABC):
     """A filter that finds targets from the detections of several robots.
 
+    A subclass has `step`; it keeps `clusters` and `exploration`, and adds to `register()` what it
+    finds. One that stores its found targets elsewhere overrides `found_targets`, `register`,
+    `place` and `remove`.
+
     Attributes
     ----------
     settings : FilterSettings
@@ -126,10 +130,15 @@ class SearchFilter(ABC):
         e, updated with every measurement.
     clusters : list of Cluster
         Potential targets that are not found, heaviest first.
+    Settings : type or None
+        Model of the filter's own settings; with it, `settings.settings` is an instance.
+    own : BaseModel or None
+        That instance.
     """
 
-    method: ClassVar[str]
-    saved: ClassVar[dict[str, Any]]  #: types of what is saved of one method only, by attribute
+    Settings: ClassVar[type[BaseModel] | None] = None
+    #: Types of what is saved of one method only, by attribute.
+    saved: ClassVar[dict[str, Any]] = {'_found': FoundTargets}
 
     def __init__(
         self, settings: FilterSettings, area: Area | ArrayLike, generator: np.random.Generator
@@ -141,6 +150,12 @@ class SearchFilter(ABC):
         self.dimension = self.exploration.dimension
         self.generator = generator
         self.clusters: list[Cluster] = []
+        self._found = FoundTargets()
+
+    @property
+    def own(self) -> Any:
+        """The filter's own settings."""
+        return self.settings.settings
 
     def take_area(self, area: Area) -> None:
         """Take another area within the same bounds, as with other keep-outs."""
@@ -148,24 +163,24 @@ class SearchFilter(ABC):
         self.exploration.take_area(area)
 
     @property
-    @abstractmethod
     def found_targets(self) -> list[FoundTarget]:
         """Targets found so far, in the order of being found."""
+        return self._found.targets
 
     @property
-    @abstractmethod
     def particles(self) -> FloatArray:
-        """Of targets that are not found yet, (n, d), metres."""
+        """Of targets that are not found yet, (n, d), metres; empty: the filter has none."""
+        return np.empty((0, self.dimension))
 
     @property
-    @abstractmethod
     def weights(self) -> FloatArray:
         """Of the particles, (n,); they sum to `expected_number`."""
+        return np.empty(0)
 
     @property
-    @abstractmethod
     def expected_number(self) -> float:
         """Expected number of targets that are not found yet, of those that were detected."""
+        return float(sum(cluster.mass for cluster in self.clusters))
 
     @abstractmethod
     def step(
@@ -189,16 +204,14 @@ class SearchFilter(ABC):
             do not fit, or a robot appears twice. The filter is then unchanged.
         """
 
-    @abstractmethod
     def register(self) -> FoundTargets:
         """Return the found targets with the ids given so far."""
+        return self._found
 
-    @abstractmethod
-    def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
+    def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:  # noqa: B027
         """Take found targets into the state, of which some are new or changed."""
 
-    @abstractmethod
-    def remove(self, found: FoundTargets, withdrawn: Sequence[FoundTarget]) -> None:
+    def remove(self, found: FoundTargets, withdrawn: Sequence[FoundTarget]) -> None:  # noqa: B027
         """Take found targets into the state without those that their filter has withdrawn."""
 
     def own_found_targets(self) -> list[FoundTarget]:
@@ -254,9 +267,9 @@ class SearchFilter(ABC):
         write_state(path, self.state())
 
     def state(self) -> dict[str, dict[str, Any]]:
-        """Return the whole state, random generator included, by the method."""
+        """Return the whole state, random generator included, by the name of the method."""
         state = {name: getattr(self, name) for name in (*_SAVED, *self.saved)}
-        return {self.method: {**state, 'exploration': self.exploration.values}}
+        return {self.settings.method: {**state, 'exploration': self.exploration.values}}
 
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> Self:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -209,6 +210,29 @@ class PmbSettings(Settings):
     )
 
 
+FILTERS = PluginGroup(
+    'maasi.filters',
+    'filter',
+    'maasi_filter.search_filter:SearchFilter',
+    {
+        'ic_phd': 'maasi_filter.ic_phd.filter:IcPhdFilter',
+        'pmb': 'maasi_filter.pmb.filter:PmbFilter',
+    },
+)
+_FILTER = OwnSettings(FILTERS, 'method')
+
+
+@dataclass(frozen=True)
+class _Only:
+    """Marks a setting that one method of the suite uses, and the other one does not."""
+
+    method: str
+    plugins: bool = False  # Whether filters of plugins can use it
+
+
+_IC_PHD, _PMB_ONLY = _Only('ic_phd'), _Only('pmb')
+_CHECKED = _Only('pmb', plugins=True)  # Used by `check_measurements`
+
 Preset = Literal['paper_000', 'paper_001', 'paper_002', 'paper_003']
 
 _PAPER_000: dict[str, Any] = {
@@ -253,10 +277,17 @@ class FilterSettings(Settings):
     each step from the sensor and the environment, or not used.
     """
 
-    method: Literal['ic_phd', 'pmb'] = Field(
-        'ic_phd', description="The papers' PHD, or a Poisson multi-Bernoulli filter"
+    method: Annotated[str, FILTERS, AfterValidator(FILTERS.check)] = Field(
+        'ic_phd',
+        description="The papers' PHD, a Poisson multi-Bernoulli filter, or module:Class of your "
+        'own',
     )
-    preset: Preset = Field('paper_000', description='ic_phd: where values left None come from')
+    settings: Annotated[Any, _FILTER, AfterValidator(_FILTER.check)] = Field(
+        None, validate_default=True, description='Settings of a filter of your own'
+    )
+    preset: Annotated[Preset, _IC_PHD] = Field(
+        'paper_000', description='ic_phd: where values left None come from'
+    )
     found_radius: float | None = Field(
         None, gt=0.0, description='T_r, largest root mean square radius of what is found [m]'
     )
@@ -266,69 +297,72 @@ class FilterSettings(Settings):
     threads: int | None = Field(
         None, ge=1, le=256, description='Threads for large particle sets; results do not depend [1]'
     )
-    particles: int | None = Field(
+    particles: Annotated[int | None, _IC_PHD] = Field(
         None,
         ge=1,
         le=5_000_000,
         description='ic_phd: largest number of particles after resampling [1]',
     )
-    particles_minimum: int | None = Field(
+    particles_minimum: Annotated[int | None, _IC_PHD] = Field(
         None,
         ge=0,
         description='ic_phd: smallest number of particles after resampling, if any mass [1]',
     )
-    particles_per_target: int | None = Field(
+    particles_per_target: Annotated[int | None, _IC_PHD] = Field(
         None,
         ge=1,
         description='ic_phd: l, particles for each expected target, within the bounds [1]',
     )
-    survival_probability: float | None = Field(
+    survival_probability: Annotated[float | None, _IC_PHD] = Field(
         None,
         ge=0.0,
         le=1.0,
         description='ic_phd: p_s, that a target still exists after one step [1]',
     )
-    births: Literal['measurement', 'uniform', 'gaussian'] | None = Field(
+    births: Annotated[Literal['measurement', 'uniform', 'gaussian'] | None, _IC_PHD] = Field(
         None, description='ic_phd: births at each measurement, anywhere (001), or as in 003'
     )
-    birth_particles: int | None = Field(
+    birth_particles: Annotated[int | None, _IC_PHD] = Field(
         None,
         ge=1,
         le=1_000_000,
         description='ic_phd: J, particles of a birth (measurement: for each) [1]',
     )
-    birth_targets: float | None = Field(
+    birth_targets: Annotated[float | None, _IC_PHD] = Field(
         None,
         ge=0.0,
         description='ic_phd: Y V, targets expected to appear at a batch (not at z) [1]',
     )
-    jitter_deviation: float | None = Field(
+    jitter_deviation: Annotated[float | None, _IC_PHD] = Field(
         None,
         ge=0.0,
         description='ic_phd: deviation of the noise that moves copies of a particle apart [m]',
     )
-    found_mass: float | None = Field(
+    found_mass: Annotated[float | None, _IC_PHD] = Field(
         None, ge=0.0, description='ic_phd: T_m, smallest mass of a cluster that is found [1]'
     )
-    removal: Literal['closest', 'every'] | None = Field(
+    removal: Annotated[Literal['closest', 'every'] | None, _IC_PHD] = Field(
         None, description='ic_phd: which measurements near a found target are removed (000, or 003)'
     )
+    # Without mark: T_z is also the length by which found targets are scored.
     removal_distance: float | None = Field(
         None, gt=0.0, description='ic_phd: T_z, largest distance of a removed measurement [m]'
     )
-    kmeans_iterations: int | None = Field(
+    kmeans_iterations: Annotated[int | None, _IC_PHD] = Field(
         None, ge=1, le=1000, description='ic_phd: largest number of K-means iterations [1]'
     )
-    pose_error: float | None = Field(
+    pose_error: Annotated[float | None, _CHECKED] = Field(
         None,
         ge=0.0,
         description='pmb: deviation of the error of a robot position, per axis; none: as it says '
         '[m]',
     )
-    use_detection_covariances: bool | None = Field(
+    use_detection_covariances: Annotated[bool | None, _CHECKED] = Field(
         None, description='pmb: whether covariances of detections replace that of the sensor'
     )
-    pmb: PmbSettings = Field(default_factory=PmbSettings, description='pmb: what only it has')
+    pmb: Annotated[PmbSettings, _PMB_ONLY] = Field(
+        default_factory=PmbSettings, description='pmb: what only it has'
+    )
 
     @field_validator('preset', mode='before')
     @classmethod
@@ -339,7 +373,7 @@ class FilterSettings(Settings):
 
     def resolved(self) -> FilterSettings:
         """Return a copy with None replaced by the value of the method or preset."""
-        filled = PRESETS[self.preset] if self.method == 'ic_phd' else _PMB
+        filled = {'ic_phd': PRESETS[self.preset], 'pmb': _PMB}.get(self.method, {})
         values = {name: value for name, value in filled.items() if getattr(self, name) is None}
         return self.model_copy(update=values)
 
@@ -362,17 +396,16 @@ def unsuitable_lengths(settings: FilterSettings, bounds: FloatArray) -> str:
 
 
 def unused_settings(settings: FilterSettings) -> str:
-    """Return a warning if settings are given that only the other method has, else ''."""
-    # The description of a setting begins with the only method that has it.
-    other = 'pmb' if settings.method == 'ic_phd' else 'ic_phd'
-    # T_z is also the length by which found targets are scored.
-    names = [
-        name
-        for name, field in FilterSettings.model_fields.items()
-        if str(field.description).startswith(f'{other}:')
-        and getattr(settings, name) != field.get_default(call_default_factory=True)
-        and name != 'removal_distance'
-    ]
-    if not names:
-        return ''
-    return f'filter: {", ".join(names)}: of method {other}; {settings.method} does not use them'
+    """Return a warning if settings are given that only another method has, else ''."""
+    method, unused = settings.method, dict[str, list[str]]()
+    for name, info in FilterSettings.model_fields.items():
+        for mark in info.metadata:
+            if not isinstance(mark, _Only) or mark.method == method:
+                continue
+            given = getattr(settings, name) != info.get_default(call_default_factory=True)
+            if given and not (mark.plugins and method not in FILTERS.own):
+                unused.setdefault(mark.method, []).append(name)
+    return '\n'.join(
+        f'filter: {", ".join(names)}: of method {other}; {method} does not use them'
+        for other, names in unused.items()
+    )

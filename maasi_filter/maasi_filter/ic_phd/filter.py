@@ -42,14 +42,13 @@ LEAST_BIRTHS = 20  # fewest particles of a birth, when many detections share the
 class IcPhdFilter(SearchFilter):
     """Particle PHD filter with an iterated corrector, K-means, and removal of found targets."""
 
-    method = 'ic_phd'
     particles: FloatArray = np.empty((0, 0))
     weights: FloatArray = np.empty(0)
     saved: ClassVar[dict[str, Any]] = {
+        **SearchFilter.saved,
         'particles': FloatArray,
         'weights': FloatArray,
         '_centres': FloatArray,
-        '_found': FoundTargets,
     }
 
     def __init__(
@@ -60,14 +59,8 @@ class IcPhdFilter(SearchFilter):
         self._numbers: Any = settings.resolved()
         self.particles = np.empty((0, self.dimension))
         self.weights = np.empty(0)
-        self._found = FoundTargets()
         self._centres: FloatArray = np.empty((0, self.dimension))
         self._pool: ThreadPoolExecutor | None = None
-
-    @property
-    def found_targets(self) -> list[FoundTarget]:
-        """Targets found so far, in the order of being found."""
-        return self._found.targets
 
     @property
     def expected_number(self) -> float:
@@ -228,20 +221,12 @@ class IcPhdFilter(SearchFilter):
             self._pool = ThreadPoolExecutor(threads)
         return self._pool
 
-    def register(self) -> FoundTargets:
-        """Return the found targets with the ids given so far."""
-        return self._found
-
     def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
         """Delete the particles that new found targets explain: those within T_z."""
         for target in changed:
             offset = self.particles - target.position
             keep = (offset * offset).sum(axis=1) > self._numbers.removal_distance**2
             self.particles, self.weights = self.particles[keep], self.weights[keep]
-
-    def remove(self, found: FoundTargets, withdrawn: Sequence[FoundTarget]) -> None:
-        """Keep the found targets that remain; particles arise from the next detection."""
-        self._found = found
 
 
 def nearest_detection(

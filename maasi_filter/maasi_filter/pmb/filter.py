@@ -52,7 +52,6 @@ CERTAIN = 0.999  # existence probability of targets that other filters found
 class PmbFilter(SearchFilter):
     """Poisson multi-Bernoulli filter; `components` are potential targets, found ones included."""
 
-    method = 'pmb'
     saved: ClassVar[dict[str, Any]] = {
         'components': list[Component],
         '_learnt': dict[str, Learnt],

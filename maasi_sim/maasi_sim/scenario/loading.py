@@ -153,9 +153,9 @@ def checked(
         # What wins over the file hides none of its errors.
         validate(model, layer)
         for origin, (key, value) in overrides.items():
-            if key == ('planner', 'name'):
-                # Of the planner that this one replaces.
-                layer.data.get('planner', {}).pop('settings', None)
+            if key in (('planner', 'name'), ('filter', 'method')):
+                # Of the planner or filter that this one replaces.
+                layer.data.get(key[0], {}).pop('settings', None)
             layer = merge(layer, under(key, value, {key: origin}, layer.folder))
         layer = _with_folders(layer)
     scenario = validate(model, layer)
