@@ -45,7 +45,7 @@ setup(
             'mavlink_camera_driver = maasi_entry:mavlink_camera_driver',
             'calibrate_sensor = maasi_entry:calibrate_sensor',
             'mambo_onboard_driver = maasi_entry:mambo_onboard_driver',
-            'robot_command = maasi_entry:robot_command',
+            'team_command = maasi_entry:team_command',
             'measure_mambo = maasi_entry:measure_mambo',
             'guard_node = maasi_entry:guard_node',
         ]

@@ -33,7 +33,6 @@ setup(
         'console_scripts': [
             'cuboid_planner_node = maasi_entry:cuboid_planner_node',
             'planner_node = maasi_entry:planner_node',
-            'search_command = maasi_entry:search_command',
         ]
     },
 )

@@ -1,5 +1,6 @@
 """Code blocks of the documents: Python is run, YAML is validated, options of commands exist."""
 
+import argparse
 import importlib
 import re
 import shlex
@@ -209,7 +210,11 @@ def check_module(name, arguments):
         assert not arguments or arguments[0] in ('--ros-args', '--help'), arguments
         return
     parser = module.build_parser()
-    check_options(arguments, parser._option_string_actions)
+    known = set(parser._option_string_actions)
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            known.update(*(item._option_string_actions for item in action.choices.values()))
+    check_options(arguments, known)
     # A line of usage has choices, and names for values.
     if not re.search(r'[\[\]|]|\.\.\.', ' '.join(arguments)) and '--help' not in arguments:
         try:

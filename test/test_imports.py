@@ -15,17 +15,15 @@ ROS_FILES = (
     '*_node.py',
     '*_driver.py',
     'conversions.py',
-    # Of the planner.
-    'search_command.py',
     # Of the drivers.
     '*_link.py',
     'camera_input.py',
     'goal_server.py',
     'measurement_responder.py',
     'robot_topics.py',
-    'robot_command.py',
     'robot_frames.py',
     'sensor_input.py',
+    'team_command.py',
     'watchdog.py',
     # Of the simulation.
     'sim_topics.py',

@@ -13,14 +13,20 @@ from rclpy.node import Node
 from sensor_msgs.msg import BatteryState
 from waiting import PATIENCE, wait_until
 
-from maasi_drivers import robot_command
 from maasi_drivers.agent.agent_driver import STOPPED
-from maasi_drivers.robot_command import DONE, FAILED, INTERRUPTED
+from maasi_drivers.team_command import (
+    ABSENT,
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    build_parser,
+    main,
+    wanted,
+)
 from maasi_filter.ros.qos import SENSOR
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
 from maasi_msgs.srv import SetKeepOuts
-from maasi_planner import search_command
 from maasi_planner.endurance import EnduranceSettings
 from maasi_planner.node_settings import PlannerNodeSettings
 
@@ -226,30 +232,34 @@ def test_a_keep_out_on_the_way_home_leads_it_around_and_one_at_home_lets_it_wait
         came_home(world, a)
 
 
-def test_search_command_reaches_planner_and_drivers(world):
+def test_commands_reach_planner_and_drivers(world):
     a, b = world.robots.values()
-    search = partial(world.command, search_command.main)
+    search = partial(world.command, main)
     answer = '/search/pause: a, b: waiting for start; pause changes nothing\n'
-    process = world.run('-m', 'maasi_planner.search_command', 'pause')
-    assert world.ended(process) == (1, answer)
-    assert search('start', '--robot', 'a') == (0, '/a/search/start: start: a\n')
+    process = world.run('-m', 'maasi_drivers.team_command', 'pause')
+    assert world.ended(process) == (FAILED, answer)
+    assert search('start', 'a') == (DONE, '/a/search/start: start: a\n')
     world.until(lambda: a.moves)
     assert b.state.goal_id == 0
     assert world.call('search/start').success
     world.until(world.moving)
-    code, text = search('stop', '--robot', 'b')
-    assert code == 0 and '/b/search/stop: stop: b' in text and '/b/stop: ' in text
+    code, text = search('stop', 'b')
+    assert code == DONE and '/b/search/stop: stop: b' in text and '/b/stop: ' in text
     assert '/a' not in text
     world.until(lambda: b.stands and b.state.reason == STOPPED)
     assert a.state.reason != STOPPED
     # Without a planner the drivers are reached all the same.
     world.end_planner()
-    code, text = search('stop')
-    assert code == 0 and '/a/stop: ' in text and '/b/stop: ' in text
+    code, text = search('stop', 'a', 'b')
+    assert code == DONE and '/a/stop: ' in text and '/b/stop: ' in text
     world.until(lambda: a.stands and a.state.reason == STOPPED)
     code, text = search('pause', '--timeout', '2')
-    assert code == 2 and text.startswith('no service for pause within 2 s')
-    assert search('release')[0] == 0
+    assert code == ABSENT and text.startswith('no service for pause within 2 s')
+    # One that is not there is named; the others follow.
+    code, text = search('release', 'a', 'ghost', '--timeout', '8')
+    assert code == ABSENT and '/a/release: ' in text
+    assert 'no service for release of ghost within 8 s' in text
+    assert search('release')[0] == DONE
     for item in (a, b):
         world.until(lambda item=item: item.state.goal_status != AgentState.UNAVAILABLE)
 
@@ -271,39 +281,40 @@ SERVICES |= {'/a/search/pause': TRIGGER, '/b/search/pause': TRIGGER}  # a planne
 
 
 @pytest.mark.parametrize(
-    ('word', 'name', 'team', 'called'),
+    ('words', 'called'),
     [
-        ('stop', '', '', {'/search/stop', '/a/stop', '/b/stop'}),
-        ('stop', 'a', '', {'/a/search/stop', '/a/stop'}),
-        ('release', '', 'north', {'/north/a/release', '/north/b/release'}),
-        ('stop', 'b', '/north/', {'/north/b/search/stop', '/north/b/stop'}),
-        ('stop', '', 'south', set()),
-        ('pause', '', 'north', set()),
+        ('stop', {'/search/stop', '/a/stop', '/b/stop'}),
+        ('stop a', {'/a/search/stop', '/a/stop'}),
+        ('stop a b', {f'/{name}{word}/stop' for name in 'ab' for word in ('', '/search')}),
+        ('release --namespace north', {'/north/a/release', '/north/b/release'}),
+        ('stop b --namespace /north/', {'/north/b/search/stop', '/north/b/stop'}),
+        ('stop --namespace south', set()),
+        ('pause --namespace north', set()),
         # Of those that fly.
-        ('arm', '', '', {'/a/arm'}),
-        ('arm', 'b', '', set()),
-        ('pause', '', '', {'/a/search/pause', '/b/search/pause'}),
+        ('arm', {'/a/arm'}),
+        ('arm b', set()),
+        ('pause', {'/a/search/pause', '/b/search/pause'}),
     ],
 )
-def test_search_command_calls_what_was_asked_for(word, name, team, called):
-    assert search_command.wanted(SERVICES, word, name, team) == called
+def test_services_that_a_command_calls(words, called):
+    assert wanted(SERVICES, build_parser().parse_args(words.split())) == called
 
 
-def test_robot_command_shows_sends_and_stops_a_robot(world):
-    a, robot = world.robots['a'], partial(world.command, robot_command.main)
-    code, said = robot('a', 'state')
+def test_a_robot_is_shown_sent_and_stopped(world):
+    a, robot = world.robots['a'], partial(world.command, main)
+    code, said = robot('state', 'a')
     assert code == DONE, said
     assert said.startswith('a: no goal; at (') and 'in map, battery' in said
 
     x, y = a.place[0] + 0.1, a.place[1]
-    code, said = robot('a', 'go', f'{x}', f'{y}')
+    code, said = robot('go', 'a', f'{x}', f'{y}')
     assert code == DONE and said.startswith('reached; it stands at'), said
     assert abs(a.place[0] - x) < 0.05
 
-    code, said = robot('a', 'go', '100', '0')
+    code, said = robot('go', 'a', '100', '0')
     assert code == FAILED and ('refused' in said or 'not reached' in said), said
 
-    process = world.run('-m', 'maasi_drivers.robot_command', 'a', 'go', f'{x - 0.6}', f'{y}')
+    process = world.run('-m', 'maasi_drivers.team_command', 'go', 'a', f'{x - 0.6}', f'{y}')
     world.until(lambda: a.moves, 'it does not move')
     process.send_signal(signal.SIGINT)
     code, said = world.ended(process)
@@ -323,27 +334,31 @@ def test_robot_command_shows_sends_and_stops_a_robot(world):
     state.pose.pose.position.z = 5.0
     timer = world.node.create_timer(0.05, lambda: publisher.publish(state))
     for words in (['1', '2'], ['1', '2', '3']):
-        code, said = robot('drone', 'go', *words)
+        code, said = robot('go', 'drone', *words)
         assert code == DONE, said
     assert [(goal.x, goal.y, goal.z) for goal in goals] == [(1.0, 2.0, 5.0), (1.0, 2.0, 3.0)]
     for entity in (timer, publisher, server):
         entity.destroy()
 
 
-def test_robot_command_that_waits_for_a_driver_ends_at_once(context):
+@pytest.mark.parametrize('words', ['go nobody 1 2', 'start'])
+def test_a_command_that_waits_for_a_node_ends_at_once(context, words):
     node = Node('observer', context=context)
-    command = [sys.executable, '-m', 'maasi_drivers.robot_command', '--timeout', '1000']
-    command += ['nobody', 'go', '1', '2']
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    # As the console script runs it, which has no handler of its own for SIGINT.
+    code = 'import sys, maasi_entry; sys.exit(maasi_entry.team_command())'
+    command = [sys.executable, '-c', code, *words.split(), '--timeout', '1000']
+    with subprocess.Popen(command, stdout=-1, stderr=-1, text=True) as process:
         # A node of it is in the graph: it waits.
-        wait_until(lambda: 'robot_command' in node.get_node_names(), what='it does not start')
+        wait_until(lambda: 'team_command' in node.get_node_names(), what='it does not start')
         process.send_signal(signal.SIGINT)
-        said, _ = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, said) == (INTERRUPTED, '')
+        said = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, *said) == (INTERRUPTED, '', '')
     node.destroy_node()
 
 
-@pytest.mark.parametrize('words', [[], ['a'], ['a', 'go'], ['a', 'go', '1', 'nan'], ['a', 'fly']])
-def test_wrong_arguments_of_robot_command_end_with_2(words):
+@pytest.mark.parametrize(
+    'words', ['', 'a', 'state', 'go a', 'go a 1 nan', 'fly a', 'start --robot a']
+)
+def test_wrong_arguments_end_with_2(words):
     with pytest.raises(SystemExit, match='2'):
-        robot_command.build_parser().parse_args(words)
+        build_parser().parse_args(words.split())

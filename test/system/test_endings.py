@@ -194,7 +194,7 @@ def test_a_middleware_that_is_not_there_is_named(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     'command',
-    ['filter_node', 'planner_node', 'sim_node', 'turtlebot_driver', 'view_node', 'search_command'],
+    ['filter_node', 'planner_node', 'sim_node', 'turtlebot_driver', 'view_node', 'team_command'],
 )
 def test_a_node_or_command_without_its_middleware_says_so(command):
     environment = os.environ | {'RMW_IMPLEMENTATION': 'rmw_none_cpp'}

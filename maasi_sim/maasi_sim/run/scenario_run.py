@@ -256,7 +256,7 @@ class ScenarioRun:
             if robot.external and robot.link != 'topics':
                 self.display.say(
                     f'{name} is external: it takes off when you call its service arm '
-                    f'(search_command arm --robot {name}{where}, with ROS_DOMAIN_ID={domain})'
+                    f'(team_command arm {name}{where}, with ROS_DOMAIN_ID={domain})'
                 )
 
     def _follow(self) -> Ending:

@@ -7,7 +7,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 
-from maasi_planner.search_command import call_all
+from maasi_drivers.team_command import call_all
 
 _PATIENCE = 5.0  # longest wait for the answers of all services [s]
 
@@ -27,7 +27,10 @@ class Control:
     def __call__(self, command: str, robot: str | None) -> tuple[bool, str]:
         """Carry out a command for a robot (None: all); return whether all followed, and answers."""
         options = argparse.Namespace(
-            command=command, robot=robot, namespace=self._namespace, timeout=_PATIENCE
+            command=command,
+            robots=[robot] if robot else [],
+            namespace=self._namespace,
+            timeout=_PATIENCE,
         )
         with self._changed:
             if not self._context.ok():
