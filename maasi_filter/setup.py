@@ -32,5 +32,5 @@ setup(
         'the filter node'
     ),
     license='Apache-2.0',
-    entry_points={'console_scripts': ['filter_node = maasi_entry:filter_node']},
+    entry_points={'console_scripts': ['filter_node = maasi_filter_entry:filter_node']},
 )

@@ -31,8 +31,8 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'cuboid_planner_node = maasi_entry:cuboid_planner_node',
-            'planner_node = maasi_entry:planner_node',
+            'cuboid_planner_node = maasi_planner_entry:cuboid_planner_node',
+            'planner_node = maasi_planner_entry:planner_node',
         ]
     },
 )

@@ -45,13 +45,13 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'cuboid_sim_node = maasi_entry:cuboid_sim_node',
-            'sim_node = maasi_entry:sim_node',
-            'fake_mambo = maasi_entry:fake_mambo',
-            'fake_mavlink_vehicle = maasi_entry:fake_mavlink_vehicle',
-            'view_node = maasi_entry:view_node',
-            'compare = maasi_entry:compare',
-            'run_scenario = maasi_entry:run_scenario',
+            'cuboid_sim_node = maasi_sim_entry:cuboid_sim_node',
+            'sim_node = maasi_sim_entry:sim_node',
+            'fake_mambo = maasi_sim_entry:fake_mambo',
+            'fake_mavlink_vehicle = maasi_sim_entry:fake_mavlink_vehicle',
+            'view_node = maasi_sim_entry:view_node',
+            'compare = maasi_sim_entry:compare',
+            'run_scenario = maasi_sim_entry:run_scenario',
         ]
     },
 )

@@ -11,7 +11,6 @@ import pytest
 import yaml
 from markdown_it import MarkdownIt
 
-import maasi_entry
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.node_parameters import check
 from maasi_filter.ros.node_settings import FilterNodeSettings
@@ -170,9 +169,9 @@ def check_command(program, *rest):
     elif program == 'ros2' and rest[1].startswith('maasi'):
         verb, package, name, *arguments = rest
         if verb == 'run':
-            entry = f"'{name} = maasi_entry:{name}'"
-            assert entry in (ROOT / package / 'setup.py').read_text(), rest
-            (target,) = getattr(maasi_entry, name).args
+            commands = vars(importlib.import_module(f'{package}_entry'))
+            assert name in commands, rest
+            (target,) = commands[name].args
             check_module(target.partition(':')[0], arguments)
         else:
             launch = (ROOT / package / 'launch' / name).read_text()

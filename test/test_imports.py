@@ -1,14 +1,16 @@
 """Which module may import which: packages one way, ROS in few places, no cycles."""
 
 import ast
+import re
 from fnmatch import fnmatch
-from functools import cache
+from functools import cache, partial
 from graphlib import TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-# Each imports only those before it. maasi_entry starts nodes of all packages, by name.
-PACKAGES = ('msgs', 'entry', 'filter', 'planner', 'drivers', 'sim')
+# Each imports only those before it.
+PACKAGES = ('msgs', 'filter', 'planner', 'drivers', 'sim')
 # Folders and files that may import ROS.
 ROS_FOLDERS = ('ros', 'node')
 ROS_FILES = (
@@ -36,7 +38,7 @@ ROS_PACKAGES = ('*_msgs', '*_interfaces', 'rcl*', 'rosidl*', 'std_srvs', 'tf2_*'
 def modules():
     found = {}
     for package in PACKAGES[1:]:
-        for path in sorted(ROOT.glob(f'maasi_*/maasi_{package}/**/*.py')):
+        for path in sorted(ROOT.glob(f'maasi_{package}/maasi_{package}*/**/*.py')):
             parts = path.relative_to(ROOT).with_suffix('').parts[1:]
             found['.'.join(parts[:-1] if parts[-1] == '__init__' else parts)] = path
     return found
@@ -63,7 +65,7 @@ def imports(name):
 
 def rank(name):
     """Return which of our packages a module belongs to; -1: to none."""
-    package = name.partition('.')[0].removeprefix('maasi_')
+    package = name.partition('.')[0].removeprefix('maasi_').removesuffix('_entry')
     return PACKAGES.index(package) if name.startswith('maasi_') else -1
 
 
@@ -71,6 +73,19 @@ def test_packages_import_one_way():
     every = [(name, *item) for name in modules() for item in imports(name)]
     wrong = [place for name, other, place in every if rank(other) > rank(name)]
     assert not wrong, '\n'.join(wrong)
+
+
+def test_each_package_names_its_own_console_scripts():
+    for package in PACKAGES[1:]:
+        setup = (ROOT / f'maasi_{package}' / 'setup.py').read_text()
+        scripts = {
+            name: item.args[0]
+            for name, item in vars(import_module(f'maasi_{package}_entry')).items()
+            if isinstance(item, partial)
+        }
+        assert all(target.startswith(f'maasi_{package}.') for target in scripts.values())
+        declared = re.findall(rf"'(\w+) = maasi_{package}_entry:(\w+)'", setup)
+        assert sorted(declared) == sorted((name, name) for name in scripts)
 
 
 def test_only_few_places_import_ros():

@@ -35,8 +35,7 @@ def imported(package: Path, tests: bool) -> set[str]:
                 found |= {item.name.partition('.')[0] for item in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
                 found.add(node.module.partition('.')[0])
-    if 'maasi_entry' in found:
-        found = found - {'maasi_entry'} | {'maasi_filter'}
+    found = {name.removesuffix('_entry') for name in found}
     own = {path.parent.name for path in package.glob('*/__init__.py')}
     return found - own - set(sys.stdlib_module_names)
 

@@ -3,7 +3,7 @@
 import signal
 import sys
 
-import maasi_entry
+import maasi_filter_entry
 
 
 def test_a_script_runs_main_of_its_module(monkeypatch):
@@ -11,7 +11,7 @@ def test_a_script_runs_main_of_its_module(monkeypatch):
 
     monkeypatch.setattr(signal, 'signal', lambda *_: None)
     monkeypatch.setattr(filter_node, 'main', lambda: 7)
-    assert maasi_entry.filter_node() == 7
+    assert maasi_filter_entry.filter_node() == 7
 
 
 def test_what_an_extra_brings_is_named_where_it_is_missing(monkeypatch, capsys):
@@ -23,7 +23,7 @@ def test_what_an_extra_brings_is_named_where_it_is_missing(monkeypatch, capsys):
     monkeypatch.setattr(signal, 'signal', lambda *_: None)
     monkeypatch.setattr(filter_node, 'main', main)
     monkeypatch.setattr(sys, 'argv', ['/opt/lib/maasi_filter/filter_node'])
-    assert maasi_entry.filter_node() == 2
+    assert maasi_filter_entry.filter_node() == 2
     assert capsys.readouterr().err == (
         'error: filter_node: no module matplotlib: it comes with an extra of the package '
         '(docs/install.md)\n'

@@ -19,8 +19,6 @@ from typing import Any
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from setproctitle import getproctitle, setproctitle
 
-import maasi_entry
-
 _PR_SET_PDEATHSIG = 1
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Of the suite: a node of another one is executed, and inherits nothing.
@@ -193,7 +191,8 @@ class NodeProcess(ForkServerProcess):
             os.execv(self.command[0], self.command)
         sys.argv = list(self.command)
         setproctitle(' '.join(self.command))
-        sys.exit(getattr(maasi_entry, executable.name)())
+        commands = importlib.import_module(f'{executable.parent.name}_entry')
+        sys.exit(getattr(commands, executable.name)())
 
     def signal(self, number: int) -> None:
         """Send a signal, if it still runs."""
