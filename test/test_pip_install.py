@@ -1,6 +1,7 @@
 """The packages installed by pip, where ROS and what only extras need cannot be imported."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -81,7 +82,7 @@ def test_an_installed_scenario_is_loaded_from_any_folder(prefix, tmp_path):
 def test_a_command_that_needs_ros_says_so(prefix, tmp_path):
     done = run(tmp_path, [modules_of(prefix)], next(prefix.glob('**/bin/filter_node')))
     assert done.returncode == 2
-    assert 'error: filter_node: no module rclpy: it needs ROS 2 Jazzy' in done.stderr
+    assert re.match('error: filter_node: no module [a-z_]+: it needs ROS 2 Jazzy', done.stderr)
     assert 'Traceback' not in done.stderr
 
 

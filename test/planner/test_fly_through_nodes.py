@@ -25,10 +25,13 @@ def world():
 
 def test_robots_whose_planner_dies_while_they_pass_a_waypoint_stop_at_the_last_one(world):
     a = world.robots['a']
-    world.until(lambda: a.moves and a.state.goal_id >= 3)
-    # It has passed two waypoints, and never stood.
-    statuses = {state.goal_status for state in a.states if 0 < state.goal_id < 3}
-    assert statuses == {AgentState.MOVING}
+
+    def passed():
+        """Return how many waypoints it did not stop at; on a busy machine a decision is late."""
+        stopped = {state.goal_id for state in a.states if state.goal_status != AgentState.MOVING}
+        return len(set(range(1, a.state.goal_id)) - stopped)
+
+    world.until(lambda: a.moves and passed() >= 2)
     robots = [robot for decision in world.decisions for robot in decision.robots]
     last = [robot.waypoint for robot in robots if robot.robot == 'a'][-1]
     world.end_planner()
