@@ -304,7 +304,7 @@ class Endurance:
 
     # ---- changes -----------------------------------------------------------------------------
 
-    def hear(self, charge: float) -> None:
+    def update_charge(self, charge: float) -> None:
         """Take a charge that was reported, 0 to 1; anything else is unknown."""
         known = 0.0 <= charge <= 1.0
         self.estimated = not (known or math.isnan(self.charge))
@@ -350,7 +350,7 @@ class Endurance:
             predicted = self.settings.per_second * seconds + self.settings.per_metre * metres
         self._before = step, here
         home = stands and self.is_home(here)
-        self.hear(charge)
+        self.update_charge(charge)
         if self.estimated and not home:
             self.charge = max(before - predicted * self.use_ratio, 0.0)
         # A jump upwards is another battery.

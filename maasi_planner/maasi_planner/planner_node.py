@@ -229,8 +229,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 heard = self._heard.get(name)
                 why = heard.reason if heard is not None else f'no {name}/state yet'
                 answer += f'; {name} does not take part now: {why or "it is silent"}'
-            if name in self._orders.lent:
-                goal = self._orders.lent[name]
+            if name in self._orders.external_goals:
+                goal = self._orders.external_goals[name]
                 answer += f'; {name} follows goal {goal} of another client, which goes on'
         self.get_logger().info(answer)
         return True, answer
@@ -256,7 +256,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             'search': self.modes.describe(),
             'finished': self.coordinator.finished or '',
             'goals of other clients': ', '.join(
-                f'{name} (goal {goal})' for name, goal in sorted(self._orders.lent.items())
+                f'{name} (goal {goal})'
+                for name, goal in sorted(self._orders.external_goals.items())
             ),
             'robots': ', '.join(name for name in self.coordinator.names if name not in self._away),
             'decisions': self._decisions,
@@ -267,11 +268,11 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     def warnings(self) -> list[str]:
         """Return robots that follow goals of other clients, and estimated charges."""
-        lent = [
+        external = [
             f'{name} follows goal {goal} of another client'
-            for name, goal in sorted(self._orders.lent.items())
+            for name, goal in sorted(self._orders.external_goals.items())
         ]
-        return lent + self.coordinator.homing.estimates()
+        return external + self.coordinator.homing.estimates()
 
     # ---- input -------------------------------------------------------------------------------
 
@@ -487,7 +488,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             if self.coordinator.plans[name].errand is not None:
                 self.get_logger().info(f'{name} {robot.reason}')
                 self._orders.interrupt_homing(name)
-            self._orders.send(name, indices[name] + 1, robot.waypoint, header)
+            self._orders.send(name, self.coordinator.plans[name].goal_id, robot.waypoint, header)
             self._path_publishers[name].publish(path_to_ros(robot.positions, header))
 
     def _try_done(self) -> None:

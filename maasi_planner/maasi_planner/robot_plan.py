@@ -95,6 +95,11 @@ class RobotPlan:
     progress: int = 0
     progress_at: int = 0
 
+    @property
+    def goal_id(self) -> int:
+        """Id of the goal of its last decision; 0 before the first."""
+        return self.decision + 1
+
     def destination(self, state: RobotState) -> FloatArray:
         """Return the final position of its plan at a state, (3,) [m]."""
         if self.staying or not len(self.positions):
@@ -112,7 +117,7 @@ class RobotPlan:
         self.errand = None
         self.idle = self.queues = False
 
-    def lend(self, step: int) -> None:
+    def on_external_goal(self, step: int) -> None:
         """Note that it follows a goal of another client: it measures without a plan."""
         began = self.decided_at
         if began is not None and self.staying and not len(self.positions):

@@ -100,7 +100,7 @@ def field(batteries):
         settings = EnduranceSettings(per_metre=0.75 / 9000.0)
         for name, view in robots.items():
             endurance = Endurance(settings, view.motion, view.state.pose.position)
-            endurance.hear(1.0)
+            endurance.update_charge(1.0)
             robots[name] = replace(view, endurance=endurance)
     return TeamView(0, 0.1, robots, [], UnexploredMap(bounds, 5.0))
 

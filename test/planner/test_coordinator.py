@@ -206,7 +206,7 @@ def test_without_a_radius_or_for_another_client_it_is_decided_on_arrival(monkeyp
     assert coordinator.plan(1, on_the_way(3.0, 1.0)) is None
     assert coordinator.plan(2, there(a=(3.0, 1.0))) is not None
     coordinator = flying(monkeypatch)
-    coordinator.plans['a'].lend(1)
+    coordinator.plans['a'].on_external_goal(1)
     assert coordinator.plan(2, on_the_way(2.9, 1.0)) is None
 
 

@@ -79,7 +79,7 @@ class Flight:
         robots = {}
         for name, follower in self.followers.items():
             plan, mode = self.coordinator.plans[name], self.modes[name]
-            ended = follower.goal is not None and follower.goal.id == plan.decision + 1
+            ended = follower.goal is not None and follower.goal.id == plan.goal_id
             free = plan.staying or (ended and follower.status != GoalStatus.MOVING)
             robots[name] = PresentRobot(
                 self.bodies[name].robot_state(),
@@ -103,7 +103,7 @@ class Flight:
                 self.decisions.append(decision)
                 for name, chosen in decision.robots.items():
                     if not chosen.stays:
-                        number = self.coordinator.plans[name].decision + 1
+                        number = self.coordinator.plans[name].goal_id
                         self.followers[name].take(Goal(number, self.step, chosen.waypoint))
             members = self.coordinator.measuring(self.step, robots)
             self.coordinator.absorb({m.robot: robots[m.robot].state.pose for m in members}, [])

@@ -32,7 +32,7 @@ def team_of(starts, per_metre):
         if use is not None:
             settings = EnduranceSettings(per_metre=use, reserve=0.1)
             view.endurance = Endurance(settings, motion, [*start, 0.0])
-            view.endurance.hear(1.0)
+            view.endurance.update_charge(1.0)
         robots[f'robot{number}'] = view
     return TeamView(0, 0.1, robots, [], UnexploredMap(area, 0.25))
 
@@ -55,11 +55,11 @@ def mow(team, planner, most=100):
                 view.state = RobotState.at_rest(robot.waypoint)
                 length = np.linalg.norm(np.diff(robot.positions, axis=0), axis=1).sum()
                 if view.endurance is not None:
-                    view.endurance.hear(view.endurance.charge - 0.1 * length * 0.01)
+                    view.endurance.update_charge(view.endurance.charge - 0.1 * length * 0.01)
                     view.endurance.topped = False
             elif robot.unaffordable:
                 view.state = RobotState.at_rest(view.endurance.chargers[0])
-                view.endurance.hear(1.0)
+                view.endurance.update_charge(1.0)
                 view.endurance.topped = True
     raise AssertionError('does not end')
 
@@ -95,10 +95,10 @@ def test_lanes_that_one_robot_cannot_afford_are_left_to_another(use):
 
 def test_a_robot_that_is_not_full_charges_before_it_gives_up_a_lane():
     team, planner = team_of([(1.0, 1.0)], [0.02]), make_planner('lawnmower')
-    team.robots['robot0'].endurance.hear(0.2)
+    team.robots['robot0'].endurance.update_charge(0.2)
     chosen = planner.decide(team).robots['robot0']
     assert chosen.stays and chosen.unaffordable and planner.finished(team) is None
-    team.robots['robot0'].endurance.hear(1.0)
+    team.robots['robot0'].endurance.update_charge(1.0)
     assert not planner.decide(team).robots['robot0'].stays
 
 

@@ -382,7 +382,7 @@ def test_the_way_home_is_to_another_charger_where_the_nearest_is_taken_if_the_ba
     view.endurance = Endurance(settings, view.motion, np.zeros(3))
     view.state, other.state, other.remaining_path = at(0.2, 1.0), at(2.0, 1.0), None
     for charge, reached in ((0.34, True), (0.28, False)):
-        view.endurance.hear(charge)
+        view.endurance.update_charge(charge)
         decision = Decision(0, robots={name: stay(view, 'stays')})
         chosen = decision.robots[name] = go_home(team, name, decision, 'goes home')
         assert (chosen.waypoint.tolist() == settings.chargers[1]) == reached

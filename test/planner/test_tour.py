@@ -177,13 +177,13 @@ def test_places_that_the_battery_does_not_afford_are_passed_over_then_it_charges
     view = team.robots['robot0']
     settings = EnduranceSettings(per_metre=0.01, reserve=0.2)
     view.endurance = Endurance(settings, view.motion, view.state.pose.position)
-    view.endurance.hear(1.0)
+    view.endurance.update_charge(1.0)
     planner.decide(team)
     # Since it planned it has lost most of its battery: what is left is for places near it.
-    view.endurance.hear(0.28)
+    view.endurance.update_charge(0.28)
     place = fly(planner, team)
     assert place is not None and np.linalg.norm(place[:2] - 1.0) < 4.0
-    view.endurance.hear(0.21)
+    view.endurance.update_charge(0.21)
     chosen = planner.decide(team).robots['robot0']
     assert chosen.stays and chosen.unaffordable and SAVES_BATTERY in chosen.reason
 
@@ -195,10 +195,10 @@ def test_each_robot_has_its_own_path_home(charge):
     view, other = team.robots.values()
     settings = EnduranceSettings(per_metre=0.01, reserve=0.2)
     view.endurance = Endurance(settings, view.motion, view.state.pose.position)
-    view.endurance.hear(0.5)
+    view.endurance.update_charge(0.5)
     if charge is not None:
         other.endurance = Endurance(settings, other.motion, other.state.pose.position)
-        other.endurance.hear(charge)
+        other.endurance.update_charge(charge)
     planner._plan(team)
     way = planner._ways['robot0']
     budget, home = view.endurance.range_from(view.state.pose.position)

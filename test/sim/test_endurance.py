@@ -161,12 +161,12 @@ def test_a_way_is_afforded_if_the_path_home_is_left_with_the_reserve():
         (0.45, [True, False, False, False]),
         (0.3, [False] * 4),
     ):
-        endurance.hear(charge)
+        endurance.update_charge(charge)
         assert endurance.affords(ways, 0.1).tolist() == allowed, charge
     # With a factor for the path home the second needs 0.204 + 1.5 x 0.204 + 0.2 at least.
     windy = Endurance(settings.model_copy(update={'return_factor': 1.5}), motion, [0.0, 0.0, 0.0])
     for charge, allowed in ((0.73, True), (0.70, False)):
-        windy.hear(charge)
+        windy.update_charge(charge)
         assert windy.affords(ways, 0.1)[1] == allowed
 
 

@@ -33,7 +33,7 @@ class Orders:
         """Reset for a new search."""
         self._coordinator = coordinator
         #: Robots that follow a goal of another client, with its number.
-        self.lent: dict[str, int] = {}
+        self.external_goals: dict[str, int] = {}
         # Robots on their way to their start, with the number of that goal; 0: arrived, -1: to be
         # sent there as soon as they are free.
         self._homing: dict[str, int] = {}
@@ -77,7 +77,7 @@ class Orders:
     def leave(self, name: str) -> None:
         """Forget the goals of a robot that takes part no more."""
         self.goals.cancel(name)
-        self.lent.pop(name, None)
+        self.external_goals.pop(name, None)
         if name in self._homing:
             self._homing[name] = -1
         self._coordinator.plans[name].leave()
@@ -106,7 +106,7 @@ class Orders:
             )
             return False
         plan.decision += 1
-        number = self._homing[name] = plan.decision + 1
+        number = self._homing[name] = plan.goal_id
         self.send(name, number, start, header)
         return True
 
@@ -130,7 +130,7 @@ class Orders:
         plan, logger = self._coordinator.plans[name], self._node.get_logger()
         # Without one, the last has ended and the search is over: no other follows.
         if not plan.staying and self.goals.has(name):
-            number = plan.decision + 1
+            number = plan.goal_id
             if heard.goal == number:
                 self._refused_since, self.refused_for = None, 0.0
             course = self.goals.course(name, number, heard)
@@ -153,18 +153,18 @@ class Orders:
             return False
         if self.goals.driven(heard):
             if not self.goals.ends(name, heard):
-                self._lend(name, heard, step)
+                self._on_external_goal(name, heard, step)
             return False
-        if self.lent.pop(name, None) is not None:
+        if self.external_goals.pop(name, None) is not None:
             logger.info(f'{name} takes goals of the planner again')
         return True
 
-    def _lend(self, name: str, heard: HeardState, step: int) -> None:
-        new = self.lent.get(name) != heard.goal
-        self.lent[name] = heard.goal
+    def _on_external_goal(self, name: str, heard: HeardState, step: int) -> None:
+        new = self.external_goals.get(name) != heard.goal
+        self.external_goals[name] = heard.goal
         plan = self._coordinator.plans[name]
         if self._modes.of[name] is Mode.SEARCHING:
-            plan.lend(step)
+            plan.on_external_goal(step)
         if new:
             self._node.get_logger().warning(
                 f'{name} follows goal {heard.goal} of another client: it measures, and gets no '
