@@ -229,9 +229,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 heard = self._heard.get(name)
                 why = heard.reason if heard is not None else f'no {name}/state yet'
                 answer += f'; {name} does not take part now: {why or "it is silent"}'
-            if name in self._orders.external_goals:
-                goal = self._orders.external_goals[name]
-                answer += f'; {name} follows goal {goal} of another client, which goes on'
+        for text in self._orders.warnings(follow):
+            answer += f'; {text}, which goes on'
         self.get_logger().info(answer)
         return True, answer
 
@@ -242,10 +241,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             if not self.active:
                 raise ValueError('the planner is not active')
             self._keep_outs.change(request.zones)
-            response.success, response.message = (
-                True,
-                f'keep-outs that hold now: {len(request.zones)}',
-            )
+            response.message = f'keep-outs that hold now: {len(request.zones)}'
+            response.success = True
         except ValueError as error:
             response.message = str(error)
         return response
@@ -255,10 +252,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         return {
             'search': self.modes.describe(),
             'finished': self.coordinator.finished or '',
-            'goals of other clients': ', '.join(
-                f'{name} (goal {goal})'
-                for name, goal in sorted(self._orders.external_goals.items())
-            ),
+            'goals of other clients': self._orders.describe_external(),
             'robots': ', '.join(name for name in self.coordinator.names if name not in self._away),
             'decisions': self._decisions,
             'batches': self._batches.last,
@@ -268,11 +262,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     def warnings(self) -> list[str]:
         """Return robots that follow goals of other clients, and estimated charges."""
-        external = [
-            f'{name} follows goal {goal} of another client'
-            for name, goal in sorted(self._orders.external_goals.items())
-        ]
-        return external + self.coordinator.homing.estimates()
+        return self._orders.warnings() + self.coordinator.homing.estimates()
 
     # ---- input -------------------------------------------------------------------------------
 

@@ -110,6 +110,21 @@ class Orders:
         self.send(name, number, start, header)
         return True
 
+    def describe_external(self) -> str:
+        """Return the robots that follow goals of other clients, with these, as text."""
+        return ', '.join(
+            f'{name} (goal {goal})' for name, goal in sorted(self.external_goals.items())
+        )
+
+    def warnings(self, names: Iterable[str] | None = None) -> list[str]:
+        """Return that robots (default: all) follow goals of other clients."""
+        goals = self.external_goals
+        return [
+            f'{name} follows goal {goals[name]} of another client'
+            for name in (sorted(goals) if names is None else names)
+            if name in goals
+        ]
+
     def _on_answer(self, name: str, number: int, accepted: bool) -> None:
         if not accepted:
             self.refuse(name)
