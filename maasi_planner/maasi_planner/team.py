@@ -93,6 +93,12 @@ class RobotView:
             if shape and (len(shape) != 2 or shape[1] != 3):
                 raise ValueError(f'{name}: got shape {shape}, allowed is (n, 3)')
 
+    @property
+    def height(self) -> float:
+        """Height of its waypoints in a planar search, metres: its own without candidates."""
+        known = self.candidates[0] if len(self.candidates) else self.state.pose.position
+        return float(known[2])
+
 
 @dataclass
 class TeamView:

@@ -241,9 +241,9 @@ def usable_options(
 
 
 def centres_of(team: TeamView, view: RobotView, clusters: Sequence[Cluster]) -> FloatArray:
-    """Return the centres of clusters as waypoints (n, 3); in 2D at the height of the candidates."""
+    """Return the centres of clusters as waypoints (n, 3); in 2D at the robot's height."""
     centres = np.zeros((len(clusters), 3))
-    centres[:, 2] = view.candidates[0, 2] if len(view.candidates) else 0.0
+    centres[:, 2] = view.height
     for row, cluster in zip(centres, clusters):
         row[: team.dimension] = cluster.position[: team.dimension]
     return centres

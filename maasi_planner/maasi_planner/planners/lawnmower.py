@@ -156,9 +156,8 @@ class Lawnmower(Planner):
         here = view.state.pose.position
         ends = [lane[0].copy(), lane[1].copy()]
         if team.dimension == 2:
-            height = view.candidates[0, 2] if len(view.candidates) else here[2]
             for end in ends:
-                end[2] = height
+                end[2] = view.height
         gaps = [float(((end - here) ** 2).sum()) for end in ends]
         if gaps[1] < gaps[0]:
             ends.reverse()

@@ -197,8 +197,8 @@ class Tour(Planner):
                 passed.append(way.pop(0))
             index = passed[-1]
             place = np.array(here)
-            if d == 2 and len(view.candidates):
-                place[2] = view.candidates[0, 2]
+            if d == 2:
+                place[2] = view.height
             place[:d] = self._points[index]
             waypoint, whole = self._leg(team, view, place)
             moved = view.motion.keep_out.moved_out(here, waypoint)
