@@ -25,7 +25,8 @@ from maasi_sim.search import search
 ONE_BY_ONE = '''
 from pydantic import BaseModel, ConfigDict, Field
 
-from maasi_planner.planners.base import Planner, options_of, waiting_places
+from maasi_planner.planners.base import Planner
+from maasi_planner.planners.options import options_of, waiting_places
 from maasi_planner.team import Decision, single_choice, stay
 
 

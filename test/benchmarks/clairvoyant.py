@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.models.detection import detection_probability_at
-from maasi_planner.planners.base import Planner, explain, options_of, waiting_places
+from maasi_planner.planners.base import Planner, explain
+from maasi_planner.planners.options import options_of, waiting_places
 from maasi_planner.team import Decision, single_choice, stay
 
 # A robot moves to its next target when the present one is found with this probability.

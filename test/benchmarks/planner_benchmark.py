@@ -22,7 +22,7 @@ from maasi_planner import (
     warm_up,
 )
 from maasi_planner.endurance import Endurance, EnduranceSettings
-from maasi_planner.planners.base import options_of
+from maasi_planner.planners.options import options_of
 
 CUBE = np.array([[0.0, 260.0]] * 3)
 FLOOR = np.array([[-0.3, 2.4]] * 2)

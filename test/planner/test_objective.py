@@ -28,7 +28,8 @@ from maasi_planner.objective import team_objective
 from maasi_planner.objective.candidate_table import total_value
 from maasi_planner.objective.joint_search import _search_in_turn, ranking_of, search
 from maasi_planner.objective.team_objective import TeamObjective
-from maasi_planner.planners.base import all_apart, free_of_robots, waiting_places
+from maasi_planner.planners.options import waiting_places
+from maasi_planner.planners.separation import all_apart, free_of_robots
 from maasi_planner.team import UsableCandidates
 
 

@@ -14,8 +14,11 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.planners.base import Planner, all_apart, explain, search_jointly, usable_options
+from maasi_planner.planners.base import Planner, explain
+from maasi_planner.planners.joint_choice import search_jointly
 from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
+from maasi_planner.planners.options import usable_options
+from maasi_planner.planners.separation import all_apart
 from maasi_planner.team import (
     Decision,
     RobotDecision,

@@ -4,7 +4,8 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion.base import Trajectories
-from maasi_planner.planners.base import affordable, crossed, free_of_robots
+from maasi_planner.planners.options import affordable
+from maasi_planner.planners.separation import crossed, free_of_robots
 from maasi_planner.team import Decision, TeamView
 
 PASSES = 'passes robots that stand on its path'

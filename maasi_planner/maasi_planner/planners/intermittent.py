@@ -9,7 +9,8 @@ from maasi_planner.objective.joint_search import PAIRS_LIMIT, search
 from maasi_planner.objective.predicted_measurements import CoarseTrajectories
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.objective.terms import Terms
-from maasi_planner.planners.base import Planner, centres_of, explain, usable_options
+from maasi_planner.planners.base import Planner, explain
+from maasi_planner.planners.options import centres_of, usable_options
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, TeamView, single_choice, stay
 

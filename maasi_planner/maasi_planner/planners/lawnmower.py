@@ -12,8 +12,9 @@ import numpy as np
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_planner.candidates import half_view
-from maasi_planner.planners.base import Planner, explain, held_back
+from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.detour import PASSES, others_move, past_standing
+from maasi_planner.planners.options import held_back
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import (
     CROSSED,

@@ -18,7 +18,9 @@ from numba import njit
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.planners.base import Planner, explain, search_jointly, usable_options
+from maasi_planner.planners.base import Planner, explain
+from maasi_planner.planners.joint_choice import search_jointly
+from maasi_planner.planners.options import usable_options
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotView, TeamView, single_choice, stay
 

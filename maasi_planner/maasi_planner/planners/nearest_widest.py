@@ -6,15 +6,9 @@ Without clusters a robot goes to the candidate with the largest e (ties: the nea
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.planners.base import (
-    Planner,
-    affordable,
-    apart,
-    centres_of,
-    explain,
-    options_of,
-    waiting_places,
-)
+from maasi_planner.planners.base import Planner, explain
+from maasi_planner.planners.options import affordable, centres_of, options_of, waiting_places
+from maasi_planner.planners.separation import apart
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 

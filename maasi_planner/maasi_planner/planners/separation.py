@@ -8,7 +8,7 @@ from numba import njit
 
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.motion.base import MotionModel, RobotState
+from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 from maasi_planner.team import CROSSED, Decision, RobotDecision, RobotView, TeamView, stay
 
 # Steps in which a robot brakes at most, and the speed below which it stands [m/s].
@@ -141,6 +141,23 @@ def ways_apart(
             reach = min(view.radius + radius, now)
             free &= _gaps(ways, np.ascontiguousarray(path, dtype=float)) >= reach - 1e-9
     return free
+
+
+def crossed(team: TeamView, name: str, prediction: Trajectories, decision: Decision) -> bool:
+    """Return whether others, also those just decided, are on the only way of a prediction."""
+    others = {key: robot.positions for key, robot in decision.robots.items()}
+    return not ways_apart(team, name, prediction.positions, others)[0]
+
+
+def all_apart(team: TeamView, waypoints: Mapping[str, FloatArray]) -> bool:
+    """Return whether the waypoints (3,) of robots, by name, keep their radii apart."""
+    taken: list[tuple[FloatArray, float]] = []
+    for name, point in waypoints.items():
+        radius = team.robots[name].radius
+        if not apart(point, radius, taken):
+            return False
+        taken.append((point, radius))
+    return True
 
 
 def paths_of(

@@ -6,17 +6,12 @@ import numpy as np
 
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
-from maasi_planner.planners.base import (
-    Planner,
-    affordable,
-    crossed,
-    explain,
-    free_of_robots,
-    waiting_places,
-)
+from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.detour import PASSES, others_move, past_standing
 from maasi_planner.planners.lattice import Lattice, lanes_of
+from maasi_planner.planners.options import affordable, waiting_places
 from maasi_planner.planners.orienteering import plan_ways
+from maasi_planner.planners.separation import crossed, free_of_robots
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import (
     CROSSED,

@@ -1,0 +1,145 @@
+"""What robots may choose: waypoints that are usable, reached, apart from others, affordable."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.records import Cluster
+from maasi_planner.motion.base import Trajectories
+from maasi_planner.planners.separation import crossed, free_of_robots, ways_apart
+from maasi_planner.team import (
+    BLOCKED,
+    CROSSED,
+    SAVES_BATTERY,
+    Decision,
+    RobotView,
+    TeamView,
+    UsableCandidates,
+    stay,
+)
+
+
+def usable_candidates(
+    team: TeamView, name: str, extra: FloatArray | None = None
+) -> tuple[FloatArray, str]:
+    """Return a robot's candidates moved out of obstacles, and which were dropped."""
+    view = team.robots[name]
+    points = np.asarray(view.candidates, dtype=float).reshape(-1, 3)
+    dropped: list[str] = []
+    inside = team.area.inside(points)
+    if not inside.all():
+        finite = np.isfinite(points).all(axis=1)
+        for wrong, reason in ((~finite, 'not finite'), (finite & ~inside, 'outside the area')):
+            if wrong.any():
+                dropped.append(f'{np.count_nonzero(wrong)} {reason}')
+        points = points[inside]
+    number = len(points)
+    if extra is not None and len(extra):
+        points = np.vstack([points, extra[team.area.inside(extra)]])
+    if len(view.motion.keep_out):
+        here = view.state.pose.position
+        moved = [view.motion.keep_out.moved_out(here, point) for point in points]
+        lost = sum(point is None for point in moved[:number])
+        if lost:
+            dropped.append(f'{lost} in obstacles')
+        points = np.array([point for point in moved if point is not None]).reshape(-1, 3)
+        # They move towards the robot, which may be outside.
+        points = points[team.area.inside(points)]
+    return points, ', '.join(dropped)
+
+
+def waiting_places(team: TeamView) -> list[tuple[FloatArray, float]]:
+    """Return where robots that do not plan will stand, with their radii."""
+    places = list(team.taken)
+    for name in team.names():
+        view = team.robots[name]
+        if view.planning:
+            continue
+        if view.remaining_path is not None and len(view.remaining_path):
+            place = np.asarray(view.remaining_path[-1], dtype=float)
+        else:
+            place = np.array(view.state.pose.position)
+        places.append((place, view.radius))
+    return places
+
+
+def options_of(
+    team: TeamView,
+    name: str,
+    places: list[tuple[FloatArray, float]],
+    extra: FloatArray | None = None,
+) -> UsableCandidates | str:
+    """Return the candidates of a robot, or why it has to stay."""
+    view = team.robots[name]
+    if not len(view.candidates) and (extra is None or not len(extra)):
+        return 'it has no candidates'
+    points, dropped = usable_candidates(team, name, extra)
+    if not len(points):
+        return f'no candidate is usable ({dropped})'
+    prediction = view.motion.predict(view.state, points, team.step_time)
+    free = free_of_robots(points, view.radius, places)
+    allowed = prediction.reached & free & (prediction.lengths > 0)
+    if allowed.any():
+        allowed &= ways_apart(team, name, prediction.positions, {})
+        if not allowed.any():
+            return BLOCKED[0]
+        allowed = affordable(team, name, prediction, allowed)
+        if not allowed.any():
+            return SAVES_BATTERY
+        return UsableCandidates(points, prediction, allowed)
+    if not free.any():
+        return BLOCKED[1]
+    if (prediction.lengths == 0).any():
+        return 'it is at its only candidate already'
+    return 'no candidate can be reached'
+
+
+def usable_options(
+    team: TeamView,
+    decision: Decision,
+    extra: Callable[[str], FloatArray | None] = lambda _: None,
+    kept: Callable[[str, Trajectories], Trajectories] = lambda _, exact: exact,
+) -> dict[str, UsableCandidates]:
+    """Return the candidates of the robots that have some; the others stay in `decision`.
+
+    extra: further waypoints (n, 3) of a robot; kept: what is kept of its predicted trajectories.
+    """
+    places = waiting_places(team)
+    options = {}
+    for name in team.planning():
+        found = options_of(team, name, places, extra(name))
+        if isinstance(found, str):
+            decision.robots[name] = stay(team.robots[name], f'stays: {found}')
+        else:
+            options[name] = replace(found, prediction=kept(name, found.prediction))
+    return options
+
+
+def centres_of(team: TeamView, view: RobotView, clusters: Sequence[Cluster]) -> FloatArray:
+    """Return the centres of clusters as waypoints (n, 3); in 2D at the robot's height."""
+    centres = np.zeros((len(clusters), 3))
+    centres[:, 2] = view.height
+    for row, cluster in zip(centres, clusters):
+        row[: team.dimension] = cluster.position[: team.dimension]
+    return centres
+
+
+def affordable(
+    team: TeamView, name: str, prediction: Trajectories, allowed: BoolArray
+) -> BoolArray:
+    """Return which of the allowed ways leave a robot enough of its battery to come home, (W,)."""
+    endurance = team.robots[name].endurance
+    if endurance is None:
+        return allowed
+    return allowed & endurance.affords(prediction, team.step_time)
+
+
+def held_back(team: TeamView, name: str, prediction: Trajectories, decision: Decision) -> str:
+    """Return why a robot must not go the only way of a prediction now, or an empty text."""
+    if crossed(team, name, prediction, decision):
+        return CROSSED
+    if not affordable(team, name, prediction, prediction.reached)[0]:
+        return f'stays: {SAVES_BATTERY}'
+    return ''
