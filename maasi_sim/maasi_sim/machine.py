@@ -24,7 +24,8 @@ _SEARCH = (
     'maasi_drivers',
     'maasi_sim.scenario',
     'maasi_sim.simulation',
-    'maasi_sim.run.targets',
+    'maasi_sim.run.log',
+    'maasi_sim.run.scores',
     'maasi_sim.search',
     'maasi_sim.search_result',
 )

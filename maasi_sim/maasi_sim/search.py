@@ -24,11 +24,10 @@ from maasi_planner.planners import Planner
 from maasi_planner.robot_plan import PresentRobot
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.compiling import compiling_said
-from maasi_sim.run.targets.tally import Scores, numbered, score, scoring_radius
-from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.live_view import SearchTrace
+from maasi_sim.run.log import Decided, Left, Measured, Truth, Updated
+from maasi_sim.run.view.search_page import SearchPage
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
-from maasi_sim.search_result import SearchResult, SearchState
+from maasi_sim.search_result import SearchResult
 from maasi_sim.simulation.robots import SimulatedRobot, Simulation
 
 # From the settings, and a function that returns the true targets that are not found yet.
@@ -77,11 +76,13 @@ def search(
         planner = None
     with compiling_said():
         running = _Search(scenario, seed, planner)
+        page = None
         if view:
-            running.trace.show()
-        result = running.run(most_measurements)
-    running.trace.end(result.end_reason)
-    return result
+            page = SearchPage(running.log)
+        running.run(most_measurements)
+    if page is not None:
+        page.end()
+    return running.log
 
 
 class _Search:
@@ -92,7 +93,8 @@ class _Search:
         self.scenario = scenario
         self.simulation = Simulation(scenario, seed)
         self.world = self.simulation.world
-        self.trace = SearchTrace(scenario, seed)
+        self.log = SearchResult(scenario, seed, self.world)
+        self.log.add(Truth(0.0, self.log.truth))
         self.step, self.time = 0, 0.0
         self._robots = {
             name: _Robot(body, scenario) for name, body in self.simulation.robots.items()
@@ -114,30 +116,23 @@ class _Search:
         self._destinations = {
             name: np.array(robot.start) for name, robot in scenario.robots.items()
         }
-        truth = np.asarray(self.world.targets, dtype=float)
-        self.trace.add(EventMaker.truth, 0.0, truth)
-        self._radius = scoring_radius(scenario, truth)
-        counts, ways = dict.fromkeys(self._robots, 0), dict.fromkeys(self._robots, 0.0)
-        self._result = SearchResult(scenario, self.trace, counts, ways)
-        self._complete = False  # whether the last score of a step was complete
 
-    def run(self, most_measurements: int | None) -> SearchResult:
+    def run(self, most_measurements: int | None) -> None:
         reason = None
         for step in range(steps_of(self.scenario.limits.time, self.scenario.step)):
             self.step, self.time = step, self.simulation.time
             for name in sorted(self._here.keys() & self.simulation.away):
                 del self._here[name]
-                self.trace.add(EventMaker.leave, self.time, name)
+                self.log.add(Left(self.time, name))
                 (group,) = (group for group in self._groups if name in group.names)
                 group.coordinator.plans[name].leave()
             for robot in self._here.values():
                 robot.observe(round(self.time * 1e9))
-            self.trace.robots(self.time, {name: r.state for name, r in self._here.items()})
+            self.log.add_states(self.time, {name: r.state for name, r in self._here.items()})
             commands = {
                 name: robot.follower.update(robot.state, self.step)[0]
                 for name, robot in self._here.items()
             }
-            self._complete = False
             for group in self._groups:
                 present = self._plan(group)
                 self._measure(group, present)
@@ -147,11 +142,7 @@ class _Search:
             for group in self._groups:
                 group.shared = group.filter.own_found_targets()
             self._move(commands)
-        result = self._result
-        result.end_reason = reason or 'time_limit'
-        result.steps = self.step + 1
-        result.found_targets, result.truth, result.scores = self._state()
-        return result
+        self.log.end(self.step, reason or 'time_limit')
 
     def _plan(self, group: _Group) -> dict[str, PresentRobot]:
         """Plan for the free robots of a group, and send them to their waypoints."""
@@ -159,7 +150,7 @@ class _Search:
         present = {}
         for name in [name for name in group.names if name in here]:
             follower, plan = here[name].follower, plans[name]
-            ended = follower.goal is not None and follower.goal.id == plan.decision + 1
+            ended = follower.goal is not None and follower.goal.id == plan.goal_id
             ended = ended and follower.status != GoalStatus.MOVING
             free, charge = plan.staying or ended, here[name].body.battery.charge
             present[name] = PresentRobot(here[name].state, free, charge)
@@ -172,12 +163,14 @@ class _Search:
         begin = perf_counter()
         decision = coordinator.plan(self.step, present, taken)
         if decision is not None:
-            self._result.planning_times.append(perf_counter() - begin)
-            self._result.decisions.append(decision)
-            self.trace.decision(self.time, group.space, decision, coordinator)
+            duration = perf_counter() - begin
+            indices = {name: plans[name].decision for name in decision.robots}
+            explored = coordinator.exploration.explored_fraction()
+            self.log.add(Decided(self.time, group.space, decision, indices, explored, duration))
+            self.log.add_map(self.time, group.space, coordinator.exploration, now=True)
             for name, chosen in decision.robots.items():
                 if not chosen.stays:
-                    number = plans[name].decision + 1
+                    number = plans[name].goal_id
                     here[name].follower.take(Goal(number, self.step, chosen.waypoint))
         for name, robot in present.items():
             self._destinations[name] = plans[name].destination(robot.state)
@@ -202,12 +195,25 @@ class _Search:
         for other in others:
             group.filter.withdraw(other.names[0], other.shared)
         result = group.filter.step(measurements, gone, self.time)
-        self._result.filter_times.append(perf_counter() - begin)
+        duration = perf_counter() - begin
         group.coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)
         known = result.found_changed or bool(others)
         found = group.filter.own_found_targets() if known else None
-        self.trace.update(self.time, group.space, measurements, result, found, group.coordinator)
-        self._score([item.robot for item in members])
+        for item in measurements:
+            self.log.add(Measured(self.time, item))
+        update = Updated(
+            self.time,
+            self.step,
+            group.space,
+            [(item.robot, item.index) for item in measurements],
+            found,
+            result.expected_number,
+            result.clusters,
+            duration,
+            {name: robot.body.state.pose.position for name, robot in self._robots.items()},
+        )
+        self.log.add(update)
+        self.log.add_map(self.time, group.space, group.coordinator.exploration, now=False)
 
     def _move(self, commands: Mapping[str, FloatArray]) -> None:
         """Advance by a step, under the commands of the robots that are here."""
@@ -218,49 +224,21 @@ class _Search:
         self.simulation.advance()
         for name, place in places.items():
             moved = robots[name].state.pose.position - place
-            self._result.distance[name] += float(np.sqrt((moved * moved).sum()))
-
-    def _score(self, measured: list[str]) -> None:
-        counts = self._result.measurements
-        for name in measured:
-            counts[name] += 1
-        found, truth, scores = self._state()
-        if self.world.walk > 0.0:
-            self.trace.add(EventMaker.truth, self.time, truth)
-        self._complete = self._complete or (bool(len(truth)) and scores.complete)
-        self._result.progress.append(
-            SearchState(
-                self.time,
-                self.step,
-                sum(counts.values()),
-                len(found),
-                scores.match.true_found,
-                scores.match.rmse,
-                tuple(measured),
-                {name: r.body.state.pose.position for name, r in self._robots.items()},
-            )
-        )
+            self.log.distance[name] += float(np.sqrt((moved * moved).sum()))
 
     def _end_reason(self, most_measurements: int | None) -> str | None:
-        if self._complete and self.scenario.stop == 'all_found':
+        if self.log.completed is not None:
             return 'all_found'
         searching = [group for group in self._groups if self._here.keys() & set(group.names)]
         if searching and all(group.coordinator.ended is not None for group in searching):
             return 'planner_done'
-        measured = sum(self._result.measurements.values())
-        if most_measurements is not None and measured >= most_measurements:
+        if most_measurements is not None and self.log.total_measurements >= most_measurements:
             return 'measurement_limit'
         return None
 
-    def _state(self) -> tuple[list[FoundTarget], FloatArray, Scores]:
-        """Return the found targets of all groups, the true ones, and the scores now."""
-        found = numbered([group.filter.own_found_targets() for group in self._groups])
-        truth = np.asarray(self.world.targets_at(self.step), dtype=float)
-        return found, truth, score(found, truth, self._radius, self.scenario.scoring.order)
-
     def _missing(self) -> FloatArray:
         """Return the true targets that are not found yet, (n, 3) [m]."""
-        matched = [j for _, j in self._state()[2].match.pairs]
+        matched = [j for _, j in self.log.scores_now(self.step).match.pairs]
         return np.delete(self.world.targets_3d_at(self.step), matched, axis=0)
 
 

@@ -12,6 +12,7 @@ from maasi_sim.experiments.campaign import Workers, plan
 from maasi_sim.experiments.outputs import write_outputs
 from maasi_sim.experiments.papers import experiments
 from maasi_sim.experiments.runs import load_run
+from maasi_sim.run.view.search_page import event_log
 from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.search import search
 
@@ -112,7 +113,7 @@ def test_robot_that_leaves_measures_no_more():
     assert np.array(outcome.columns['drone1_measures']).all()
     assert outcome.summary['measurements'] == 20
     result = search(scenario_from_values(content, 'test'), 3, 20)
-    said = [event[4:] for event in result.trace.log().events if event[1] == 'log']
+    said = [event[4:] for event in event_log(result).events if event[1] == 'log']
     assert ['drone2', 'left'] in said
     # The way is at least that from one measurement to the next.
     places = np.array([item.positions['drone1'] for item in result.progress])

@@ -21,11 +21,11 @@ from maasi_msgs import msg
 from maasi_sim.run.bag import load_types
 from maasi_sim.run.mission import RunEnd
 from maasi_sim.run.report_files import write_report
+from maasi_sim.run.scores import score, scoring_radius
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.targets.observer import TargetObserver
 from maasi_sim.run.targets.report import build_report, target_summary
 from maasi_sim.run.targets.report_figure import plot_report
-from maasi_sim.run.targets.tally import score, scoring_radius
 from maasi_sim.run.topics import within
 from maasi_sim.scenario.loading import load_scenario
 
@@ -341,13 +341,13 @@ def test_updates_alone_tell_what_was_found_and_refined_positions_win(run):
     run.update(0.4, latched=False)
     run.declare(0.5, [0.6, 0.5])
     run.update(0.5, latched=False)
-    assert run.observer.found == 1 and run.record().tally.progress[-1].true_found == 1
+    assert run.observer.found == 1 and run.record().log.progress[-1].true_found == 1
     run.found[0].position.x = 0.501
     run.update(0.6)
     # A filter that was restarted publishes an update again.
     run.batch, run.found[0].position.x = 1, 0.6
     run.update(0.5, latched=False)
-    (found,) = run.record().tally.found
+    (found,) = run.record().log.found_targets
     assert found.position[0] == pytest.approx(0.501)
     assert run.observer.measurements == 3
 

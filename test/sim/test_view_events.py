@@ -27,6 +27,7 @@ from maasi_sim.run.view.event_log import EventLog, line, thin
 from maasi_sim.run.view.event_maker import ENDED, LEFT, SILENT, EventMaker
 from maasi_sim.run.view.messages import MessageEvents, read_events
 from maasi_sim.run.view.scene import empty_scene, scene_of, scene_of_facts
+from maasi_sim.run.view.search_page import event_log
 from maasi_sim.search import search
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -297,7 +298,7 @@ def result():
 
 
 def test_a_search_in_one_process_leaves_the_same_events(result):
-    log = result.trace.log('drone')
+    log = event_log(result, 'drone')
     found = [event for event in log.events if event[1] == 'found'][-1]
     assert [item[0] for item in found[3]] == [item.id for item in result.found_targets]
     assert np.allclose(found[3][0][1:4], result.found_targets[0].position, atol=0.01)
@@ -314,7 +315,7 @@ def test_a_search_in_one_process_leaves_the_same_events(result):
 
 
 def test_the_objective_is_made_of_its_terms_with_the_weights_of_the_scene(result):
-    log = result.trace.log()
+    log = event_log(result)
     weights = log.scene['weights']
     plans = [robot for event in log.events if event[1] == 'plan' for robot in event[7]]
     rows = [row for robot in plans for row in robot[4] if row[6] is not None]

@@ -18,6 +18,7 @@ from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.page_file import FOLDER, write_replay
 from maasi_sim.run.view.scene import scene_of
+from maasi_sim.run.view.search_page import event_log
 from maasi_sim.scenario.loading import config_folder
 from maasi_sim.search import search
 
@@ -59,7 +60,7 @@ def test_a_video_shows_the_run_move(tmp_path):
 
 
 def test_a_video_of_a_search_in_space(tmp_path):
-    log = search(load_mission('ranging_drone_3d').scenario, 1).trace.log('drone')
+    log = event_log(search(load_mission('ranging_drone_3d').scenario, 1), 'drone')
     pictures = frames(log, tmp_path / 'run.mp4', 10.0 * log.duration)
     assert pictures[0].shape == (576, 768, 3)
     # A tenth of a second.
@@ -170,7 +171,7 @@ def searched(tmp_path_factory):
     """Return the replay of a search with a robot that leaves, and its log."""
     scenario = load_mission('mambo_turtlebot').scenario
     content = {**scenario.content(), 'events': [{'at': 8.0, 'robot': 'mambo', 'do': 'leave'}]}
-    log = search(type(scenario).model_validate(content), 901, 120).trace.log('search')
+    log = event_log(search(type(scenario).model_validate(content), 901, 120))
     path = tmp_path_factory.mktemp('searched') / 'page.html'
     write_replay(log, path)
     return path, log

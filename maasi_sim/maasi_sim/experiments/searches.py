@@ -22,6 +22,7 @@ from maasi_sim.experiments.figures import draw_comparison
 from maasi_sim.experiments.tables import SearchTable
 from maasi_sim.machine import code_digest
 from maasi_sim.run.buildings.scenario import is_cuboid_scenario
+from maasi_sim.run.log import RunLog
 from maasi_sim.scenario.layering import Key, ScenarioError, merged
 from maasi_sim.scenario.loading import (
     find_scenario,
@@ -31,7 +32,6 @@ from maasi_sim.scenario.loading import (
 )
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import check_events, search
-from maasi_sim.search_result import SearchResult
 from maasi_sim.simulation.world import noise_stream
 
 QUANTITIES = (
@@ -89,7 +89,7 @@ def run_search(settings: dict[str, Any], seed: int) -> Outcome:
     return outcome_of(result, settings['most_measurements'], scenario.limits.time)
 
 
-def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: float) -> Outcome:
+def outcome_of(result: RunLog, most_measurements: int | None, time_limit: float) -> Outcome:
     """Return the results of a search."""
     progress = result.progress
     complete = next(
@@ -177,7 +177,7 @@ def run_among_obstacles(settings: dict[str, Any], seed: int) -> Outcome:
     share = np.linspace(0.0, 1.0, 5)[:, None, None]
     ways = [
         (places[:-1] + share * np.diff(places, axis=0)).reshape(-1, 3)
-        for places in result.trace.positions().values()
+        for places in result.paths().values()
     ]
     nearest = [area.distances(place).min(initial=np.inf) for way in ways for place in way]
     outcome.summary['clearance'] = float(min(nearest)) if scenario.environment.obstacles else None
@@ -302,7 +302,7 @@ def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
     return outcome
 
 
-def find_times(result: SearchResult, limit: float) -> FloatArray:
+def find_times(result: RunLog, limit: float) -> FloatArray:
     """Return when the first, second and so on of n targets was found, or the limit [s]."""
     times = np.full(len(result.truth), limit)
     for item in reversed(result.progress):

@@ -12,20 +12,20 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.marker_detector import read_markers
 from maasi_filter.area import Area
 from maasi_filter.make_filter import make_filter
-from maasi_filter.records import AgentMeasurement, FoundTarget
+from maasi_filter.records import AgentMeasurement
 from maasi_planner.coordinator import Coordinator
 from maasi_sim.run.ending import DONE
+from maasi_sim.run.log import Measured, RobotAt, RunLog, Updated
 from maasi_sim.run.run_folder import make_folder, write_text
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.tables import csv_text, found_rows
-from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.live_view import SearchTrace
 from maasi_sim.run.view.page_file import REPLAY, write_replay
+from maasi_sim.run.view.search_page import event_log
 from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, planner_settings
 
-Measured = tuple[StampedPose, AgentMeasurement]  # where a robot was, and what it saw there
+Placed = tuple[StampedPose, AgentMeasurement]  # where a robot was, and what it saw there
 
 
 def search_recording(options: Options) -> int:
@@ -37,12 +37,13 @@ def search_recording(options: Options) -> int:
     recorded = [
         item for name in loaded.names() for item in recorded_measurements(loaded, name, bag, topics)
     ]
-    found, explored, trace = search_measurements(loaded, recorded)
+    log, explored = search_measurements(loaded, recorded)
+    found = log.found_targets
     folder = make_folder(options.out, '_replay')
     origin = loaded.environment.origin
     rows = found_rows(found, np.zeros((0, loaded.dimension)), [], origin)
     write_text(folder / 'found_targets.csv', csv_text(rows, loaded.dimension, origin))
-    write_replay(trace.log(bag.name), folder / REPLAY)
+    write_replay(event_log(log, bag.name), folder / REPLAY)
     for target in found:
         place = ' '.join(f'{value:.3f}' for value in target.position)
         print(f'target {target.id} of {target.robot} at {place} m, after {target.time:.1f} s')
@@ -55,7 +56,7 @@ def search_recording(options: Options) -> int:
 
 def recorded_measurements(
     scenario: Scenario, name: str, bag: Path, remap: Mapping[str, str]
-) -> list[Measured]:
+) -> list[Placed]:
     """Return the measurements of a robot by its recorded images, by the steps of its driver."""
     robot = scenario.robots[name]
     if robot.camera is None:
@@ -78,7 +79,7 @@ def recorded_measurements(
         if not recorded.records('/camera/camera_info'):
             print(f'{name}: no camera_info is recorded, its camera is that of the scenario')
         detector, sensor = recorded.detector(), robot.sensor.build(name, scenario.dimension)
-        found: list[Measured] = []
+        found: list[Placed] = []
         for place, image in recorded.images(robot.sensor.period):
             seen = read_markers(image, place, detector, sensor)
             known = place.covariance[:3, :3]
@@ -99,15 +100,13 @@ def recorded_measurements(
     return found
 
 
-def search_measurements(
-    scenario: Scenario, recorded: list[Measured]
-) -> tuple[list[FoundTarget], float, SearchTrace]:
-    """Feed a filter with measurements by stamp; return what is found, share explored, events."""
+def search_measurements(scenario: Scenario, recorded: list[Placed]) -> tuple[RunLog, float]:
+    """Feed a filter with measurements by stamp; return the log, and the explored share."""
     common = {'step': scenario.step, 'seed': scenario.seed, 'lockstep': True}
     coordinator = Coordinator(planner_settings(scenario, scenario.names(), common))
     generator = np.random.default_rng(scenario.seed)
     search_filter = make_filter(scenario.filter, Area(scenario.environment), generator)
-    trace = SearchTrace(scenario, scenario.seed)
+    log = RunLog(scenario, scenario.seed)
     recorded = sorted(recorded, key=lambda item: (item[0].stamp, item[1].robot))
     first, before = recorded[0][0].stamp, 0
     for place, measurement in recorded:
@@ -116,8 +115,11 @@ def search_measurements(
         result = search_filter.step([measurement], step - before, time)
         before = step
         coordinator.absorb({name: place.pose}, result.clusters)
-        trace.add(EventMaker.robot, time, name, (*place.pose.position.tolist(), place.pose.yaw))
+        log.add(RobotAt(time, name, (*place.pose.position.tolist(), place.pose.yaw)))
         found = search_filter.found_targets if result.found_changed else None
-        trace.update(time, '', [measurement], result, found, coordinator)
-    explored = coordinator.exploration.explored_fraction()
-    return search_filter.found_targets, explored, trace
+        log.add(Measured(time, measurement))
+        members = [(name, measurement.index)]
+        expected, clusters = result.expected_number, result.clusters
+        log.add(Updated(time, step, '', members, found, expected, clusters))
+        log.add_map(time, '', coordinator.exploration, now=False)
+    return log, coordinator.exploration.explored_fraction()

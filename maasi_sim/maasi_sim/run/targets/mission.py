@@ -16,9 +16,9 @@ from maasi_filter.settings import unsuitable_lengths, unused_settings
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.observer import TargetObserver
+from maasi_sim.run.targets.record import TargetRecord
 from maasi_sim.run.targets.report import build_report, target_summary
 from maasi_sim.run.targets.tables import csv_text, found_geojson, found_rows, ways_geojson
-from maasi_sim.run.targets.tally import TargetRecord
 from maasi_sim.run.topics import BATCH, within
 from maasi_sim.scenario.checks import never_seen
 from maasi_sim.scenario.layering import ScenarioError
@@ -82,8 +82,8 @@ class TargetMission:
     def tables(self, record: TargetRecord) -> dict[str, str]:
         """See `Mission.tables`."""
         origin = self.scenario.environment.origin
-        tally = record.tally
-        rows = found_rows(tally.found, tally.truth, tally.scores().match.pairs, origin)
+        log = record.log
+        rows = found_rows(log.found_targets, log.truth, log.scores.match.pairs, origin)
         files = {'found_targets.csv': csv_text(rows, record.scenario.dimension, origin)}
         if origin is not None:
             files['found_targets.geojson'] = found_geojson(rows)

@@ -2,14 +2,17 @@
 
 import contextlib
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.models.pose import Pose
+from maasi_filter.records import FoundTarget
+from maasi_sim.run.log import RunLog, Updated
 from maasi_sim.run.mission import UNAVAILABLE, Observer, RunEnd, rows
-from maasi_sim.run.targets.tally import Tally, TargetRecord
+from maasi_sim.run.targets.record import TargetRecord, found_target
 from maasi_sim.run.topics import DECISIONS, FOUND, UPDATE, point, within
 from maasi_sim.scenario.schema import Scenario
 
@@ -33,7 +36,7 @@ class TargetObserver(Observer):
         self.update_topics = list(self._updates)
         self.world = scenario.world(seed)
         self.total = len(self.world.targets)
-        self._tally = Tally(scenario, self.world, self)
+        self._log = self._new_log()
         self._new_updates: list[tuple[str, Any]] = []
         self._new_arrays: dict[str, list[Any]] = {space: [] for space in spaces}
         # Updates of several filters, with the found targets that came with them.
@@ -115,13 +118,39 @@ class TargetObserver(Observer):
                 found = waiting.pop(0)
             if several:
                 self._history.append((space, update, found))
-            self.news = self._tally.take(space, update, found) or self.news
-            now = self._tally.progress[-1]
+            self._count(self._log, space, update, found)
+            now = self._log.progress[-1]
+            first = len(self._log.progress) == 1
+            self.news |= first or now.found != self.found + self.false_found
             self.found, self.false_found = now.true_found, now.found - now.true_found
             self.measurements = now.measurements
-            self.completed = self._tally.completed
+            self.completed = self._log.completed
             if self.completed is not None:
                 self.end_step = self.completed.step
+
+    def _new_log(self) -> RunLog:
+        return RunLog(self.scenario, self.seed, self.world, keeps=False)
+
+    def _count(self, log: RunLog, space: str, update: Any, array: Any) -> None:
+        """Add an update to a log; `array` has all found targets, None if they have not changed."""
+        before = log.found_by(space) if array is None else self._own(space, array.targets)
+        known = {item.id for item in before}
+        new = [item for item in self._own(space, update.newly_found) if item.id not in known]
+        found = [*before, *new] if new or array is not None else None
+        if found is not None:
+            found = sorted(found, key=lambda item: item.id)
+        members = [(item.robot, int(item.measurement)) for item in update.members]
+        time, step = self.time(update.header.stamp), int(update.step)
+        log.add(Updated(time, step, space, members, found))
+
+    def _own(self, space: str, targets: Iterable[Any]) -> list[FoundTarget]:
+        """Return the targets that a filter found itself, not those that others told it."""
+        begin, dimension = self.begin or 0.0, self.scenario.dimension
+        return [
+            found_target(item, begin, dimension)
+            for item in targets
+            if len(self._updates) == 1 or item.robot == space
+        ]
 
     def _note_ending(self, step: int) -> None:
         """Note the end of the search: all planners that have a robot are settled."""
@@ -144,19 +173,19 @@ class TargetObserver(Observer):
 
     def record(self, end: RunEnd) -> TargetRecord:
         """See `Observer.record`."""
-        tally = self._tally
+        log = self._log
         if self._history:
             # Several filters in the order of steps and names, not in that of arrival.
-            tally = Tally(self.scenario, self.world, self)
+            log = self._new_log()
             self._history.sort(key=lambda item: (item[1].step, item[0], item[1].batch_id))
             for space, update, found in self._history:
-                if tally.completed is not None and update.step > tally.completed.step:
+                if log.completed is not None and update.step > log.completed.step:
                     break
-                tally.take(space, update, found)
+                self._count(log, space, update, found)
         end_time, last = end.time, math.inf
-        if tally.completed is not None:
-            end_time, last = tally.completed.time, tally.completed.step
-        record = TargetRecord(self.name, self.scenario, self.seed, tally, end_time=end_time)
+        if log.completed is not None:
+            end_time, last = log.completed.time, log.completed.step
+        record = TargetRecord(self.name, self.scenario, self.seed, log, end_time=end_time)
         for name, messages in zip(self.scenario.names(), self._detections.values()):
             ways = [at for step, who, at in self._waypoints if who == name and step <= last]
             record.waypoints[name] = rows(ways, 3)

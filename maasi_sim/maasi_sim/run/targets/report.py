@@ -8,15 +8,15 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import map_spacing
 from maasi_sim.run.report_files import finite, summary, whole_report
-from maasi_sim.run.targets.tally import TargetRecord
+from maasi_sim.run.targets.record import TargetRecord
 
 
 def build_report(record: TargetRecord) -> dict[str, Any]:
     """Return the report of a run as plain values."""
-    tally = record.tally
-    scores, total = tally.scores(), len(tally.truth)
+    log = record.log
+    scores, total = log.scores, len(log.truth)
     # All targets were found, and stayed so, since the last of these.
-    stayed = list(takewhile(lambda item: item.true_found == total, tally.progress[::-1]))
+    stayed = list(takewhile(lambda item: item.true_found == total, log.progress[::-1]))
     complete = stayed[-1] if total and stayed else None
     true = dict(scores.match.pairs)
     found = [
@@ -32,18 +32,18 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
             'identity': target.label.identity,
             'target': true.get(index),
         }
-        for index, target in enumerate(tally.found)
+        for index, target in enumerate(log.found_targets)
     ]
     parts = ('total', 'localisation', 'missed', 'false')
     content = {
-        'targets': [_numbers(position) for position in tally.truth],
+        'targets': [_numbers(position) for position in log.truth],
         'found': found,
         'true_found': scores.match.true_found,
         'missed': scores.match.missed,
         'false_found': scores.match.false_found,
         'rmse': finite(scores.match.rmse),
         'gospa': {part: getattr(scores.gospa, part) for part in parts},
-        'measurements': dict(sorted(tally.measurements.items())),
+        'measurements': dict(sorted(log.measurements.items())),
         'measurements_to_find_all': complete.measurements if complete else None,
         'time_to_find_all': complete.time if complete else None,
         'decisions': sum(map(len, record.waypoints.values())),

@@ -18,8 +18,8 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import reason_of_end
 from maasi_sim.run.report_panels import MARGIN, PALE, UNSEEN, MapView, draw_report, ellipse
+from maasi_sim.run.targets.record import TargetRecord
 from maasi_sim.run.targets.report import build_report, explored_after, to_find_all
-from maasi_sim.run.targets.tally import TargetRecord
 
 _TRUE, _MISSED, _FALSE = '#222222', '#D62728', '#E6007E'
 _SIGMAS = 3.0
@@ -125,9 +125,9 @@ def _draw_field(
 
 
 def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> None:
-    axes, width, found, truth = view.axes, len(bounds), record.tally.found, record.tally.truth
+    axes, width, found, truth = view.axes, len(bounds), record.log.found_targets, record.log.truth
     positions = np.array([item.position for item in found], float).reshape(-1, width)
-    pairs = record.tally.scores().match.pairs
+    pairs = record.log.scores.match.pairs
     right = [index for index, _ in pairs]
     wrong = np.setdiff1d(np.arange(len(positions)), right)
     missed = np.setdiff1d(np.arange(len(truth)), [true for _, true in pairs])
@@ -155,7 +155,7 @@ def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> No
 
 def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
     """Draw targets found over time, or over measurements."""
-    progress, number = record.tally.progress, len(record.tally.truth)
+    progress, number = record.log.progress, len(record.log.truth)
     places = [0.0, *(item.time if by_time else item.measurements for item in progress)]
     right = [0, *(item.true_found for item in progress)]
     every = [0, *(item.found for item in progress)]

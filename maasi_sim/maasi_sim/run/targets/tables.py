@@ -15,8 +15,8 @@ from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget
+from maasi_sim.run.targets.record import TargetRecord
 from maasi_sim.run.targets.report import explored_after
-from maasi_sim.run.targets.tally import TargetRecord
 
 Row = dict[str, Any]
 

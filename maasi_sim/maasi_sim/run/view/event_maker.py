@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import Cluster, FoundTarget
 from maasi_planner.team import Decision
-from maasi_sim.run.targets.tally import score
+from maasi_sim.run.log import Decided, Explored, Fact, Left, Measured, RobotAt, Truth, Updated
+from maasi_sim.run.scores import score
 from maasi_sim.run.topics import point
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning, shades
 
@@ -65,6 +66,27 @@ class EventMaker:
         self._planned: dict[str, list[int]] = {}
         self._measured: set[tuple[str, str, int]] = set()
         self.latest = 0.0  #: latest time of an event [s]
+
+    def take(self, fact: Fact) -> None:
+        """Add the events of a fact of a search in one process."""
+        match fact:
+            case RobotAt():
+                self.robot(fact.time, fact.robot, fact.pose)
+            case Left():
+                self.leave(fact.time, fact.robot)
+            case Measured(time, item):
+                self.seen(time, item.robot, item.pose.position, item.values, item.covariances)
+            case Updated():
+                if fact.found is not None:
+                    self.found(fact.time, fact.team, fact.found)
+                self.filter(fact.time, fact.team, fact.expected, fact.clusters, fact.members)
+            case Decided():
+                planner, decision = self.scene['planner'], fact.decision
+                self.plan(fact.time, fact.team, planner, decision, fact.indices, fact.explored)
+            case Explored():
+                self.map(fact.time, fact.team, fact.lower, fact.step, fact.letters, fact.share)
+            case Truth():
+                self.truth(fact.time, fact.targets)
 
     def _put(self, time: float, kind: str, owner: str, *content: Any) -> None:
         key = kind, owner

@@ -16,7 +16,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
 from maasi_planner.team import Decision, RobotDecision
 from maasi_sim.run.bag import Bag, BagError
-from maasi_sim.run.targets.tally import found_target
+from maasi_sim.run.targets.record import found_target
 from maasi_sim.run.topics import point, seconds
 from maasi_sim.run.view.event_log import Event, EventLog
 from maasi_sim.run.view.event_maker import EventMaker

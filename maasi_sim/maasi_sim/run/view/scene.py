@@ -17,7 +17,7 @@ from maasi_planner.buildings.settings import FACES
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.run.buildings.scenario import NAME as BUILDINGS
 from maasi_sim.run.buildings.scenario import CuboidScenario
-from maasi_sim.run.targets.tally import scoring_radius
+from maasi_sim.run.scores import scoring_radius
 from maasi_sim.run.view.event_log import Scene
 from maasi_sim.scenario.background import background_of
 from maasi_sim.scenario.base import BaseScenario
