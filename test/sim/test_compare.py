@@ -128,6 +128,18 @@ def test_planner_of_ones_own_is_compared_and_its_changes_are_noticed(
     assert executed[2:] == [(f'{name}:Mine', 1)]
 
 
+def test_a_changed_filter_of_ones_own_is_other_code(scenario, tmp_path):
+    name = 'own_filter_to_compare'
+    module = tmp_path / f'{name}.py'
+    text = 'from maasi_filter.pmb.filter import PmbFilter\n\nclass Mine(PmbFilter):\n    pass\n'
+    codes = []
+    for line in ('', '# Another one.\n'):
+        module.write_text(line + text)
+        (case,) = searches.compared(scenario, [], [f'{name}:Mine'], 4.0).cases(False)
+        codes.append(case.settings['code'])
+    assert codes[0] != codes[1]
+
+
 def test_filters_are_compared_with_each_planner(scenario):
     cases = searches.compared(scenario, PLANNERS, ['pmb', 'ic_phd'], 4.0).cases(False)
     assert [case.name for case in cases] == [

@@ -15,6 +15,7 @@ from scipy import ndimage
 from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
+from maasi_filter.settings import FILTERS
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.settings import PLANNERS
 from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Quantity
@@ -272,12 +273,13 @@ def search_settings(scenario: Scenario, planner: str | None = None) -> dict[str,
 
 
 def code_of(scenario: Scenario) -> str:
-    """Return a hash of the code of a search, including the file of a user's own planner."""
-    name = scenario.planner.name
-    if name in PLANNERS.own:
+    """Return a hash of the code of a search, with the files of a user's own planner and filter."""
+    chosen = (PLANNERS, scenario.planner.name), (FILTERS, scenario.filter.method)
+    classes = [group.load(name) for group, name in chosen if name not in group.own]
+    if not classes:
         return code_digest()
-    file = inspect.getsourcefile(PLANNERS.load(name))
-    own = Path(file).read_bytes() if file is not None else b''
+    files = filter(None, map(inspect.getsourcefile, classes))
+    own = b''.join(Path(file).read_bytes() for file in files)
     return f'{code_digest()} {hashlib.sha256(own).hexdigest()[:16]}'
 
 
