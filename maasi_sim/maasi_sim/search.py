@@ -79,10 +79,10 @@ def search(
         page = None
         if view:
             page = SearchPage(running.log)
-        running.run(most_measurements)
+        result = running.run(most_measurements)
     if page is not None:
         page.end()
-    return running.log
+    return result
 
 
 class _Search:
@@ -117,7 +117,7 @@ class _Search:
             name: np.array(robot.start) for name, robot in scenario.robots.items()
         }
 
-    def run(self, most_measurements: int | None) -> None:
+    def run(self, most_measurements: int | None) -> SearchResult:
         reason = None
         for step in range(steps_of(self.scenario.limits.time, self.scenario.step)):
             self.step, self.time = step, self.simulation.time
@@ -143,6 +143,7 @@ class _Search:
                 group.shared = group.filter.own_found_targets()
             self._move(commands)
         self.log.end(self.step, reason or 'time_limit')
+        return self.log
 
     def _plan(self, group: _Group) -> dict[str, PresentRobot]:
         """Plan for the free robots of a group, and send them to their waypoints."""

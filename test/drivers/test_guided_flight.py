@@ -263,7 +263,7 @@ def test_by_the_words_of_the_document_it_arms_rises_and_flies_in_its_fence(monke
     scenario = load_scenario(DOCS / f'{name}.yaml')
     ((robot_name, robot),) = scenario.robots.items()
     text = (DOCS / 'robots_mavlink.md').read_text()
-    assert f'docs/{name}.yaml' in text and f'arm --robot {robot_name}' in text
+    assert f'docs/{name}.yaml' in text and f'team_command arm {robot_name}' in text
     block = re.search(r'<!-- not run: a file for ArduPilot -->\n((?:    \w+ \d+\n)+)', text)[1]
     parameters = {key: float(value) for key, value in map(str.split, block.splitlines())}
     assert parameters['FENCE_ENABLE'] == 1.0 and parameters['FENCE_TYPE'] == 4.0
