@@ -86,7 +86,9 @@ def test_one_that_lands_by_itself_is_not_told_to_take_off_again(pair):
     assert fake.firmware.take_offs == 1 and link.flying_state == 'landed'
 
 
-def test_a_packet_that_is_repeated_is_not_believed(pair):
+@pytest.mark.parametrize('last', ['true', 'none'])
+def test_a_packet_that_is_repeated_is_not_believed(pair, last):
+    """Also where the last new stamps came without their position."""
     fake, link = pair
     handle = link._drone.drone_connection.handle_data
     packets = []
@@ -98,18 +100,23 @@ def test_a_packet_that_is_repeated_is_not_believed(pair):
 
     link._drone.drone_connection.handle_data = keep
     wait_until(lambda: len(packets) > 20)
+    fake.position_sent, heard = last, link.heard_at
+    wait_until(lambda: link.heard_at > heard)
     fake.cut_down = True
     # Those on their way have come when nothing is heard for a while.
     wait_until(lambda: time.monotonic() - link.heard_at > 1.0)
     heard, received = link.heard_at, link.position.received
-    for packet in packets[-4:]:
+    repeated = packets[-4:]
+    if last == 'none':
+        repeated = [packet for packet in packets if packet[7:11] == struct.pack('<BBH', 2, 18, 0)]
+    for packet in repeated[-4:]:
         handle(packet)
     assert link.heard_at == heard and link.position.received == received
     # What it did meanwhile is asked for when it is heard again.
     fake.firmware.emergency()
     end = fake.firmware.time + 2.0
     wait_until(lambda: fake.firmware.time > end and not fake._unacked)
-    fake.cut_down = False
+    fake.cut_down, fake.position_sent = False, 'true'
     wait_until(lambda: link.position.received > received)
     wait_until(lambda: link.flying_state == 'emergency')
 

@@ -28,6 +28,8 @@ _STAMPS = ('DroneSpeed_ts', 'DroneAltitude_ts', 'DroneQuaternion_ts')
 _ROUND = 0.05  # period of the thread's loop [s]; requests wake it
 CALLER_TIMEOUT = 0.5  # silence of its caller after which the drone is commanded to hover [s]
 _REPEAT = 0.7  # from one take-off or landing command to the next while the drone does not obey [s]
+# Longest time from a new stamp to the position that came with it; a later one is repeated [s].
+_TOGETHER = 0.4
 _OUTDATED = 1.0  # age of what was heard last after which a reported landing does not count [s]
 # Over Bluetooth: silence after which a command is sent that the drone has to acknowledge [s].
 _PROBE_PERIOD = 0.3
@@ -78,7 +80,7 @@ class MamboLink:
         self.bad_events = 0
         self._drone: Any = None
         self._stamps: dict[str, Any] = {}
-        self._fresh = False
+        self._fresh_until = -math.inf
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._closing = threading.Event()
@@ -303,19 +305,19 @@ class MamboLink:
 
     def _take(self, name: str, value: Any, sensors: Any) -> None:
         if self.kind == 'ble':
-            self._fresh = True
             self.heard_at = time.monotonic()
+            self._fresh_until = self.heard_at + _TOGETHER
         if name in _STAMPS and self._stamps.get(name) != value:
             self._stamps[name] = value
-            self._fresh = True
             self.heard_at = time.monotonic()
+            self._fresh_until = self.heard_at + _TOGETHER
         elif name == 'FlyingStateChanged_state':
             self.flying_state = str(sensors.flying_state)
         elif name == 'BatteryStateChanged_battery_percent':
             self.battery = min(max(0.01 * float(value), 0.0), 1.0)
-        elif name == 'DronePosition_ts' and self._fresh:
+        elif name == 'DronePosition_ts' and time.monotonic() <= self._fresh_until:
             # The last number of its event.
-            self._fresh = False
+            self._fresh_until = -math.inf
             read = sensors.sensors_dict
             keys = ('posx', 'posy', 'posz', 'psi')
             *place, psi = (float(read[f'DronePosition_{key}']) for key in keys)
