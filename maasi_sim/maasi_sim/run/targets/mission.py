@@ -29,6 +29,7 @@ from maasi_sim.simulation.emulators.linked_robots import with_addresses
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_BATCH_TIMEOUT = 3.0  # at most: planners hold robots after four seconds without an update [s]
 _LOCKSTEP_TF_RATE = 4.0  # of the robots' frames in lockstep, where each message counts [Hz]
 # Settings of a robot that its driver has as well.
 _OF_THE_DRIVER = ['start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'link']
@@ -105,6 +106,8 @@ def _team_plans(
     others = [name for name in scenario.names() if name not in names]
     respawns = scenario.on_exit == 'respawn'
     file = state / f'{namespace}_filter_node.maasi'.strip('_')
+    # A robot that is asked just after a measurement answers a period later.
+    longest = max(scenario.robots[name].sensor.period for name in names)
     filter_settings = FilterNodeSettings.model_validate(
         {
             **common,
@@ -112,6 +115,7 @@ def _team_plans(
             'filter': scenario.filter,
             'robots': {name: {'sensor': scenario.robots[name].sensor} for name in names},
             'share_with': others,
+            'batch_timeout': min(1.0 + longest, _BATCH_TIMEOUT),
             'save_file': str(file) if respawns else '',
             'save_batches': respawns,
         }
