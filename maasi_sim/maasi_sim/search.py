@@ -239,7 +239,8 @@ class _Search:
 
     def _missing(self) -> FloatArray:
         """Return the true targets that are not found yet, (n, 3) [m]."""
-        matched = [j for _, j in self.log.scores_now(self.step).match.pairs]
+        truth = np.asarray(self.world.targets_at(self.step), dtype=float)
+        matched = [j for _, j in self.log.scores_against(truth).match.pairs]
         return np.delete(self.world.targets_3d_at(self.step), matched, axis=0)
 
 

@@ -69,7 +69,7 @@ class FeedPeer:
 class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
     """Where link, sensor and parts of a driver meet: the state they share, what they report to.
 
-    All of it but `arrivals` is made anew in *configure*.
+    All of it but `arrivals` is made again in *configure*.
 
     Attributes
     ----------

@@ -65,7 +65,7 @@ class StampGate:
         return True
 
 
-# An arrival clock uses ticks of this time [s of the steady clock], and goes on after the last one
+# An arrival clock uses ticks of this time [s of the steady clock], and continues after the last one
 # for so many.
 _MEMORY, _AHEAD = 0.5, 2
 

@@ -179,7 +179,7 @@ class RunLog:
         self._counted: set[tuple[str, str, int]] = set()
         self._last_states = -np.inf
         self._last_maps: dict[str, float] = {}
-        self.scores = self.scores_now()
+        self.scores = self.scores_against(self.truth)
 
     def add(self, fact: Fact) -> None:
         """Add a fact."""
@@ -221,9 +221,9 @@ class RunLog:
             self.truth = np.asarray(self._world.targets_at(update.step), dtype=float)
             if self._keeps:
                 self.add(Truth(update.time, self.truth))
-            self.scores = self.scores_now()
+            self.scores = self.scores_against(self.truth)
         elif update.found is not None:
-            self.scores = self.scores_now()
+            self.scores = self.scores_against(self.truth)
         now = Count(
             update.time,
             update.step,
@@ -248,16 +248,16 @@ class RunLog:
         """Targets found so far, of all filters."""
         return numbered(list(self._found.values()))
 
-    def scores_now(self, step: int | None = None) -> Scores:
-        """Return the scores against the targets where they are now, or at a step."""
-        if step is not None and self._world is not None:
-            self.truth = np.asarray(self._world.targets_at(step), dtype=float)
-        return score(self.found_targets, self.truth, self._radius, self.scenario.scoring.order)
+    def scores_against(self, truth: FloatArray) -> Scores:
+        """Return the scores of what is found against true targets (n, d) [m]."""
+        return score(self.found_targets, truth, self._radius, self.scenario.scoring.order)
 
     def end(self, step: int, reason: str) -> None:
         """Note the last step of a search, and why it ended."""
         self.steps, self.end_reason = step + 1, reason
-        self.scores = self.scores_now(step)
+        if self._world is not None:
+            self.truth = np.asarray(self._world.targets_at(step), dtype=float)
+        self.scores = self.scores_against(self.truth)
 
     # ---- what is asked of it -----------------------------------------------------------------
 
