@@ -1,7 +1,7 @@
 """State estimation of the team: sensors, exploration, filters and found targets."""
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.make_filter import load_filter, make_filter, warm_up
 from maasi_filter.metrics import Gospa, Match, gospa, match_targets

@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.make_filter import Progress, load_state, make_filter, warm_up
 from maasi_filter.measurement_check import FOUND, REPEATED
 from maasi_filter.node.batch_assembly import BatchAssembly, PendingBatch

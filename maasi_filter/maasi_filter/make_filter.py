@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import ByteArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.association import MANY_PAIRS, associate
 from maasi_filter.pmb.component import gaps_of

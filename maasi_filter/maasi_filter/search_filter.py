@@ -11,15 +11,15 @@ from numpy.typing import ArrayLike
 from pydantic import BaseModel, TypeAdapter
 from typing_extensions import Self
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.vector_math import squared_distance
 from maasi_filter.measurement_check import check_taken
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
 from maasi_filter.state_file import SavedGenerator, write_state
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_filter.vector_math import squared_distance
 
 SAME_TARGET = 16.0  # gate on the squared normalised distance of two estimates of the same target
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 
 from maasi_filter import BoxDetection, ExponentialDetection, Pose, UnexploredMap
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.unexplored_map import CELLS, MOST_CELLS, default_spacing, spacing_for
 
 BOUNDS = np.array([[0.0, 100.0], [-20.0, 50.0], [0.0, 30.0]])

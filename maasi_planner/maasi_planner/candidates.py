@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.detection import (
     BOX,
     CUSTOM,

@@ -11,9 +11,9 @@ from nav_msgs.msg import OccupancyGrid, Path
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.colours import KEEP_OUT
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
 from maasi_filter.ros.clocks import LAST_STAMP, batch_id_limit

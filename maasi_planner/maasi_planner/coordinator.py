@@ -5,8 +5,8 @@ Used by the planner node and the in-process search (000, algorithms 1 and 2).
 
 from collections.abc import Collection, Mapping, Sequence
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster

@@ -14,8 +14,8 @@ from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 from shapely.ops import nearest_points
 
-from maasi_filter.area import Area, edges_of, level_shape
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area, edges_of, level_shape
 from maasi_planner.guidance import head_for, length_to
 from maasi_planner.nearby import nearby_of
 from maasi_planner.obstacles import (

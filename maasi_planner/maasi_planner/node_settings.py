@@ -7,7 +7,7 @@ from typing import ClassVar
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.settings import NotNegative, Positive, SensorSettings, Settings, Vector3
 from maasi_planner.endurance import EnduranceSettings

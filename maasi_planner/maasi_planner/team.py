@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap

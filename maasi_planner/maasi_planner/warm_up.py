@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster

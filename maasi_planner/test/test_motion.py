@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_planner import MotionSettings, RobotState, make_motion
 from maasi_planner.motion.mambo import GRAVITY, INERTIA, MASS, PERIOD, lqr_gains, mambo_parameters
 

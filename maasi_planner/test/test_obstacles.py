@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import shapely
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_planner import MotionSettings, RobotState, make_motion
 from maasi_planner.keep_out import KeepOut
 

@@ -4,8 +4,8 @@ import numpy as np
 import shapely
 from numpy.testing import assert_allclose, assert_array_equal
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.pose import Pose
 from maasi_sim.simulation.sensors import LaserScanner, LaserSettings
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
 from maasi_planner.motion import RobotState

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy.spatial.distance import pdist
 
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_sim.simulation.world import TargetSettings, World, noise_stream
 
 FLOOR = {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]}

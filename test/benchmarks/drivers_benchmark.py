@@ -7,7 +7,7 @@ from timing import entry, few, median_time
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.pose import Pose
 from maasi_sim.simulation.camera import CameraRenderer
 from maasi_sim.simulation.floor import RenderSettings, scene_of

@@ -19,7 +19,7 @@ from quality_conditions import CONDITIONS, DEGREES, RETURNS, SCENARIOS, changed,
 from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
-from maasi_filter.vector_math import squared_distance
+from maasi_filter.geometry.vector_math import squared_distance
 from maasi_sim.experiments.campaign import make_workers, run_command
 from maasi_sim.experiments.statistics import mean_interval, paired_difference
 from maasi_sim.experiments.tables import markdown_table

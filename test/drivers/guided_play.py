@@ -16,9 +16,9 @@ from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.mavlink_robot_link import MavlinkRobotLink
 from maasi_drivers.links.mavlink.vehicle import Vehicle
 from maasi_drivers.settings.driver import DriverSettings
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_planner.motion import RobotState
 
 ORIGIN = OriginSettings(latitude=46.6, longitude=9.9)

@@ -10,7 +10,7 @@ from ideal_floor import ideal
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.measurement import RangeAndAngles
 from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_sim.simulation.camera import CameraRenderer

@@ -10,7 +10,7 @@ from guided_play import GuidedPlay
 
 from maasi_drivers.agent.waypoint_follower import GoalStatus
 from maasi_drivers.links.mavlink.vehicle import VehiclePhase
-from maasi_filter.geodesy import geodetic
+from maasi_filter.geometry.geodesy import geodetic
 from maasi_sim.scenario.loading import load_scenario
 
 

@@ -7,9 +7,9 @@ from numpy.testing import assert_allclose
 
 from maasi_drivers.links.mavlink.fence import fence_items
 from maasi_drivers.links.mavlink.vehicle import VehiclePhase
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
-from maasi_filter.geodesy import OriginSettings, to_map
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.geodesy import OriginSettings, to_map
 
 INSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
 OUTSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION

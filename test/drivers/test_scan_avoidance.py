@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.scan_motion import ScanUnicycle, scan_points
 from maasi_drivers.settings.driver import ScanSettings
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
 from maasi_planner.settings import MotionSettings

@@ -18,7 +18,7 @@ from robot_team import NANOSECONDS, STEP, TURTLEBOT, parameters_of, stamped
 from sensor_msgs.msg import LaserScan
 
 from maasi_drivers.drivers import TurtlebotDriver
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState

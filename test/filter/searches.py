@@ -12,8 +12,8 @@ from maasi_filter import (
     SensorSettings,
     wrap_angle,
 )
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.measurement_check import check_measurements
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.state_file import pack

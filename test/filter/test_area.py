@@ -12,9 +12,9 @@ from pydantic import ValidationError
 from rasterio.warp import transform
 
 from maasi_filter import BoxDetection, Pose, UnexploredMap
-from maasi_filter.area import Area, level_shape
-from maasi_filter.environment import EnvironmentSettings
-from maasi_filter.geodesy import OriginSettings, geodetic, to_map
+from maasi_filter.geometry.area import Area, level_shape
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic, to_map
 from maasi_filter.ros.keep_outs import with_keep_outs
 from maasi_filter.ros.node_parameters import check
 from maasi_filter.ros.node_settings import FilterNodeSettings

@@ -19,7 +19,7 @@ from waiting import PATIENCE
 
 from maasi_filter import FilterSettings, make_filter
 from maasi_filter.filter_node import FilterNode
-from maasi_filter.geodesy import OriginSettings
+from maasi_filter.geometry.geodesy import OriginSettings
 from maasi_filter.ros.conversions import MOST_DETECTIONS
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES

@@ -5,7 +5,7 @@ import pytest
 from searches import log_density
 
 from maasi_filter import AgentMeasurement, ExponentialDetection, Pose, Sensor
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.ic_phd.births import gaussian_births, measurement_births, noise_in_space, resample
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.corrector import phd_correct, phd_scan

@@ -21,14 +21,14 @@ from searches import (
 from shapely import wkt
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, wrap_angle
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.vector_math import squared_distance
 from maasi_filter.make_filter import make_filter
 from maasi_filter.metrics import match_targets
 from maasi_filter.pmb.density import NO_PRIOR
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.pmb.scan import make_scan
 from maasi_filter.records import Label
-from maasi_filter.vector_math import squared_distance
 
 
 def scans(seed, number=25, clutter=1.0, order=None):

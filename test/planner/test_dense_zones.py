@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import shapely
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.keep_outs import CORNERS, ZONES, with_keep_outs
 from maasi_planner import MotionSettings, RobotState, make_motion

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from planner_helpers import random_team
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor

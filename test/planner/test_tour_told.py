@@ -7,8 +7,8 @@ import pytest
 import shapely
 from std_msgs.msg import Header
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster

@@ -13,8 +13,8 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString, Point
 
-from maasi_filter.area import Area, level_shape
-from maasi_filter.shapes import read_shape
+from maasi_filter.geometry.area import Area, level_shape
+from maasi_filter.geometry.shapes import read_shape
 
 ROUNDING = 1e-3  # of what is judged [m]
 UNSEEN = {'lawnmower': 0.5}  # share that a search may leave though it could be had

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from maasi_filter.occupancy_map import read_map
+from maasi_filter.geometry.occupancy_map import read_map
 
 PERFECT = {'position_noise': 0.0, 'heading_noise': 0.0, 'velocity_noise': 0.0}
 

@@ -26,7 +26,7 @@ from field_maker import Field, draw_zone, make_field
 from quality_conditions import SEEDS
 
 from maasi_drivers.agent.waypoint_follower import GoalStatus
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.ros.keep_outs import with_keep_outs
 from maasi_planner.motion import RobotState
 from maasi_sim.scenario.layering import ScenarioWarning

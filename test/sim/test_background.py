@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from maasi_filter.environment import EnvironmentSettings
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.page_file import write_replay
@@ -49,7 +49,7 @@ def written(folder, kind):
         grid = from_bounds(*limits, 500, 400)
         columns, rows = np.meshgrid(np.arange(500) + 0.5, np.arange(400) + 0.5)
         places = transform(kind, 'EPSG:4326', *(np.ravel(item) for item in grid * (columns, rows)))
-        from maasi_filter.geodesy import to_map
+        from maasi_filter.geometry.geodesy import to_map
 
         at = to_map(np.stack(places, axis=1), OriginSettings(**ORIGIN)).reshape(400, 500, 2)
         with rasterio.open(

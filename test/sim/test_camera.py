@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_sim.simulation.camera import CameraRenderer
 from maasi_sim.simulation.floor import RenderSettings, disc, draw_distractors, scene_of

@@ -10,7 +10,7 @@ import shapely
 import yaml
 from small_field import SMALL_FIELD
 
-from maasi_filter.area import Area, level_shape
+from maasi_filter.geometry.area import Area, level_shape
 from maasi_planner.motion import RobotState, make_motion
 from maasi_sim.scenario.checks import doubts_about
 from maasi_sim.scenario.free_space import FreeSpace

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_field import SMALL_FIELD
 
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_planner import MotionSettings, RobotState, make_motion
 from maasi_planner.endurance import Endurance, EnduranceSettings, Phase
 from maasi_planner.planners import Planner

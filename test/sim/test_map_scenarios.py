@@ -7,7 +7,7 @@ import pytest
 from made_maps import hall, pillar_room
 from map_scenarios import Watched, hall_scenario, room_scenario
 
-from maasi_filter.occupancy_map import read_map
+from maasi_filter.geometry.occupancy_map import read_map
 from maasi_sim.scenario.layering import ScenarioWarning
 from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.search import _Search

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from maasi_filter.geodesy import OriginSettings, to_map
-from maasi_filter.shapes import InputWarning
+from maasi_filter.geometry.geodesy import OriginSettings, to_map
+from maasi_filter.geometry.shapes import InputWarning
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 

@@ -9,7 +9,7 @@ import pytest
 import shapely
 import yaml
 
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_sim.run import run_scenario
 from maasi_sim.run.ending import DONE, NOT_ALL_FOUND, end_of_planners
 from maasi_sim.run.missions import load_mission

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from small_field import SMALL_FIELD
 
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget, Label
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission

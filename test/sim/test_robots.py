@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from maasi_drivers.agent.odometry import MapOdometry
 from maasi_drivers.settings.camera import CameraSettings
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
 from maasi_planner.endurance import EnduranceSettings

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import shapely
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
-from maasi_filter.geodesy import OriginSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.geodesy import OriginSettings
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.run.view.scene import zones_of

@@ -8,7 +8,7 @@ import pytest
 import shapely
 from scenario_runs import check_replay, of_topic, run_scenario, start
 
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_sim.run.bag import Bag
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search

@@ -18,7 +18,7 @@ from maasi_drivers.agent.robot_topics import PoseTopic
 from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import SettingsError

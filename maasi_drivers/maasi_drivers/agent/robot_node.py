@@ -12,7 +12,7 @@ from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
 from maasi_drivers.agent.robot_frames import RobotFrames
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_drivers.settings.driver import DriverSettings
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.clocks import JUMP, ArrivalClock, Silence, StampGate
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.settings.driver import ScanSettings
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_planner.guidance import head_for
 from maasi_planner.motion import RobotState, Unicycle
 from maasi_planner.motion.base import check_waypoint

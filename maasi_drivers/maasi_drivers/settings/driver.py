@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.plugins import PluginGroup
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE, NodeSettings
 from maasi_filter.settings import Finite, SensorSettings, Settings, Vector2, Vector3

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.measurement_check import CheckedMeasurement
 
 

@@ -9,11 +9,11 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.vector_math import arctan2, exponential, use_wide_vectors
 from maasi_filter.models.detection import fill_probabilities
 from maasi_filter.models.measurement import TWO_PI, wrap
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
-from maasi_filter.vector_math import arctan2, exponential, use_wide_vectors
 
 CHUNK = 2048
 SUMS = {'reassoc', 'nsz', 'nnan'}  # sums may be added in vector lanes; all numbers are finite

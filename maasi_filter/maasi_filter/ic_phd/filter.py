@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.ic_phd.births import (
     gaussian_births,
     jittered,

@@ -16,8 +16,8 @@ from numba.extending import intrinsic
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.vector_math import exponential
 from maasi_filter.models.pose import Pose
-from maasi_filter.vector_math import exponential
 
 EXPONENTIAL, GAUSSIAN, BOX, CUSTOM = 0, 1, 2, 3
 PARAMETERS = 9

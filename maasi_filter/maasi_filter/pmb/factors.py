@@ -13,12 +13,12 @@ import math
 import numpy as np
 from numba import njit
 
-from maasi_filter.area import density_at
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.geometry.area import density_at
+from maasi_filter.geometry.vector_math import arctan2, exponential, use_wide_vectors
 from maasi_filter.models.detection import PARAMETERS, fill_probabilities
 from maasi_filter.models.measurement import TWO_PI
 from maasi_filter.unexplored_map import interpolate_at
-from maasi_filter.vector_math import arctan2, exponential, use_wide_vectors
 
 ALWAYS = -1  # kind of pi of a factor that is no scan's: 1 everywhere
 MOST_PROBABLE = 0.98  # with 1, a single miss would end a component that certainly exists

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
     check_measurements,

@@ -8,12 +8,12 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.vector_math import normalised
 from maasi_filter.measurement_check import CheckedMeasurement
 from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.pmb.association import MANY_PAIRS, propagate
 from maasi_filter.pmb.component import Component, moments
 from maasi_filter.pmb.factors import MOST_PROBABLE
-from maasi_filter.vector_math import normalised
 
 PRIOR_SCANS = 10.0  # weight of the prior of the clutter, in scans
 PRIOR_DETECTIONS = 6.0  # detections that the belief in the noise is worth

@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.colours import FOUND, POTENTIAL
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor, is_covariance
 from maasi_filter.records import (

@@ -6,8 +6,8 @@ from typing import Any
 from pydantic import ValidationError
 from std_msgs.msg import Header
 
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings, shapes_of_texts
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings, shapes_of_texts
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL

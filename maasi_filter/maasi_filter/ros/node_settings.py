@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar
 from pydantic import AfterValidator, Field
 from typing_extensions import Self
 
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.plugins import add_folders
 from maasi_filter.settings import FilterSettings, NotNegative, Positive, SensorSettings, Settings
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.settings import Finite, NotNegative, Positive, Settings, Vector3
 

@@ -1,6 +1,6 @@
 """Motion models: each has its controller, its prediction and its body."""
 
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_planner.motion.base import Body, MotionModel, RobotState, Trajectories
 from maasi_planner.motion.models import ConstantSpeed, Mambo, Quadrotor, Unicycle
 from maasi_planner.settings import MOTIONS, MotionSettings

@@ -12,8 +12,8 @@ from numba import njit
 from numpy.typing import ArrayLike
 from pydantic import BaseModel
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_planner.keep_out import shared_keep_out
 from maasi_planner.settings import MotionSettings

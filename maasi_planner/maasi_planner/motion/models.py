@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_planner.guidance import length_to
 from maasi_planner.motion import mambo, quadrotor

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import BaseModel
 
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
 from maasi_planner.planners.options import options_of as options_of

@@ -2,8 +2,8 @@
 
 from numba import njit
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.objective.joint_search import PAIRS_LIMIT, search
 from maasi_planner.objective.predicted_measurements import CoarseTrajectories

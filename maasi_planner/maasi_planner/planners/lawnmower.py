@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_planner.candidates import half_view
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.detour import PASSES, others_move, past_standing

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.detour import PASSES, others_move, past_standing
 from maasi_planner.planners.lattice import Lattice, lanes_of

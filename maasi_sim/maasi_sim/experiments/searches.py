@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import FILTERS
 from maasi_filter.unexplored_map import UnexploredMap

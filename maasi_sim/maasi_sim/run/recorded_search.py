@@ -10,7 +10,7 @@ from maasi_drivers.calibration.bag_reader import BagError, BagReader
 from maasi_drivers.calibration.recorded_robot import USED, RecordedRobot
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.marker_detector import read_markers
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.make_filter import make_filter
 from maasi_filter.records import AgentMeasurement
 from maasi_planner.coordinator import Coordinator

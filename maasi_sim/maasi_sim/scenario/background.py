@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.environment import EnvironmentSettings
-from maasi_filter.geodesy import geodetic
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.geodesy import geodetic
 
 # Longest side of what is shown [px], its quality, and the margin around the bounds.
 _SIZE, _QUALITY, _MARGIN = 1100, 70, 0.06

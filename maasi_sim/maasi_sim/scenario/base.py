@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.plugins import add_folders
 from maasi_filter.settings import NotNegative, Positive, Settings
 from maasi_sim.arguments import LARGEST

@@ -10,8 +10,8 @@ import numpy as np
 
 from maasi_drivers.settings.driver import DRIVERS
 from maasi_drivers.settings.vehicles import MamboSettings
-from maasi_filter.area import Area
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.plugins import unknown
 from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_parts
 from maasi_planner.planners.auto import SQUARES

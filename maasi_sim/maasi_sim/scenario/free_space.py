@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import nearest_points
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_planner.keep_out import KeepOut
 from maasi_sim.scenario.schema import RobotSettings
 

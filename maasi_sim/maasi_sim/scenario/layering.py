@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from maasi_filter.geometry.shapes import InputWarning
 from maasi_filter.plugins import own_settings, unknown
 from maasi_filter.ros.parameters import choices
-from maasi_filter.shapes import InputWarning
 
 Key = tuple[str | int, ...]
 Model = TypeVar('Model', bound=BaseModel)

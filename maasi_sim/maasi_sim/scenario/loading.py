@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, TypeVar
 
-from maasi_filter.environment import FILES, EnvironmentSettings
+from maasi_filter.geometry.environment import FILES, EnvironmentSettings
 from maasi_filter.plugins import is_reference, unknown
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.checks import (

@@ -12,8 +12,8 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from maasi_filter.area import Area, level_shape
-from maasi_filter.geodesy import OriginSettings
+from maasi_filter.geometry.area import Area, level_shape
+from maasi_filter.geometry.geodesy import OriginSettings
 from maasi_planner.candidates import half_view, map_spacing, swath_of
 from maasi_sim.scenario.free_space import FreeSpace
 from maasi_sim.scenario.on_earth import place_text

@@ -9,8 +9,8 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.measurement import wrap_angle
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor

@@ -9,9 +9,9 @@ from zlib import crc32
 import numpy as np
 from pydantic import Field, model_validator
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.records import Label
 from maasi_filter.settings import Finite, NotNegative, Settings
 

@@ -10,9 +10,9 @@ import shapely
 
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, ReportLog, mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
-from maasi_filter.area import Area, level_shape
 from maasi_filter.arrays import FloatArray
-from maasi_filter.geodesy import geodetic
+from maasi_filter.geometry.area import Area, level_shape
+from maasi_filter.geometry.geodesy import geodetic
 
 Item = tuple[int, float, int, int]  # command, corners or radius [m], 1e-7 degrees north, east
 

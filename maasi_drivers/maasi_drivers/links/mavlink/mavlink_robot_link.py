@@ -19,8 +19,8 @@ from maasi_drivers.links.mavlink.fence import fence_items
 from maasi_drivers.links.mavlink.link import VehicleLink
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING
 from maasi_drivers.settings.vehicles import MavlinkSettings
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose, compose, inverse
 
 POLL_PERIOD = 0.02

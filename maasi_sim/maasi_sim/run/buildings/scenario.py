@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from maasi_filter.environment import EnvironmentSettings
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_planner.buildings.agent import SearchAgent
 from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
 from maasi_planner.buildings.settings import CuboidSettings, DynamicsSettings, SearcherSettings

@@ -3,8 +3,8 @@
 from itertools import takewhile
 from typing import Any
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import map_spacing
 from maasi_sim.run.report_files import finite, summary, whole_report

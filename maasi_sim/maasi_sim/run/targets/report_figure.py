@@ -10,9 +10,9 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
 from maasi_filter.colours import FOUND, KEEP_OUT, robot_colours
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap

@@ -11,9 +11,9 @@ import shapely
 from shapely.geometry import mapping
 from shapely.geometry.base import BaseGeometry
 
-from maasi_filter.area import Area
 from maasi_filter.arrays import FloatArray
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget
 from maasi_sim.run.targets.record import TargetRecord
 from maasi_sim.run.targets.report import explored_after

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from maasi_filter.area import level_shape
 from maasi_filter.arrays import FloatArray
-from maasi_filter.environment import Zone
+from maasi_filter.geometry.area import level_shape
+from maasi_filter.geometry.environment import Zone
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
 from maasi_planner.team import Decision, RobotDecision

@@ -10,7 +10,7 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_drivers.agent.flight_rules import make_fence
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
-from maasi_filter.area import Area
+from maasi_filter.geometry.area import Area
 from maasi_filter.settings import DETECTIONS
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.buildings.settings import FACES

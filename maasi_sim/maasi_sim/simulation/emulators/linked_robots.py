@@ -5,7 +5,7 @@ from typing import Protocol
 import numpy as np
 
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
-from maasi_filter.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.models.pose import Pose
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.simulation.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port

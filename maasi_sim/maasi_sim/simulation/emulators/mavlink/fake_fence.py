@@ -8,7 +8,7 @@ import shapely
 
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.arrays import FloatArray
-from maasi_filter.geodesy import OriginSettings, to_map
+from maasi_filter.geometry.geodesy import OriginSettings, to_map
 
 Item = tuple[int, float, int, int]
 

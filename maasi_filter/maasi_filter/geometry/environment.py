@@ -19,9 +19,8 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.geodesy import OriginSettings
-from maasi_filter.settings import Finite, Positive, Settings, Vector2
-from maasi_filter.shapes import (
+from maasi_filter.geometry.geodesy import OriginSettings
+from maasi_filter.geometry.shapes import (
     Feature,
     InputWarning,
     centre_of,
@@ -32,6 +31,7 @@ from maasi_filter.shapes import (
     read_shape,
     short,
 )
+from maasi_filter.settings import Finite, Positive, Settings, Vector2
 
 _NUMBER = '-+.0123456789'  # with which a number begins
 # Of files that an environment names.

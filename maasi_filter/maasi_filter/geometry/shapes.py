@@ -16,8 +16,8 @@ from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.geodesy import OriginSettings, to_map
-from maasi_filter.occupancy_map import read_map
+from maasi_filter.geometry.geodesy import OriginSettings, to_map
+from maasi_filter.geometry.occupancy_map import read_map
 
 _GEOJSON, MAPS = ('.json', '.geojson'), ('.yaml', '.yml')
 _LARGEST = 10_000.0  # of an area in degrees [km2]; larger ones are mistakes

@@ -18,10 +18,10 @@ from shapely.geometry import box
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.environment import EnvironmentSettings, Zone
-from maasi_filter.geodesy import OriginSettings, geodetic, on_ground, to_map
-from maasi_filter.occupancy_map import check_pixels, read_image
-from maasi_filter.shapes import read_shape
+from maasi_filter.geometry.environment import EnvironmentSettings, Zone
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic, on_ground, to_map
+from maasi_filter.geometry.occupancy_map import check_pixels, read_image
+from maasi_filter.geometry.shapes import read_shape
 
 _ROUNDING = 1e-6  # of coordinates, also of those that are large [m]
 # Cells of the density along the longer side, and every how many are looked at to check it.

@@ -1,0 +1,1 @@
+"""Geometry of the search: areas, keep-out zones, obstacles, maps and coordinates."""
