@@ -1,7 +1,7 @@
 """Planning of waypoints and measurements: motion models, objective and planners."""
 
 from maasi_planner.candidates import CandidateSet, Unseen, Viewer, unseen_parts
-from maasi_planner.measurement_trigger import MeasurementTrigger
+from maasi_planner.measurement_schedule import MeasurementSchedule
 from maasi_planner.motion import MotionModel, RobotState, Trajectories, make_motion
 from maasi_planner.planners import Planner, make_planner
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
@@ -12,7 +12,7 @@ __all__ = [
     'CandidateSet',
     'CandidateSettings',
     'Decision',
-    'MeasurementTrigger',
+    'MeasurementSchedule',
     'MotionModel',
     'MotionSettings',
     'Planner',

@@ -166,6 +166,8 @@ class Endurance:
         self.leg = 0.0  #: share of the battery that the rest of its present path takes
         self._use, self._pace = Ratio(_USE_WINDOW, _USE_PRIOR), Ratio(_TIME_WINDOW, _TIME_PRIOR)
         self._before: tuple[int, FloatArray] | None = None
+        # Index on its predicted path that it has reached, and at which step.
+        self._progress, self._progress_at = 0, 0
         # Charge that remained beyond the path home when it was predicted last, less twice what was
         # used since: to fly back what it has flown takes as much again. None: to be predicted.
         self._slack: float | None = None
@@ -336,6 +338,28 @@ class Endurance:
     def note_pace(self, seconds: float, predicted: float) -> None:
         """Note the time in which a part of a predicted path was flown, and the predicted time."""
         self._pace.add(seconds, predicted)
+
+    def begin_path(self, step: int) -> None:
+        """Note that another path begins."""
+        self._progress, self._progress_at = 0, step
+
+    def note_progress(self, step: int, position: FloatArray, path: FloatArray) -> None:
+        """Learn from how far it has come on its predicted path (n, 3) since the last step."""
+        last = len(path) - 1
+        if self._progress >= last:
+            return
+        gone = step - self._progress_at
+        ahead = path[self._progress : min(self._progress + 3 * gone + 1, last) + 1] - position
+        reached = int(np.argmin((ahead * ahead).sum(axis=1)))
+        self._progress, self._progress_at = self._progress + reached, step
+        # At its end it slows down, and may turn to the next waypoint.
+        if self._progress < last:
+            self.note_pace(gone * self._step, reached * self._step)
+
+    def plan_leg(self, path: FloatArray) -> None:
+        """Note the rest of its present path, (n, 3), which is empty where it stands."""
+        metres = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+        self.leg = self.use(self._step * (len(path) - 1), metres) if len(path) else 0.0
 
     def update(self, step: int, state: RobotState, charge: float, stands: bool) -> None:
         """Take the state and the charge of a step.

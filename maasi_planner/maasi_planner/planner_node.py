@@ -439,15 +439,16 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if decision is not None:
             self._planning_time = time.perf_counter() - begin
         self._batteries.report(self.coordinator.homing)
-        plans = self.coordinator.plans
+        known = self.coordinator.robots
         self._others.publish(
-            header, {name: plans[name].destination(robot.state) for name, robot in robots.items()}
+            header,
+            {name: known[name].plan.destination(robot.state) for name, robot in robots.items()},
         )
         if not commanded:
             return
         if decision is not None:
             self._announce(decision, header)
-        members = self.coordinator.measuring(step, robots, imaging)
+        members = self.coordinator.measure(step, robots, imaging)
         if members:
             self._batches.publish(step, members, header)
         self._views.publish(self.coordinator, robots, header, stamp * 1e-9)
@@ -455,7 +456,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     def _announce(self, decision: Any, header: Header) -> None:
         """Publish a decision and send the goals."""
         self._decisions += 1
-        indices = {name: self.coordinator.plans[name].decision for name in decision.robots}
+        indices = {name: self.coordinator.robots[name].plan.decision for name in decision.robots}
         self._decision_publisher.publish(
             decision_to_ros(
                 decision,
@@ -469,16 +470,16 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if not decision.robots:
             self.get_logger().info(f'nothing is left to gain: {decision.reason}')
         for name in sorted(decision.robots):
-            robot = decision.robots[name]
+            robot, plan = decision.robots[name], self.coordinator.robots[name].plan
             if robot.stays:
                 # Only of a robot that cannot come home somebody has to know.
                 log = self.warn_throttled if CUT_OFF in robot.reason else self.tell_throttled
                 log(f'{name} stays', f'{name} {robot.reason}')
                 continue
-            if self.coordinator.plans[name].errand is not None:
+            if plan.errand is not None:
                 self.get_logger().info(f'{name} {robot.reason}')
                 self._orders.interrupt_homing(name)
-            self._orders.send(name, self.coordinator.plans[name].goal_id, robot.waypoint, header)
+            self._orders.send(name, plan.goal_id, robot.waypoint, header)
             self._path_publishers[name].publish(path_to_ros(robot.positions, header))
 
     def _try_done(self) -> None:

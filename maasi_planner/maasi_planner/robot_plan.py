@@ -1,4 +1,4 @@
-"""Robots in the eyes of the coordinator: what is known of them at a step, and their plans."""
+"""A robot in the eyes of the coordinator: facts, plan, measurements and battery."""
 
 import math
 from dataclasses import dataclass, field
@@ -7,12 +7,17 @@ from enum import Enum
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import CandidateSet
 from maasi_planner.endurance import Endurance
+from maasi_planner.measurement_schedule import MeasurementSchedule
 from maasi_planner.motion import MotionModel, RobotState
 from maasi_planner.team import TAKEN, RobotDecision, RobotView
+
+# Speed below which a robot that follows another client stands [m/s].
+_SLOW = 0.1
 
 
 @dataclass
@@ -29,10 +34,6 @@ class PresentRobot:
     charge: float = math.nan
     searches: bool = True
     returns: bool = True
-
-
-# Speed below which a robot that follows another client stands [m/s].
-_SLOW = 0.1
 
 
 class Errand(Enum):
@@ -52,53 +53,72 @@ class Member:
     measurement: int
 
 
-@dataclass
-class RobotPlan:
-    """A robot, and its present plan.
+@dataclass(frozen=True)
+class RobotFacts:
+    """What is known of a robot before the search.
 
-    decision: index of its last decision, -1 before the first; positions (K + 1, 3): predicted
-    trajectory [m]; staying: whether it has no goal: it never had one, refused it, or is commanded
-    to stay.
+    period: steps between possible measurements; arrival_radius: distance from a waypoint at which
+    the next one is decided [m], 0: it stops at each.
     """
 
     motion: MotionModel
     sensor: Sensor
-    candidates: CandidateSet
     period: int
     radius: float
-    # Distance from a waypoint at which the next one is decided [m]; 0: it stops at each.
     arrival_radius: float
-    endurance: Endurance | None = None
-    exploration: UnexploredMap | None = None
+
+
+@dataclass
+class RobotPlan:
+    """What was decided for a robot last.
+
+    decision: index of that decision, -1 before the first; chosen: None where it has no path;
+    staying: whether it has no goal: it never had one, refused it, or is commanded to stay;
+    turning_distance: of the present waypoint, see `RobotFacts.arrival_radius`; errand: what its
+    present leg is for, if the planner did not decide it.
+    """
+
     decision: int = -1
     decided_at: int | None = None
+    chosen: RobotDecision | None = None
     waypoint: FloatArray = field(default_factory=lambda: np.zeros(3))
-    turning_distance: float = 0.0  # the same for the present waypoint
-    # Waypoint that was left for the next one, until its closest point, and its distance squared.
-    passed: FloatArray | None = None
-    nearest: float = 0.0
-    # Step from which the periods of measurements count.
-    measured_from: int = 0
-    positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    yaws: FloatArray = field(default_factory=lambda: np.zeros(0))
-    tour: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    turning_distance: float = 0.0
     staying: bool = True
-    measurements: int = 0
-    due: bool = False
-    # What its present leg is for, if the planner did not decide it.
     errand: Errand | None = None
-    # Whether its last decision was to stay, as there is nothing to do for it.
-    idle: bool = False
-    # Whether it waits until a charger is free, or goes there to wait.
-    queues: bool = False
-    # Index on `positions` that it has reached, and at which step.
-    progress: int = 0
-    progress_at: int = 0
 
     @property
     def goal_id(self) -> int:
         """Id of the goal of its last decision; 0 before the first."""
         return self.decision + 1
+
+    @property
+    def positions(self) -> FloatArray:
+        """Predicted trajectory, (K + 1, 3) [m]; empty where it has no path."""
+        return np.zeros((0, 3)) if self.chosen is None else self.chosen.positions
+
+    @property
+    def tour(self) -> FloatArray:
+        """Where it is to go after the waypoint, (n, 3) [m]."""
+        return np.zeros((0, 3)) if self.chosen is None else self.chosen.tour
+
+    @property
+    def idle(self) -> bool:
+        """Whether it was decided to stay, as there is nothing to do for it."""
+        chosen = self.chosen
+        waits = chosen is not None and (chosen.blocked or chosen.reason.startswith('waits'))
+        return chosen is not None and chosen.stays and not waits
+
+    @property
+    def queues(self) -> bool:
+        """Whether it waits until a charger is free, or goes there to wait."""
+        return self.chosen is not None and TAKEN in self.chosen.reason
+
+    def remaining(self, step: int) -> tuple[FloatArray, FloatArray]:
+        """Return the rest of its predicted trajectory: positions (n, 3) and headings (n,)."""
+        if self.chosen is None:
+            return np.zeros((0, 3)), np.zeros(0)
+        first = min(step - (self.decided_at or 0), len(self.positions) - 1)
+        return self.chosen.positions[first:], self.chosen.yaws[first:]
 
     def destination(self, state: RobotState) -> FloatArray:
         """Return the final position of its plan at a state, (3,) [m]."""
@@ -106,124 +126,138 @@ class RobotPlan:
             return np.array(state.pose.position)
         return self.positions[-1].copy()
 
+
+class PlannedRobot:
+    """One robot of a team: facts, plan, measuring schedule, and battery where it has one.
+
+    exploration: e after its own measurements, where it is not that of the team.
+    """
+
+    def __init__(
+        self,
+        facts: RobotFacts,
+        candidates: CandidateSet,
+        schedule: MeasurementSchedule,
+        endurance: Endurance | None,
+        exploration: UnexploredMap | None,
+    ) -> None:
+        self.facts, self.candidates, self.schedule = facts, candidates, schedule
+        self.endurance, self.exploration = endurance, exploration
+        self.plan = RobotPlan()
+
+    # ---- queries -----------------------------------------------------------------------------
+
+    def is_due(self, step: int, present: PresentRobot) -> bool:
+        """Return whether it is to be planned for now.
+
+        It has arrived, or is near enough to pass its waypoint without a stop; one that was
+        commanded to stay replans at its next possible measurement.
+        """
+        plan = self.plan
+        if present.free:
+            waited = plan.decided_at is None or step - plan.decided_at >= self.facts.period
+            return not plan.staying or waited
+        if plan.staying or not plan.turning_distance:
+            return False
+        here = present.state.pose.position
+        return self.facts.motion.squared_distance(here, plan.waypoint) < plan.turning_distance**2
+
+    def is_home(self, present: PresentRobot) -> bool:
+        """Return whether it stands at a charger of its own."""
+        position = present.state.pose.position
+        return present.free and self.endurance is not None and self.endurance.is_home(position)
+
+    def view(self, step: int, present: PresentRobot, planning: bool) -> RobotView:
+        """Return what a planner sees of it."""
+        view = RobotView(
+            state=present.state,
+            candidates=self.candidates.at(present.state.pose.position),
+            motion=self.facts.motion,
+            sensor=self.facts.sensor,
+            period_steps=self.facts.period,
+            planning=planning,
+            radius=self.facts.radius,
+            endurance=self.endurance,
+            arrival_radius=self.facts.arrival_radius,
+            exploration=self.exploration,
+        )
+        if not planning and self.plan.decided_at is not None:
+            view.phase = self.schedule.phase(step)
+            if len(self.plan.positions):
+                view.remaining_path, view.remaining_yaws = self.plan.remaining(step)
+        return view
+
+    # ---- changes -----------------------------------------------------------------------------
+
+    def adopt_area(self, area: Area) -> None:
+        """Take another area within the same bounds, as with other keep-outs."""
+        self.facts.motion.take_area(area, self.facts.radius)
+        lasting, before = Area(area.settings.without_keep_outs()), self.candidates
+        self.candidates = CandidateSet(before.settings, lasting, before.height)
+        self.candidates.restrict(area)
+        if self.exploration is not None:
+            self.exploration.take_area(area)
+
+    def begin_again(self) -> None:
+        """Begin a new search with nothing explored; decision indices continue."""
+        self.leave()
+        self.schedule.begin_again()
+        if self.exploration is not None:
+            self.exploration.values[...] = 1.0
+        if self.endurance is not None:
+            self.endurance.begin_again()
+
+    def adopt(self, step: int, present: PresentRobot, chosen: RobotDecision) -> None:
+        """Take over what was decided for it."""
+        plan, facts = self.plan, self.facts
+        here = present.state.pose.position
+        self.schedule.turn(step, here, None if present.free else plan.waypoint)
+        if self.endurance is not None:
+            self.endurance.begin_path(step)
+        # A waypoint within the radius already is gone to until it is reached.
+        near = facts.motion.squared_distance(here, chosen.waypoint) <= facts.arrival_radius**2
+        self.plan = RobotPlan(
+            plan.decision + 1,
+            step,
+            chosen,
+            chosen.waypoint,
+            turning_distance=0.0 if near else facts.arrival_radius,
+            staying=chosen.stays,
+        )
+
     def leave(self) -> None:
         """Discard its plan: it does not take part."""
-        self.decided_at = None
-        self.positions, self.yaws = np.zeros((0, 3)), np.zeros(0)
-        self.tour = np.zeros((0, 3))
-        self.staying = True
-        self.passed = None
-        self.due = False
-        self.errand = None
-        self.idle = self.queues = False
+        self.plan = RobotPlan(self.plan.decision, waypoint=self.plan.waypoint)
+        self.schedule.cancel()
+
+    def stay(self, step: int) -> None:
+        """Note the decision that it stays where it is, as the search ends."""
+        self.plan.decision += 1
+        self.plan.decided_at, self.plan.staying = step, True
+        self.schedule.restart(step)
 
     def on_external_goal(self, step: int) -> None:
         """Note that it follows a goal of another client: it measures without a plan."""
-        began = self.decided_at
-        if began is not None and self.staying and not len(self.positions):
+        began = self.plan.decided_at
+        if began is not None and self.plan.staying and not len(self.plan.positions):
             return  # it does so already
         self.leave()
         if began is None:
-            began = self.measured_from = step
-        self.decided_at = began
+            began = step
+            self.schedule.restart(step)
+        self.plan.decided_at = began
         # Measurements need a decision index, which is not negative.
-        self.decision = max(self.decision, 0)
+        self.plan.decision = max(self.plan.decision, 0)
 
-    def nears(self, robot: PresentRobot) -> bool:
-        """Return whether it is on its way, near enough to turn to the next waypoint."""
-        if robot.free or self.staying or not self.turning_distance:
-            return False
-        left = self.motion.squared_distance(robot.state.pose.position, self.waypoint)
-        return left < self.turning_distance**2
-
-    def adopt(self, step: int, robot: PresentRobot, chosen: RobotDecision) -> None:
-        """Take over what was decided for it."""
-        here = robot.state.pose.position
-        # Of two waypoints passed in a row the first is measured now.
-        self.due = self.due or self.passed is not None
-        self.passed = None
-        if robot.free:
-            self.measured_from = step
-        else:
-            self.passed = self.waypoint
-            self.nearest = self.motion.squared_distance(here, self.passed)
-        self.decision += 1
-        self.decided_at = self.progress_at = step
-        self.progress, self.errand = 0, None
-        self.queues = TAKEN in chosen.reason
-        waits = chosen.blocked or chosen.reason.startswith('waits')
-        self.idle = chosen.stays and not waits
-        self.positions, self.yaws, self.tour = chosen.positions, chosen.yaws, chosen.tour
-        self.staying, self.waypoint = chosen.stays, chosen.waypoint
-        # A waypoint within the radius already is gone to until it is reached.
-        near = self.motion.squared_distance(here, chosen.waypoint) <= self.arrival_radius**2
-        self.turning_distance = 0.0 if near else self.arrival_radius
-
-    def pass_waypoint(self, step: int, robot: PresentRobot) -> None:
-        """Count the measurements from the closest point to a waypoint that is passed."""
-        if self.passed is None or step == self.decided_at:
-            return
-        distance = self.motion.squared_distance(robot.state.pose.position, self.passed)
-        if distance >= self.nearest:
-            self.passed = None
-            self.measured_from = step
-        else:
-            self.nearest = distance
-
-    def is_home(self, robot: PresentRobot) -> bool:
-        """Return whether it stands at a charger of its own."""
-        position = robot.state.pose.position
-        return robot.free and self.endurance is not None and self.endurance.is_home(position)
-
-    def note_progress(self, step: int, robot: PresentRobot, step_time: float) -> None:
-        """Learn from how far it has come on its predicted trajectory since the last step."""
-        last = len(self.positions) - 1
-        if self.endurance is None or robot.free or self.staying or self.progress >= last:
-            return
-        gone, here = step - self.progress_at, robot.state.pose.position
-        end = min(self.progress + 3 * gone + 1, last)
-        ahead = self.positions[self.progress : end + 1] - here
-        reached = int(np.argmin((ahead * ahead).sum(axis=1)))
-        self.progress, self.progress_at = self.progress + reached, step
-        # At its end it slows down, and may turn to the next waypoint.
-        if self.progress < last:
-            self.endurance.note_pace(gone * step_time, reached * step_time)
-
-    def update_battery(self, step: int, robot: PresentRobot, step_time: float) -> None:
+    def update_battery(self, step: int, present: PresentRobot) -> None:
         """Take its charge, and what its present leg still takes of it."""
         if self.endurance is None:
             return
-        self.note_progress(step, robot, step_time)
-        slow = float(np.linalg.norm(robot.state.velocity)) < _SLOW
-        stands = robot.free or (self.staying and slow)
-        self.endurance.update(step, robot.state, robot.charge, stands)
-        self.endurance.leg = 0.0
-        if not (robot.free or self.staying) and len(self.positions):
-            path = self.left(step)[0]
-            metres = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-            self.endurance.leg = self.endurance.use(step_time * (len(path) - 1), metres)
-
-    def view(self, step: int, robot: PresentRobot, planning: bool) -> RobotView:
-        """Return what a planner sees of it."""
-        view = RobotView(
-            state=robot.state,
-            candidates=self.candidates.at(robot.state.pose.position),
-            motion=self.motion,
-            sensor=self.sensor,
-            period_steps=self.period,
-            planning=planning,
-            radius=self.radius,
-            endurance=self.endurance,
-            arrival_radius=self.arrival_radius,
-            exploration=self.exploration,
-        )
-        if not planning and self.decided_at is not None:
-            view.phase = (self.measured_from - step) % self.period
-            if len(self.positions):
-                view.remaining_path, view.remaining_yaws = self.left(step)
-        return view
-
-    def left(self, step: int) -> tuple[FloatArray, FloatArray]:
-        """Return the rest of its predicted trajectory: positions (n, 3) and headings (n,)."""
-        first = min(step - (self.decided_at or 0), len(self.positions) - 1)
-        return self.positions[first:], self.yaws[first:]
+        plan, state = self.plan, present.state
+        moves = not (present.free or plan.staying)
+        if moves:
+            self.endurance.note_progress(step, state.pose.position, plan.positions)
+        slow = float(np.linalg.norm(state.velocity)) < _SLOW
+        stands = present.free or (plan.staying and slow)
+        self.endurance.update(step, state, present.charge, stands)
+        self.endurance.plan_leg(plan.remaining(step)[0] if moves else np.zeros((0, 3)))

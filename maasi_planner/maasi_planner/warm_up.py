@@ -8,7 +8,7 @@ from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_planner.measurement_trigger import MeasurementTrigger
+from maasi_planner.measurement_schedule import MeasurementSchedule
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.objective.joint_search import PAIRS_LIMIT
 from maasi_planner.planners import make_planner
@@ -34,10 +34,10 @@ def _decide(team: TeamView) -> None:
     last.remaining_path = np.stack([start, start + 0.1])
     for settings in (PlannerSettings(objective='paper'), PlannerSettings()):
         make_planner('maasi', settings).decide(team)
-    name = team.names()[0]
-    view = team.robots[name]
-    trigger = MeasurementTrigger(PlannerSettings(measurement='event'))
-    trigger.measures(name, 1, view.sensor, view.state.pose, team.clusters, team.exploration)
+    view = team.robots[team.names()[0]]
+    settings = PlannerSettings(measurement='event')
+    schedule = MeasurementSchedule(view.motion, view.sensor, view.period_steps, settings)
+    schedule.is_of_use(view.state.pose, team.clusters, team.exploration)
     team.exploration.update(view.sensor.detection, view.state.pose)
 
 

@@ -125,7 +125,7 @@ class _Search:
                 del self._here[name]
                 self.log.add(Left(self.time, name))
                 (group,) = (group for group in self._groups if name in group.names)
-                group.coordinator.plans[name].leave()
+                group.coordinator.robots[name].leave()
             for robot in self._here.values():
                 robot.observe(round(self.time * 1e9))
             self.log.add_states(self.time, {name: r.state for name, r in self._here.items()})
@@ -147,10 +147,10 @@ class _Search:
 
     def _plan(self, group: _Group) -> dict[str, PresentRobot]:
         """Plan for the free robots of a group, and send them to their waypoints."""
-        coordinator, plans, here = group.coordinator, group.coordinator.plans, self._here
+        coordinator, robots, here = group.coordinator, group.coordinator.robots, self._here
         present = {}
         for name in [name for name in group.names if name in here]:
-            follower, plan = here[name].follower, plans[name]
+            follower, plan = here[name].follower, robots[name].plan
             ended = follower.goal is not None and follower.goal.id == plan.goal_id
             ended = ended and follower.status != GoalStatus.MOVING
             free, charge = plan.staying or ended, here[name].body.battery.charge
@@ -165,22 +165,22 @@ class _Search:
         decision = coordinator.plan(self.step, present, taken)
         if decision is not None:
             duration = perf_counter() - begin
-            indices = {name: plans[name].decision for name in decision.robots}
+            indices = {name: robots[name].plan.decision for name in decision.robots}
             explored = coordinator.exploration.explored_fraction()
             self.log.add(Decided(self.time, group.space, decision, indices, explored, duration))
             self.log.add_map(self.time, group.space, coordinator.exploration, now=True)
             for name, chosen in decision.robots.items():
                 if not chosen.stays:
-                    number = plans[name].goal_id
+                    number = robots[name].plan.goal_id
                     here[name].follower.take(Goal(number, self.step, chosen.waypoint))
         for name, robot in present.items():
-            self._destinations[name] = plans[name].destination(robot.state)
+            self._destinations[name] = robots[name].plan.destination(robot.state)
         return present
 
     def _measure(self, group: _Group, present: Mapping[str, PresentRobot]) -> None:
         """Measure with the robots of a group that are due, update its filter, and score."""
         able = {name for name in present if self.simulation.images_due(name)}
-        members = group.coordinator.measuring(self.step, present, able)
+        members = group.coordinator.measure(self.step, present, able)
         if not members:
             return
         measurements = [

@@ -89,4 +89,4 @@ def test_own_explorations_are_the_default():
     # What is published, and what decides about the end, is the exploration of the team.
     assert coordinator.exploration.at([[5.0, 5.0]])[0] == pytest.approx(0.02)
     other = explored([('a', (5.0, 5.0))], name='maasi')
-    assert all(plan.exploration is None for plan in other.plans.values())
+    assert all(robot.exploration is None for robot in other.robots.values())

@@ -153,7 +153,7 @@ def charging(world, a, reason):
 
     def has(charge):
         publisher.publish(BatteryState(percentage=charge))
-        return world.coordinator.plans['a'].endurance.charging
+        return world.coordinator.robots['a'].endurance.charging
 
     world.coordinator = world.planner.coordinator
     world.until(lambda: has(0.05))

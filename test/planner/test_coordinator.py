@@ -54,39 +54,39 @@ def test_free_robots_plan_together_and_measure_at_once_then_every_period():
     coordinator = make()
     robots = there(a=(1.0, 1.0), b=(9.0, 9.0))
     assert sorted(coordinator.plan(0, robots).robots) == ['a', 'b']
-    assert coordinator.measuring(0, robots) == [Member('a', 0, 0), Member('b', 0, 0)]
+    assert coordinator.measure(0, robots) == [Member('a', 0, 0), Member('b', 0, 0)]
     moving = there(free=False, a=(1.1, 1.0), b=(9.0, 8.9))
     for step in (1, 2, 3):
         assert coordinator.plan(step, moving) is None
-        assert coordinator.measuring(step, moving) == []
-    assert coordinator.measuring(4, moving) == [Member('a', 0, 1), Member('b', 0, 1)]
+        assert coordinator.measure(step, moving) == []
+    assert coordinator.measure(4, moving) == [Member('a', 0, 1), Member('b', 0, 1)]
 
 
 def test_who_arrives_plans_alone_and_starts_its_period_anew():
     coordinator = started()
     robots = there(a=(2.0, 2.0)) | there(free=False, b=(8.5, 8.5))
     # The planner receives the other's destination and its next measurement.
-    view = coordinator.plans['b'].view(5, robots['b'], False)
+    view = coordinator.robots['b'].view(5, robots['b'], False)
     assert view.phase == 3
-    assert view.remaining_path == pytest.approx(coordinator.plans['b'].positions[5:])
+    assert view.remaining_path == pytest.approx(coordinator.robots['b'].plan.positions[5:])
     assert list(coordinator.plan(6, robots).robots) == ['a']
-    assert coordinator.plans['a'].decision == 1
-    assert coordinator.plans['b'].decision == 0
+    assert coordinator.robots['a'].plan.decision == 1
+    assert coordinator.robots['b'].plan.decision == 0
     for step, name in ((6, 'a'), (8, 'b'), (10, 'a')):
-        assert [item.robot for item in coordinator.measuring(step, robots)] == [name]
+        assert [item.robot for item in coordinator.measure(step, robots)] == [name]
 
 
 def test_a_measurement_waits_for_an_image():
     coordinator = started()
     robots = there(a=(1.0, 1.0), b=(9.0, 9.0))
-    assert [item.robot for item in coordinator.measuring(0, robots, ['b'])] == ['b']
-    assert [item.robot for item in coordinator.measuring(1, robots, ['a', 'b'])] == ['a']
-    assert coordinator.measuring(2, robots, ['a', 'b']) == []
+    assert [item.robot for item in coordinator.measure(0, robots, ['b'])] == ['b']
+    assert [item.robot for item in coordinator.measure(1, robots, ['a', 'b'])] == ['a']
+    assert coordinator.measure(2, robots, ['a', 'b']) == []
 
 
 def test_one_left_alone_plans_alone_and_the_other_joins_again():
     coordinator = started()
-    coordinator.plans['b'].leave()
+    coordinator.robots['b'].leave()
     assert list(coordinator.plan(5, there(a=(2.0, 2.0))).robots) == ['a']
     robots = there(free=False, a=(3.0, 2.0)) | there(b=(9.0, 9.0))
     assert list(coordinator.plan(9, robots).robots) == ['b']
@@ -104,12 +104,12 @@ def test_without_measurements_on_the_way_those_at_waypoints_are_left(planner):
     coordinator = make(**planner)
     robots = there(a=(1.0, 1.0))
     coordinator.plan(0, robots)
-    assert len(coordinator.measuring(0, robots)) == 1
+    assert len(coordinator.measure(0, robots)) == 1
     for step in (4, 8, 12):
-        assert coordinator.measuring(step, there(free=False, a=(2.0, 1.0))) == []
+        assert coordinator.measure(step, there(free=False, a=(2.0, 1.0))) == []
     arrived = there(a=(2.0, 2.0))
     assert coordinator.plan(14, arrived) is not None
-    assert len(coordinator.measuring(14, arrived)) == 1
+    assert len(coordinator.measure(14, arrived)) == 1
 
 
 def test_nothing_is_planned_any_more_once_all_is_explored():
@@ -126,7 +126,7 @@ def test_a_refused_goal_is_planned_anew_at_the_next_period():
     coordinator = make()
     robots = there(a=(1.0, 1.0))
     coordinator.plan(0, robots)
-    coordinator.plans['a'].staying = True
+    coordinator.robots['a'].plan.staying = True
     assert coordinator.plan(2, robots) is None
     assert list(coordinator.plan(4, robots).robots) == ['a']
 
@@ -137,9 +137,9 @@ def test_places_of_robots_that_plan_for_themselves_are_kept_clear():
     again = make(name='nearest_widest')
     other = again.plan(0, robots, taken=[(free, 0.1)]).robots['a'].waypoint
     assert np.linalg.norm(other - free) >= 0.2
-    assert again.plans['a'].destination(robots['a'].state) == pytest.approx(other, abs=0.1)
-    again.plans['a'].staying = True
-    assert again.plans['a'].destination(robots['a'].state) == pytest.approx([1.0, 1.0, 0.0])
+    assert again.robots['a'].plan.destination(robots['a'].state) == pytest.approx(other, abs=0.1)
+    again.robots['a'].plan.staying = True
+    assert again.robots['a'].plan.destination(robots['a'].state) == pytest.approx([1.0, 1.0, 0.0])
 
 
 # ---- decisions before a robot arrives -----------------------------------------------------------
@@ -164,7 +164,7 @@ def flying(monkeypatch, radius=0.5, goals=GOALS, period=0.4):
     sensor = ROBOT['sensor'] | {'period': period}
     coordinator = make({'a': ROBOT | {'motion': motion, 'sensor': sensor}})
     coordinator.plan(0, there(a=(1.0, 1.0)))
-    assert coordinator.measuring(0, there(a=(1.0, 1.0))) == [Member('a', 0, 0)]
+    assert coordinator.measure(0, there(a=(1.0, 1.0))) == [Member('a', 0, 0)]
     return coordinator
 
 
@@ -189,7 +189,7 @@ def on_the_way(*place):
 )
 def test_radius_within_which_the_next_waypoint_is_decided(planner, motion, radius):
     robot = ROBOT | {'motion': ROBOT['motion'] | motion}
-    assert make({'a': robot}, **planner).plans['a'].arrival_radius == pytest.approx(radius)
+    assert make({'a': robot}, **planner).robots['a'].facts.arrival_radius == pytest.approx(radius)
 
 
 def test_the_next_waypoint_is_decided_within_the_radius(monkeypatch):
@@ -197,7 +197,7 @@ def test_the_next_waypoint_is_decided_within_the_radius(monkeypatch):
     assert coordinator.plan(1, on_the_way(2.4, 1.0)) is None
     decision = coordinator.plan(2, on_the_way(2.6, 1.0))
     assert_allclose(decision.robots['a'].waypoint[:2], GOALS[1])
-    assert coordinator.plans['a'].decision == 1
+    assert coordinator.robots['a'].plan.decision == 1
     assert coordinator.plan(3, on_the_way(2.7, 1.0)) is None
 
 
@@ -206,15 +206,15 @@ def test_without_a_radius_or_for_another_client_it_is_decided_on_arrival(monkeyp
     assert coordinator.plan(1, on_the_way(3.0, 1.0)) is None
     assert coordinator.plan(2, there(a=(3.0, 1.0))) is not None
     coordinator = flying(monkeypatch)
-    coordinator.plans['a'].on_external_goal(1)
+    coordinator.robots['a'].on_external_goal(1)
     assert coordinator.plan(2, on_the_way(2.9, 1.0)) is None
 
 
 def test_a_robot_with_nowhere_further_to_go_keeps_its_waypoint_and_plans_there(monkeypatch):
     coordinator = flying(monkeypatch, goals=GOALS[:1])
     assert coordinator.plan(2, on_the_way(2.6, 1.0)) is None
-    assert_allclose(coordinator.plans['a'].positions[-1][:2], GOALS[0], atol=0.2)
-    assert coordinator.plans['a'].decision == 0 and not coordinator.plans['a'].staying
+    assert_allclose(coordinator.robots['a'].plan.positions[-1][:2], GOALS[0], atol=0.2)
+    assert coordinator.robots['a'].plan.decision == 0 and not coordinator.robots['a'].plan.staying
     assert coordinator.plan(3, on_the_way(2.7, 1.0)) is None
     assert coordinator.plan(6, there(a=(3.0, 1.0))).robots['a'].stays
 
@@ -243,7 +243,7 @@ def test_the_measurement_at_a_waypoint_is_taken_at_the_closest_point(monkeypatch
         robots = on_the_way(*way.get(step, (3.0, 3.0)))
         if step in way:
             coordinator.plan(step, robots)
-        measured += [step] * len(coordinator.measuring(step, robots))
+        measured += [step] * len(coordinator.measure(step, robots))
     # At step 4 it begins to get farther away, and the period begins.
     assert measured == [4, 12, 20]
 
@@ -252,11 +252,11 @@ def test_of_two_waypoints_passed_in_a_row_each_is_measured(monkeypatch):
     goals = ((3.0, 1.0), (3.6, 1.0), (7.0, 4.0))
     coordinator = flying(monkeypatch, goals=goals, period=10.0)
     coordinator.plan(2, on_the_way(2.6, 1.0))
-    assert coordinator.measuring(2, on_the_way(2.6, 1.0)) == []
+    assert coordinator.measure(2, on_the_way(2.6, 1.0)) == []
     robots = on_the_way(2.95, 0.6)
-    coordinator.plans['a'].turning_distance = 1.0
+    coordinator.robots['a'].plan.turning_distance = 1.0
     assert coordinator.plan(3, robots) is not None
-    assert [item.robot for item in coordinator.measuring(3, robots)] == ['a']
+    assert [item.robot for item in coordinator.measure(3, robots)] == ['a']
 
 
 def test_a_robot_that_must_turn_home_does_so_as_soon_as_its_charger_is_free():
@@ -278,7 +278,7 @@ def test_a_robot_that_must_turn_home_does_so_as_soon_as_its_charger_is_free():
     # Over its charger it is not home before it has stopped there.
     over = RobotState.at_rest([1.0, 1.0, 0.0])
     assert coordinator.plan(40, {'a': PresentRobot(over, False, 0.01)}) is None
-    assert coordinator.plans['a'].endurance.phase is Phase.RETURNING
+    assert coordinator.robots['a'].endurance.phase is Phase.RETURNING
     landed = coordinator.plan(41, {'a': PresentRobot(over, True, 0.01)}).robots['a']
     assert landed.reason == 'charges: its battery is at 1 %'
     assert coordinator.plan(60, {'a': PresentRobot(over, True, 0.5)}) is None
@@ -289,8 +289,8 @@ def test_who_is_sent_further_than_its_battery_affords_goes_home(monkeypatch):
     """By hand: 2.9 m there, and 3.5 m and a tenth home, use 0.34 of the battery."""
     for charge, waypoint in ((0.6, GOALS[1]), (0.58, (1.0, 1.0))):
         coordinator = flying(monkeypatch)
-        plan = coordinator.plans['a']
+        robot = coordinator.robots['a']
         settings = EnduranceSettings(per_metre=0.05, reserve=0.25)
-        plan.endurance = Endurance(settings, plan.motion, [1.0, 1.0, 0.0])
+        robot.endurance = Endurance(settings, robot.facts.motion, [1.0, 1.0, 0.0])
         arrived = PresentRobot(RobotState.at_rest([*GOALS[0], 0.0]), True, charge)
         assert_allclose(coordinator.plan(30, {'a': arrived}).robots['a'].waypoint[:2], waypoint)

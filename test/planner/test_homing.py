@@ -63,22 +63,23 @@ class Flight:
         self.heard = dict.fromkeys(robots, True)  # whether its charge is reported
         self.drain, self.charger = 1.0, 1.0 / 30.0  # share of a full battery each second
         self.followers, self.bodies, self.traces = {}, {}, {name: [] for name in robots}
-        for name, plan in self.coordinator.plans.items():
+        for name, known in self.coordinator.robots.items():
             settings = self.settings.robots[name]
             area = self.coordinator.area
             self.followers[name] = WaypointFollower(make_motion(settings.motion, area, 0.4))
-            self.bodies[name] = plan.motion.body(RobotState.at_rest(settings.start))
+            self.bodies[name] = known.facts.motion.body(RobotState.at_rest(settings.start))
 
     def place(self, name):
         return np.array(self.bodies[name].robot_state().pose.position)
 
     def put(self, name, position):
-        self.bodies[name] = self.coordinator.plans[name].motion.body(RobotState.at_rest(position))
+        motion = self.coordinator.robots[name].facts.motion
+        self.bodies[name] = motion.body(RobotState.at_rest(position))
 
     def present(self):
         robots = {}
         for name, follower in self.followers.items():
-            plan, mode = self.coordinator.plans[name], self.modes[name]
+            plan, mode = self.coordinator.robots[name].plan, self.modes[name]
             ended = follower.goal is not None and follower.goal.id == plan.goal_id
             free = plan.staying or (ended and follower.status != GoalStatus.MOVING)
             robots[name] = PresentRobot(
@@ -103,9 +104,9 @@ class Flight:
                 self.decisions.append(decision)
                 for name, chosen in decision.robots.items():
                     if not chosen.stays:
-                        number = self.coordinator.plans[name].goal_id
+                        number = self.coordinator.robots[name].plan.goal_id
                         self.followers[name].take(Goal(number, self.step, chosen.waypoint))
-            members = self.coordinator.measuring(self.step, robots)
+            members = self.coordinator.measure(self.step, robots)
             self.coordinator.absorb({m.robot: robots[m.robot].state.pose for m in members}, [])
             if until():
                 return True
@@ -118,7 +119,7 @@ class Flight:
         return until()
 
     def _use(self, name, metres):
-        endurance = self.coordinator.plans[name].endurance
+        endurance = self.coordinator.robots[name].endurance
         home = endurance.is_home(self.place(name)) and metres < 0.1 * STEP
         change = self.charger * STEP
         if not (home and self.charger > 0.0):
@@ -136,11 +137,11 @@ class Flight:
 
     def is_outside(self):
         """Return whether robot `a` is in no closed zone."""
-        keep_out = self.coordinator.plans['a'].motion.keep_out
+        keep_out = self.coordinator.robots['a'].facts.motion.keep_out
         return keep_out.exit_from(self.place('a')) is None
 
     def at_home(self, name):
-        return self.coordinator.plans[name].endurance.is_home(self.place(name))
+        return self.coordinator.robots[name].endurance.is_home(self.place(name))
 
 
 @pytest.mark.parametrize('planner', ['nearest_widest', 'maasi', 'tour', 'lawnmower', 'maas'])
@@ -161,8 +162,8 @@ def test_after_the_search_robots_with_batteries_come_home_and_then_it_has_ended(
     assert len(flight.decisions) == number and flight.at_home('a')
     # A new search begins with nothing explored.
     flight.coordinator.begin_again()
-    for plan in flight.coordinator.plans.values():
-        assert plan.exploration is None or (plan.exploration.values == 1.0).all()
+    for known in flight.coordinator.robots.values():
+        assert known.exploration is None or (known.exploration.values == 1.0).all()
     assert flight.fly(20.0, lambda: not flight.at_home('a'))
 
 
@@ -174,7 +175,7 @@ def test_a_paused_robot_comes_home_in_time_and_stays_and_one_that_waits_is_not_m
     assert flight.fly(40.0, lambda: math.dist(flight.place('a'), [3.0, 3.0, 10.0]) > 20.0)
     flight.modes['a'] = 'paused'
     flight.followers['a'].end(GoalStatus.CANCELED, 'paused')
-    flight.coordinator.plans['a'].leave()
+    flight.coordinator.robots['a'].leave()
     place = flight.place('a')
     flight.fly(2.0)
     assert math.dist(flight.place('a'), place) < 4.0
@@ -184,7 +185,7 @@ def test_a_paused_robot_comes_home_in_time_and_stays_and_one_that_waits_is_not_m
     flight.fly(60.0)
     # It is charged, and stays until it is resumed.
     assert flight.at_home('a') and flight.charges['a'] > 0.95
-    assert flight.coordinator.plans['a'].endurance.phase is Phase.AVAILABLE
+    assert flight.coordinator.robots['a'].endurance.phase is Phase.AVAILABLE
     assert flight.place('b').tolist() == [30.0, 57.0, 10.0] and not flight.reasons('b')
     flight.modes['a'] = 'searching'
     assert flight.fly(20.0, lambda: not flight.at_home('a'))
@@ -219,7 +220,7 @@ def test_with_any_drain_robots_are_home_with_about_the_reserve(seed):
 
 def test_a_charge_that_is_not_reported_any_more_is_estimated():
     flight = Flight({'a': robot([3.0, 3.0])})
-    endurance = flight.coordinator.plans['a'].endurance
+    endurance = flight.coordinator.robots['a'].endurance
     flight.drain = 1.2
     assert flight.fly(60.0, lambda: flight.charges['a'] < 0.7)
     assert not flight.coordinator.homing.estimates()
@@ -240,7 +241,7 @@ def test_a_robot_that_is_not_charged_stays_at_home_and_the_search_goes_on_withou
     flight = Flight({'a': robot([3.0, 3.0]), 'b': robot([57.0, 57.0])})
     flight.charger = 0.0
     flight.charges['b'] = 0.6
-    endurance = flight.coordinator.plans['b'].endurance
+    endurance = flight.coordinator.robots['b'].endurance
     assert flight.fly(120.0, lambda: endurance.phase is Phase.DONE)
     assert endurance.done_reason == NOT_CHARGED and flight.at_home('b')
     assert f'b: {NOT_CHARGED}' in flight.coordinator.homing.news
@@ -342,23 +343,30 @@ def test_two_robots_that_share_one_charger_charge_in_turn():
     assert any('all chargers are taken' in text for n in 'ab' for text in flight.reasons(n))
 
 
-def test_queries_of_a_battery_change_nothing():
-    flight = Flight({'a': robot([3.0, 3.0])})
+@pytest.mark.parametrize('charge', [1.0, 0.2])
+def test_queries_change_nothing(charge):
+    flight = Flight({'a': robot([3.0, 3.0]), 'b': robot([57.0, 57.0])})
+    flight.charges['a'] = charge
     flight.fly(10.0)
-    plan = flight.coordinator.plans['a']
-    endurance, state = plan.endurance, flight.bodies['a'].robot_state()
+    coordinator, known = flight.coordinator, flight.coordinator.robots['a']
+    homing, endurance = coordinator.homing, known.endurance
+    state = flight.bodies['a'].robot_state()
 
     def facts():
-        return {
-            key: str(value)
-            for key, value in vars(endurance).items()
-            if key not in ('_paths', 'motion', 'settings')
-        }
+        parts = [coordinator, homing, endurance, known.plan, known.schedule, known]
+        fixed = '_paths', 'robots', '_robots', 'plan', 'schedule', 'endurance'
+        return [{k: repr(v) for k, v in vars(part).items() if k not in fixed} for part in parts]
 
     before = facts()
-    paths = plan.motion.predict(state, plan.candidates.at(state.pose.position), STEP)
-    first = endurance.affords(paths, STEP).tolist()
-    endurance.range_from(state.pose.position)
-    endurance.chargers_within(state.pose.position)
-    flight.coordinator.planning(flight.step, flight.present())
-    assert endurance.affords(paths, STEP).tolist() == first and facts() == before
+    for _ in range(2):
+        present = flight.present()
+        paths = known.facts.motion.predict(state, known.candidates.at(state.pose.position), STEP)
+        first = endurance.affords(paths, STEP).tolist()
+        endurance.range_from(state.pose.position)
+        endurance.chargers_within(state.pose.position)
+        coordinator.planning(flight.step, present)
+        errands = homing.errands(flight.step, present, True)
+        homing.waiting(flight.step, present, errands)
+        homing.settled(present)
+        known.view(flight.step, present['a'], False)
+        assert endurance.affords(paths, STEP).tolist() == first and facts() == before

@@ -379,7 +379,7 @@ def test_keep_outs_are_taken_by_service_published_and_checked(team):
         team.until(answer.done)
         return answer.result()
 
-    before = len(team.tested.coordinator.plans['a'].candidates.at([0.0, 0.0, 0.0]))
+    before = len(team.tested.coordinator.robots['a'].candidates.at([0.0, 0.0, 0.0]))
     wrong = ask('0.5 0.5')
     assert not wrong.success and "got '0.5 0.5', allowed are x y radius" in wrong.message
     assert not heard
@@ -387,8 +387,8 @@ def test_keep_outs_are_taken_by_service_published_and_checked(team):
     team.until(lambda: heard)
     assert heard[-1].version == 1 and len(heard[-1].zones) == 2
     coordinator = team.tested.coordinator
-    assert len(coordinator.plans['a'].candidates.at([0.0, 0.0, 0.0])) < before
-    assert not coordinator.plans['a'].motion.keep_out.is_free([0.5, 0.5, 0.0])
+    assert len(coordinator.robots['a'].candidates.at([0.0, 0.0, 0.0])) < before
+    assert not coordinator.robots['a'].facts.motion.keep_out.is_free([0.5, 0.5, 0.0])
     assert ask().success
     team.until(lambda: heard[-1].version == 2)
     assert not heard[-1].zones and coordinator.area.region is None

@@ -84,8 +84,8 @@ class Batches:
         if number <= self._before:
             # An update of an earlier planner process: continue after its indices.
             for member in message.members:
-                plan = coordinator.plans[member.robot]
-                plan.measurements = max(plan.measurements, int(member.measurement) + 1)
+                schedule = coordinator.robots[member.robot].schedule
+                schedule.number = max(schedule.number, int(member.measurement) + 1)
             return
         self._guard.watch.answered(number)
         measured = [(member.robot, int(member.measurement)) for member in message.members]

@@ -51,12 +51,12 @@ class Orders:
         """Cancel the goals of robots, and discard their plans."""
         for name in names:
             self.goals.cancel(name)
-            self._coordinator.plans[name].leave()
+            self._coordinator.robots[name].leave()
 
     def hold(self, names: Iterable[str]) -> None:
         """Stop robots where they are, but for those on their way home; they get new goals."""
         for name in names:
-            plan = self._coordinator.plans[name]
+            plan = self._coordinator.robots[name].plan
             if name not in self._homing and (plan.errand is None or plan.staying):
                 self.goals.cancel(name)
                 plan.staying = True
@@ -80,7 +80,7 @@ class Orders:
         self.external_goals.pop(name, None)
         if name in self._homing:
             self._homing[name] = -1
-        self._coordinator.plans[name].leave()
+        self._coordinator.robots[name].leave()
 
     def send(self, name: str, number: int, waypoint: FloatArray, header: Header) -> None:
         """Send a goal to a robot."""
@@ -95,7 +95,7 @@ class Orders:
 
         One whose battery does not allow it goes later.
         """
-        plan, homing = self._coordinator.plans[name], self._coordinator.homing
+        plan, homing = self._coordinator.robots[name].plan, self._coordinator.homing
         if name not in self._homing or homing.occupies(name):
             return False
         start, step = np.array(self._node.settings.robots[name].start), self._node.settings.step
@@ -138,11 +138,11 @@ class Orders:
             self._refused_since = now
         self.refused_for = now - self._refused_since
         self.goals.forget(name)
-        self._coordinator.plans[name].staying = True
+        self._coordinator.robots[name].plan.staying = True
 
     def is_free(self, name: str, heard: HeardState, step: int) -> bool:
         """Return whether a robot can take a goal: it has none, from any client."""
-        plan, logger = self._coordinator.plans[name], self._node.get_logger()
+        plan, logger = self._coordinator.robots[name].plan, self._node.get_logger()
         # Without one, the last has ended and the search is over: no other follows.
         if not plan.staying and self.goals.has(name):
             number = plan.goal_id
@@ -177,9 +177,8 @@ class Orders:
     def _on_external_goal(self, name: str, heard: HeardState, step: int) -> None:
         new = self.external_goals.get(name) != heard.goal
         self.external_goals[name] = heard.goal
-        plan = self._coordinator.plans[name]
         if self._modes.of[name] is Mode.SEARCHING:
-            plan.on_external_goal(step)
+            self._coordinator.robots[name].on_external_goal(step)
         if new:
             self._node.get_logger().warning(
                 f'{name} follows goal {heard.goal} of another client: it measures, and gets no '

@@ -57,7 +57,7 @@ class PlannerViews:
             self._exploration.publish(particles_to_ros(exploration.nodes(), unseen, header))
         shown = {}
         for name, robot in robots.items():
-            plan = coordinator.plans[name]
+            plan = coordinator.robots[name].plan
             place = np.asarray(robot.state.pose.position)
             waypoint = plan.positions[-1] if len(plan.positions) else place
             shown[name] = (place, waypoint, plan.positions, plan.tour)
