@@ -27,7 +27,7 @@ from maasi_planner.robot_plan import (
     PresentRobot,
     RobotFacts,
 )
-from maasi_planner.settings import PlannerSettings
+from maasi_planner.settings import PLANNERS, PlannerSettings
 from maasi_planner.team import Decision, TeamView, stay
 
 _ROUNDING = 1e-9  # of shares
@@ -53,7 +53,7 @@ class Coordinator:
         self.exploration = UnexploredMap(self.area, settings.exploration_spacing or spacing)
         self.clusters: list[Cluster] = []
         self.finished: str | None = None
-        self.planner = make_planner(settings.planner.name, settings.planner)
+        self.planner = self._planner()
         self.robots = {name: self._robot(name, sensor) for name, sensor in sensors.items()}
         self.homing = Homing(self.robots)
         self._ended = False
@@ -61,11 +61,16 @@ class Coordinator:
         self._unasked: set[str] = set()
         self._live = _live(settings.planner)
 
+    def _planner(self) -> Planner | None:
+        """Return the planner; None: the robots that decide first choose it."""
+        settings = self.settings.planner
+        return None if settings.name == 'auto' else make_planner(settings.name, settings)
+
     def _robot(self, name: str, sensor: Sensor) -> PlannedRobot:
         planner, robot, step = self.settings.planner, self.settings.robots[name], self.settings.step
         motion = make_motion(robot.motion, self.area, robot.radius)
         period = max(1, round(robot.sensor.period / step))
-        radius = arrival_radius(motion, sensor, self.planner)
+        radius = arrival_radius(motion, sensor, planner)
         separate = planner.name in ('maas', 'as') and planner.agent_exploration == 'own'
         battery = robot.endurance
         return PlannedRobot(
@@ -133,7 +138,7 @@ class Coordinator:
         self.exploration.values[...] = 1.0
         self.clusters = []
         self.finished, self._ended, self._unasked = None, False, set()
-        self.planner = make_planner(self.settings.planner.name, self.settings.planner)
+        self.planner = self._planner()
         for robot in self.robots.values():
             robot.begin_again()
         self.homing.begin_again()
@@ -185,7 +190,8 @@ class Coordinator:
         settings = self.settings.planner
         if (live := _live(settings)) != self._live:
             self._live = live
-            self.planner.take_settings(settings)
+            if self.planner is not None:
+                self.planner.take_settings(settings.renamed(self.planner.settings.name))
 
     def _check_batteries(self, step: int, present: Mapping[str, PresentRobot]) -> None:
         """Finish the search where batteries leave no robot anything to do."""
@@ -219,11 +225,15 @@ class Coordinator:
             return Decision(team.step)
         unasked = self._unasked.intersection(asked)
         self._unasked -= unasked
-        conclusion = None if unasked else self.planner.finished(team)
+        settings = self.settings.planner
+        planner = self.planner = self.planner or make_planner(settings.name, settings, team)
+        conclusion = None if unasked else planner.finished(team)
         if conclusion is not None:
             return self._conclude(team, present, asked, conclusion)
-        decision = self.planner.decide(team)
-        check_decision(self.planner, team, decision)
+        decision = planner.decide(team)
+        check_decision(planner, team, decision)
+        if planner.settings.name != settings.name:
+            decision.reason = f'{planner.settings.name}: {decision.reason}'
         decided = dict(decision.robots)
         self.homing.check(team, decision, [name for name in decided if present[name].free])
         if any(decision.robots[name] is not chosen for name, chosen in decided.items()):
@@ -295,7 +305,8 @@ class Coordinator:
             plan, schedule = self.robots[name].plan, self.robots[name].schedule
             if plan.decided_at is None or not present[name].searches:
                 continue
-            pose, underway = present[name].state.pose, self.planner.measures_underway
+            pose = present[name].state.pose
+            underway = self.planner is None or self.planner.measures_underway
             schedule.update(step, pose, underway, self.clusters, self.exploration)
             if schedule.due and (able is None or name in able):
                 members.append(Member(name, plan.decision, schedule.begin()))
@@ -318,7 +329,7 @@ def _live(settings: PlannerSettings) -> tuple[object, ...]:
     return tuple(getattr(settings, part) for part in parts)
 
 
-def arrival_radius(motion: MotionModel, sensor: Sensor, planner: Planner) -> float:
+def arrival_radius(motion: MotionModel, sensor: Sensor, settings: PlannerSettings) -> float:
     """Return the distance from its waypoint at which a robot takes its next decision [m].
 
     The setting `arrival_radius` where it is given. Else 0, as in 000, for the objective of the
@@ -329,6 +340,7 @@ def arrival_radius(motion: MotionModel, sensor: Sensor, planner: Planner) -> flo
     given = motion.settings.arrival_radius
     if given is not None:
         return given
-    if planner.settings.objective == 'paper' or not planner.measures_underway:
+    planner: type[Planner] = PLANNERS.load(settings.name)
+    if settings.objective == 'paper' or not planner.measures_underway:
         return 0.0
     return min(motion.braking_distance(), half_view(sensor))

@@ -19,7 +19,8 @@ PLANNERS = PluginGroup(
     'planner',
     'maasi_planner.planners.base:Planner',
     {
-        'auto': 'maasi_planner.planners.auto:Auto',
+        # `make_planner` takes this one, or `tour`.
+        'auto': 'maasi_planner.planners.intermittent:Intermittent',
         'maasi': 'maasi_planner.planners.intermittent:Intermittent',
         'asi': 'maasi_planner.planners.intermittent:Intermittent',
         'maas': 'maasi_planner.planners.active_search:ActiveSearch',
@@ -306,7 +307,9 @@ class PlannerSettings(Settings):
     )
 
     def renamed(self, name: str) -> PlannerSettings:
-        """Return the settings of another planner, with the same numbers."""
+        """Return the settings of a planner by name, with the same numbers."""
+        if name == self.name:
+            return self
         return PlannerSettings.model_validate({**dict(self), 'name': name, 'settings': None})
 
     def weights(self) -> Weights:

@@ -53,7 +53,8 @@ def started(**planner):
 def test_free_robots_plan_together_and_measure_at_once_then_every_period():
     coordinator = make()
     robots = there(a=(1.0, 1.0), b=(9.0, 9.0))
-    assert sorted(coordinator.plan(0, robots).robots) == ['a', 'b']
+    decision = coordinator.plan(0, robots)
+    assert sorted(decision.robots) == ['a', 'b'] and decision.reason.startswith('maasi: a: ')
     assert coordinator.measure(0, robots) == [Member('a', 0, 0), Member('b', 0, 0)]
     moving = there(free=False, a=(1.1, 1.0), b=(9.0, 8.9))
     for step in (1, 2, 3):

@@ -3,10 +3,12 @@
 from maasi_planner.planners.active_search import ActiveSearch
 from maasi_planner.planners.base import Planner
 from maasi_planner.planners.intermittent import Intermittent
+from maasi_planner.planners.lattice import lanes_of
 from maasi_planner.planners.lawnmower import Lawnmower
 from maasi_planner.planners.mutual_information import MutualInformation
 from maasi_planner.planners.nearest_widest import NearestWidest
 from maasi_planner.settings import PLANNERS, PlannerSettings
+from maasi_planner.team import TeamView
 
 __all__ = [
     'ActiveSearch',
@@ -16,10 +18,21 @@ __all__ = [
     'NearestWidest',
     'Planner',
     'make_planner',
+    'takes_tour',
 ]
 
 
-def make_planner(name: str, settings: PlannerSettings | None = None) -> Planner:
+def takes_tour(volume: float, width: float, dimension: int) -> bool:
+    """Return whether `auto` is `tour` in an area, by the width that robots see [m]; else `maasi`.
+
+    docs/search_quality.md has the measurements that the rule is from.
+    """
+    return volume >= 30 * width**dimension
+
+
+def make_planner(
+    name: str, settings: PlannerSettings | None = None, team: TeamView | None = None
+) -> Planner:
     """Return the planner called `name`.
 
     Parameters
@@ -28,14 +41,18 @@ def make_planner(name: str, settings: PlannerSettings | None = None) -> Planner:
         As in `PlannerSettings.name`.
     settings : PlannerSettings, optional
         Its parameters; `name` overrides the name in them.
+    team : TeamView, optional
+        The team that it plans for first, by which `auto` is chosen: `tour` or `maasi`.
 
     Raises
     ------
     ValueError
-        If there is no planner of that name, or its own settings are wrong.
+        If there is no planner of that name, its own settings are wrong, or `auto` has no team.
     """
-    own = settings or PlannerSettings()
-    if own.name != name:
-        own = own.renamed(name)
-    planner: Planner = PLANNERS.load(name)(own)
+    if name == 'auto':
+        if team is None:
+            raise ValueError('planner auto: got no team, which it is chosen by')
+        many = takes_tour(team.exploration.volume, lanes_of(team)[0], team.dimension)
+        name = 'tour' if many else 'maasi'
+    planner: Planner = PLANNERS.load(name)((settings or PlannerSettings()).renamed(name))
     return planner

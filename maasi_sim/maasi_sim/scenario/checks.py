@@ -14,7 +14,7 @@ from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.plugins import unknown
 from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_parts
-from maasi_planner.planners.auto import SQUARES
+from maasi_planner.planners import takes_tour
 from maasi_planner.settings import CandidateSettings
 from maasi_sim.scenario.background import background_problems
 from maasi_sim.scenario.base import BaseScenario
@@ -352,8 +352,7 @@ def _uses_candidates(scenario: Scenario, area: Area) -> bool:
     if name != 'auto':
         return name not in ('tour', 'lawnmower')
     sensors = [robot.sensor.build(n, scenario.dimension) for n, robot in scenario.robots.items()]
-    square = (2.0 * min(map(half_view, sensors))) ** scenario.dimension
-    return area.volume < SQUARES * square
+    return not takes_tour(area.volume, 2.0 * min(map(half_view, sensors)), scenario.dimension)
 
 
 def covering_grid(
