@@ -19,6 +19,7 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.operating_volume import OperatingVolume
 from maasi_planner.motion import RobotState
 
 ORIGIN = OriginSettings(latitude=46.6, longitude=9.9)
@@ -37,8 +38,8 @@ class PlainDriver:
     take_pose, take_area = AgentDriver.take_pose, AgentDriver._take_area
 
     def __init__(self, settings, make_link):
-        self.settings, self.area = settings, Area(settings.environment)
-        self.bounds, self.active, self.pose_name = self.area.bounds, True, 'odometry'
+        self.settings, self.active, self.pose_name = settings, True, 'odometry'
+        self.volume = OperatingVolume(Area(settings.environment), settings.radius)
         self.namespace, self.history = 'rover', PoseHistory()
         self.logged = []
         log = SimpleNamespace(

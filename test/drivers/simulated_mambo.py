@@ -9,6 +9,8 @@ from maasi_drivers.links.mambo.link import PositionEvent
 from maasi_drivers.links.mambo.pilot import MamboPhase, MamboPilot
 from maasi_drivers.measure_mambo import MeasuringFlight, fit_speed
 from maasi_drivers.settings.vehicles import MamboSettings
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.operating_volume import OperatingVolume
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import make_motion
 from maasi_planner.settings import MotionSettings
@@ -49,7 +51,8 @@ class Flight:
         self.flying_state, self.battery = 'landed', battery
         self.motion = make_motion(MOTION)
         settings = MamboSettings(**{'full_speed': full_speed(drag), 'arm': True} | settings)
-        self.pilot = MamboPilot(self, self.motion, settings, HOME, FENCE)
+        volume = OperatingVolume(Area(FENCE), 0.1, FENCE.copy())
+        self.pilot = MamboPilot(self, self.motion, settings, HOME, volume)
         self.pilot.update(self.time)
         if permitted:
             self.pilot.permit(self.time)

@@ -106,7 +106,7 @@ def test_a_robot_in_a_closed_zone_stays_until_it_is_sent_out(play, kind):
     publisher = team.create_publisher(KeepOuts, '/keep_outs', LATCHED)
     team.until(lambda: publisher.get_subscription_count())
     publisher.publish(KeepOuts(version=1, zones=['1.2 1.0 1.0']))
-    team.until(lambda: len(driver.area.circles))
+    team.until(lambda: len(driver.volume.area.circles))
     team.move(40)
     assert_allclose(team.place[:2], [1.0, 1.0], atol=0.01)
     assert 'keep-outs' in team.refused([1.3, 1.0, 1.0])

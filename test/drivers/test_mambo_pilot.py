@@ -73,8 +73,7 @@ def test_it_stays_inside_the_field_with_what_the_measuring_flight_says(drag, del
 @pytest.mark.parametrize(('end', 'speed'), [(2.5, 0.8), (14.0, 3.0)])
 def test_a_velocity_that_cannot_be_stopped_before_the_geofence_is_not_flown(end, speed):
     flight = Flight(drag=0.3, firmware_delay=0.3, delay=0.4).up()
-    flight.pilot.fence = FENCE.copy()
-    flight.pilot.fence[0, 1] = end
+    flight.pilot.volume.limits[0, 1] = end
     for _ in range(400):
         flight.step()
         # Along the map's x axis.
@@ -299,5 +298,5 @@ def test_a_permission_ends_with_the_link():
     flight.is_silent(60)
     assert 'link lost' in flight.pilot.permit(flight.time)
     flight.connected = False
-    other = MamboPilot(flight, flight.motion, flight.pilot.settings, HOME, FENCE)
+    other = MamboPilot(flight, flight.motion, flight.pilot.settings, HOME, flight.pilot.volume)
     assert other.permit(flight.time) == 'connecting to the Mambo'

@@ -10,6 +10,7 @@ from maasi_drivers.links.mavlink.vehicle import VehiclePhase
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import OriginSettings, to_map
+from maasi_filter.geometry.operating_volume import MARGIN, OperatingVolume
 
 INSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
 OUTSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION
@@ -27,7 +28,8 @@ def items_of(keep_outs=(BARN, WELL), area=(BORDER, POND), start=(0.0, 0.0, 2.0))
     place = {'area': area} if area else {'bounds': BOX[:2].tolist()}
     place['origin'] = ORIGIN
     environment = EnvironmentSettings.model_validate(place | {'keep_outs': list(keep_outs)})
-    return fence_items(Area(environment), list(start), BOX)
+    limits = BOX + np.array([MARGIN, -MARGIN])
+    return fence_items(OperatingVolume(Area(environment), 0.2, limits), list(start))
 
 
 def play_of(firmware='arducopter', items=None, **changes):

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
-from maasi_drivers.agent.flight_rules import MARGIN
 from maasi_drivers.agent.goal_server import GoalServer
 from maasi_drivers.agent.measurement_responder import MeasurementResponder
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
@@ -19,6 +18,7 @@ from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.operating_volume import MARGIN
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import SettingsError
@@ -186,9 +186,7 @@ class AgentDriver(RobotNode):
         """Take the robot's pose, and do the control step for it."""
         self.link.observe(placed)
         self.silence.end()
-        outside = self.area.outside_by(placed.pose.position)
-        # Goals may be on the sides of a box, where the robot is beyond them by its radius.
-        allowed = 0.0 if self.settings.environment.area else self.settings.radius
+        outside, allowed = self.volume.beyond_border(placed.pose.position)
         if outside > allowed + MARGIN:
             self.health.begin(AREA, f'{outside:.1f} m outside of the area')
         elif outside <= allowed:
@@ -224,7 +222,7 @@ class AgentDriver(RobotNode):
 
         The part of the way on which a robot leaves a zone that it is in does not count.
         """
-        self.area, motion, latest = area, self._motion, self.history.latest
+        self.volume.area, motion, latest = area, self._motion, self.history.latest
         goal, ways = self.follower.current, None
         if goal is not None and latest is not None:
             state = RobotState(latest.pose, latest.velocity, latest.angular_velocity)

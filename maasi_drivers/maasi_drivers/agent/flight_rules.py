@@ -7,6 +7,8 @@ import numpy as np
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.operating_volume import OperatingVolume
 
 UNTIL_ARM = 'until the service arm is called'  # reason in `state` while a vehicle waits for it
 
@@ -81,32 +83,22 @@ class HomeLanding:
 
 
 _HEIGHT = 1.0  # between the heights of start and ground and the geofence, where none is given [m]
-MARGIN = 0.5  # how far outside it may drift before it lands [m]
 
 
-def make_fence(
-    bounds: FloatArray, radius: float, start: float, flight: FlightSettings
-) -> FloatArray:
-    """Return the lowest and highest x, y, z (3, 2) of goals [m, map].
+def flight_volume(
+    area: Area, radius: float, start: float, flight: FlightSettings
+) -> OperatingVolume:
+    """Return where a robot may fly that starts at a height [m, map].
 
-    Without a geofence they are the bounds (2 or 3, 2) with the radius; in the plane from 1 m below
-    the lower to 1 m above the higher one of ground and start. What starts above the ground is not
-    sent below it.
+    Without a geofence the limits are the bounds with the radius; in the plane from 1 m below the
+    lower to 1 m above the higher one of ground and start. What starts above the ground is not sent
+    below it.
     """
     if flight.geofence is not None:
-        return np.array(flight.geofence)
-    ground, fence = flight.ground, np.zeros((3, 2))
-    fence[2] = min(ground, start) - _HEIGHT, max(ground, start) + _HEIGHT
-    fence[: len(bounds)] = bounds + np.array([-radius, radius])
+        return OperatingVolume(area, radius, np.array(flight.geofence))
+    ground, limits = flight.ground, np.zeros((3, 2))
+    limits[2] = min(ground, start) - _HEIGHT, max(ground, start) + _HEIGHT
+    limits[: area.dimension] = area.bounds + np.array([-radius, radius])
     if start > ground:
-        fence[2, 0] = max(fence[2, 0], ground)
-    return fence
-
-
-def outside_fence(fence: FloatArray, position: FloatArray) -> str:
-    """Return where a robot is too far outside, or nothing; below the fence it may land."""
-    for axis, value, (low, high) in zip('xyz', position.tolist(), fence.tolist(), strict=True):
-        lowest = -math.inf if axis == 'z' else low - MARGIN
-        if not lowest <= value <= high + MARGIN:
-            return f'{axis} at {value:.2f} m, outside the geofence, {low:g} to {high:g} m'
-    return ''
+        limits[2, 0] = max(limits[2, 0], ground)
+    return OperatingVolume(area, radius, limits)

@@ -85,18 +85,8 @@ class GoalServer:
         position = (point.x, point.y, point.z)
         if not np.isfinite(position).all():
             return f'waypoint.pose.position: read {list(position)}, allowed are finite numbers [m]'
-        margin = driver.settings.radius
-        for axis, (low, high) in enumerate(driver.bounds.tolist()):
-            if not low - margin <= position[axis] <= high + margin:
-                return (
-                    f'waypoint.pose.position.{"xyz"[axis]}: read {position[axis]}, '
-                    f'allowed is {low - margin:g} to {high + margin:g} [m]'
-                )
-        if not driver.area.inside([position], bounded=False)[0]:
-            return (
-                f'waypoint.pose.position: read {list(position)}, allowed is what lies inside the '
-                'area and outside of its keep-outs'
-            )
+        if problem := driver.volume.goal_problem(position):
+            return f'waypoint.pose.position{problem}'
         if not (np.isfinite(request.tolerance) and request.tolerance >= 0.0):
             return f'tolerance: read {request.tolerance}, allowed are finite numbers from 0 [m]'
         return self._link.goal_problem(position)

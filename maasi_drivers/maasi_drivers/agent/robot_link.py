@@ -8,8 +8,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
@@ -31,8 +29,6 @@ class RobotLink(ABC):
 
     def __init__(self, driver: RobotNode) -> None:
         self.driver = driver
-        #: Lowest and highest x, y, z of goals, (3, 2) [m, map], beside the driver's bounds.
-        self.fence: FloatArray = np.tile([-math.inf, math.inf], (3, 1))
 
     @abstractmethod
     def connect(self) -> None:
@@ -89,13 +85,7 @@ class RobotLink(ABC):
         """Take note of a new pose, before it is used."""
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
-        """Return why a waypoint (x, y, z) [m, map] is refused, or None."""
-        for axis, value, (low, high) in zip('xyz', position, self.fence.tolist(), strict=True):
-            if not low <= value <= high:
-                return (
-                    f'waypoint.pose.position.{axis}: read {value}, allowed is {low:g} to '
-                    f'{high:g} [m], the geofence'
-                )
+        """Return why a waypoint (x, y, z) [m, map] inside the volume is refused, or None."""
         return None
 
     def goal_taken(self, goal: Goal) -> None:
@@ -110,7 +100,7 @@ class RobotLink(ABC):
     def make_motion(self) -> MotionModel:
         """Return the controller."""
         settings = self.driver.settings
-        return make_motion(settings.motion, self.driver.area, settings.radius)
+        return make_motion(settings.motion, self.driver.volume.area, settings.radius)
 
     def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
         """Return the command (4,) and the goal reached; see `WaypointFollower.update`."""

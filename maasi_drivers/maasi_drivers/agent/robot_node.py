@@ -13,6 +13,7 @@ from maasi_drivers.agent.robot_frames import RobotFrames
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.operating_volume import OperatingVolume
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.clocks import JUMP, ArrivalClock, Silence, StampGate
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
@@ -75,6 +76,8 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
     ----------
     robot : str
         Name, the last part of the namespace.
+    volume : OperatingVolume
+        Where it may be; its link may limit it further.
     start_pose : Pose
         Where its odometry is zero, in the map.
     history : PoseHistory
@@ -115,8 +118,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         """Make the shared state."""
         settings = self.settings
         self.dimension = settings.environment.dimension
-        self.area = Area(settings.environment)
-        self.bounds = self.area.bounds
+        self.volume = OperatingVolume(Area(settings.environment), settings.radius)
         self.sensor = settings.sensor.build(self.robot, self.dimension)
         self.start_pose = Pose.from_yaw(settings.start, settings.yaw)
         self.history = PoseHistory()

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import MARGIN
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.operating_volume import MARGIN
 from maasi_planner.motion import MotionModel, RobotState
 
 

@@ -8,7 +8,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from maasi_drivers.agent.flight_rules import make_fence
+from maasi_drivers.agent.flight_rules import flight_volume
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
@@ -102,7 +102,7 @@ class TopicLink(RobotLink):
         if settings.motion.model != 'unicycle':
             # In the plane the bounds of the environment have no heights.
             height, flight = settings.start[2], FlightSettings()
-            self.fence = make_fence(driver.bounds, settings.radius, height, flight)
+            driver.volume = flight_volume(driver.volume.area, settings.radius, height, flight)
         self._commands = CommandPublisher(
             driver, 'cmd_vel', settings.command_type, settings.lockstep
         )

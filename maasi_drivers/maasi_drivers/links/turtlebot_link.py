@@ -47,7 +47,7 @@ class TurtlebotLink(TopicLink):
         settings = self.driver.settings
         if settings.scan is None:
             return super().make_motion()
-        area = self.driver.area
+        area = self.driver.volume.area
         self._motion = ScanUnicycle(settings.motion, area, settings.radius, settings.scan)
         return self._motion
 

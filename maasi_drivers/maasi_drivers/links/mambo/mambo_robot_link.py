@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import make_fence
+from maasi_drivers.agent.flight_rules import flight_volume
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
@@ -54,7 +54,8 @@ class MamboRobotLink(RobotLink):
     def prepare(self) -> None:
         """Make link and geofence; check that a connection is possible."""
         driver, mambo, settings = self.driver, self._mambo, self.driver.settings
-        self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], mambo)
+        area, height = driver.volume.area, settings.start[2]
+        driver.volume = flight_volume(area, settings.radius, height, mambo)
         if settings.motion.model == 'unicycle':
             raise SettingsError(
                 f"parameter motion.model: read 'unicycle', allowed with link {settings.link} "
@@ -89,7 +90,7 @@ class MamboRobotLink(RobotLink):
         """Begin a flight."""
         self._phase = MamboPhase.CONNECTING
         self._pilot = MamboPilot(
-            self._link, self._motion, self._mambo, self.driver.start_pose, self.fence
+            self._link, self._motion, self._mambo, self.driver.start_pose, self.driver.volume
         )
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission, make_fence, outside_fence
+from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission, flight_volume
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import FeedPeer, RobotNode
@@ -77,7 +77,8 @@ class OnboardLink(RobotLink):
                 'mambo_feed is feed'
             )
         driver.feed_peer = FeedPeer(mambo.address, self._take_feed_pose)
-        self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], mambo)
+        area, height = driver.volume.area, settings.start[2]
+        driver.volume = flight_volume(area, settings.radius, height, mambo)
         # Positions of the feed are relative to this.
         self._origin = Pose.from_yaw([*settings.start[:2], mambo.ground], settings.yaw)
 
@@ -190,7 +191,7 @@ class OnboardLink(RobotLink):
             return NOT_ALLOWED
         if 0.0 <= pose.battery < mambo.battery_minimum:
             return self._land(f'battery at {pose.battery:.2f}, below {mambo.battery_minimum:.2f}')
-        if too_far := outside_fence(self.fence, place.position):
+        if too_far := self.driver.volume.drift_problem(place.position):
             return self._land(too_far)
         if self._up:
             down = pose.state != FeedState.AIR

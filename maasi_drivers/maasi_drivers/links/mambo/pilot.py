@@ -6,11 +6,12 @@ from enum import Enum
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission, outside_fence
+from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission
 from maasi_drivers.links.mambo.link import MamboLink, PositionEvent
 from maasi_drivers.links.mambo.reckoning import Course, DeadReckoning, TiltModel
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.operating_volume import OperatingVolume
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import MotionModel, RobotState
 
@@ -43,13 +44,13 @@ class MamboPhase(Enum):
 
 @dataclass(eq=False)
 class MamboPilot:
-    """Flies a Mambo from take-off to landing, in a fence (3, 2) [m, map]; lands it on a fault."""
+    """Flies a Mambo from take-off to landing, in a volume; lands it on a fault."""
 
     link: MamboLink
     motion: MotionModel
     settings: MamboSettings
     home: Pose
-    fence: FloatArray
+    volume: OperatingVolume
 
     def __post_init__(self) -> None:
         link, settings, home = self.link, self.settings, self.home
@@ -146,8 +147,9 @@ class MamboPilot:
     def _stoppable(self, course: Course, desired: FloatArray) -> FloatArray:
         """Return a velocity in the map (2,) that can be stopped before the geofence."""
         brake = 2.0 * _BRAKE_SHARE * self.reckoning.model.thrust
-        room = np.abs(self.fence[:2].T - course.position[:2])
-        inside = (course.position[:2] > self.fence[:2, 0], course.position[:2] < self.fence[:2, 1])
+        low, high = self.volume.limits[:2].T
+        room = np.abs([low - course.position[:2], high - course.position[:2]])
+        inside = (course.position[:2] > low, course.position[:2] < high)
         most = inside * np.minimum(np.sqrt(brake * room), _NEAR_RATE * room)
         return np.clip(desired, -most[0], most[1])
 
@@ -303,7 +305,7 @@ class MamboPilot:
             return MamboPhase.TAKING_OFF.value
         if flying_state in ('landed', 'landing'):
             return self.end(f'the Mambo is {flying_state} by itself')
-        if outside := outside_fence(self.fence, self.reckoning.course.position):
+        if outside := self.volume.drift_problem(self.reckoning.course.position):
             return self.end(outside)
         if self.phase is MamboPhase.CLIMBING:
             offset = self.reckoning.course.position[2] - self.home.position[2]

@@ -10,9 +10,9 @@ import shapely
 
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, ReportLog, mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
-from maasi_filter.arrays import FloatArray
-from maasi_filter.geometry.area import Area, level_shape
+from maasi_filter.geometry.area import level_shape
 from maasi_filter.geometry.geodesy import geodetic
+from maasi_filter.geometry.operating_volume import MARGIN, OperatingVolume
 
 Item = tuple[int, float, int, int]  # command, corners or radius [m], 1e-7 degrees north, east
 
@@ -26,11 +26,14 @@ _PATIENCE, _TRIES, _PAUSE = 1.5, 8, 10.0
 _ROUNDING = 0.5, 0.01, 1.5, 1.5  # of the numbers of an item, as an autopilot keeps them
 
 
-def fence_items(area: Area, start: list[float], bounds: FloatArray) -> list[Item]:
-    """Return the border of an area, or of a box (2 or 3, 2), with its holes and keep-outs."""
+def fence_items(volume: OperatingVolume, start: list[float]) -> list[Item]:
+    """Return the border of a volume on the map, with its holes and keep-outs."""
+    area = volume.area
     zones, origin = area.settings.keep_outs, area.settings.origin
     assert origin is not None
-    parts = shapely.get_parts(area.shapes['area'] or [shapely.box(*bounds[:2].T.ravel())])
+    # Goals may lie on the border of a box; the driver itself acts at the margin.
+    box = shapely.box(*(volume.limits[:2] + np.array([-MARGIN, MARGIN])).T.ravel())
+    parts = shapely.get_parts(area.shapes['area'] or [box])
     # Autopilots intersect borders: of an area in parts the one at the start counts.
     part = min(parts, key=shapely.Point(start[:2]).distance)
     closed = shapely.get_parts([level_shape(zone) for zone in zones if zone.polygon])

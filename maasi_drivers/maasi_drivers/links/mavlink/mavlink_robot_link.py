@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import MARGIN, HomeLanding, make_fence
+from maasi_drivers.agent.flight_rules import HomeLanding, flight_volume
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, RobotNode
@@ -21,6 +21,7 @@ from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.operating_volume import MARGIN
 from maasi_filter.models.pose import Pose, compose, inverse
 
 POLL_PERIOD = 0.02
@@ -63,7 +64,8 @@ class MavlinkRobotLink(RobotLink):
         # Whether a set-point was rejected since the last goal.
         self._rejected = False
         self._landing = HomeLanding(driver.settings, self._mavlink.home_timeout)
-        self.fence = make_fence(driver.bounds, settings.radius, settings.start[2], self._mavlink)
+        area, height = driver.volume.area, settings.start[2]
+        driver.volume = flight_volume(area, settings.radius, height, self._mavlink)
 
     def prepare(self) -> None:
         """Make the link; it remembers the origin of a flight."""
@@ -216,7 +218,8 @@ class MavlinkRobotLink(RobotLink):
             }
 
     def _send_target(self, position: FloatArray, yaw: float) -> None:
-        goal = compose(inverse(self._map_from_local), Pose.from_yaw(self._inside(position), yaw))
+        inside = self.driver.volume.nearest_inside(position)
+        goal = compose(inverse(self._map_from_local), Pose.from_yaw(inside, yaw))
         with self._link.lock:
             self._link.vehicle.set_target(goal.position + self._local_origin, goal.yaw)
 
@@ -229,7 +232,7 @@ class MavlinkRobotLink(RobotLink):
             charge, reports = estimate.charge, estimate.charge_reports
             telemetry, self._local_origin = estimate.telemetry, estimate.origin
             rejected, in_air = vehicle.rejected, vehicle.in_air
-        if self._fenced is not driver.area:
+        if self._fenced is not driver.volume.area:
             self._upload_fence()
         self._log_reports()
         if not driver.active:
@@ -279,16 +282,14 @@ class MavlinkRobotLink(RobotLink):
         return self._landing.judge(latest.pose.position, charge, time.monotonic())
 
     def _upload_fence(self) -> None:
-        area, mavlink = self.driver.area, self._mavlink
-        self._fenced, turned = area, mavlink.map_yaw != 0.0 and not self._localised
-        if mavlink.fence == 'none' or area.settings.origin is None or turned:
+        volume, mavlink = self.driver.volume, self._mavlink
+        self._fenced, turned = volume.area, mavlink.map_yaw != 0.0 and not self._localised
+        if mavlink.fence == 'none' or volume.area.settings.origin is None or turned:
             needs = 'mavlink.fence: upload, environment.origin, mavlink.map_yaw: 0'
             self.driver.get_logger().info(f'fence: not uploaded, which needs {needs}')
             return
-        # Goals may lie on the border of a box; the driver itself acts at the margin.
-        bounds = self.fence + np.array([-MARGIN, MARGIN])
         with self._link.lock:
-            self._link.vehicle.fence.begin(fence_items(area, self.driver.settings.start, bounds))
+            self._link.vehicle.fence.begin(fence_items(volume, self.driver.settings.start))
 
     def _log_reports(self) -> None:
         with self._link.lock:
@@ -332,7 +333,7 @@ class MavlinkRobotLink(RobotLink):
         if self._localised:
             self._align(placed)
         position, health = placed.pose.position, self.driver.health
-        outside = float(np.abs(position - self._inside(position)).max())
+        outside = self.driver.volume.distance_outside(position)
         if outside > MARGIN and _VEHICLE not in health:
             there = np.round(position, 2).tolist()
             text = f'{outside:.1f} m outside the geofence, at {there} m: it returns'
@@ -347,6 +348,3 @@ class MavlinkRobotLink(RobotLink):
         turn = Pose.from_yaw(np.zeros(3), placed.pose.yaw - local.pose.yaw)
         position = placed.pose.position - turn.rotation() @ local.pose.position
         self._map_from_local = Pose(position, turn.orientation)
-
-    def _inside(self, position: FloatArray) -> FloatArray:
-        return np.clip(position, self.fence[:, 0], self.fence[:, 1])

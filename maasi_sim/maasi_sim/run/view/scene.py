@@ -8,7 +8,7 @@ import shapely
 from numpy.typing import ArrayLike
 from shapely.geometry.base import BaseGeometry
 
-from maasi_drivers.agent.flight_rules import make_fence
+from maasi_drivers.agent.flight_rules import flight_volume
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.geometry.area import Area
 from maasi_filter.settings import DETECTIONS
@@ -149,9 +149,9 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
         # As its driver makes it.
         flies = robot.link == 'mambo_wifi'
         limits = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
-        bounds = scenario.environment.array()
-        made = make_fence(bounds, robot.radius, robot.start[2], limits)
-        fence = {} if made is None else {'fence': rounded(made)}
+        area = Area(scenario.environment.bounds)
+        volume = flight_volume(area, robot.radius, robot.start[2], limits)
+        fence = {'fence': rounded(volume.limits)}
     return {
         'type': robot.type,
         'description': robot.description,

@@ -1,0 +1,69 @@
+"""Where one robot may be: in an area, and between lowest and highest coordinates."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
+
+MARGIN = 0.5  # how far outside a robot may drift before its driver acts [m]
+
+
+@dataclass(eq=False)
+class OperatingVolume:
+    """Where one robot may be: in an area, between lowest and highest coordinates of goals.
+
+    radius: by which it may be beyond the sides of bounds [m]; limits (3, 2): of x, y, z, the
+    geofence [m, map]; none: only those of the area.
+    """
+
+    area: Area
+    radius: float
+    limits: FloatArray = field(default_factory=lambda: np.tile([-math.inf, math.inf], (3, 1)))
+
+    def contains(self, position: Sequence[float]) -> bool:
+        """Return whether a robot may be sent to a position (3,)."""
+        return not self.goal_problem(position)
+
+    def goal_problem(self, position: Sequence[float]) -> str:
+        """Return why a robot is not sent to a position (3,), or nothing."""
+        bounds = self.area.bounds + np.array([-self.radius, self.radius])
+        if problem := _beyond(bounds, position):
+            return problem
+        if not self.area.inside([position], bounded=False)[0]:
+            allowed = 'what lies inside the area and outside of its keep-outs'
+            return f': read {list(position)}, allowed is {allowed}'
+        problem = _beyond(self.limits, position)
+        return problem and f'{problem}, the geofence'
+
+    def nearest_inside(self, position: FloatArray) -> FloatArray:
+        """Return the position between the limits that is nearest to a position (3,)."""
+        return np.clip(position, self.limits[:, 0], self.limits[:, 1])
+
+    def distance_outside(self, position: FloatArray) -> float:
+        """Return how far a position (3,) is outside of the limits along an axis [m]; 0: inside."""
+        return float(np.abs(position - self.nearest_inside(position)).max())
+
+    def beyond_border(self, position: FloatArray) -> tuple[float, float]:
+        """Return how far a position (3,) is outside of the area, and how far goals may be [m]."""
+        overhang = self.radius if self.area.settings.area is None else 0.0
+        return self.area.outside_by(position), overhang
+
+    def drift_problem(self, position: FloatArray) -> str:
+        """Return where a robot is too far outside of the limits; below them it may land."""
+        for axis, value, (low, high) in zip('xyz', position.tolist(), self.limits.tolist()):
+            lowest = -math.inf if axis == 'z' else low - MARGIN
+            if not lowest <= value <= high + MARGIN:
+                return f'{axis} at {value:.2f} m, outside the geofence, {low:g} to {high:g} m'
+        return ''
+
+
+def _beyond(limits: FloatArray, position: Sequence[float]) -> str:
+    """Return which coordinate of a position is beyond limits (2 or 3, 2), and what is allowed."""
+    for axis, value, (low, high) in zip('xyz', position, limits.tolist()):
+        if not low <= value <= high:
+            return f'.{axis}: read {value}, allowed is {low:g} to {high:g} [m]'
+    return ''
