@@ -191,10 +191,7 @@ class _Search:
         group.last_batch = self.step
         others = [other for other in self._groups if other is not group]
         begin = perf_counter()
-        for other in others:
-            group.filter.take_over(other.names[0], other.shared)
-        for other in others:
-            group.filter.withdraw(other.names[0], other.shared)
+        group.filter.merge({other.names[0]: other.shared for other in others})
         result = group.filter.step(measurements, gone, self.time)
         duration = perf_counter() - begin
         group.coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)

@@ -5,13 +5,13 @@ import pytest
 from searches import log_density
 
 from maasi_filter import AgentMeasurement, ExponentialDetection, Pose, Sensor
+from maasi_filter.found_targets import FoundTargets, restore
 from maasi_filter.geometry.area import Area
 from maasi_filter.ic_phd.births import gaussian_births, measurement_births, noise_in_space, resample
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.corrector import phd_correct, phd_scan
 from maasi_filter.ic_phd.filter import kept_measurements
 from maasi_filter.records import FoundTarget
-from maasi_filter.search_filter import FoundTargets
 
 POSE = Pose.from_yaw([40.0, 50.0, 45.0], 0.3)
 NOISE = {2: np.diag([2.0, 0.02]), 3: np.diag([2.0, 0.02, 0.03])}
@@ -146,7 +146,8 @@ def test_papers_remove_the_closest_and_003_every_detection():
 def test_targets_kept_over_a_restart_keep_their_ids_unless_taken():
     known = FoundTargets(found_at([0.0, 0.0]), 1)
     same, other = found_at([0.1, 0.0], [40.0, 0.0])
-    assert known.keep([same]) == []
-    added = known.keep([other, FoundTarget(1, np.full(2, 80.0), np.eye(2), 'own', 0, 1.0)])
-    assert [target.id for target in added] == [2, 3]
-    assert known.next_id() == 4
+    assert not restore(known, [same])
+    change = restore(known, [other, FoundTarget(1, np.full(2, 80.0), np.eye(2), 'own', 0, 1.0)])
+    assert [target.id for target in change.changed] == [2, 3]
+    assert change.found.next_id() == 4
+    assert known.last_id == len(known.targets) == 1

@@ -1,5 +1,6 @@
 """Filters of several robots that share their found targets (002, section 4)."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from searches import FLOOR, FLOOR_LENGTHS, floor_sensor
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, load_filter, make_filter
+from maasi_filter.found_targets import merge
 from maasi_filter.records import FoundTarget
 
 POSE = Pose([1.0, 1.0, 1.0])
@@ -41,7 +43,7 @@ def test_what_another_one_found_is_not_found_again(new_filter):
     look(alone, 'own', 12)
     assert len(alone.found_targets) == 1
     search = new_filter()
-    assert search.take_over('other', [target()])
+    assert search.merge({'other': [target()]})
     result = look(search, 'own', 12)
     assert [(item.robot, item.origin) for item in search.found_targets] == [('other', 1)]
     assert search.own_found_targets() == []
@@ -55,7 +57,7 @@ def test_particles_of_a_target_that_another_one_found_are_deleted(new_filter):
     look(search, 'own', 1, values=far)
     before = search.expected_number
     assert before > 1.5
-    search.take_over('other', [target()])
+    search.merge({'other': [target()]})
     assert search.expected_number == pytest.approx(before - 1.0, abs=0.2)
     # The groups that are left go on as they are.
     look(search, 'own', 6, begin=1, values=far)
@@ -73,7 +75,7 @@ def test_a_target_of_two_belongs_to_who_was_first_or_is_by_name(new_filter, robo
     search = new_filter()
     look(search, 'own', 12)
     number, time = search.found_targets[0].id, search.found_targets[0].time
-    assert search.take_over(robot, [target(time=time + later)]) == (owner == robot)
+    assert search.merge({robot: [target(time=time + later)]}) == (owner == robot)
     assert [item.robot for item in search.found_targets] == [owner]
     assert search.found_targets[0].id == number
     assert bool(search.own_found_targets()) == (owner == 'own')
@@ -81,10 +83,10 @@ def test_a_target_of_two_belongs_to_who_was_first_or_is_by_name(new_filter, robo
 
 def test_the_estimate_is_that_of_its_owner(new_filter, tmp_path):
     search = new_filter()
-    search.take_over('other', [target()])
-    assert not search.take_over('other', [target()])
+    search.merge({'other': [target()]})
+    assert not search.merge({'other': [target()]})
     moved = PLACE + 0.004
-    assert search.take_over('other', [target(moved), target([0.0, 2.0], number=2)])
+    assert search.merge({'other': [target(moved), target([0.0, 2.0], number=2)]})
     assert len(search.found_targets) == 2
     assert search.found_targets[0].position == pytest.approx(moved)
     look(search, 'own', 5)
@@ -92,7 +94,7 @@ def test_the_estimate_is_that_of_its_owner(new_filter, tmp_path):
     search.save(tmp_path / 'state')
     loaded = load_filter(tmp_path / 'state')
     assert [item.origin for item in loaded.found_targets] == [1, 2]
-    assert not loaded.take_over('other', [target(moved)])
+    assert not loaded.merge({'other': [target(moved), target([0.0, 2.0], number=2)]})
 
 
 def test_bad_targets_are_refused_and_change_nothing(new_filter):
@@ -100,9 +102,9 @@ def test_bad_targets_are_refused_and_change_nothing(new_filter):
     wrong = [target([np.nan, 1.0]), target(deviation=np.inf), target(deviation=0.0)]
     for item in wrong:
         with pytest.raises(ValueError, match='other: target 1'):
-            search.take_over('other', [target([0.0, 0.0], number=2), item])
+            search.merge({'other': [target([0.0, 0.0], number=2), item]})
     with pytest.raises(ValueError, match='dimensions'):
-        search.take_over('other', [target([1.0, 1.0, 1.0])])
+        search.merge({'other': [target([1.0, 1.0, 1.0])]})
     with pytest.raises(ValueError, match='different ones from 1'):
         search.keep_found([target(), target()])
     assert search.found_targets == []
@@ -110,14 +112,14 @@ def test_bad_targets_are_refused_and_change_nothing(new_filter):
 
 def test_a_target_that_another_one_withdraws_is_not_found_any_more(new_filter, tmp_path):
     search = new_filter()
-    search.take_over('other', [target(), target([0.0, 2.0], number=2)])
-    search.take_over('third', [target([2.0, 0.0], number=1)])
-    assert search.withdraw('other', [target([0.0, 2.0], number=2)])
+    search.merge({'other': [target(), target([0.0, 2.0], number=2)]})
+    search.merge({'third': [target([2.0, 0.0], number=1)]})
+    assert search.merge({'other': [target([0.0, 2.0], number=2)]})
     assert [(item.robot, item.origin) for item in search.found_targets] == [
         ('other', 2),
         ('third', 1),
     ]
-    assert not search.withdraw('other', [target([0.0, 2.0], number=2)])
+    assert not search.merge({'other': [target([0.0, 2.0], number=2)]})
     search.save(tmp_path / 'state')
     for again in (search, load_filter(tmp_path / 'state')):
         # Neither does it rise from a single detection, nor where nothing is seen.
@@ -135,9 +137,9 @@ def test_a_target_kept_over_a_restart_is_still_that_of_its_filter(new_filter):
     search = new_filter()
     kept = replace(target(), id=7)
     search.keep_found([kept])
-    assert search.take_over('other', [target(PLACE + 0.004)])
+    assert search.merge({'other': [target(PLACE + 0.004)]})
     assert [(item.id, item.origin) for item in search.found_targets] == [(7, 1)]
-    assert search.withdraw('other', []) and search.found_targets == []
+    assert search.merge({'other': []}) and search.found_targets == []
 
 
 @pytest.mark.parametrize('seed', range(10))
@@ -149,9 +151,11 @@ def test_what_is_known_of_others_is_what_they_published_last(new_filter, seed):
         for k, robot in enumerate('abc'):
             numbers = np.flatnonzero(draw.random(5) < 0.5)
             published[robot] = [target(places[5 * k + n], number=int(n) + 1) for n in numbers]
-            search.take_over(robot, published[robot])
-        for robot, targets in published.items():
-            search.withdraw(robot, targets)
+        before = deepcopy(search.register())
+        known = merge(search.register(), published)
+        assert repr(search.register()) == repr(before)
+        assert not merge(known.found, published)
+        search.merge(published)
         expected = {(robot, item.id) for robot, items in published.items() for item in items}
         known = [(item.robot, item.origin) for item in search.found_targets]
         assert set(known) == expected and len(known) == len(expected)

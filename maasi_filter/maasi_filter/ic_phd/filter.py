@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.found_targets import SAME_TARGET, Change, distance
 from maasi_filter.geometry.area import Area
 from maasi_filter.ic_phd.births import (
     gaussian_births,
@@ -32,7 +33,7 @@ from maasi_filter.measurement_check import (
 )
 from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.records import UNLABELLED, AgentMeasurement, FilterResult, FoundTarget, Label
-from maasi_filter.search_filter import SAME_TARGET, FoundTargets, SearchFilter, distance
+from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
 
 PARALLEL_PARTICLES = 65_536  # particle sets below this size are faster on one thread
@@ -221,9 +222,10 @@ class IcPhdFilter(SearchFilter):
             self._pool = ThreadPoolExecutor(threads)
         return self._pool
 
-    def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
+    def adopt(self, change: Change) -> None:
         """Delete the particles that new found targets explain: those within T_z."""
-        for target in changed:
+        super().adopt(change)
+        for target in change.changed:
             offset = self.particles - target.position
             keep = (offset * offset).sum(axis=1) > self._numbers.removal_distance**2
             self.particles, self.weights = self.particles[keep], self.weights[keep]

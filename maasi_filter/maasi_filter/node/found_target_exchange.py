@@ -5,6 +5,7 @@ from functools import partial
 
 from rclpy.subscription import Subscription
 
+from maasi_filter.measurement_check import check_taken
 from maasi_filter.ros.conversions import found_target_from_ros, stamp_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
@@ -49,7 +50,7 @@ class SharedFoundTargets:
             handle, raw = subscription.handle, subscription.raw
             while (taken := handle.take_message(FoundTargetArray, raw)) is not None:
                 subscription.callback(taken[0])
-        changed, newest = False, {}
+        newest = {}
         for name, waiting in self._waiting.items():
             last = None
             while waiting and stamp_from_ros(waiting[0].header.stamp) < stamp:
@@ -57,18 +58,15 @@ class SharedFoundTargets:
             if last is None:
                 continue
             # Targets that it received itself arrive from the filter that found them.
-            own = [item for item in last.targets if item.robot == name]
-            dimension = self._node.settings.environment.dimension
+            theirs = [item for item in last.targets if item.robot == name]
             try:
-                targets = [found_target_from_ros(item, dimension) for item in own]
-                changed |= search.take_over(name, targets)
+                targets = [found_target_from_ros(item, search.dimension) for item in theirs]
+                check_taken(name, targets, search.dimension)
             except ValueError as error:
                 self._node.drop('bad found targets', f'{name}/found_targets: {error}')
                 continue
             newest[name] = targets
-        for name, targets in newest.items():
-            changed |= search.withdraw(name, targets)
-        return changed
+        return search.merge(newest)
 
     def _on_found(self, name: str, message: FoundTargetArray) -> None:
         node = self._node

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_filter.found_targets import SAME_TARGET
 from maasi_filter.geometry.vector_math import normalised, squared_distance
 from maasi_filter.pmb.association import MANY_PAIRS
 from maasi_filter.pmb.density import Density
@@ -17,7 +18,6 @@ from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
 from maasi_filter.pmb.labels import LabelTally
 from maasi_filter.pmb.scan import LEAST_SUPPORT, Scan
 from maasi_filter.records import FoundTarget
-from maasi_filter.search_filter import SAME_TARGET
 
 # Shares of the believed pi with which a place may answer.
 RATES = np.array([1.0, 0.7, 0.5, 0.35, 0.2])

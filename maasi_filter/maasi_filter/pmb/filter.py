@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.found_targets import Change, FoundTargets, nearest
 from maasi_filter.geometry.area import Area
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
@@ -35,7 +36,7 @@ from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.scan import Scan, make_scan
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
-from maasi_filter.search_filter import FoundTargets, SearchFilter, nearest
+from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
 
 LEAST_EXISTENCE = 1e-4
@@ -289,10 +290,13 @@ class PmbFilter(SearchFilter):
         """Return the found targets with the ids given so far."""
         return FoundTargets(self.found_targets, self._last_id)
 
-    def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
-        """Mark components, or new ones, as found targets."""
-        self._last_id = found.last_id
-        for target in changed:
+    def adopt(self, change: Change) -> None:
+        """Mark components, or new ones, as found targets.
+
+        Those of withdrawn targets are potential ones, which only own detections find.
+        """
+        self._last_id = change.found.last_id
+        for target in change.changed:
             same = [item for item in self.components if item.target and item.target.id == target.id]
             others = self.potential
             moments = [(item.density.mean, item.density.covariance) for item in others]
@@ -311,10 +315,7 @@ class PmbFilter(SearchFilter):
             item.existence, item.density, item.target = CERTAIN, density, target
             item.pose_error = 0.0
             item.labels = LabelTally.of(target.label)
-
-    def remove(self, found: FoundTargets, withdrawn: Sequence[FoundTarget]) -> None:
-        """Let components of withdrawn targets be potential ones, which only own detections find."""
-        ids = {target.id for target in withdrawn}
+        ids = {target.id for target in change.withdrawn}
         for item in self.components:
             if item.target is not None and item.target.id in ids:
                 item.target, item.hits = None, 0.0

@@ -122,11 +122,9 @@ class FoundKeeper:
         if filters - self._filters:
             self._published = set()
         self._filters |= filters
-        ids = {item.id for item in message.targets}
-        for withdrawn in self._published - ids:
-            self._targets.pop(withdrawn, None)
-        self._published = ids
-        self._targets.update({item.id: item for item in message.targets})
+        kept = {key: item for key, item in self._targets.items() if key not in self._published}
+        now = {item.id: item for item in message.targets}
+        self._targets, self._published = kept | now, set(now)
         self._publisher.publish(
             FoundTargetArray(
                 header=message.header,
