@@ -120,10 +120,6 @@ def test_a_run_whose_time_stands_still_names_who_is_late(run):
     run.nodes[PLANNER].restarts = 0
     when, words = run.until(180.0, stands_still=True)
     assert words == f'step 7: nothing from {PLANNER} for 30 s' and 129.9 < when < 130.5
-    run.supervisor._options = Options(follow_clock=True)
-    when, words = run.until(181.0, stands_still=True)
-    assert words == '/clock, which this run follows, stands still for 30 s'
-    run.supervisor._options = Options(lockstep=True)
     # The planner lives, and waits for the other one.
     for filter_beaten, who in ((when, PLANNER), (when - 10.0, FILTER)):
         run.beats = {FILTER: filter_beaten, PLANNER: when}

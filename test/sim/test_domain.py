@@ -189,7 +189,7 @@ def test_domains_are_not_shared_with_runs_or_other_nodes(monkeypatch):
                 assert domain.number != number
 
 
-def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_path):
+def test_teams_share_a_domain_where_another_program_publishes_their_clock(tmp_path):
     with Domain(57, str(tmp_path), team='team_a') as first:
         assert first.number == 57
         with Domain(57, str(tmp_path), team='team/b', shared=True) as second:

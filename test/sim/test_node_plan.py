@@ -72,9 +72,9 @@ def test_the_sim_gets_the_file_how_fast_it_goes_and_whose_clock_it_is(lockstep, 
     assert values == ('/s.yaml', 4, lockstep, expected, True)
     # The clock is its own.
     assert not simulated
-    follower = plans_of(scenario, lockstep=False, follow_clock=True)['/sim_node']
-    settings, simulated = read_back(follower, SimNodeSettings)
-    assert settings.follow_clock and simulated
+    moved = {'body': (('robots', 'mambo', 'body'), 'external')}
+    plans = plans_of(load_scenario('mambo', moved), lockstep=False)
+    assert read_back(plans['/sim_node'], SimNodeSettings)[1]
 
 
 def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there(tmp_path):

@@ -368,11 +368,9 @@ def test_lockstep_keeps_to_the_rate_that_is_asked_for(make_team):
 
 
 def test_wrong_parameters_are_refused_with_what_is_wrong(make_team):
-    follow = 'follow_clock: read true, allowed is false in lockstep'
     for content, parameters, text in (
         (SCENARIO, {'lockstep': False, 'rate': 0.0}, 'parameter rate: read 0'),
         (SCENARIO, {'rate': -1.0}, 'rate'),
-        (SCENARIO, {'follow_clock': True}, follow),
         (SCENARIO, {'step': 0.03}, 'whole multiples of step'),
         (LINKED, {'lockstep': False, 'rate': 2.0}, r'drone\.link: .* runs in real time'),
     ):

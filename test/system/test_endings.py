@@ -10,9 +10,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
-from rclpy.node import Node
-from rosgraph_msgs.msg import Clock
-from scenario_runs import beside, command, run_scenario, start, started, wait_for, write_scenario
+from scenario_runs import command, run_scenario, start, started, wait_for, write_scenario
 
 from maasi_filter.ros import middleware
 from maasi_sim.run import scenario_run
@@ -125,34 +123,17 @@ def test_report_and_replay_of_a_long_run_may_be_skipped(tmp_path):
         assert bag.counts['/filter_update'] > 0
 
 
-def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(tmp_path):
-    """The run has no home folder, and a poor environment."""
+def test_a_run_needs_no_home_folder_and_leaves_no_warning(tmp_path):
     names = ('HOME', 'ROS_HOME', 'ROS_LOG_DIR', 'XDG_RUNTIME_DIR', 'XDG_CACHE_HOME')
     poor = ['env', *(f'--unset={name}' for name in names), 'LC_ALL=C']
     path, folder = write_scenario(tmp_path / 'near.yaml', NEAR), tmp_path / """it's "here" """
-    with beside() as operator:
-        # The simulation of another run.
-        other = Node('sim_node', namespace='/other', context=operator.context)
-        operator.executor.add_node(other)
-        times = []
-        other.create_subscription(Clock, '/clock', times.append, 10)
-        # Slow enough to discover the follower before the end.
-        options = (*operator.options, '--rate', '0.1')
-        words = [*poor, *command(path, folder, *options)]
-        with started(words, folder, umask=0o077) as run:
-            run.wait_for('report: ')
-            run.wait_for('the clock keeps running for /other')
-            assert '1 of 1 targets found' in run.output
-            assert run.report['end_reason'] == 'all_found'
-            with Bag(run.folder) as bag:
-                assert bag.counts['/mambo/state'] > 0
-            times.clear()
-            operator.until(lambda: len(times) >= 20, 'the clock')
-            assert [len(run.processes(node)) for node in ('/sim_node', '/filter_node')] == [1, 0]
-            operator.executor.remove_node(other)
-            other.destroy_node()
-            run.finish()
+    with started([*poor, *command(path, folder)], folder, umask=0o077) as run:
+        run.finish()
     assert run.code == 0, run.output
+    assert '1 of 1 targets found' in run.output
+    assert run.report['end_reason'] == 'all_found'
+    with Bag(run.folder) as bag:
+        assert bag.counts['/mambo/state'] > 0
     assert run.processes() == []
     assert run.warnings == []
 
@@ -211,8 +192,6 @@ def test_a_node_or_command_without_its_middleware_says_so(command):
         (['--rate', '0'], '--rate'),
         (['--time-limit', 'nan'], '--time-limit'),
         (['--lokstep'], 'unknown: --lokstep (did you mean --lockstep?)'),
-        (['--follow-clock'], '--follow-clock needs the --domain-id'),
-        (['--follow-clock', '--domain-id', '7', '--lockstep'], 'allowed without --lockstep'),
         (['--namespace', '1a'], "read '1a', allowed are letters"),
     ],
 )

@@ -101,7 +101,7 @@ def test_a_wrong_argument_ends_the_launch_with_one_clear_error(launch):
     assert run.code == code(2), run.output
     assert "read 'abc', allowed are whole numbers from 0" in run.output
     assert 'Traceback' not in run.output
-    for name in ('lockstep', 'record', 'rviz', 'view', 'follow_clock'):
+    for name in ('lockstep', 'record', 'rviz', 'view'):
         with pytest.raises(ValueError, match=f"{name}: read 'maybe', allowed are true and false"):
             scenario_options({**DEFAULTS, name: 'maybe'})
 
@@ -110,13 +110,13 @@ def test_arguments_become_options_that_run_scenario_knows(monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', '7')
     given = {'out': '-folder', 'seed': '3', 'lockstep': 'True', 'record': 'false', 'rate': '2'}
     given |= {'planner': 'maasi', 'time_limit': '9', 'log_level': 'debug', 'namespace': 'team_a'}
-    others = {'follow_clock': 'true', 'view': 'true', 'port': '8500'}
+    others = {'view': 'true', 'port': '8500'}
     first, second = (
         vars(build_parser().parse_args(scenario_options(DEFAULTS | item)))
         for item in (given, others)
     )
     expected = given | {'scenario': 'mambo_turtlebot', 'out': Path('-folder'), 'seed': 3}
     expected |= {'lockstep': True, 'record': False, 'rate': 2.0, 'time_limit': 9.0}
-    expected |= {'domain_id': 7, 'follow_clock': False, 'view': False, 'port': None}
+    expected |= {'domain_id': 7, 'view': False, 'port': None}
     assert expected.items() <= first.items()
-    assert {'follow_clock': True, 'view': True, 'port': 8500}.items() <= second.items()
+    assert {'view': True, 'port': 8500}.items() <= second.items()

@@ -1,36 +1,79 @@
-"""Two teams in one ROS domain, each in its namespace, on one clock."""
+"""Two teams in one ROS domain, each in its namespace, of robots that another program moves."""
 
-import itertools
+from contextlib import ExitStack
 
 import pytest
+from geometry_msgs.msg import TwistStamped
+from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-from scenario_runs import beside, check_replay, start, write_scenario
+from scenario_runs import Operator, beside, check_replay, start, write_scenario
 
-from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
+from maasi_filter.ros.qos import SENSOR
 from maasi_sim.run.bag import Bag
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.simulation.robots import Simulation
+from maasi_sim.simulation.sim_topics import RobotTopics
 
 pytestmark = pytest.mark.system
-STEP = 0.05
+STEP, FIRST = 0.05, 20_000
+CANDIDATES = {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]}
+
+
+class Mover(Operator):
+    """A program that moves a robot for each team, and publishes the time of all."""
+
+    def __init__(self, domain):
+        super().__init__(domain)
+        self.clock = self.node.create_publisher(Clock, '/clock', 10)
+        self.teams, self.step = [], FIRST
+        self.node.create_timer(STEP, self.move)
+
+    def add(self, team, path):
+        """Move the robot of a team's scenario."""
+        moved = {'test': (('robots', 'mambo', 'body'), 'simulated')}
+        simulation = Simulation(load_scenario(path, moved), 1)
+        node = Node('mover', namespace=team, context=self.context)
+        self.executor.add_node(node)
+        self.teams.append((simulation, RobotTopics(node, simulation, 'mambo', SENSOR)))
+
+        def command(message):
+            linear, turn = message.twist.linear, message.twist.angular.z
+            simulation.robots['mambo'].command((linear.x, linear.y, linear.z, turn))
+
+        node.create_subscription(TwistStamped, 'mambo/cmd_vel', command, 10)
+
+    def move(self):
+        """Move all robots by a step."""
+        self.step += 1
+        stamp = stamp_to_ros(stamp_of_step(self.step, STEP))
+        self.clock.publish(Clock(clock=stamp))
+        for simulation, topics in self.teams:
+            simulation.advance()
+            topics.publish_odometry(stamp)
+
+
+def write(path, target, start=(1.9, 1.9, 1.0), **changes):
+    robot = {'type': 'mambo', 'start': [*start], 'candidates': CANDIDATES, 'body': 'external'}
+    return write_scenario(path, [target], robots={'mambo': robot}, **changes)
 
 
 @pytest.fixture(scope='module')
 def teams(tmp_path_factory):
-    """Return the runs of two teams, by namespace; the first one's clock is that of both."""
+    """Return the runs of two teams, by namespace."""
     folder = tmp_path_factory.mktemp('teams')
-    first = write_scenario(folder / 'first.yaml', [[0.3, 0.4]])
-    second = write_scenario(folder / 'second.yaml', [[0.6, 0.6]], (0.3, 0.3, 1.0))
-    with beside() as operator:
-        options = [*operator.options, '--namespace']
-        with start(first, folder / 'team_a', *options, 'team_a') as leading:
-            # A robot that does not take part yet is not paused.
-            leading.wait_for('measurements')
-            # It would find all before the second one measures.
-            operator.call('/team_a/search/pause')
-            options += ['team_b', '--follow-clock']
-            with start(second, folder / 'team_b', *options) as following:
-                following.wait_for('measurements')
-                operator.call('/team_a/search/resume')
-                return {'team_b': following.finish(), 'team_a': leading.finish()}
+    with beside(Mover) as mover, ExitStack() as ends:
+        runs = {}
+        for team, target, begin in (
+            ('team_a', [1.5, 1.5], (1.9, 1.9, 1.0)),
+            ('team_b', [0.6, 0.6], (0.3, 0.3, 1.0)),
+        ):
+            path = write(folder / f'{team}.yaml', target, begin)
+            mover.add(team, path)
+            run = start(path, folder / team, *mover.options, '--namespace', team)
+            runs[team] = ends.enter_context(run)
+        mover.until(lambda: all(run.process.poll() is not None for run in runs.values()), 'the end')
+        return {team: run.finish() for team, run in runs.items()}
 
 
 def test_both_teams_find_their_targets(teams):
@@ -64,30 +107,24 @@ def test_a_recording_holds_its_own_team_from_its_first_measurement_on(teams, tea
     numbers = [step.step for step in steps]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     assert stamp_from_ros(steps[-1].stamp) <= clock[-1]
-    follows = team == 'team_b'
-    assert (facts['namespace'], facts['follow_clock']) == (team, follows)
+    assert facts['namespace'] == team
     assert '/filter_node' in facts['nodes']
-    # The second team begins when it is ready.
-    assert (steps[0].step > 0) == (stamp_from_ros(steps[0].stamp) > 0) == follows
+    # The time is that of the program.
+    assert steps[0].step > FIRST
+    assert stamp_from_ros(steps[0].stamp) == stamp_of_step(steps[0].step, STEP)
 
 
-def test_a_run_ends_where_the_clock_that_it_follows_stands_still(tmp_path):
+def test_a_run_ends_where_the_clock_of_another_program_stands_still(tmp_path):
     limits = {'time': 120.0, 'silence': 4.0}
-    path = write_scenario(tmp_path / 'far.yaml', [[0.0, 0.0]], limits=limits)
-    with beside() as operator:
-        clock = operator.node.create_publisher(Clock, '/clock', 10)
-        ticks = itertools.count(round(1000.0 / STEP))
-        with start(path, tmp_path / 'run', *operator.options, '--follow-clock') as run:
+    path = write(tmp_path / 'far.yaml', [0.0, 0.0], limits=limits)
+    with beside(Mover) as mover:
+        mover.add('', path)
+        with start(path, tmp_path / 'run', *mover.options) as run:
             file = run.bag / 'bag.mcap'
-
-            def tick():
-                clock.publish(Clock(clock=stamp_to_ros(round(next(ticks) * STEP * 1e9))))
-                return file.exists() and file.stat().st_size > 100_000
-
-            operator.until(tick, 'the run moves')
+            mover.until(lambda: file.exists() and file.stat().st_size > 100_000, 'the run moves')
             run.finish()
     assert run.code == 3, run.output
-    assert '/clock, which this run follows, stands still for 4 s' in run.output
+    assert '/clock, which another program publishes, stands still for 4 s' in run.output
     assert run.report['end_reason'] == 'clock_stopped'
     with Bag(run.folder) as recorded:
         *_, last = recorded.messages(['/mambo/cmd_vel'])

@@ -79,7 +79,7 @@ def common_parameters(scenario: BaseScenario, options: Options) -> dict[str, Any
 
 
 def sim_plan(executable: str, scenario: BaseScenario, options: Options, file: Path) -> NodePlan:
-    """Return the simulation node, whose clock is that of the run, or follows that of another."""
+    """Return the simulation node; it publishes the clock, unless robots bring theirs."""
     pace = options.rate if options.rate is not None else 0.0 if options.lockstep else 1.0
     parameters: dict[str, Any] = {
         'scenario': str(file),
@@ -88,7 +88,6 @@ def sim_plan(executable: str, scenario: BaseScenario, options: Options, file: Pa
         'rate': pace,
         'recorder': True,
         **(SIMULATED if scenario.external_clock else {}),
-        **(SIMULATED | {'follow_clock': True} if options.follow_clock else {}),
     }
     return NodePlan('maasi_sim', executable, 'sim_node', parameters=parameters, role='clock')
 

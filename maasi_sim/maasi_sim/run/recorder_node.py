@@ -441,14 +441,6 @@ class Recorder:
                 publisher.publish(message)
             self.node.destroy_publisher(publisher)
 
-    def followers(self) -> list[str]:
-        """Return the namespaces of the runs that follow the clock of this one."""
-        return sorted(
-            info.node_namespace
-            for info in self.node.get_subscriptions_info_by_topic(CLOCK)
-            if info.node_name == 'sim_node' and info.node_namespace.strip('/') != self._team
-        )
-
     def close(self) -> None:
         """Leave the graph."""
         if self.context.ok():

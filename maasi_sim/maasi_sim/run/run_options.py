@@ -17,7 +17,7 @@ from maasi_sim.run.ending import EXIT_CODES
 LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 # Options that are arguments of a launch as well.
 _LAUNCH_OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'namespace', 'log_level', 'port')
-_LAUNCH_FLAGS = ('lockstep', 'follow_clock', 'view')
+_LAUNCH_FLAGS = ('lockstep', 'view')
 Key = tuple[str | int, ...]  # as of a scenario file
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
@@ -43,7 +43,6 @@ class Options:
     domain_id: int | None = None
     log_level: str | None = None
     namespace: str = ''
-    follow_clock: bool = False
     replay: Path | None = None
     remap: tuple[tuple[str, str], ...] = ()
     check: bool = False
@@ -110,11 +109,6 @@ def build_parser() -> argparse.ArgumentParser:
         type=_namespace,
         metavar='NS',
         help='of all nodes and topics of the run; /clock and /diagnostics are shared',
-    )
-    add(
-        '--follow-clock',
-        action='store_true',
-        help='its time is the /clock of another run in the domain --domain-id',
     )
     add(
         '--check',
@@ -200,10 +194,6 @@ def parse(arguments: list[str] | None) -> Options:
         parser.error('--remap: allowed with a scenario and --replay BAG')
     if options.replay is None and not options.scenario:
         parser.error('give either a scenario or --replay BAG')
-    if options.follow_clock and options.domain_id is None:
-        parser.error('--follow-clock needs the --domain-id of the run whose clock it is')
-    if options.follow_clock and (options.lockstep or options.rate is not None):
-        parser.error('--follow-clock: allowed without --lockstep and --rate')
     return options
 
 

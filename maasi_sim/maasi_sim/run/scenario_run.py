@@ -39,7 +39,6 @@ from maasi_sim.scenario.layering import ScenarioError, to_yaml
 
 # Between two checks of processes and topics; while the nodes start, and while they run [s].
 _START_POLL, _POLL = 0.02, 0.05
-_FOLLOWERS_PERIOD = 0.5  # between two checks for runs that follow the clock [s]
 # Longest wait for a publisher of others, which may not fit the recorder [s].
 _CONNECTION_PATIENCE = 5.0
 _START_PATIENCE = 10.0  # wall time between two messages about missing nodes [s]
@@ -62,8 +61,6 @@ class ScenarioRun:
                 f"--namespace: read '{options.namespace}', allowed is a name that is none of "
                 'a robot of the scenario'
             )
-        # Whether its time is that of others.
-        self._follows = options.follow_clock or self.mission.scenario.external_clock
         self._bag: BagWriter | None = None
         self._page: RunPage | None = None
         self.unwritten: list[str] = []  #: errors of writing
@@ -82,7 +79,9 @@ class ScenarioRun:
 
     def _execute(self, served: contextlib.ExitStack) -> int:
         options = self.options
-        number, team, shared = options.domain_id, options.namespace, options.follow_clock
+        number, team = options.domain_id, options.namespace
+        # Teams of robots that another program moves have its clock in common.
+        shared = self.mission.scenario.external_clock and number is not None
         with Domain(number, team=team, shared=shared) as domain, contextlib.ExitStack() as ends:
             self.folder = make_folder(options.out)
             self.mission.prepare()
@@ -130,17 +129,8 @@ class ScenarioRun:
             # Beside the report; never before the server of the nodes is there.
             ran = options.record and processes[0].pid is not None
             self._replay = beside(send_replay, self.folder) if ran else iter(())
-            followed = self._is_followed()
-            if not followed:
-                ends.close()
-            code = self._report()
-            if followed:
-                teams = ', '.join(self.recorder.followers())
-                self.display.say(f'the clock keeps running for {teams} (Ctrl-C ends it)')
-                while self._is_followed():
-                    time.sleep(_FOLLOWERS_PERIOD)
-                    self.recorder.drain()
-            return code
+            ends.close()
+            return self._report()
 
     def _facts(self) -> str:
         options = self.options
@@ -151,7 +141,6 @@ class ScenarioRun:
             'lockstep': options.lockstep,
             'rate': options.rate,
             'namespace': options.namespace,
-            'follow_clock': options.follow_clock,
             'scenario': self._scenario.content(),
             'nodes': {
                 plan.full_name: {
@@ -200,7 +189,7 @@ class ScenarioRun:
         self.wall_time = now - (self._begun or now)
         self.recorder.finish()
         self._check_recording()
-        self.supervisor.stop(self._is_followed())
+        self.supervisor.stop()
 
     def _wait_until_ready(self) -> Ending | None:
         """Wait until every node is ready, the recorder last; return an ending if one is not."""
@@ -318,7 +307,7 @@ class ScenarioRun:
         if not self.options.record or self.ending.code not in (DONE, NOT_ALL_FOUND):
             return
         patience = _CONNECTION_PATIENCE * (self.options.rate or 1.0)
-        for gap in self.recorder.gaps(self._follows, patience):
+        for gap in self.recorder.gaps(self._scenario.external_clock, patience):
             self.unwritten.append(gap)
             self.supervisor.note('recorder', 'gap', reason=gap)
 
@@ -328,12 +317,6 @@ class ScenarioRun:
                 self._bag.close()
         except BagError as error:
             self.unwritten.append(str(error))
-
-    def _is_followed(self) -> bool:
-        if self._follows or self.options.lockstep or self.interruption:
-            return False
-        alive = all(clock.is_alive() for clock in self.supervisor.nodes('clock'))
-        return alive and bool(self.recorder.followers())
 
     def _report(self) -> int:
         ending = self.ending

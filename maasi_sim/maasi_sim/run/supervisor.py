@@ -118,8 +118,8 @@ class Supervisor:
 
     def _standstill(self, now: float) -> Ending:
         silence = f'for {self._scenario.limits.silence:g} s'
-        if self._options.follow_clock:
-            text = f'/clock, which this run follows, stands still {silence}'
+        if self._scenario.external_clock:
+            text = f'/clock, which another program publishes, stands still {silence}'
             return Ending('clock_stopped', NODE_FAILED, text)
         step = self.recorder.step
         if step is None:
@@ -142,11 +142,11 @@ class Supervisor:
         """Return the processes of the nodes of some roles."""
         return [self.processes[name] for name, plan in self.plans.items() if plan.role in roles]
 
-    def stop(self, keep_clock: bool) -> None:
+    def stop(self) -> None:
         """Stop the robots, then the nodes, and record their last messages."""
         recorder, robots = self.recorder, self._scenario.names()
         stubborn = []
-        if self._options.lockstep and not keep_clock:
+        if self._options.lockstep:
             # Robots stand still between steps: no further one follows.
             stubborn = stop(self.nodes('clock'))
         # Drivers stop their robots while the simulation, or the robot, still runs. One that hangs
@@ -160,7 +160,7 @@ class Supervisor:
         recorder.stop_robots(robots)
         time.sleep(_LAST_MESSAGES)
         recorder.drain()
-        stubborn += stop([] if keep_clock else self.nodes('clock'))
+        stubborn += stop(self.nodes('clock'))
         recorder.drain()
         if stubborn:
             self._display.say(f'had to be killed: {", ".join(stubborn)}')

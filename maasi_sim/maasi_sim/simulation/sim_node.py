@@ -54,11 +54,6 @@ class SimNodeSettings(NodeSettings):
         1.0,
         description='Simulated over wall time, at most; 0: as fast as possible, in lockstep only',
     )
-    follow_clock: bool = Field(
-        False,
-        description='Whether its time is a /clock that somebody else publishes; not in lockstep, '
-        'and `rate` does not count',
-    )
     recorder: bool = Field(False, description='Whether it waits for the recorder, too')
     command_age: Positive = Field(
         1.0,
@@ -77,9 +72,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     far behind. The step is republished for a restarted node that reports ready, so that a step can
     be received twice.
 
-    With `follow_clock`, or where another program moves a robot, the time is that of a `/clock`
-    published elsewhere: the robots stand until all nodes are ready, and the first step is that of
-    the time then.
+    Where another program moves a robot, the time is that of the `/clock` that it publishes: the
+    first step is that of the time when all nodes are ready.
 
     Publishes
     ---------
@@ -88,7 +82,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     `<robot>/camera/image_raw` (sensor_msgs/Image), `<robot>/camera/camera_info`
     (sensor_msgs/CameraInfo), `<robot>/scan` (sensor_msgs/LaserScan), `<robot>/ranges`
     (maasi_msgs/RangeArray): those that the robot has;
-    `/clock` (rosgraph_msgs/Clock), unless it follows one, in lockstep four times a second;
+    `/clock` (rosgraph_msgs/Clock), unless another program does, in lockstep four times a second;
     `lockstep/step` (maasi_msgs/LockstepStep), and, latched, `lockstep/robots` where these change;
     `ground_truth/targets` (geometry_msgs/PoseArray), `ground_truth/markers`
     (visualization_msgs/MarkerArray): latched, only for scoring and for the eye
@@ -96,7 +90,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     Subscribes
     ----------
     `<robot>/cmd_vel` (geometry_msgs/TwistStamped); `<robot>/state` (maasi_msgs/AgentState) of
-    robots that another program moves; `/clock`, if it follows one;
+    robots that another program moves; `/clock` then;
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone)
     """
 
@@ -115,8 +109,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         settings = self.settings
         if not settings.lockstep and settings.rate == 0.0:
             raise SettingsError('parameter rate: read 0, allowed is above 0 unless in lockstep')
-        if settings.lockstep and settings.follow_clock:
-            raise SettingsError('parameter follow_clock: read true, allowed is false in lockstep')
         overrides = {'parameter step': (('step',), settings.step)} if settings.step > 0.0 else {}
         try:
             self.scenario: Scenario = self.load(settings.scenario, overrides)
@@ -125,13 +117,12 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self.simulation: Simulation = self.simulate(self.scenario, settings.seed)
         except (ScenarioError, ValueError) as error:
             raise SettingsError(str(error)) from error
-        self._follows = settings.follow_clock or self.scenario.external_clock
         self._length = self.scenario.step
         self._period = self._length / settings.rate if settings.rate > 0.0 else 0.0
         self._stamp = 0
-        # First step, and last time of the followed clock [ns].
+        # First step, and last time of an external clock [ns].
         self._first = 0
-        self._followed: int | None = None
+        self._external_time: int | None = None
         self._repeated = -1  # stamp of the last step that was republished
         # Topics that each expected node subscribes to.
         self._expected: dict[str, list[str]] = {}
@@ -198,7 +189,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._robots_publisher = self.create_publisher(LockstepStep, 'lockstep/robots', LATCHED)
         # After all other publishers, which the recorder then knows: it waits for clock and step.
         self._clock_publisher: Publisher | None = None
-        if self._follows:
+        if self.scenario.external_clock:
             self.create_subscription(Clock, '/clock', self._on_clock, sensor_reader(False))
         else:
             self._clock_publisher = self.create_publisher(Clock, '/clock', qos)
@@ -219,7 +210,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._look_timer.reset()
         elif self.settings.lockstep:
             self._advance_if_complete()
-        elif not self._follows:
+        elif not self.scenario.external_clock:
             self._step_timer.reset()
 
     def halt(self) -> None:
@@ -273,7 +264,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
 
     def _missing(self) -> str:
         missing = sorted(set(self._expected) - self._ready)
-        if self._follows and self._followed is None:
+        if self.scenario.external_clock and self._external_time is None:
             missing.append('/clock')
         return ', '.join(missing)
 
@@ -304,10 +295,10 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         )
         self._connections.remember()
         self._wall_start = self._due = now
-        if self._followed is not None:
-            self._first = self._step_at(self._followed)
+        if self._external_time is not None:
+            self._first = self._step_at(self._external_time)
         self._begin_step()
-        if not self.settings.lockstep and not self._follows:
+        if not self.settings.lockstep and not self.scenario.external_clock:
             self._step_timer.reset()
 
     def _look_for_returned(self) -> None:
@@ -485,9 +476,9 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         return step + 1 if stamp_of_step(step + 1, self._length) <= time_ else step
 
     def _on_clock(self, message: Clock) -> None:
-        """Follow a clock; the simulation pauses if a restarted publisher repeats time."""
-        self._followed = stamp_from_ros(message.clock)
-        while self.active and 0 <= self.step < self._step_at(self._followed):
+        """Advance to an external time; pause if a restarted publisher repeats time."""
+        self._external_time = stamp_from_ros(message.clock)
+        while self.active and 0 <= self.step < self._step_at(self._external_time):
             self._advance_freely()
 
 
