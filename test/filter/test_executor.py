@@ -8,7 +8,7 @@ from std_msgs.msg import Int32
 from std_srvs.srv import Trigger
 from waiting import wait_until
 
-from maasi_filter.ros import entities
+from maasi_filter.ros import readiness
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.qos import RELIABLE
@@ -81,7 +81,7 @@ def test_the_end_of_the_context_ends_the_spin(pair):
 
 
 def test_an_endpoint_that_does_not_fit_is_named(pair, monkeypatch):
-    monkeypatch.setattr(entities, '_CONNECTION_PATIENCE', 0.5)
+    monkeypatch.setattr(readiness, '_CONNECTION_PATIENCE', 0.5)
     node = LockstepLifecycleNode('searcher', NodeSettings, context=pair.talker.context)
     node.create_publisher(Int32, 'found', 10)
     node.create_subscription(Int32, 'seen', print, RELIABLE)

@@ -82,7 +82,8 @@ class ArrivalClock:
         # Instants [s] and the times that began there [ns]. Replaced as a whole: a tick may be
         # handled in another thread.
         self._ticks: tuple[tuple[float, int], ...] = ()
-        # rclpy only borrows the pointer: without this reference a jump segfaults.
+        # rclpy 7.1 only borrows the pointer: until its clock keeps a reference to it, a jump
+        # after the loss of this handle segfaults.
         self._handle: Any = clock.create_jump_callback(
             JumpThreshold(
                 min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1)
@@ -170,7 +171,8 @@ class ClockWatch:
         self._node, self._warn, self._on_restart = node, warn, on_restart
         # Unconfirmed jump: time before it [ns], and steady time at which it happened [s].
         self._pending: tuple[int, float] | None = None
-        # rclpy only borrows the pointer: without this reference a jump segfaults.
+        # rclpy 7.1 only borrows the pointer: until its clock keeps a reference to it, a jump
+        # after the loss of this handle segfaults.
         self._handle: Any = node.get_clock().create_jump_callback(
             JumpThreshold(
                 min_forward=Duration(nanoseconds=_LEAST_FORWARD),

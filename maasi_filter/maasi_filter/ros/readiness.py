@@ -1,0 +1,158 @@
+"""When a node is ready: all peers are there, and messages would reach them."""
+
+import math
+import time
+from collections.abc import Callable, Collection
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from maasi_filter.ros.loopback import loopback_fault
+from maasi_filter.ros.qos import LATCHED
+from maasi_filter.ros.rclpy_workarounds import SafeNode
+from maasi_msgs.msg import LockstepDone
+
+_PEERS_PERIOD = 0.02  # of the check for peers [s]
+_NOTICE_DELAY = 3.0  # from activation until a node says what it waits for [s]
+# Longest time from the discovery of an endpoint to its connection [s].
+_CONNECTION_PATIENCE = 5.0
+_OBSERVERS = ('recorder', 'guard', 'rosbag2_recorder')
+_EVERYWHERE = ('/parameter_events', '/diagnostics')
+
+
+class Endpoints:
+    """Endpoints of a node's topics: to whom a message would get, and what never connects."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        # Since when an endpoint has been known, but not connected [s of wall time].
+        self._since: dict[str, float] = {}
+        self._lasting: set[str] = set()
+
+    def look(self) -> list[str]:
+        """Return a warning, once, for each topic with a known endpoint that never connects."""
+        node, now = self._node, time.monotonic()
+        unconnected = {
+            f'{item.topic_name}: a publisher does not connect'
+            for item in node.subscriptions
+            if item.handle.get_publisher_count() < node.count_publishers(item.topic_name)
+        } | {
+            f'{item.topic_name}: a subscription does not connect'
+            for item in node.publishers
+            if item.get_subscription_count() < node.count_subscribers(item.topic_name)
+        }
+        self._since = {text: self._since.get(text, now) for text in unconnected}
+        lasting = {
+            text for text, since in self._since.items() if now - since > _CONNECTION_PATIENCE
+        }
+        warnings = [f'{text}: its quality of service or type differs' for text in sorted(lasting)]
+        for text, warning in zip(sorted(lasting), warnings):
+            if text not in self._lasting:
+                node.get_logger().warning(warning)
+        self._lasting = lasting
+        return warnings
+
+    def reach(self, publisher: Publisher, number: int, names: Collection[str]) -> bool:
+        """Return whether a message would reach so many subscribers, and nodes of all names."""
+        topic = publisher.topic_name
+        known = [info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)]
+        peers = [name for name in known if name not in _OBSERVERS and not name.startswith('_')]
+        if not set(names) <= set(known) or len(peers) < number:
+            return False
+        # An observer with an incompatible quality of service never connects.
+        late = f'{topic}: a subscription does not connect' in self._lasting
+        return late or publisher.get_subscription_count() >= len(known)
+
+    def unpublished(self) -> list[str]:
+        """Return the topics that the node subscribes to and nobody publishes."""
+        topics = {item.topic_name for item in self._node.subscriptions}.difference(_EVERYWHERE)
+        return sorted(topic for topic in topics if not self._node.count_publishers(topic))
+
+
+class ReadyNode(SafeNode):
+    """A node that publishes `lockstep/ready` (maasi_msgs/LockstepDone) once all peers are there."""
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        self._peers: list[Callable[[], bool]] = []
+        self._peers_timer: Any = None
+        # When to say what nobody publishes [s of wall time].
+        self._notice_at = math.inf
+        self._ready_publisher: Publisher | None = None
+        self._endpoints = Endpoints(self)
+
+    def expect(self, condition: Callable[[], bool]) -> None:
+        """Add a condition for being ready."""
+        self._peers.append(condition)
+
+    def expect_subscribers(
+        self,
+        publisher: Callable[[], Publisher | None] | Publisher,
+        number: int = 1,
+        names: Collection[str] = (),
+    ) -> None:
+        """Be ready only when a message would reach all expected subscribers.
+
+        `publisher` may be a function that returns the present one; `number` does not count mere
+        observers; nodes of these `names`, without namespace, have to be among the subscribers.
+        """
+
+        def reached() -> bool:
+            present = publisher() if callable(publisher) else publisher
+            return present is not None and self._endpoints.reach(present, number, names)
+
+        self.expect(reached)
+
+    def expect_publisher(self, topic: str) -> None:
+        """Be ready only with a publisher of a topic."""
+        self.expect(lambda: self.count_publishers(topic) > 0)
+
+    def offer_ready(self, topic: str) -> None:
+        """Create the publisher, after all others.
+
+        Publishers are discovered in the order of their creation: who receives it knows them all.
+        """
+        self._ready_publisher = self.create_publisher(LockstepDone, topic, LATCHED)
+
+    def await_peers(self) -> None:
+        """Begin to look for peers."""
+        self._peers_timer = self.create_wall_timer(_PEERS_PERIOD, self._look_for_peers)
+        self._notice_at = time.monotonic() + _NOTICE_DELAY
+
+    def end_wait(self) -> None:
+        """Look for peers no more."""
+        self._notice_at = math.inf
+        self._end_timer()
+
+    def forget_peers(self) -> None:
+        """Forget what was expected, before the entities are destroyed."""
+        self._peers.clear()
+        self._ready_publisher = self._peers_timer = None
+
+    def _end_timer(self) -> None:
+        if self._peers_timer is not None:
+            self._peers_timer.cancel()
+            self.destroy_timer(self._peers_timer)
+            self._peers_timer = None
+
+    def _look_for_peers(self) -> None:
+        if not self.active or not all(condition() for condition in self._peers):
+            return
+        self._end_timer()
+        if self._ready_publisher is not None:
+            self._ready_publisher.publish(LockstepDone(node=self.get_fully_qualified_name()))
+
+    def check_peers(self) -> list[str]:
+        """Warn of endpoints that never connect; name, once, the topics that nobody publishes."""
+        if time.monotonic() >= self._notice_at:
+            self._notice_at = math.inf
+            missing = self._endpoints.unpublished()
+            text = f'active, waiting for publishers of {", ".join(missing)}'
+            if '/clock' in missing:
+                self.get_logger().warning(f'{text}; use_sim_time is true')
+            elif missing:
+                self.get_logger().info(text)
+            if missing and (fault := loopback_fault()):
+                self.get_logger().warning(fault)
+        return self._endpoints.look()
