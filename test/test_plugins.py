@@ -234,7 +234,7 @@ def test_filter_of_ones_own(folder):
     (found,) = filters[-1].found_targets
     np.testing.assert_allclose(found.position, target[0], atol=1e-9)
     # Another one has not its settings.
-    pmb = load_scenario(folder / 'search.yaml', {'--filters': (('filter', 'method'), 'pmb')})
+    pmb = load_scenario(folder / 'search.yaml', {'--filter': (('filter', 'method'), 'pmb')})
     assert pmb.filter.settings is None
     with pytest.raises(ValueError, match=r"filter 'pmb' has no settings of its own"):
         FilterSettings(method='pmb', settings={'gate': 0.3})

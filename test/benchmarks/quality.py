@@ -107,10 +107,10 @@ def rows(options, conditions, seeds):
         workers = stack.enter_context(contextlib.closing(make_workers(len(seeds), options.jobs)))
         for condition in conditions:
             reference = None
-            for method in options.method:
+            for method in options.filter:
                 keys = [(condition, method, seed) for seed in seeds]
                 missing = [key for key in keys if key not in kept]
-                for key, run in workers.make(partial(run_one, settings=options.filter), missing):
+                for key, run in workers.make(partial(run_one, settings=options.settings), missing):
                     kept[key] = run
                     print(json.dumps(run), file=file, flush=True)
                 runs = [kept[key] for key in keys]
@@ -120,7 +120,7 @@ def rows(options, conditions, seeds):
 
 def main():
     parser = argparse.ArgumentParser(prog='quality', description=__doc__)
-    parser.add_argument('--method', nargs='*', choices=METHODS, default=METHODS)
+    parser.add_argument('--filter', nargs='*', choices=METHODS, default=METHODS)
     parser.add_argument(
         '--json',
         type=Path,
@@ -128,7 +128,7 @@ def main():
         help='add each run there as a line; those that are there are not run again',
     )
     parser.add_argument(
-        '--filter', type=json.loads, metavar='JSON', help='settings of the filter, in all runs'
+        '--settings', type=json.loads, metavar='JSON', help='settings of the filter, in all runs'
     )
     parser.add_argument(
         '--stone-soup', action='store_true', help="GOSPA beside Stone Soup's JPDA tracker instead"

@@ -35,10 +35,10 @@ def executed(monkeypatch):
 
 
 def command(scenario, out, *more, seeds=2):
-    arguments = [str(scenario), '--planners', ','.join(PLANNERS), '--seeds', str(seeds)]
+    arguments = [str(scenario), '--planner', ','.join(PLANNERS), '--seeds', str(seeds)]
     if out is not None:
         arguments += ['--out', str(out)]
-    return compare.main([*arguments, '--workers', '1', *more])
+    return compare.main([*arguments, '--jobs', '1', *more])
 
 
 def test_comparison_is_written_and_not_made_twice(scenario, tmp_path, executed, capsys):
@@ -115,8 +115,8 @@ def test_planner_of_ones_own_is_compared_and_its_changes_are_noticed(
         'from maasi_planner.planners import NearestWidest\n\nclass Mine(NearestWidest):\n    pass\n'
     )
     module.write_text(text)
-    arguments = [str(scenario), '--planners', f'lawnmower,{name}:Mine', '--seeds', '1']
-    arguments += ['--workers', '1', '--out', str(tmp_path / 'out')]
+    arguments = [str(scenario), '--planner', f'lawnmower,{name}:Mine', '--seeds', '1']
+    arguments += ['--jobs', '1', '--out', str(tmp_path / 'out')]
     assert compare.main(arguments) == 0
     assert executed == [('lawnmower', 1), (f'{name}:Mine', 1)]
     facts = json.loads((tmp_path / 'out' / 'comparison.json').read_text())
@@ -154,9 +154,9 @@ def test_filters_are_compared_with_each_planner(scenario):
     ('arguments', 'words'),
     [
         (['nothing_like_it'], 'known are'),
-        (['field.yaml', '--planners', 'maasi,none_such'], 'none_such'),
-        (['field.yaml', '--planners', 'maasi,maasi'], 'different names'),
-        (['field.yaml', '--filters', 'kalman'], 'pmb'),
+        (['field.yaml', '--planner', 'maasi,none_such'], 'none_such'),
+        (['field.yaml', '--planner', 'maasi,maasi'], 'different names'),
+        (['field.yaml', '--filter', 'kalman'], 'pmb'),
         (['field.yaml', 'field.yaml'], 'different names'),
         (['field.yaml', '--seeds', '0'], 'from 1 to 9999'),
         (['field.yaml', '--first-seed', '1.5'], 'whole numbers'),
@@ -167,7 +167,7 @@ def test_filters_are_compared_with_each_planner(scenario):
 def test_bad_input(scenario, monkeypatch, arguments, words, capsys):
     monkeypatch.chdir(scenario.parent)
     with pytest.raises(SystemExit) as ended:
-        raise SystemExit(compare.main([*arguments, '--workers', '1']))
+        raise SystemExit(compare.main([*arguments, '--jobs', '1']))
     assert ended.value.code == 2
     assert words in capsys.readouterr().err
     assert not (scenario.parent / 'runs').exists()

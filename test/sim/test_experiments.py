@@ -75,7 +75,7 @@ def toy(monkeypatch):
 
 
 def command(out, *more):
-    return reproduce.main(['000-toy', '--out', str(out), '--workers', '1', *map(str, more)])
+    return reproduce.main(['000-toy', '--out', str(out), '--jobs', '1', *map(str, more)])
 
 
 def run_files(out: Path) -> dict[str, str]:
@@ -275,7 +275,7 @@ def test_page_says_what_was_run_and_keeps_what_was_not_run_again(toy, tmp_path):
         (['000-fgi4'], '000-fig4'),
         ([], 'give names'),
         (['000-fig4', '--runs', '0'], '--runs'),
-        (['000-fig4', '--workers', 'two'], '--workers'),
+        (['000-fig4', '--jobs', 'two'], '--jobs'),
         (['000-fig4', '--case', 'none such'], "unknown case 'none such'"),
     ],
 )

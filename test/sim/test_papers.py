@@ -81,7 +81,7 @@ def test_cluster_makes_the_same_runs(tmp_path):
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
         there = [*command, str(tmp_path / 'there'), '--cluster', cluster.scheduler_address]
         assert reproduce.main(there) == 0
-    assert reproduce.main([*command, str(tmp_path / 'here'), '--workers', '1']) == 0
+    assert reproduce.main([*command, str(tmp_path / 'here'), '--jobs', '1']) == 0
     here, there = (tmp_path / place / '000-fig7' / 'steps.csv' for place in ('here', 'there'))
     assert here.read_text() == there.read_text()
     assert here.read_text().count('\n') > 30

@@ -243,11 +243,11 @@ def one_machine(workers: Workers, campaigns: Sequence[Campaign]) -> dict[str, st
 # Of the commands.
 
 
-def add_worker_options(parser: argparse.ArgumentParser, cluster: str) -> None:
-    """Add the options of `carry_out_all`; `cluster` is the name of that of a Dask cluster."""
+def add_worker_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `carry_out_all`."""
     add = parser.add_argument
-    add('--workers', type=count, metavar='N', help='processes (default: one for each core)')
-    add(cluster, dest='cluster', metavar='ADDRESS', help='scheduler of a Dask cluster')
+    add('--jobs', type=count, metavar='N', help='processes (default: one for each core)')
+    add('--cluster', metavar='ADDRESS', help='scheduler of a Dask cluster')
     add(
         '--mixed-workers',
         action='store_true',

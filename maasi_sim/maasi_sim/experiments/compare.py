@@ -40,14 +40,14 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add('scenarios', nargs='+', metavar='SCENARIO', help='file, or name of one in config/scenarios')
     add(
-        '--planners',
+        '--planner',
         type=_names,
         default=(),
         metavar='NAME,...',
         help="planners; differences are to the first one (default: the scenario's)",
     )
     add(
-        '--filters',
+        '--filter',
         type=_names,
         default=(),
         metavar='NAME,...',
@@ -62,7 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
         help='the first (default: %(default)s)',
     )
     add('--time-limit', type=positive, metavar='S', help="of a search [s], not the scenario's")
-    add_worker_options(parser, '--dask')
+    add_worker_options(parser)
     add(
         '--again',
         action='store_true',
@@ -95,7 +95,7 @@ def main(arguments: list[str] | None = None) -> int:
 def compare(options: argparse.Namespace) -> int:
     """Make the missing searches, write the results, and return the exit code."""
     comparisons = [
-        compared(scenario, options.planners, options.filters, options.time_limit)
+        compared(scenario, options.planner, options.filter, options.time_limit)
         for scenario in options.scenarios
     ]
     names = [item.name for item in comparisons]
@@ -115,7 +115,7 @@ def compare(options: argparse.Namespace) -> int:
         _refuse_others(campaigns, out)
     print(f'results: {out}', file=sys.stderr)
     write_file(out / 'request.json', json.dumps(wanted, indent=2) + '\n')
-    problems = carry_out_all(campaigns, options.workers, options.cluster, options.mixed_workers)
+    problems = carry_out_all(campaigns, options.jobs, options.cluster, options.mixed_workers)
     tables = [SearchTable(work.results()) for work in campaigns if work.done]
     if tables:
         seeds = range(options.first_seed, options.first_seed + options.seeds)

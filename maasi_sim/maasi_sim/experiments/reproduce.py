@@ -38,7 +38,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar='NAME',
         help='only this case of each experiment; may be given several times',
     )
-    add_worker_options(parser, '--cluster')
+    add_worker_options(parser)
     add(
         '--out',
         type=Path,
@@ -111,9 +111,7 @@ def _run(wanted: Sequence[Experiment], options: argparse.Namespace) -> list[str]
         write_outputs(work, options.seed)
         return f'{work.experiment.name}: {work.folder}/table.md'
 
-    return carry_out_all(
-        campaigns, options.workers, options.cluster, options.mixed_workers, finished
-    )
+    return carry_out_all(campaigns, options.jobs, options.cluster, options.mixed_workers, finished)
 
 
 if __name__ == '__main__':

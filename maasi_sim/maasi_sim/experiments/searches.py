@@ -328,9 +328,9 @@ def compared(
             # Many searches run in parallel; results do not depend on the number of threads.
             overrides: dict[str, tuple[Key, Any]] = {'one process': (('filter', 'threads'), 1)}
             if planner is not None:
-                overrides['--planners'] = ('planner', 'name'), planner
+                overrides['--planner'] = ('planner', 'name'), planner
             if method is not None:
-                overrides['--filters'] = ('filter', 'method'), method
+                overrides['--filter'] = ('filter', 'method'), method
             if time_limit is not None:
                 overrides['--time-limit'] = ('limits', 'time'), time_limit
             loaded = load_scenario(path, overrides)
