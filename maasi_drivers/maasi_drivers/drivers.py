@@ -5,9 +5,9 @@ from pkgutil import resolve_name
 from typing import Any
 
 from maasi_drivers.agent.agent_driver import AgentDriver
-from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.sensor_input import RangingInput
+from maasi_drivers.links.robot_link import RobotLink
 from maasi_drivers.links.topic_link import TopicLink
 from maasi_drivers.vision.camera_input import CameraInput
 from maasi_filter.ros.lifecycle_node import SettingsError

@@ -11,12 +11,12 @@ from maasi_drivers.agent.goal_server import GoalServer
 from maasi_drivers.agent.measurement_responder import MeasurementResponder
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.robot_frames import RobotFrames
-from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import AREA, FROZEN_POSE, ODOMETRY, STOP, RobotNode
 from maasi_drivers.agent.robot_topics import PoseTopic
 from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
+from maasi_drivers.links.robot_link import RobotLink
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.operating_volume import MARGIN
 from maasi_filter.models.pose import Pose

@@ -6,9 +6,9 @@ import numpy as np
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
 
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
+from maasi_drivers.links.robot_link import RobotLink
 from maasi_filter.ros.conversions import pose_to_ros
 from maasi_msgs.action import GoToWaypoint
 

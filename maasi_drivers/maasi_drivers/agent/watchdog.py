@@ -3,9 +3,9 @@
 import time
 
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, FROZEN_POSE, ODOMETRY, SENSOR, RobotNode
 from maasi_drivers.agent.sensor_input import SensorInput
+from maasi_drivers.links.robot_link import RobotLink
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_filter.ros.qos import LIVELINESS_PERIOD, LIVELY

@@ -1,5 +1,101 @@
-"""The interface of links, for drivers of users' own."""
+"""How a driver reaches its robot: the interface that every link implements."""
 
-from maasi_drivers.agent.robot_link import RobotLink
+# Optional hooks do nothing.
 
-__all__ = ['RobotLink']
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.waypoint_follower import Goal
+from maasi_drivers.links.link_hooks import LinkHooks
+from maasi_filter.arrays import FloatArray
+from maasi_planner.motion import MotionModel, RobotState, make_motion
+
+
+class RobotLink(LinkHooks, ABC):
+    """The link to one robot.
+
+    A driver makes it in *configure*. Everything that comes in goes to `driver`: poses to
+    `take_pose`, the charge to `take_charge`, faults to `judge`. No method waits, except `stop`.
+
+    Parameters
+    ----------
+    driver : RobotNode
+        The robot's node.
+    """
+
+    def __init__(self, driver: RobotNode) -> None:
+        self.driver = driver
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Open the link, in *configure*; where this raises, the node stays unconfigured."""
+
+    @abstractmethod
+    def send(self, placed: StampedPose, command: Sequence[float]) -> None:
+        """Send a velocity command, after each pose.
+
+        Parameters
+        ----------
+        placed : StampedPose
+            Pose of the robot.
+        command : sequence of float
+            vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+        """
+
+    @abstractmethod
+    def hold(self) -> None:
+        """Stop the robot now: its goal was cancelled, or its pose is unknown."""
+
+    def hold_step(self, stamp: int) -> None:
+        """Answer the step at `stamp` [ns], whose odometry could not be used, by a stop."""
+        self.hold()
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop the robot because the driver ends; may wait until that is confirmed."""
+
+    @abstractmethod
+    def poll(self) -> None:
+        """Check the link: ten times a second on wall time while active; not in lockstep."""
+
+    def close(self) -> None:
+        """Undo `connect`; called once. ROS entities are destroyed by the node."""
+
+    def status(self) -> dict[str, Any]:
+        """Return values for the diagnostics."""
+        return {}
+
+    def prepare(self) -> None:
+        """Check the settings, before `connect`; `SettingsError` for what is not allowed."""
+
+    def activate(self) -> None:
+        """Begin to work, in *activate*: from now on the robot may move."""
+
+    def reset(self) -> None:
+        """Discard what belongs to the time before a jump back of the clock."""
+
+    def latch_stop(self) -> None:
+        """Handle the service `stop`, after `hold`."""
+
+    def observe(self, placed: StampedPose) -> None:
+        """Take note of a new pose, before it is used."""
+
+    def goal_taken(self, goal: Goal) -> None:
+        """Take note of a new goal."""
+
+    def make_motion(self) -> MotionModel:
+        """Return the controller."""
+        settings = self.driver.settings
+        return make_motion(settings.motion, self.driver.volume.area, settings.radius)
+
+    def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
+        """Return the command (4,) and the goal reached; see `WaypointFollower.update`."""
+        return self.driver.follower.update(robot, step)
+
+    def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
+        """Return whether this command must change pose and images."""
+        return bool(math.hypot(*command[:3]) > 0.02 or abs(command[3]) > 0.05)

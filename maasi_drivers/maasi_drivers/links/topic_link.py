@@ -10,9 +10,9 @@ from rclpy.node import Node
 
 from maasi_drivers.agent.flight_rules import flight_volume
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.robot_topics import BatteryTopic, OdometryTopic
+from maasi_drivers.links.robot_link import RobotLink
 from maasi_drivers.settings.driver import CommandType
 from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.ros.conversions import stamp_to_ros

@@ -9,12 +9,12 @@ import numpy as np
 
 from maasi_drivers.agent.flight_rules import flight_volume
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
-from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.robot_topics import OdometryTopic, PoseTopic
 from maasi_drivers.agent.waypoint_follower import Goal
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
 from maasi_drivers.links.mambo.pilot import MamboPhase, MamboPilot
+from maasi_drivers.links.robot_link import RobotLink
 from maasi_drivers.settings.vehicles import LEAST_TILT, MOST_TILT, MamboSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose

@@ -13,9 +13,9 @@ import numpy as np
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission, flight_volume
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
-from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import FeedPeer, RobotNode
 from maasi_drivers.links.mambo.pilot import ALTITUDE_TOLERANCE, NOT_ALLOWED
+from maasi_drivers.links.robot_link import RobotLink
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_drivers.vision.measurement_feed import FeedPose, FeedState
 from maasi_filter.arrays import FloatArray

@@ -11,13 +11,13 @@ import numpy as np
 
 from maasi_drivers.agent.flight_rules import HomeLanding, flight_volume
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
-from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
 from maasi_drivers.links.mavlink.estimate import Telemetry
 from maasi_drivers.links.mavlink.fence import fence_items
 from maasi_drivers.links.mavlink.link import VehicleLink
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING
+from maasi_drivers.links.robot_link import RobotLink
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
