@@ -4,11 +4,11 @@ from functools import partial
 from pkgutil import resolve_name
 from typing import Any
 
-from maasi_drivers.agent.agent_driver import AgentDriver
+from maasi_drivers.agent.agent_driver import AgentDriver, MakeLink
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.sensor_input import RangingInput
 from maasi_drivers.links.robot_link import RobotLink
-from maasi_drivers.links.topic_link import TopicLink
+from maasi_drivers.settings.driver import LINKS
 from maasi_drivers.vision.camera_input import CameraInput
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.run_node import run
@@ -25,45 +25,53 @@ def _link(name: str, driver: RobotNode) -> RobotLink:
     return link
 
 
-_MAMBO = partial(_link, 'mambo.mambo_robot_link:MamboRobotLink')
-_MAVLINK = partial(_link, 'mavlink.mavlink_robot_link:MavlinkRobotLink')
+_CLASSES = {
+    'topics': 'topic_link:TopicLink',
+    'mambo_wifi': 'mambo.mambo_robot_link:MamboRobotLink',
+    'mambo_ble': 'mambo.mambo_robot_link:MamboRobotLink',
+    'mambo_feed': 'mambo.onboard_link:OnboardLink',
+    'mavlink': 'mavlink.mavlink_robot_link:MavlinkRobotLink',
+}
+
+
+def _links(driver: str) -> dict[str, MakeLink]:
+    """Return what makes each link of a driver."""
+    return {name: partial(_link, _CLASSES[name]) for name in LINKS[driver]}
 
 
 class MamboDriver(AgentDriver):
     """A quadrotor with a camera that looks down; see `MamboRobotLink` and `CameraInput`."""
 
     def __init__(self, **options: Any) -> None:
-        links = {'mambo_wifi': _MAMBO, 'mambo_ble': _MAMBO}
-        super().__init__({'topics': TopicLink, **links}, CameraInput, **options)
+        super().__init__(_links('mambo_driver'), CameraInput, **options)
 
 
 class MamboOnboardDriver(AgentDriver):
     """A drone with a program of its own; see `OnboardLink` and docs/measurement_feed.md."""
 
     def __init__(self, **options: Any) -> None:
-        links = {'mambo_feed': partial(_link, 'mambo.onboard_link:OnboardLink')}
-        super().__init__(links, CameraInput, **options)
+        super().__init__(_links('mambo_onboard_driver'), CameraInput, **options)
 
 
 class MavlinkDriver(AgentDriver):
     """A vehicle with a ranging sensor; see `MavlinkRobotLink` and `RangingInput`."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__({'topics': TopicLink, 'mavlink': _MAVLINK}, RangingInput, **options)
+        super().__init__(_links('mavlink_driver'), RangingInput, **options)
 
 
 class MavlinkCameraDriver(AgentDriver):
     """A vehicle with a camera; see `MavlinkRobotLink` and `CameraInput`."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__({'topics': TopicLink, 'mavlink': _MAVLINK}, CameraInput, **options)
+        super().__init__(_links('mavlink_camera_driver'), CameraInput, **options)
 
 
 class RangingDriver(AgentDriver):
     """A robot with topics and a ranging sensor; see `TopicLink` and `RangingInput`."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__({'topics': TopicLink}, RangingInput, **options)
+        super().__init__(_links('ranging_driver'), RangingInput, **options)
 
 
 class TurtlebotDriver(AgentDriver):

@@ -9,23 +9,18 @@ from typing_extensions import Self
 
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.ros.node_settings import NodeSettings
-from maasi_filter.settings import NotNegative, Positive, SensorSettings, Settings, Vector3
+from maasi_filter.settings import NotNegative, Positive, Settings, Vector3
 from maasi_planner.endurance import EnduranceSettings
-from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
+from maasi_planner.settings import CandidateSettings, PlannerSettings, RobotModel
 
 
-class PlannedRobotSettings(Settings):
+class PlannedRobotSettings(RobotModel):
     """Settings of a robot for the planner."""
 
-    candidates: CandidateSettings = Field(description='Waypoints to choose from')
-    motion: MotionSettings = Field(default_factory=MotionSettings, description='How it moves')
-    sensor: SensorSettings = Field(
-        default_factory=SensorSettings, description='Its sensor, as the planner believes'
-    )
     radius: NotNegative = Field(0.1, description='Of a circle around the robot [m]')
-    start: Vector3 = Field(
-        [0.0, 0.0, 0.0],
-        description='Position at the start; its height is that of the waypoints in 2D [m, map]',
+    candidates: CandidateSettings = Field(
+        description='Waypoints to choose from; left out in a scenario: a grid from which it sees '
+        'everything'
     )
     endurance: EnduranceSettings | None = Field(
         None, description='So that it is home before its battery is empty; none: no matter'

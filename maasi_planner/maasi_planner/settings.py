@@ -7,11 +7,15 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import AfterValidator, Field, model_validator
 
 from maasi_filter.plugins import OwnSettings, PluginGroup
-from maasi_filter.settings import Settings
+from maasi_filter.settings import (
+    Finite,
+    NotNegative,
+    Positive,
+    SensorSettings,
+    Settings,
+    Vector3,
+)
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 PositiveInt = Annotated[int, Field(ge=1, le=10_000)]
 
 PLANNERS = PluginGroup(
@@ -174,6 +178,25 @@ class MotionSettings(Settings):
                 'acts in place of it; allowed is one of them'
             )
         return self
+
+
+class RobotModel(Settings):
+    """What planner, driver and simulation know of a robot."""
+
+    start: Vector3 = Field(
+        [0.0, 0.0, 0.0],
+        description='Position at the start; its height is that of the waypoints in 2D [m, map]',
+    )
+    radius: Positive = Field(0.1, description='Of a circle around the robot [m]')
+    motion: MotionSettings = Field(default_factory=MotionSettings, description='How it moves')
+    sensor: SensorSettings = Field(
+        default_factory=SensorSettings, description='Its sensor, as filter and planner believe'
+    )
+
+    @classmethod
+    def part_of(cls, robot: RobotModel) -> dict[str, Any]:
+        """Return the values of a robot's model that this one has."""
+        return {key: getattr(robot, key) for key in cls.model_fields}
 
 
 class Weights(NamedTuple):

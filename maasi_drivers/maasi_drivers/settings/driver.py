@@ -11,8 +11,8 @@ from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.plugins import PluginGroup
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE, NodeSettings
-from maasi_filter.settings import Finite, SensorSettings, Settings, Vector2, Vector3
-from maasi_planner.settings import MotionSettings
+from maasi_filter.settings import Finite, Settings, Vector2, Vector3
+from maasi_planner.settings import RobotModel
 
 BatteryUnit = Literal['fraction', 'percent']
 CommandType = Annotated[
@@ -23,20 +23,21 @@ CommandType = Annotated[
     ),
 ]
 
+# Links that each driver of the suite has.
+LINKS: dict[str, tuple[str, ...]] = {
+    'mambo_driver': ('topics', 'mambo_wifi', 'mambo_ble'),
+    'mambo_onboard_driver': ('mambo_feed',),
+    'turtlebot_driver': ('topics',),
+    'ranging_driver': ('topics',),
+    'mavlink_driver': ('topics', 'mavlink'),
+    'mavlink_camera_driver': ('topics', 'mavlink'),
+}
 DRIVERS = PluginGroup(
     'maasi.drivers',
     'driver',
     'maasi_drivers.agent.agent_driver:AgentDriver',
-    {
-        name: f'maasi_drivers.drivers:{name}'
-        for name in (
-            'mambo_driver',
-            'turtlebot_driver',
-            'ranging_driver',
-            'mavlink_driver',
-            'mavlink_camera_driver',
-        )
-    },
+    # Those of robots that the simulation stands in for.
+    {name: f'maasi_drivers.drivers:{name}' for name, has in LINKS.items() if 'topics' in has},
 )
 
 
@@ -82,7 +83,40 @@ class ScanSettings(Settings):
     )
 
 
-class DriverSettings(NodeSettings):
+class DrivenRobot(RobotModel):
+    """What driver and simulation know of a robot."""
+
+    link: Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink'] = Field(
+        'topics',
+        description='How it is reached: ROS topics; pyparrot over WiFi or Bluetooth '
+        '(mambo_driver); a program of its own by UDP (mambo_onboard_driver); MAVLink '
+        '(mavlink_driver)',
+    )
+    mambo: MamboSettings | None = Field(
+        None,
+        description='With a link mambo_...: how, and what it may be made to do; where the drone '
+        'is simulated, an address that is not of this host is replaced',
+    )
+    mavlink: MavlinkSettings | None = Field(
+        None, description='With link mavlink: how, and what it may be made to do'
+    )
+    yaw: Finite = Field(0.0, description='Heading at the start, from the x axis of the map [rad]')
+    camera: CameraSettings | None = Field(None, description='Its camera; none: a ranging sensor')
+    battery_unit: BatteryUnit = Field(
+        'fraction',
+        description='Unit of battery_state.percentage: fraction, 0 to 1 as its definition says, or '
+        'percent, 0 to 100 as a TurtleBot3 has it',
+    )
+    battery_minimum: float = Field(
+        0.05,
+        ge=0.0,
+        lt=1.0,
+        description='Charge below which its driver takes no goals, and lands it where it can; '
+        '0: disabled [1]',
+    )
+
+
+class DriverSettings(DrivenRobot, NodeSettings):
     """What the driver of a robot needs to know."""
 
     live: ClassVar[frozenset[str]] = frozenset(
@@ -98,30 +132,6 @@ class DriverSettings(NodeSettings):
     )
 
     environment: EnvironmentSettings = Field(description='Where the robot may go')
-    link: Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink'] = Field(
-        'topics',
-        description='How it is reached: ROS topics; pyparrot over WiFi or Bluetooth '
-        '(mambo_driver); a program of its own by UDP (mambo_onboard_driver); MAVLink '
-        '(mavlink_driver)',
-    )
-    mambo: MamboSettings | None = Field(
-        None, description='With a link mambo_...: how, and what it may be made to do'
-    )
-    mavlink: MavlinkSettings | None = Field(
-        None, description='With link mavlink: how, and what it may be made to do'
-    )
-    start: Vector3 = Field(
-        [0.0, 0.0, 0.0], description='Position in the map where its odometry is zero [m]'
-    )
-    yaw: Finite = Field(0.0, description='Heading there, from the x axis of the map [rad]')
-    radius: float = Field(0.1, gt=0.0, description='Of the robot [m]')
-    motion: MotionSettings = Field(
-        default_factory=MotionSettings, description='Motion model and controller'
-    )
-    sensor: SensorSettings = Field(
-        default_factory=SensorSettings, description='What it measures targets with'
-    )
-    camera: CameraSettings | None = Field(None, description='Its camera; none: it has none')
     ranging: RangingSettings = Field(
         default_factory=RangingSettings,
         description='What the angles of `ranges` are relative to; of drivers with a ranging sensor',
@@ -217,18 +227,6 @@ class DriverSettings(NodeSettings):
         'lockstep [s]',
     )
     command_type: CommandType = 'auto'
-    battery_unit: BatteryUnit = Field(
-        'fraction',
-        description='Unit of battery_state.percentage: fraction, 0 to 1 as its definition says, or '
-        'percent, 0 to 100 as a TurtleBot3 has it',
-    )
-    battery_minimum: float = Field(
-        0.05,
-        ge=0.0,
-        lt=1.0,
-        description='Charge below which the robot takes no goals, and lands where it can; '
-        '0: disabled [1]',
-    )
     battery_timeout: float = Field(
         30.0,
         ge=0.0,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.settings.driver import DRIVERS
+from maasi_drivers.settings.driver import DRIVERS, LINKS
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
@@ -29,8 +29,6 @@ _ROBOT_NAME = re.compile(r'^[a-z][a-z0-9]*(_[a-z0-9]+)*$')
 _RESERVED = ('exploration', 'ground_truth', 'lockstep', 'scenario')
 _STEP_TOLERANCE = 1e-6  # largest deviation of a time from a whole number of steps
 _RANGING = ('ranging_driver', 'mavlink_driver')  # drivers of robots that have no camera
-# Drivers by the link that they have.
-_DRIVERS = {'mambo_wifi': ('mambo_driver',), 'mavlink': ('mavlink_driver', 'mavlink_camera_driver')}
 _MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')  # URL of the driver of a simulated vehicle
 
 
@@ -212,7 +210,7 @@ def _link_problems(robot: RobotSettings) -> Problems:
         return
     link = robot.mambo if robot.link == 'mambo_wifi' else robot.mavlink
     key = robot.link.removesuffix('_wifi')
-    drivers = _DRIVERS[robot.link]
+    drivers = [driver for driver, links in LINKS.items() if robot.link in links]
     if robot.body == 'external':
         yield f"body: read 'external', allowed with link {robot.link} is simulated"
     if robot.driver not in drivers:

@@ -6,14 +6,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from maasi_drivers.settings.camera import CameraSettings
-from maasi_drivers.settings.driver import DRIVERS, BatteryUnit
-from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
+from maasi_drivers.settings.driver import DRIVERS, DrivenRobot
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import (
     FilterSettings,
-    Finite,
     NoiseSettings,
     NotNegative,
     Positive,
@@ -22,9 +19,8 @@ from maasi_filter.settings import (
     Vector2,
     Vector3,
 )
-from maasi_planner.endurance import EnduranceSettings
 from maasi_planner.node_settings import PlannedRobotSettings, PlannerNodeSettings
-from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
+from maasi_planner.settings import MotionSettings, PlannerSettings
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
@@ -122,7 +118,7 @@ class WeatherSettings(Settings):
     )
 
 
-class RobotSettings(Settings):
+class RobotSettings(DrivenRobot, PlannedRobotSettings):
     """One robot: its type's settings with the scenario's own on top."""
 
     type: str = Field(description='Name of the type: a file in config/robots')
@@ -143,47 +139,19 @@ class RobotSettings(Settings):
     link: Literal['topics', 'mambo_wifi', 'mavlink'] = Field(
         'topics', description='How its driver reaches it; the other end is simulated'
     )
-    mambo: MamboSettings | None = Field(
-        None,
-        description='With link mambo_wifi: how, and what it may be made to do; an address that '
-        'is not of this host is replaced, as the drone is simulated',
-    )
-    mavlink: MavlinkSettings | None = Field(
-        None, description='With link mavlink: how, and what it may be made to do'
-    )
     autopilot: AutopilotSettings = Field(
         default_factory=AutopilotSettings,
         description='With link mavlink: its autopilot, simulated; or external: another program',
     )
     start: Vector3 = Field(description='Position at the start, x y z [m, map]')
-    yaw: Finite = Field(0.0, description='Heading at the start [rad]')
-    radius: Positive = Field(0.1, description='Of a circle around the robot [m]')
-    candidates: CandidateSettings = Field(
-        description='Waypoints to choose from; left out: a grid from which it sees everything'
-    )
     motion: MotionSettings = Field(description='How it moves')
     sensor: SensorSettings = Field(description='Its sensor, as assumed by the filter')
-    camera: CameraSettings | None = Field(None, description='Its camera; none: a ranging sensor')
     laser: LaserSettings | None = Field(None, description='Its laser scanner, if any')
     odometry: OdometrySettings = Field(
         default_factory=OdometrySettings, description='Errors of its simulated odometry'
     )
     battery: BatterySettings = Field(
         default_factory=BatterySettings, description='Its battery, simulated'
-    )
-    endurance: EnduranceSettings | None = Field(
-        None, description='So that it is home before its battery is empty; none: no matter'
-    )
-    battery_unit: BatteryUnit = Field(
-        'fraction',
-        description='Unit of battery_state.percentage: fraction, 0 to 1, or percent, 0 to 100',
-    )
-    battery_minimum: float = Field(
-        0.05,
-        ge=0.0,
-        lt=1.0,
-        description='Charge below which its driver takes no goals, and lands it where it can; '
-        '0: disabled [1]',
     )
     simulated: SimulatedSettings = Field(
         default_factory=SimulatedSettings,
@@ -299,13 +267,7 @@ def planner_settings(
             'planner': scenario.planner,
             # As the filter has it.
             'exploration_spacing': scenario.filter.exploration_spacing,
-            'robots': {
-                name: {
-                    key: getattr(scenario.robots[name], key)
-                    for key in PlannedRobotSettings.model_fields
-                }
-                for name in names
-            },
+            'robots': {name: PlannedRobotSettings.part_of(scenario.robots[name]) for name in names},
             'others': {
                 name: {'radius': robot.radius, 'start': robot.start}
                 for name, robot in scenario.robots.items()

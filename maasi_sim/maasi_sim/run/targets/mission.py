@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.store import Typestore
 
-from maasi_drivers.settings.driver import DRIVERS, DriverSettings
+from maasi_drivers.settings.driver import DRIVERS, DrivenRobot, DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import unsuitable_lengths, unused_settings
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 
 _BATCH_TIMEOUT = 3.0  # at most: planners hold robots after four seconds without an update [s]
 _LOCKSTEP_TF_RATE = 4.0  # of the robots' frames in lockstep, where each message counts [Hz]
-# Settings of a robot that its driver has as well.
-_OF_THE_DRIVER = ['start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'link']
-_OF_THE_DRIVER += ['battery_unit', 'battery_minimum']
 
 
 class TargetMission:
@@ -160,7 +157,7 @@ def _robot_plans(
         {
             **common,
             'environment': scenario.environment,
-            **{name: getattr(robot, name) for name in _OF_THE_DRIVER},
+            **DrivenRobot.part_of(robot),
             'chargers': robot.endurance.chargers if robot.endurance else [],
             **({'tf_rate': _LOCKSTEP_TF_RATE} if common['lockstep'] else {}),
             'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,
