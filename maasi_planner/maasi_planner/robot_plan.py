@@ -127,23 +127,19 @@ class RobotPlan:
         return self.positions[-1].copy()
 
 
+@dataclass
 class PlannedRobot:
     """One robot of a team: facts, plan, measuring schedule, and battery where it has one.
 
     exploration: e after its own measurements, where it is not that of the team.
     """
 
-    def __init__(
-        self,
-        facts: RobotFacts,
-        candidates: CandidateSet,
-        schedule: MeasurementSchedule,
-        endurance: Endurance | None,
-        exploration: UnexploredMap | None,
-    ) -> None:
-        self.facts, self.candidates, self.schedule = facts, candidates, schedule
-        self.endurance, self.exploration = endurance, exploration
-        self.plan = RobotPlan()
+    facts: RobotFacts
+    candidates: CandidateSet
+    schedule: MeasurementSchedule
+    endurance: Endurance | None
+    exploration: UnexploredMap | None
+    plan: RobotPlan = field(default_factory=RobotPlan)
 
     # ---- queries -----------------------------------------------------------------------------
 

@@ -86,7 +86,7 @@ def test_an_endpoint_that_does_not_fit_is_named(pair, monkeypatch):
     node.create_publisher(Int32, 'found', 10)
     node.create_subscription(Int32, 'seen', print, RELIABLE)
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    assert node._endpoints.look() == []
+    assert node.check_peers() == []
     odd = pair.talker.create_subscription(Int32, 'found', print, latched)
     hurried = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     pair.talker.create_publisher(Int32, 'seen', hurried)
@@ -94,7 +94,7 @@ def test_an_endpoint_that_does_not_fit_is_named(pair, monkeypatch):
         '/found: a subscription does not connect: its quality of service or type differs',
         '/seen: a publisher does not connect: its quality of service or type differs',
     ]
-    wait_until(lambda: node._endpoints.look() == expected)
+    wait_until(lambda: node.check_peers() == expected)
     pair.talker.destroy_subscription(odd)
-    wait_until(lambda: node._endpoints.look() == expected[1:])
+    wait_until(lambda: node.check_peers() == expected[1:])
     node.destroy_node()

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Collection
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from maasi_filter.ros.loopback import loopback_fault
@@ -21,55 +20,6 @@ _OBSERVERS = ('recorder', 'guard', 'rosbag2_recorder')
 _EVERYWHERE = ('/parameter_events', '/diagnostics')
 
 
-class Endpoints:
-    """Endpoints of a node's topics: to whom a message would get, and what never connects."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        # Since when an endpoint has been known, but not connected [s of wall time].
-        self._since: dict[str, float] = {}
-        self._lasting: set[str] = set()
-
-    def look(self) -> list[str]:
-        """Return a warning, once, for each topic with a known endpoint that never connects."""
-        node, now = self._node, time.monotonic()
-        unconnected = {
-            f'{item.topic_name}: a publisher does not connect'
-            for item in node.subscriptions
-            if item.handle.get_publisher_count() < node.count_publishers(item.topic_name)
-        } | {
-            f'{item.topic_name}: a subscription does not connect'
-            for item in node.publishers
-            if item.get_subscription_count() < node.count_subscribers(item.topic_name)
-        }
-        self._since = {text: self._since.get(text, now) for text in unconnected}
-        lasting = {
-            text for text, since in self._since.items() if now - since > _CONNECTION_PATIENCE
-        }
-        warnings = [f'{text}: its quality of service or type differs' for text in sorted(lasting)]
-        for text, warning in zip(sorted(lasting), warnings):
-            if text not in self._lasting:
-                node.get_logger().warning(warning)
-        self._lasting = lasting
-        return warnings
-
-    def reach(self, publisher: Publisher, number: int, names: Collection[str]) -> bool:
-        """Return whether a message would reach so many subscribers, and nodes of all names."""
-        topic = publisher.topic_name
-        known = [info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)]
-        peers = [name for name in known if name not in _OBSERVERS and not name.startswith('_')]
-        if not set(names) <= set(known) or len(peers) < number:
-            return False
-        # An observer with an incompatible quality of service never connects.
-        late = f'{topic}: a subscription does not connect' in self._lasting
-        return late or publisher.get_subscription_count() >= len(known)
-
-    def unpublished(self) -> list[str]:
-        """Return the topics that the node subscribes to and nobody publishes."""
-        topics = {item.topic_name for item in self._node.subscriptions}.difference(_EVERYWHERE)
-        return sorted(topic for topic in topics if not self._node.count_publishers(topic))
-
-
 class ReadyNode(SafeNode):
     """A node that publishes `lockstep/ready` (maasi_msgs/LockstepDone) once all peers are there."""
 
@@ -80,7 +30,10 @@ class ReadyNode(SafeNode):
         # When to say what nobody publishes [s of wall time].
         self._notice_at = math.inf
         self._ready_publisher: Publisher | None = None
-        self._endpoints = Endpoints(self)
+        # Since when an endpoint has been known, but not connected [s of wall time], and which of
+        # these count as never connected.
+        self._unconnected: dict[str, float] = {}
+        self._lasting: set[str] = set()
 
     def expect(self, condition: Callable[[], bool]) -> None:
         """Add a condition for being ready."""
@@ -100,7 +53,7 @@ class ReadyNode(SafeNode):
 
         def reached() -> bool:
             present = publisher() if callable(publisher) else publisher
-            return present is not None and self._endpoints.reach(present, number, names)
+            return present is not None and self._reaches(present, number, names)
 
         self.expect(reached)
 
@@ -143,16 +96,53 @@ class ReadyNode(SafeNode):
         if self._ready_publisher is not None:
             self._ready_publisher.publish(LockstepDone(node=self.get_fully_qualified_name()))
 
+    def _reaches(self, publisher: Publisher, number: int, names: Collection[str]) -> bool:
+        """Return whether a message would reach so many subscribers, and nodes of all names."""
+        topic = publisher.topic_name
+        known = [info.node_name for info in self.get_subscriptions_info_by_topic(topic)]
+        peers = [name for name in known if name not in _OBSERVERS and not name.startswith('_')]
+        if not set(names) <= set(known) or len(peers) < number:
+            return False
+        # An observer with an incompatible quality of service never connects.
+        late = f'{topic}: a subscription does not connect' in self._lasting
+        return late or publisher.get_subscription_count() >= len(known)
+
     def check_peers(self) -> list[str]:
-        """Warn of endpoints that never connect; name, once, the topics that nobody publishes."""
-        if time.monotonic() >= self._notice_at:
+        """Name, once, the topics that nobody publishes; warn of endpoints that never connect."""
+        now = time.monotonic()
+        if now >= self._notice_at:
             self._notice_at = math.inf
-            missing = self._endpoints.unpublished()
-            text = f'active, waiting for publishers of {", ".join(missing)}'
-            if '/clock' in missing:
-                self.get_logger().warning(f'{text}; use_sim_time is true')
-            elif missing:
-                self.get_logger().info(text)
-            if missing and (fault := loopback_fault()):
-                self.get_logger().warning(fault)
-        return self._endpoints.look()
+            self._say_what_is_missing()
+        unconnected = {
+            f'{item.topic_name}: a publisher does not connect'
+            for item in self.subscriptions
+            if item.handle.get_publisher_count() < self.count_publishers(item.topic_name)
+        } | {
+            f'{item.topic_name}: a subscription does not connect'
+            for item in self.publishers
+            if item.get_subscription_count() < self.count_subscribers(item.topic_name)
+        }
+        self._unconnected = {text: self._unconnected.get(text, now) for text in unconnected}
+        before, self._lasting = (
+            self._lasting,
+            {
+                text
+                for text, since in self._unconnected.items()
+                if now - since > _CONNECTION_PATIENCE
+            },
+        )
+        reason = 'its quality of service or type differs'
+        for text in sorted(self._lasting - before):
+            self.get_logger().warning(f'{text}: {reason}')
+        return [f'{text}: {reason}' for text in sorted(self._lasting)]
+
+    def _say_what_is_missing(self) -> None:
+        topics = {item.topic_name for item in self.subscriptions}.difference(_EVERYWHERE)
+        missing = sorted(topic for topic in topics if not self.count_publishers(topic))
+        text = f'active, waiting for publishers of {", ".join(missing)}'
+        if '/clock' in missing:
+            self.get_logger().warning(f'{text}; use_sim_time is true')
+        elif missing:
+            self.get_logger().info(text)
+        if missing and (fault := loopback_fault()):
+            self.get_logger().warning(fault)
