@@ -14,6 +14,7 @@ from page_tables import code, table
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
+from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.ros.parameters import ParameterField
 from maasi_sim.run.buildings.scenario import CuboidScenario
@@ -34,6 +35,7 @@ ONE_AND_MANY = {
     int: ('whole number', 'whole numbers'),
     float: ('number', 'numbers'),
     str: ('text', 'texts'),
+    BaseGeometry: ('text', 'texts'),
 }
 
 

@@ -26,6 +26,16 @@ Vector2 = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
+def _ascending(intervals: list[list[float]]) -> list[list[float]]:
+    for axis, pair in enumerate(intervals):
+        if not pair[0] < pair[1]:
+            raise ValueError(f'axis {axis}: got {pair}, allowed is [lower, upper], lower < upper')
+    return intervals
+
+
+Intervals = Annotated[list[Vector2], AfterValidator(_ascending)]  # lower and upper on each axis
+
+
 class Settings(BaseModel):
     """Base of all settings: unknown keys are refused, and so is what is not finite."""
 

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.occupancy_map import read_map
-from maasi_filter.geometry.shapes import InputWarning
+from maasi_filter.geometry.polygons import InputWarning
 
 FACTS = {'image': 'room.pgm', 'resolution': 0.05, 'origin': [-3.2, -1.7, 0.0], 'negate': 0}
 THRESHOLDS = {'occupied_thresh': 0.65, 'free_thresh': 0.25}

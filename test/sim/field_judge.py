@@ -14,7 +14,6 @@ import shapely
 from shapely.geometry import LineString, Point
 
 from maasi_filter.geometry.area import Area, level_shape
-from maasi_filter.geometry.shapes import read_shape
 
 ROUNDING = 1e-3  # of what is judged [m]
 UNSEEN = {'lawnmower': 0.5}  # share that a search may leave though it could be had
@@ -138,7 +137,7 @@ class Judge:
                 d = len(zone.centre)
                 near = np.linalg.norm(places[:, :d] - zone.centre, axis=1) - zone.radius
             else:
-                near = shapely.distance(read_shape(zone.polygon), shapely.points(places[:, :2]))
+                near = shapely.distance(zone.polygon, shapely.points(places[:, :2]))
             gaps = np.minimum(gaps, near)
         gaps -= self.robots[index].radius
         yield from self._first('solid', index, gaps < -ROUNDING, gaps)

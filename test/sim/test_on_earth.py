@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from maasi_filter.geometry.geodesy import OriginSettings, to_map
-from maasi_filter.geometry.shapes import InputWarning
+from maasi_filter.geometry.polygons import InputWarning
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 

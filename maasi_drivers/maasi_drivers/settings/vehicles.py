@@ -3,25 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.settings import Finite, Settings, Vector2
-
-
-def _ordered(intervals: list[list[float]]) -> list[list[float]]:
-    for interval in intervals:
-        if interval[0] >= interval[1]:
-            raise ValueError(f'got {interval}, allowed is a lowest below a highest value')
-    return intervals
-
-
-# Lowest and highest x, y and z.
-Fence = Annotated[list[Vector2], Field(min_length=3, max_length=3), AfterValidator(_ordered)]
-
+from maasi_filter.settings import Finite, Intervals, Settings
 
 # Tilt that a Mambo lets itself be set to [rad].
 LEAST_TILT, MOST_TILT = math.radians(5.0), math.radians(25.0)
@@ -45,8 +33,10 @@ class FlightSettings(Settings):
         0.0, description='Height in the map of the ground, or the surface, at its start [m]'
     )
     latency: float = Field(0.0, ge=0.0, le=1.0, description='Age of a position when it arrives [s]')
-    geofence: Fence | None = Field(
+    geofence: Intervals | None = Field(
         None,
+        min_length=3,
+        max_length=3,
         description='Lowest and highest x, y and z that it is sent to; none: the environment with '
         'the radius around it, in the plane 1 m above and below its heights at the start; for what '
         'starts above the ground, not below that [m, map]',

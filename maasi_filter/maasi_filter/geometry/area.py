@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from functools import cached_property
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +16,8 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.geometry.environment import EnvironmentSettings, Zone
-from maasi_filter.geometry.geodesy import OriginSettings, geodetic, on_ground, to_map
-from maasi_filter.geometry.occupancy_map import check_pixels, read_image
-from maasi_filter.geometry.shapes import read_shape
+from maasi_filter.geometry.geodesy import on_ground, to_map
+from maasi_filter.geometry.raster import read_raster, scaled
 
 _ROUNDING = 1e-6  # of coordinates, also of those that are large [m]
 # Cells of the density along the longer side, and every how many are looked at to check it.
@@ -86,25 +82,23 @@ class Area:
 
     def __init__(self, environment: EnvironmentSettings | ArrayLike) -> None:
         if not isinstance(environment, EnvironmentSettings):
-            bounds = check_bounds(environment).tolist()
-            environment = EnvironmentSettings(bounds=bounds)
+            environment = EnvironmentSettings(bounds=np.asarray(environment, dtype=float).tolist())
         self.settings = environment
-        self.bounds = check_bounds(environment.bounds)
+        self.bounds = environment.array()
         self.dimension = len(self.bounds)
         self.expected_targets = environment.expected_targets
         self.circles = _circles([*environment.obstacles, *environment.keep_outs])
         #: (n, 5): The same of solid ones.
         self.solid = _circles(environment.obstacles)
         self._solid_polygons = _polygons(environment.obstacles)
-        self._fence = read_shape(environment.area) if environment.area else None
         #: Level shape in which robots stay: the area, or its bounds.
-        self.border: BaseGeometry = self._fence or box(*self.bounds[:2].T.ravel())
+        self.border: BaseGeometry = environment.area or box(*self.bounds[:2].T.ravel())
         closed = list(map(level_shape, environment.keep_outs))
         #: Of what is shown: level shapes by what they are, but for round obstacles.
-        self.shapes = {'area': [self._fence] if self._fence else [], 'keep_out': closed}
+        self.shapes = {'area': [environment.area] if environment.area else [], 'keep_out': closed}
         self.shapes['obstacle'] = self._solid_polygons
         self.region: BaseGeometry | None = None
-        if self._fence is not None or closed:
+        if environment.area is not None or closed:
             self.region = self.border.difference(shapely.union_all(closed))
             if _is_nothing(self.region):
                 raise ValueError('environment.keep_outs: leave nothing of the area')
@@ -201,9 +195,9 @@ class Area:
         keep-outs count.
         """
         polygons = self._zone_polygons[closed]
-        if self._fence is None and polygons.is_empty and not len(self.circles):
+        whole = self.settings.area
+        if whole is None and polygons.is_empty and not len(self.circles):
             return None
-        whole = self._fence
         if whole is None:
             whole = self.border.buffer(reach, join_style='mitre')
         return whole.difference(polygons)
@@ -223,7 +217,7 @@ class Area:
             low, size = self.bounds[:2, 0], self.bounds[:2, 1] - self.bounds[:2, 0]
             inside = self.outline(low, size / inside.shape, inside.shape)
             share = self.region.area / float(np.prod(size)) if self.region else 1.0
-        likely = _scaled(likely * inside)
+        likely = scaled(likely * inside)
         promised = float(likely.sum() / inside.sum())
         if not promised > 0.0:
             return Density(inside, share, True)
@@ -271,7 +265,7 @@ class Area:
             for index, zone in enumerate(getattr(given, key))
         }
         for index, part in enumerate(given.prior.polygons):
-            zones[f'prior.polygons[{index}]'] = read_shape(part.polygon)
+            zones[f'prior.polygons[{index}]'] = part.polygon
         if given.prior.raster and given.prior.extent:
             (west, east), (south, north) = given.prior.extent
             zones['prior.extent'] = box(west, south, east, north)
@@ -320,11 +314,10 @@ class Area:
         if self.region is not None:
             inside = shapely.contains_xy(self.region, x, y).astype(float)
         for part in prior.polygons:
-            shape_of = read_shape(part.polygon)
-            shapely.prepare(shape_of)
-            likely[shapely.contains_xy(shape_of, x, y)] = part.weight
+            shapely.prepare(part.polygon)
+            likely[shapely.contains_xy(part.polygon, x, y)] = part.weight
         if self._raster is not None:
-            likely = _scaled(likely) * self._raster.at(x, y)
+            likely = scaled(likely) * self._raster.at(x, y)
         return likely, inside
 
 
@@ -345,8 +338,8 @@ def level_shape(zone: Zone) -> BaseGeometry:
     """Return the polygon of a zone; a round one as one of 128 corners."""
     if zone.centre is not None:
         return shapely.Point(zone.centre).buffer(zone.radius or 0.0, quad_segs=32)
-    shape: BaseGeometry = read_shape(zone.polygon)
-    return shape
+    assert zone.polygon is not None
+    return zone.polygon
 
 
 def edges_of(polygons: Iterable[BaseGeometry]) -> FloatArray:
@@ -359,18 +352,6 @@ def edges_of(polygons: Iterable[BaseGeometry]) -> FloatArray:
     return np.asarray(edges[(edges[:, 2:] != 0.0).any(axis=1)])
 
 
-def check_bounds(bounds: ArrayLike) -> FloatArray:
-    """Return bounds as a (d, 2) array; ValueError if not finite, or not lower < upper."""
-    array = np.array(bounds, dtype=float)
-    if array.shape not in ((2, 2), (3, 2)):
-        raise ValueError(f'bounds: got shape {array.shape}, allowed are (2, 2) and (3, 2)')
-    if not np.isfinite(array).all() or not (array[:, 0] < array[:, 1]).all():
-        raise ValueError(
-            f'bounds: got {array.tolist()}, allowed are finite [lower, upper] with lower < upper'
-        )
-    return array
-
-
 def _circles(zones: Iterable[Zone]) -> FloatArray:
     rows = [
         [*[*zone.centre, 0.0][:3], zone.radius, float(len(zone.centre) == 3)]
@@ -381,113 +362,4 @@ def _circles(zones: Iterable[Zone]) -> FloatArray:
 
 
 def _polygons(zones: Iterable[Zone]) -> list[BaseGeometry]:
-    return [read_shape(zone.polygon) for zone in zones if zone.polygon is not None]
-
-
-_CORNERS = (0, 0), (1, 0), (1, 1), (0, 1)
-
-
-@dataclass(frozen=True)
-class _Raster:
-    """Densities: values (rows, columns), and how x, y [m, map] become columns and rows.
-
-    corners (4, 2): where its file says that it lies [m, map].
-    """
-
-    values: FloatArray
-    cells: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-    corners: FloatArray | None = None
-
-    def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the values at places, 0 outside."""
-        rows, columns = self.values.shape
-        column, row = self.cells(x, y)
-        known = (column >= 0.0) & (column < columns) & (row >= 0.0) & (row < rows)
-        found = np.zeros(x.shape)
-        found[known] = self.values[row[known].astype(int), column[known].astype(int)]
-        return found
-
-
-def read_raster(environment: EnvironmentSettings) -> _Raster:
-    """Return the raster of an environment's prior: .npy or an image, first row north; or GeoTIFF.
-
-    ValueError if it cannot be read, or is not of finite numbers from 0.
-    """
-    path = str(environment.prior.raster)
-    key = f'environment.prior.raster: {path}'
-    try:
-        suffix = Path(path).suffix.lower()
-        band = environment.prior.band
-        if suffix in ('.tif', '.tiff'):
-            raster = _of_geotiff(path, environment.origin, band)
-        else:
-            values = _read_array(path) if suffix == '.npy' else read_image(path, band)
-            extent = environment.prior.extent or environment.bounds[:2]
-            raster = _over(np.asarray(values, dtype=float), extent)
-    except (OSError, ValueError, TypeError, EOFError) as error:
-        raise ValueError(f'{key}: {error}') from None
-    values = raster.values
-    if values.ndim != 2 or not np.isfinite(values).all() or (values < 0.0).any():
-        raise ValueError(
-            f'{key}: got shape {values.shape}, allowed are two axes of finite numbers from 0'
-        )
-    return dataclasses.replace(raster, values=_scaled(values))
-
-
-def _scaled(values: FloatArray) -> FloatArray:
-    """Return values from 0, at most 1, by a power of two: exact, and their sums are finite."""
-    return np.asarray(np.ldexp(values, -np.frexp(values.max(initial=0.0))[1]))
-
-
-def _read_array(path: str) -> FloatArray:
-    """Return the array of a .npy file; it is looked at before it is read."""
-    array = np.load(path, mmap_mode='r')
-    if not isinstance(array, np.ndarray):
-        raise ValueError('holds several arrays, allowed is one')
-    check_pixels(array.shape)
-    return np.array(array, dtype=float)
-
-
-def _over(values: FloatArray, extent: list[list[float]]) -> _Raster:
-    """Return a raster over bounds on x and y [m, map]."""
-    (west, east), (south, north) = extent
-
-    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        rows, columns = values.shape
-        return (x - west) / (east - west) * columns, (north - y) / (north - south) * rows
-
-    return _Raster(values, cells)
-
-
-def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> _Raster:
-    """Return a band of a GeoTIFF in its own coordinates; what has no data is 0."""
-    try:
-        import rasterio
-        from rasterio.warp import transform
-    except ImportError:
-        raise ValueError('needs rasterio, the extra geo: pip install "rasterio>=1.4"') from None
-    if origin is None:
-        raise ValueError('a GeoTIFF needs environment.origin')
-    with rasterio.open(path) as file:
-        if file.crs is None:
-            raise ValueError('has no coordinate system')
-        check_pixels(file.shape)
-        bands = [str(number) for number in file.indexes]
-        if band not in (None, *bands) or (band is None and len(bands) > 1):
-            read = 'several' if band is None else band
-            raise ValueError(f'band: read {read}, name the one that counts: {", ".join(bands)}')
-        crs, grid = file.crs, list(~file.transform)
-        a, b, c, d, e, f = list(file.transform)[:6]
-        u, v = np.transpose(_CORNERS) * [[file.width], [file.height]]
-        ends = a * u + b * v + c, d * u + e * v + f
-        corners = to_map(np.array(transform(crs, 'EPSG:4326', *ends)).T, origin)
-        values = file.read(int(band or 1), masked=True).astype(float).filled(0.0)
-
-    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)
-        places = transform('EPSG:4326', crs, degrees[:, 1], degrees[:, 0])
-        east, north = (np.reshape(axis, x.shape) for axis in places)
-        a, b, c, d, e, f = grid[:6]
-        return a * east + b * north + c, d * east + e * north + f
-
-    return _Raster(values, cells, corners)
+    return [zone.polygon for zone in zones if zone.polygon is not None]

@@ -7,7 +7,8 @@ from pydantic import ValidationError
 from std_msgs.msg import Header
 
 from maasi_filter.geometry.area import Area
-from maasi_filter.geometry.environment import EnvironmentSettings, shapes_of_texts
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.readers import shapes_of_texts
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
@@ -76,9 +77,8 @@ def with_keep_outs(environment: EnvironmentSettings, zones: Sequence[str]) -> Ar
     ):
         if read > most:
             raise ValueError(f'read {read} {what}, allowed are {most}')
-    values = environment.model_dump(exclude={'keep_outs'}, exclude_none=True)
     try:
-        given = {**values, 'keep_outs': shapes_of_texts(zones)}
+        given = {**dict(environment), 'keep_outs': shapes_of_texts(zones)}
         return Area(EnvironmentSettings.model_validate(given))
     except ValueError as error:
         # One line, without the type of error and the address that pydantic adds.

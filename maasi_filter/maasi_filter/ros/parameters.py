@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import numpy as np
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
+from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.plugins import PluginGroup, own_settings
 
@@ -126,7 +127,7 @@ def unflatten(model: type[BaseModel], flat: Mapping[str, Any]) -> dict[str, Any]
 def _as_parameter(value: Any, annotation: Any) -> Any:
     """Return a value; rows in a list become numbers, or texts if their length is not fixed."""
     if not isinstance(value, (list, tuple)):
-        return value
+        return str(value) if isinstance(value, BaseGeometry) else value
     rows = [_as_row(item) for item in value]
     if _width(annotation) is not None:
         return [number for row in rows for number in row]

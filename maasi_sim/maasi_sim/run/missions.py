@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from maasi_filter.geometry.shapes import InputWarning
+from maasi_filter.geometry.polygons import InputWarning
 from maasi_sim.run.buildings.building_mission import BuildingMission
 from maasi_sim.run.buildings.scenario import NAME, check_cuboid_scenario, is_cuboid_scenario
 from maasi_sim.run.mission import Mission

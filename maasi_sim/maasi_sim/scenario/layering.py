@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from maasi_filter.geometry.shapes import InputWarning
+from maasi_filter.geometry.polygons import InputWarning
 from maasi_filter.plugins import own_settings, unknown
 from maasi_filter.ros.parameters import choices
 

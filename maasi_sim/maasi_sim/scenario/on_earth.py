@@ -12,7 +12,8 @@ from pydantic import ValidationError
 from maasi_filter.geometry.area import Area, how_far
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic, to_map
-from maasi_filter.geometry.shapes import InputWarning, is_geojson, points_of
+from maasi_filter.geometry.geojson import is_geojson, points_of
+from maasi_filter.geometry.polygons import InputWarning
 from maasi_sim.scenario.layering import Layer, ScenarioError
 
 _DEGREES = {'latitude': 90.0, 'longitude': 180.0}

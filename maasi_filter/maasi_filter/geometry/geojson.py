@@ -1,10 +1,10 @@
-"""Polygons from corners, well-known text, maps of Nav2, and GeoJSON as map programs write it."""
+"""Polygons of GeoJSON as map programs write it."""
 
 from __future__ import annotations
 
 import json
+import math
 import re
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +17,12 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.geodesy import OriginSettings, to_map
-from maasi_filter.geometry.occupancy_map import read_map
+from maasi_filter.geometry.polygons import short, sound, warn
 
-_GEOJSON, MAPS = ('.json', '.geojson'), ('.yaml', '.yml')
+_FILES = ('.json', '.geojson')
 _LARGEST = 10_000.0  # of an area in degrees [km2]; larger ones are mistakes
-POINT_ROLES = ('start', 'home', 'charger')
+_ROLES = ('area', 'keep_out', 'prior')  # of polygons
+_POINT_ROLES = ('start', 'home', 'charger')
 _BEYOND = 10.0  # degrees by which areas across 180 degrees, as drawn on the page, go on
 _SIMPLE = ('Point', 'LineString', 'Polygon')
 _KINDS = (*_SIMPLE, *(f'Multi{kind}' for kind in _SIMPLE), 'GeometryCollection')
@@ -31,10 +32,6 @@ _WGS84 = re.compile(
     r'(CRS:?84h?|EPSG:{1,2}(4326|4979)|(?<!\d)4326|WGS[ _]?(19)?84)\)?$', re.IGNORECASE
 )
 _CONVERT = 'convert it: ogr2ogr -f GeoJSON -t_srs EPSG:4326 wgs84.geojson FILE'
-
-
-class InputWarning(UserWarning):
-    """What was assumed of an input, or left out of it."""
 
 
 @dataclass(frozen=True)
@@ -54,73 +51,11 @@ class Feature:
         return bool(self.properties.get('unit') == 'm')
 
 
-def short(value: Any) -> str:
-    """Return the beginning of a value as JSON, for messages."""
-    text = value if isinstance(value, str) else json.dumps(value, default=str)
-    return text if len(text) <= 60 else f'{text[:57]}...'
-
-
 def is_geojson(value: Any) -> bool:
     """Return whether a value is GeoJSON, or the name of a file of it."""
     if isinstance(value, str):
-        return Path(value).suffix.lower() in _GEOJSON
+        return Path(value).suffix.lower() in _FILES
     return isinstance(value, Mapping) and 'type' in value
-
-
-def is_wkt(value: Any) -> bool:
-    """Return whether a value is the well-known text of polygons."""
-    return isinstance(value, str) and value.lstrip().upper().startswith(('POLYGON', 'MULTIPOLYGON'))
-
-
-def read_shape(value: Any, origin: OriginSettings | None = None) -> BaseGeometry:
-    """Return the polygons of a value: rings [m], well-known text, a map of Nav2, or GeoJSON.
-
-    ValueError where GeoJSON in degrees has to do without an origin, or what is read is no polygon.
-    """
-    if is_wkt(value):
-        try:
-            return _sound(shapely.from_wkt(value), f'read {short(value)}')
-        except shapely.GEOSException:
-            raise ValueError(
-                f'read {short(value)}, allowed is text as POLYGON ((0 0, 9 0, 9 9, 0 0))'
-            ) from None
-    if isinstance(value, str) and Path(value).suffix.lower() in MAPS:
-        return read_map(value)
-    if isinstance(value, (list, tuple)):
-        return _sound(_of_rings(value), f'read {short(value)}')
-    return polygons_of(features_of(value), origin)
-
-
-def _of_rings(value: Sequence[Any]) -> Polygon:
-    try:
-        rings = value if np.ndim(value[0][0]) else [value]
-        corners = [np.array([[*row] for row in ring], dtype=float) for ring in rings]
-    except (TypeError, ValueError, LookupError):
-        raise ValueError(f'read {short(value)}, allowed are corners [[x, y], ...]') from None
-    for ring in corners:
-        if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 3:
-            raise ValueError(
-                f'read {short(value)}, allowed are at least 3 corners of two numbers, [[x, y], ...]'
-            )
-        if not np.isfinite(ring).all():
-            raise ValueError(f'read {short(value)}, allowed are finite numbers')
-    return Polygon(corners[0], corners[1:])
-
-
-def _sound(found: BaseGeometry, words: str, unit: str = 'm') -> BaseGeometry:
-    """Return polygons if they are some; words: what was read."""
-    if not isinstance(found, (Polygon, MultiPolygon)) or found.is_empty:
-        raise ValueError(f'{words}, allowed are polygons')
-    if not found.is_valid:
-        reason = str(shapely.is_valid_reason(found))
-        what, place = re.fullmatch(r'([^\[]*)(?:\[(.*)\])?', reason).groups()  # type: ignore[union-attr]
-        where = ''
-        if place:
-            x, y = (float(number) for number in place.split()[:2])
-            named = (f'longitude {x:.6f}, latitude {y:.6f}', f'({x:.2f}, {y:.2f}) m')
-            where = f' at {named[unit == "m"]}'
-        raise ValueError(f'{words}: {what.lower()}{where}; allowed are polygons that are simple')
-    return found
 
 
 def polygons_of(features: Sequence[Feature], origin: OriginSettings | None) -> BaseGeometry:
@@ -154,7 +89,61 @@ def _unwrapped(shape: BaseGeometry, around: float) -> BaseGeometry:
     return shapely.union_all(parts)
 
 
-def centre_of(features: Sequence[Feature]) -> dict[str, float]:
+def by_role(value: Any) -> dict[str, list[Feature]]:
+    """Return the features of an area's GeoJSON by role; programs write null or nothing for none."""
+    roles: dict[str, list[Feature]] = {role: [] for role in _ROLES}
+    for feature in features_of(value):
+        role = feature.properties.get('role')
+        role = 'area' if role in (None, '') else role
+        if role not in _ROLES:
+            raise ValueError(f'{feature.name}: role: read {role}, allowed are {", ".join(_ROLES)}')
+        roles[role].append(feature)
+    if not roles['area']:
+        raise ValueError(
+            f'{short(value)}: no polygon has the role area; keep-outs alone belong under '
+            'environment.keep_outs'
+        )
+    return roles
+
+
+def origin_of(features: Sequence[Feature]) -> Mapping[str, Any] | None:
+    """Return the origin of the run on whose page features were drawn, or the middle of others."""
+    said = (item.properties.get('origin') for item in features)
+    # Other programs have other things under that name.
+    drawn_at = (item for item in said if isinstance(item, Mapping) and 'latitude' in item)
+    in_metres = all(item.in_metres for item in features)
+    return next(drawn_at, None if in_metres else _centre_of(features))
+
+
+def with_role(features: Sequence[Feature], wanted: str, key: str) -> list[Feature]:
+    """Return those with a role or none for a key; other ones are left out, by name."""
+    others = [item for item in features if item.properties.get('role') in _ROLES]
+    others = [item for item in others if item.properties['role'] != wanted]
+    words = '; '.join(f'{item.name}: role {item.properties["role"]}' for item in others[:5])
+    if len(others) == len(features):
+        raise ValueError(f'{words}; allowed under {key} is role {wanted}, or none')
+    if others:
+        warn(f'{key}: left out, as these have another role: {words}')
+    return [item for item in features if item not in others]
+
+
+def weight_of(feature: Feature) -> float:
+    """Return the weight of a polygon of the prior; null or nothing is 1."""
+    weight = feature.properties.get('weight')
+    if weight in (None, ''):
+        return 1.0
+    try:
+        number = float(weight)
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(weight, bool) or not 0.0 <= number < math.inf:
+        raise ValueError(
+            f'{feature.name}: weight: read {short(weight)}, allowed are numbers from 0'
+        )
+    return number
+
+
+def _centre_of(features: Sequence[Feature]) -> dict[str, float]:
     """Return an origin in the middle of features in degrees; halves at 180 degrees are one area."""
     whole = shapely.union_all([feature.shape for feature in features])
     west, _, east, _ = whole.bounds
@@ -183,7 +172,7 @@ def points_of(value: Any) -> list[tuple[str, str, list[float]]]:
     found = []
     for row in _rows(value)[1]:
         facts = row.get('properties') if isinstance(row, Mapping) else None
-        if isinstance(facts, Mapping) and facts.get('role') in POINT_ROLES:
+        if isinstance(facts, Mapping) and facts.get('role') in _POINT_ROLES:
             geometry = row.get('geometry')
             if isinstance(geometry, Mapping) and geometry.get('type') == 'Point':
                 (place,) = _position(geometry.get('coordinates'), 'a point').tolist()
@@ -214,11 +203,7 @@ def features_of(value: Any) -> list[Feature]:
         raise ValueError(f'{source}there is no polygon in it' if source else 'holds no polygon')
     if left:
         more = f' and {len(left) - _NAMED} more' if len(left) > _NAMED else ''
-        warnings.warn(
-            f'{source}left out, as these are no polygons: {"; ".join(left[:_NAMED])}{more}',
-            InputWarning,
-            stacklevel=2,
-        )
+        warn(f'{source}left out, as these are no polygons: {"; ".join(left[:_NAMED])}{more}')
     return found
 
 
@@ -291,7 +276,7 @@ def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature 
     where, left, shapes = f'{source}{name}', [], []
     parts = list(_parts(row.get('geometry'), where)) or [('empty', None)]
     for kind, coordinates in parts:
-        if kind == 'Point' and facts.get('role') in POINT_ROLES:
+        if kind == 'Point' and facts.get('role') in _POINT_ROLES:
             _check_degrees(_position(coordinates, where), where)
             continue
         if kind != 'Polygon' or not coordinates:
@@ -301,7 +286,7 @@ def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature 
         if facts.get('unit') != 'm':
             _check_degrees(np.concatenate(rings), where)
             rings = _short_way(rings, where)
-        shapes.append(_sound(Polygon(rings[0], rings[1:]), where, 'degrees'))
+        shapes.append(sound(Polygon(rings[0], rings[1:]), where, 'degrees'))
     if not shapes:
         return None, left
     return Feature(where, shapely.union_all(shapes), facts), left
@@ -360,11 +345,7 @@ def _short_way(rings: Sequence[FloatArray], where: str) -> list[FloatArray]:
     """Return rings [degrees] whose edges take the short way round, and warn if some did not."""
     if not any((np.abs(np.diff(ring[:, 0])) > 180.0).any() for ring in rings):
         return list(rings)
-    warnings.warn(
-        f'{where}: has edges longer than 180 degrees: taken as an area across 180 degrees',
-        InputWarning,
-        stacklevel=2,
-    )
+    warn(f'{where}: has edges longer than 180 degrees: taken as an area across 180 degrees')
     east = [np.unwrap(ring[:, 0], period=360.0) for ring in rings]
     turns = [np.round((axis.mean() - east[0].mean()) / 360.0) for axis in east]
     columns = zip(east, turns, rings)

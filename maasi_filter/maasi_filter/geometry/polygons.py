@@ -1,0 +1,75 @@
+"""Polygons from corners and from well-known text; what is no polygon is refused by name."""
+
+import json
+import re
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry.base import BaseGeometry
+
+
+class InputWarning(UserWarning):
+    """What was assumed of an input, or left out of it."""
+
+
+def warn(text: str) -> None:
+    """Warn of what was assumed of an input, or left out of it."""
+    warnings.warn(text, InputWarning, stacklevel=3)
+
+
+def short(value: Any) -> str:
+    """Return the beginning of a value as JSON, for messages."""
+    text = value if isinstance(value, str) else json.dumps(value, default=str)
+    return text if len(text) <= 60 else f'{text[:57]}...'
+
+
+def sound(found: BaseGeometry, words: str, unit: str = 'm') -> BaseGeometry:
+    """Return polygons if they are some; words: what was read."""
+    if not isinstance(found, (Polygon, MultiPolygon)) or found.is_empty:
+        raise ValueError(f'{words}, allowed are polygons')
+    if not found.is_valid:
+        reason = str(shapely.is_valid_reason(found))
+        what, place = re.fullmatch(r'([^\[]*)(?:\[(.*)\])?', reason).groups()  # type: ignore[union-attr]
+        where = ''
+        if place:
+            x, y = (float(number) for number in place.split()[:2])
+            named = (f'longitude {x:.6f}, latitude {y:.6f}', f'({x:.2f}, {y:.2f}) m')
+            where = f' at {named[unit == "m"]}'
+        raise ValueError(f'{words}: {what.lower()}{where}; allowed are polygons that are simple')
+    return found
+
+
+def is_wkt(value: Any) -> bool:
+    """Return whether a value is the well-known text of polygons."""
+    return isinstance(value, str) and value.lstrip().upper().startswith(('POLYGON', 'MULTIPOLYGON'))
+
+
+def of_text(value: str) -> BaseGeometry:
+    """Return the polygons of well-known text."""
+    try:
+        return sound(shapely.from_wkt(value), f'read {short(value)}')
+    except shapely.GEOSException:
+        raise ValueError(
+            f'read {short(value)}, allowed is text as POLYGON ((0 0, 9 0, 9 9, 0 0))'
+        ) from None
+
+
+def of_rings(value: Sequence[Any]) -> BaseGeometry:
+    """Return the polygon of corners, or of several rings, the first around the others [m]."""
+    try:
+        rings = value if np.ndim(value[0][0]) else [value]
+        corners = [np.array([[*row] for row in ring], dtype=float) for ring in rings]
+    except (TypeError, ValueError, LookupError):
+        raise ValueError(f'read {short(value)}, allowed are corners [[x, y], ...]') from None
+    for ring in corners:
+        if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 3:
+            raise ValueError(
+                f'read {short(value)}, allowed are at least 3 corners of two numbers, [[x, y], ...]'
+            )
+        if not np.isfinite(ring).all():
+            raise ValueError(f'read {short(value)}, allowed are finite numbers')
+    return sound(Polygon(corners[0], corners[1:]), f'read {short(value)}')

@@ -1,0 +1,123 @@
+"""The raster of a prior: an array, an image, or a GeoTIFF in its own coordinates."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic, to_map
+from maasi_filter.geometry.occupancy_map import check_pixels, read_image
+
+_CORNERS = (0, 0), (1, 0), (1, 1), (0, 1)
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Densities: values (rows, columns), and how x, y [m, map] become columns and rows.
+
+    corners (4, 2): where its file says that it lies [m, map].
+    """
+
+    values: FloatArray
+    cells: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+    corners: FloatArray | None = None
+
+    def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the values at places, 0 outside."""
+        rows, columns = self.values.shape
+        column, row = self.cells(x, y)
+        known = (column >= 0.0) & (column < columns) & (row >= 0.0) & (row < rows)
+        found = np.zeros(x.shape)
+        found[known] = self.values[row[known].astype(int), column[known].astype(int)]
+        return found
+
+
+def read_raster(environment: EnvironmentSettings) -> Raster:
+    """Return the raster of an environment's prior: .npy or an image, first row north; or GeoTIFF.
+
+    ValueError if it cannot be read, or is not of finite numbers from 0.
+    """
+    path = str(environment.prior.raster)
+    key = f'environment.prior.raster: {path}'
+    try:
+        suffix = Path(path).suffix.lower()
+        band = environment.prior.band
+        if suffix in ('.tif', '.tiff'):
+            raster = _of_geotiff(path, environment.origin, band)
+        else:
+            values = _read_array(path) if suffix == '.npy' else read_image(path, band)
+            extent = environment.prior.extent or environment.bounds[:2]
+            raster = _over(np.asarray(values, dtype=float), extent)
+    except (OSError, ValueError, TypeError, EOFError) as error:
+        raise ValueError(f'{key}: {error}') from None
+    values = raster.values
+    if values.ndim != 2 or not np.isfinite(values).all() or (values < 0.0).any():
+        raise ValueError(
+            f'{key}: got shape {values.shape}, allowed are two axes of finite numbers from 0'
+        )
+    return dataclasses.replace(raster, values=scaled(values))
+
+
+def scaled(values: FloatArray) -> FloatArray:
+    """Return values from 0, at most 1, by a power of two: exact, and their sums are finite."""
+    return np.asarray(np.ldexp(values, -np.frexp(values.max(initial=0.0))[1]))
+
+
+def _read_array(path: str) -> FloatArray:
+    """Return the array of a .npy file; it is looked at before it is read."""
+    array = np.load(path, mmap_mode='r')
+    if not isinstance(array, np.ndarray):
+        raise ValueError('holds several arrays, allowed is one')
+    check_pixels(array.shape)
+    return np.array(array, dtype=float)
+
+
+def _over(values: FloatArray, extent: list[list[float]]) -> Raster:
+    """Return a raster over bounds on x and y [m, map]."""
+    (west, east), (south, north) = extent
+
+    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        rows, columns = values.shape
+        return (x - west) / (east - west) * columns, (north - y) / (north - south) * rows
+
+    return Raster(values, cells)
+
+
+def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> Raster:
+    """Return a band of a GeoTIFF in its own coordinates; what has no data is 0."""
+    try:
+        import rasterio
+        from rasterio.warp import transform
+    except ImportError:
+        raise ValueError('needs rasterio, the extra geo: pip install "rasterio>=1.4"') from None
+    if origin is None:
+        raise ValueError('a GeoTIFF needs environment.origin')
+    with rasterio.open(path) as file:
+        if file.crs is None:
+            raise ValueError('has no coordinate system')
+        check_pixels(file.shape)
+        bands = [str(number) for number in file.indexes]
+        if band not in (None, *bands) or (band is None and len(bands) > 1):
+            read = 'several' if band is None else band
+            raise ValueError(f'band: read {read}, name the one that counts: {", ".join(bands)}')
+        crs, grid = file.crs, list(~file.transform)
+        a, b, c, d, e, f = list(file.transform)[:6]
+        u, v = np.transpose(_CORNERS) * [[file.width], [file.height]]
+        ends = a * u + b * v + c, d * u + e * v + f
+        corners = to_map(np.array(transform(crs, 'EPSG:4326', *ends)).T, origin)
+        values = file.read(int(band or 1), masked=True).astype(float).filled(0.0)
+
+    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)
+        places = transform('EPSG:4326', crs, degrees[:, 1], degrees[:, 0])
+        east, north = (np.reshape(axis, x.shape) for axis in places)
+        a, b, c, d, e, f = grid[:6]
+        return a * east + b * north + c, d * east + e * north + f
+
+    return Raster(values, cells, corners)
