@@ -136,7 +136,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             self.get_logger().warning(
                 f'{file} was saved with other settings of the filter; they go on'
             )
-        self._take_area(saved.area)
+        self._adopt_area(saved.area)
         self.filter = saved
         found = f'{len(saved.found_targets)} found targets'
         if progress is None or not settings.save_batches:
@@ -172,7 +172,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 RELIABLE,
             )
         self._shared.set_up()
-        KeepOutTopic(self, self._take_area, keep=True)
+        KeepOutTopic(self, self._adopt_area, keep=True)
         # Subscribers: the filters of the others, and the planner that keeps the found targets.
         self.expect_subscribers(self._found_publisher, len(self._shared) + 1 if self._shared else 0)
         if not settings.lockstep:
@@ -191,9 +191,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         # The process may have died before it sent this update; receivers ignore a duplicate.
         self._update_publisher.publish(update)
 
-    def _take_area(self, area: Area) -> None:
+    def _adopt_area(self, area: Area) -> None:
         self.area = area
-        self.filter.take_area(area)
+        self.filter.adopt_area(area)
 
     def halt(self) -> None:
         """Save the state."""

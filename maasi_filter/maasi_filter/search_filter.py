@@ -65,7 +65,7 @@ class SearchFilter(ABC):
     ) -> None:
         self.settings = settings
         self.exploration = UnexploredMap(area, settings.exploration_spacing)
-        self.take_area(self.exploration.area)
+        self.adopt_area(self.exploration.area)
         self.bounds = self.area.bounds
         self.dimension = self.exploration.dimension
         self.generator = generator
@@ -77,10 +77,10 @@ class SearchFilter(ABC):
         """The filter's own settings."""
         return self.settings.settings
 
-    def take_area(self, area: Area) -> None:
+    def adopt_area(self, area: Area) -> None:
         """Take another area within the same bounds, as with other keep-outs."""
         self.area, self.environment = area, area.settings
-        self.exploration.take_area(area)
+        self.exploration.adopt_area(area)
 
     @property
     def found_targets(self) -> list[FoundTarget]:

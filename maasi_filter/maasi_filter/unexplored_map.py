@@ -197,7 +197,7 @@ class UnexploredMap:
         self._take(area)
         self.ground, self._ever_open = self._volumes, self._open
 
-    def take_area(self, area: Area) -> None:
+    def adopt_area(self, area: Area) -> None:
         """Take another area within the same bounds; e stays.
 
         Ground that is closed now still counts as ground, and what was never open before does from

@@ -141,7 +141,7 @@ def test_closed_ground_is_not_explored_ground():
     values[:, :41] = 0.0
     before = exploration.explored_fraction()
     assert before == pytest.approx(1200.0 / 3500.0, rel=0.02)
-    exploration.take_area(boxed(60.0, 60.0, keep_outs=zones))
+    exploration.adopt_area(boxed(60.0, 60.0, keep_outs=zones))
     hidden = 0.5 * np.pi * 81.0 / 3500.0
     # Half of the zone is explored; the other half is unseen below it.
     assert exploration.explored_fraction() == before
@@ -152,11 +152,11 @@ def test_closed_ground_is_not_explored_ground():
     # All that is open gets explored.
     values[volumes > 0.0] = 0.0
     assert exploration.explored_fraction() == pytest.approx(1.0 - hidden, abs=0.005)
-    exploration.take_area(boxed(60.0, 60.0, keep_outs=zones[1:]))
+    exploration.adopt_area(boxed(60.0, 60.0, keep_outs=zones[1:]))
     assert exploration.explored_fraction() == pytest.approx(1.0 - hidden, abs=0.005)
     assert exploration.closed_share() == 0.0 and exploration.ground.sum() == whole
     # What was closed at the start counts from when it is opened.
-    exploration.take_area(boxed(60.0, 60.0))
+    exploration.adopt_area(boxed(60.0, 60.0))
     assert exploration.ground.sum() == pytest.approx(3600.0, rel=0.002)
     left = hidden * 3500.0 + 100.0
     assert exploration.explored_fraction() == pytest.approx(1.0 - left / 3600.0, abs=0.005)
@@ -178,7 +178,7 @@ def test_closed_ground_with_a_prior_holds_its_share_of_the_targets():
         unseen = (ground * exploration.values).sum() / ground.sum()
         for _ in range(4):
             zone = {'centre': rng.uniform(0.0, 60.0, 2).tolist(), 'radius': rng.uniform(2.0, 15.0)}
-            exploration.take_area(boxed(60.0, 60.0, prior=prior, keep_outs=[*kept, zone]))
+            exploration.adopt_area(boxed(60.0, 60.0, prior=prior, keep_outs=[*kept, zone]))
             assert exploration.explored_fraction() == pytest.approx(1.0 - unseen, abs=1e-12)
             away = np.hypot(*(np.array(exploration.nodes()) - zone['centre']).T)
             below = (away < zone['radius']).reshape(ground.shape)
@@ -186,7 +186,7 @@ def test_closed_ground_with_a_prior_holds_its_share_of_the_targets():
             assert exploration.closed_share() == pytest.approx(closed, abs=0.01)
             inner = (away < zone['radius'] - 1.5).reshape(ground.shape)
             assert (exploration.cell_volumes()[inner] == 0.0).all()
-        exploration.take_area(boxed(60.0, 60.0, prior=prior, keep_outs=kept))
+        exploration.adopt_area(boxed(60.0, 60.0, prior=prior, keep_outs=kept))
         assert exploration.closed_share() == 0.0
         assert (exploration.ground == ground).all()
 

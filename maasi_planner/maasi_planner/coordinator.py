@@ -117,21 +117,21 @@ class Coordinator:
 
     # ---- changes -----------------------------------------------------------------------------
 
-    def take_area(self, area: Area) -> None:
+    def adopt_area(self, area: Area) -> None:
         """Take another area within the same bounds, as with other keep-outs.
 
         A search that was finished continues where that opens something.
         """
         self.area = area
         before = self._open_share()
-        self.exploration.take_area(area)
+        self.exploration.adopt_area(area)
         if self._open_share() > before + _ROUNDING:
             self.finished, self._ended = None, False
             # What the planner knew of each before says nothing about ground that is opened.
             self._unasked = set(self.robots)
         for robot in self.robots.values():
             robot.adopt_area(area)
-        self.homing.take_area()
+        self.homing.adopt_area()
 
     def begin_again(self) -> None:
         """Begin a new search with nothing explored; decision indices continue."""

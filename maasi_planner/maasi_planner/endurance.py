@@ -313,7 +313,7 @@ class Endurance:
         if known:
             self.charge = float(charge)
 
-    def take_area(self) -> None:
+    def adopt_area(self) -> None:
         """Note that the area has changed: paths home are predicted again."""
         self._paths.clear()
         self._slack = None

@@ -45,12 +45,12 @@ class Homing:
         self.alarms.clear()
         self._idle_since = None
 
-    def take_area(self) -> None:
+    def adopt_area(self) -> None:
         """Take another area: what was out of reach may be in reach again."""
         self._idle_since = None
         for robot in self._robots.values():
             if (endurance := robot.endurance) is not None:
-                endurance.take_area()
+                endurance.adopt_area()
                 if endurance.done_reason in (NOTHING_AFFORDABLE, SEARCH_ENDED):
                     endurance.begin(Phase.AVAILABLE)
 

@@ -146,7 +146,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._action = SearchAction(self, lambda: self._command('start', None), self._stand)
         offer_services(self, names, self._command)
         self._keep_outs = KeepOutTopic(
-            self, lambda area: self.coordinator.take_area(area), keep=True
+            self, lambda area: self.coordinator.adopt_area(area), keep=True
         )
         service = self.permanent(
             'search/keep_outs',

@@ -187,12 +187,12 @@ class PlannedRobot:
 
     def adopt_area(self, area: Area) -> None:
         """Take another area within the same bounds, as with other keep-outs."""
-        self.facts.motion.take_area(area, self.facts.radius)
+        self.facts.motion.adopt_area(area, self.facts.radius)
         lasting, before = Area(area.settings.without_keep_outs()), self.candidates
         self.candidates = CandidateSet(before.settings, lasting, before.height)
         self.candidates.restrict(area)
         if self.exploration is not None:
-            self.exploration.take_area(area)
+            self.exploration.adopt_area(area)
 
     def begin_again(self) -> None:
         """Begin a new search with nothing explored; decision indices continue."""

@@ -35,7 +35,7 @@ class PlainDriver:
     """What a link and the parts of a driver that are tried here need of the node."""
 
     judge = RobotNode.judge
-    take_pose, take_area = AgentDriver.take_pose, AgentDriver._take_area
+    take_pose, adopt_area = AgentDriver.take_pose, AgentDriver._adopt_area
 
     def __init__(self, settings, make_link):
         self.settings, self.active, self.pose_name = settings, True, 'odometry'
@@ -158,7 +158,7 @@ class GuidedPlay(Play):
         zones = type(environment).model_validate(
             environment.model_dump() | {'keep_outs': list(zones)}
         )
-        self.driver.take_area(Area(zones))
+        self.driver.adopt_area(Area(zones))
         return self
 
     @property

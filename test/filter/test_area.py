@@ -283,7 +283,7 @@ def test_the_map_counts_what_is_expected_only():
     assert explored.unseen()[0, 0] == 0.0 and explored.unseen()[-1, -1] == 1.0
     uniform = UnexploredMap([[0.0, 40.0], [0.0, 40.0]], 1.0)
     assert (uniform.unseen() == uniform.values).all()
-    explored.take_area(uniform.area)
+    explored.adopt_area(uniform.area)
     assert (explored.cell_volumes() == uniform.cell_volumes()).all()
 
 

@@ -128,9 +128,9 @@ class Flight:
 
     def close(self, *zones):
         area = with_keep_outs(self.settings.environment, zones)
-        self.coordinator.take_area(area)
+        self.coordinator.adopt_area(area)
         for follower in self.followers.values():
-            follower.motion.take_area(area, 0.4)
+            follower.motion.adopt_area(area, 0.4)
 
     def reasons(self, name):
         return [d.robots[name].reason for d in self.decisions if name in d.robots]

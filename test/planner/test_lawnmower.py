@@ -109,8 +109,8 @@ def test_lanes_below_a_zone_are_done_once_it_is_opened():
     values = {'bounds': [[0.0, 20.0], [0.0, 8.0]], 'keep_outs': [zone]}
     planner.decide(team)
     for area in (Area(EnvironmentSettings.model_validate(values)), open_area):
-        team.exploration.take_area(area)
-        view.motion.take_area(area, view.radius)
+        team.exploration.adopt_area(area)
+        view.motion.adopt_area(area, view.radius)
         assert planner.finished(team) is None
         mow(team, planner)
         if area is not open_area:

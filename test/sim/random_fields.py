@@ -92,7 +92,7 @@ class FieldSearch(_Search):
         if self._drawn != before:
             environment = self.scenario.environment
             fixed = [str(zone) for zone in environment.keep_outs]
-            self.take_area(with_keep_outs(environment, [*fixed, *self._drawn.values()]))
+            self.adopt_area(with_keep_outs(environment, [*fixed, *self._drawn.values()]))
 
     def _zone(self, change: Any) -> str | None:
         """Return a zone as text, if robots can leave it, and enough of the area is left."""
@@ -118,12 +118,12 @@ class FieldSearch(_Search):
             return None
         return str(settings.keep_outs[0])
 
-    def take_area(self, area: Area) -> None:
+    def adopt_area(self, area: Area) -> None:
         """Take another area in planners, filters and drivers, as their nodes do."""
         self._grounded(area)
         for group in self._groups:
-            group.coordinator.take_area(area)
-            group.filter.take_area(area)
+            group.coordinator.adopt_area(area)
+            group.filter.adopt_area(area)
         for robot in self._robots.values():
             follower, motion = robot.follower, robot.follower.motion
             goal, ways = follower.current, None
@@ -132,7 +132,7 @@ class FieldSearch(_Search):
                     robot.pose.pose, robot.pose.velocity, robot.pose.angular_velocity
                 )
                 ways = motion.predict(state, goal.waypoint[None, :], self.scenario.step).positions
-            motion.take_area(area, robot.body.settings.radius)
+            motion.adopt_area(area, robot.body.settings.radius)
             free = [] if ways is None else [motion.keep_out.is_free(place) for place in ways[0]]
             # The part on which it leaves a zone does not count.
             if not all(free[free.index(True) if True in free else 0 :]):

@@ -112,7 +112,7 @@ class AgentDriver(RobotNode):
         self._responder = MeasurementResponder(self, self.sensor_input, self._watchdog)
         self.frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
         self.goals = GoalServer(self, self.link)
-        KeepOutTopic(self, self._take_area, keep=False)
+        KeepOutTopic(self, self._adopt_area, keep=False)
         if self._stop_latched:
             self.health.begin(STOP, STOPPED)
         self._opened.append(self.link)
@@ -217,7 +217,7 @@ class AgentDriver(RobotNode):
         if self.active and self.is_new_pose(topic, stamp):
             self.take_pose(self._pose_speed.place(stamp, pose))
 
-    def _take_area(self, area: Area) -> None:
+    def _adopt_area(self, area: Area) -> None:
         """Take other keep-outs; give a goal up whose way leads into one: the robot stops.
 
         The part of the way on which a robot leaves a zone that it is in does not count.
@@ -227,7 +227,7 @@ class AgentDriver(RobotNode):
         if goal is not None and latest is not None:
             state = RobotState(latest.pose, latest.velocity, latest.angular_velocity)
             ways = motion.predict(state, goal.waypoint[None, :], 0.2).positions
-        motion.take_area(area, self.settings.radius)
+        motion.adopt_area(area, self.settings.radius)
         if ways is not None:
             free = [motion.keep_out.is_free(position) for position in ways[0]]
             if not all(free[free.index(True) if True in free else 0 :]):

@@ -139,9 +139,9 @@ class MotionModel(ABC):
         self, settings: MotionSettings, area: Area | None = None, radius: float = 0.0
     ) -> None:
         self.settings = settings
-        self.take_area(area, radius)
+        self.adopt_area(area, radius)
 
-    def take_area(self, area: Area | None, radius: float) -> None:
+    def adopt_area(self, area: Area | None, radius: float) -> None:
         """Take where it may go, also another area while it moves."""
         self.keep_out = shared_keep_out(area, radius, self.settings.clearance, self.reach())
         self.table = self.keep_out.table

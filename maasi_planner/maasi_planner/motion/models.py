@@ -282,9 +282,9 @@ class CompiledMotion(MotionModel):
         barrier = 1.5 * speed / self.steering.barrier
         return max(min(braking, barrier) if braking else barrier, 1.5 * speed + 4.0 * clearance)
 
-    def take_area(self, area: Area | None, radius: float) -> None:
-        """See `MotionModel.take_area`."""
-        super().take_area(area, radius)
+    def adopt_area(self, area: Area | None, radius: float) -> None:
+        """See `MotionModel.adopt_area`."""
+        super().adopt_area(area, radius)
         self.kernel = lru_cache(maxsize=4)(self._make_kernel)
 
     @abstractmethod

@@ -33,7 +33,7 @@ class Intermittent(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        self._take_area(team)
+        self._adopt_area(team)
         decision = Decision(step=team.step)
         # Whole trajectories to all candidates of all robots of a large team need much memory.
         coarse = len(team.planning()) > PAIRS_LIMIT
@@ -77,7 +77,7 @@ class Intermittent(Planner):
             decision.robots[name] = result
         return explain(decision)
 
-    def _take_area(self, team: TeamView) -> None:
+    def _adopt_area(self, team: TeamView) -> None:
         """Forget what candidates showed before zones were opened or closed."""
         if team.area is not self._area:
             self._prospects.clear()
@@ -100,7 +100,7 @@ class Intermittent(Planner):
         if reason is not None or self.settings.objective == 'paper':
             return reason
         names = self.searching(team)
-        self._take_area(team)
+        self._adopt_area(team)
         if not names or not all(name in self._prospects for name in names):
             return None
         least = self.settings.gain_threshold
