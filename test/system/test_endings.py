@@ -5,21 +5,18 @@ import re
 import signal
 import subprocess
 import sys
-from contextlib import nullcontext
-from types import SimpleNamespace
-from unittest.mock import Mock
 
 import pytest
 from scenario_runs import command, run_scenario, start, started, wait_for, write_scenario
 
 from maasi_filter.ros import middleware
-from maasi_sim.run import scenario_run
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.ending import DONE, NOT_WRITTEN, Ending
+from maasi_sim.run.ending import NOT_WRITTEN
+from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.run_folder import make_folder
 from maasi_sim.run.run_options import Options, parse
 from maasi_sim.run.run_scenario import main
-from maasi_sim.run.scenario_run import ScenarioRun
+from maasi_sim.run.scenario_run import checked
 from maasi_sim.scenario.layering import ScenarioError
 
 pytestmark = pytest.mark.system
@@ -55,6 +52,14 @@ def wait(*_):
 
 scenario_run.store_report = wait
 scenario_run.beside = lambda *_: map(wait, [0])
+sys.exit(run_scenario.main(sys.argv[1:]))
+"""
+# A recorder with a gap.
+GAP = """
+import sys
+from maasi_sim.run import recorder_node, run_scenario
+
+recorder_node.Recorder.gaps = lambda *_: ['a gap']
 sys.exit(run_scenario.main(sys.argv[1:]))
 """
 
@@ -138,20 +143,15 @@ def test_a_run_needs_no_home_folder_and_leaves_no_warning(tmp_path):
     assert run.warnings == []
 
 
-def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path, monkeypatch):
+def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path):
     path = write_scenario(tmp_path / 'near.yaml', NEAR)
-    run = ScenarioRun(Options(path), SimpleNamespace(at_once=lambda *_: nullcontext()))
-    run.ending, run.wall_time, run.folder = Ending('all_found', DONE), 1.0, tmp_path
-    run._scenario = run.mission.scenario
-    run.recorder = SimpleNamespace(gaps=lambda *_: ['a gap'], elapsed=8.0)
-    run.supervisor = SimpleNamespace(events=[], note=Mock())
-    run._check_recording()
-    run.supervisor.note.assert_called_once_with('recorder', 'gap', reason='a gap')
-    assert run.unwritten == ['a gap']
-    monkeypatch.setattr(scenario_run, 'store_report', lambda *_: ({}, None, ''))
-    run.observer = SimpleNamespace(record=lambda end: end)
-    run._leave_replay = lambda: None
-    assert run._report() == NOT_WRITTEN
+    words = [sys.executable, '-c', GAP, *command(path, tmp_path / 'run', '--lockstep')[3:]]
+    with started(words, tmp_path / 'run') as run:
+        run.finish()
+    assert run.code == NOT_WRITTEN, run.output
+    assert 'error: a gap' in run.output
+    (event,) = run.report['events']
+    assert (event['node'], event['event'], event['reason']) == ('recorder', 'gap', 'a gap')
 
 
 def test_wrong_input_is_told_before_anything_starts(tmp_path):
@@ -211,7 +211,7 @@ def test_wrong_options_are_named(options, words, capsys):
 )
 def test_what_does_not_fit_the_scenario_is_named_with_the_option(options, words):
     with pytest.raises(ScenarioError, match=re.escape(words)):
-        ScenarioRun(Options('mambo', **options), interruption=False)
+        checked(Options('mambo', **options), ProgressDisplay())
 
 
 def test_a_run_gets_a_folder_of_its_own(tmp_path, monkeypatch):

@@ -32,6 +32,11 @@ class ProgressDisplay:
         with contextlib.suppress(OSError):
             print(f'{erase}{text}\n{self._line}', end='', file=self._stream, flush=True)
 
+    def warn(self, *texts: str) -> None:
+        """Print warnings, but no empty ones."""
+        for text in filter(None, texts):
+            self.say(f'warning: {text}')
+
     def show(self, text: str, found: int) -> None:
         """Show a status, if an update is due or it has a new target."""
         if not self.due and (self._terminal or found == self._found):

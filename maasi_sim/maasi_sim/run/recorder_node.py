@@ -29,6 +29,7 @@ from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, reader_of
 from maasi_msgs.msg import LockstepDone, LockstepStep
 from maasi_sim.run.bag import BagError, BagWriter, topic_qos
 from maasi_sim.run.mission import Observer
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.topics import CLOCK, STEP, message_class, stamp_of, time_at, within
 from maasi_sim.run.view.messages import is_shown
 
@@ -81,9 +82,10 @@ class Recorder:
         observer: Observer,
         step_length: float,
         bag: BagWriter | None,
-        team: str = '',
-        lockstep: bool = False,
+        options: Options | None = None,
     ) -> None:
+        options = options or Options()
+        team, lockstep = options.namespace, options.lockstep
         self.context = Context()
         rclpy.init(
             context=self.context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO

@@ -32,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     from maasi_sim.run.domain import DomainError
     from maasi_sim.run.replay_node import replay
     from maasi_sim.run.run_folder import ResultsError
-    from maasi_sim.run.scenario_run import ScenarioRun
+    from maasi_sim.run.scenario_run import execute
     from maasi_sim.scenario.layering import ScenarioError
 
     # Modules are never garbage.
@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
             return search_recording(options)
         if options.replay is not None:
             return replay(options.replay, options.out, options.domain_id, interruption)
-        return ScenarioRun(options, interruption).execute()
+        return execute(options, interruption)
     except (ScenarioError, DomainError, ProcessError, BagError, ResultsError) as error:
         _print_errors(error)
         return NOT_WRITTEN if isinstance(error, (ResultsError, BagWriteError)) else WRONG_INPUT
