@@ -33,6 +33,7 @@ CORNERS = 12  # of the vertices around a cylinder
 # Outlines with more detail than this share of the clearance lose it, to the safe side.
 _DETAIL = 0.2
 _TABLES = 2**22  # numbers in all tables that are kept
+_ANYWHERE = Area([[-1e9, 1e9]] * 2)
 
 
 class KeepOut:
@@ -68,17 +69,18 @@ class KeepOut:
     ) -> None:
         if not (math.isfinite(radius) and radius >= 0.0):
             raise ValueError(f'radius: got {radius}, allowed are finite numbers from 0')
-        self.area, self.radius, self._reach = area, radius, reach
+        self.area = _ANYWHERE if area is None else area
+        self.radius, self._reach = radius, reach
         self.clearance = float(clearance)
         apart = radius + clearance
-        room = None if area is None else area.room(apart)
+        room = self.area.room(apart)
         detail = _DETAIL * self.clearance
         inflation = radius + 0.1 * self.clearance
         # At the sides of bounds robots may be on the bounds themselves, but not beyond.
-        held = None if area is None else area.room(inflation)
+        held = self.area.room(inflation)
         walls = None if held is None else _simplified(held, detail)
-        self._round = 0 if area is None else len(area.circles)
-        self.circles = self._inflated(np.zeros((0, 5)) if area is None else area.circles, walls)
+        self._round = len(self.area.circles)
+        self.circles = self._inflated(self.area.circles, walls)
         # Where waypoints may be; None: anywhere beside round ones.
         self._places = None if room is None else room.buffer(-apart, join_style='mitre')
         if self._places is not None:
@@ -113,7 +115,7 @@ class KeepOut:
 
     def _solid_circles(self) -> FloatArray:
         """Return the circles of what is there without keep-outs."""
-        if self.area is None or not self.area.settings.keep_outs:
+        if not self.area.settings.keep_outs:
             return self.circles
         room = self.area.room(self.radius + 0.1 * self.clearance, closed=False)
         return self._inflated(self.area.solid, room)
@@ -142,8 +144,6 @@ class KeepOut:
 
     def pushing(self) -> FloatArray:
         """Return the circles that the term of 001, eq. (14), is of: all but the sides of bounds."""
-        if self.area is None:
-            return self.circles
         low, high = self.area.bounds[:2].T
         middles = self.circles[:, :2] + 0.5 * self.circles[:, 5:]
         inside = ((middles >= low) & (middles <= high)).all(axis=1)
@@ -187,8 +187,6 @@ class KeepOut:
     ) -> FloatArray:
         """Return the next point, (3,), of the path to a goal past others (positions, radii)."""
         area = copy(self.area)
-        if area is None:
-            return goal
         # A quarter wider, for robots that cut corners.
         discs = [[*place, 1.25 * radius + 0.25 * self.radius, 0.0] for place, radius in others]
         area.circles = np.vstack([area.circles, discs])
@@ -215,7 +213,6 @@ class KeepOut:
         if self._open.is_empty:
             return None
         point = shapely.Point(x, y)
-        assert self.area is not None
         # Past zones that it is not in; through them only where there is no other exit.
         zones = self.area.shapes['keep_out']
         others = [zone for zone in zones if zone.distance(point) > self.radius]
@@ -252,7 +249,6 @@ class KeepOut:
     @cached_property
     def _open(self) -> BaseGeometry:
         """Where robots that leave a zone may go: clear of everything by the clearance."""
-        assert self.area is not None
         reach = self.circles[: self._round, 3] + 0.95 * self.clearance
         centres = shapely.points(self.circles[: self._round, :2])
         discs = shapely.buffer(centres, reach / math.cos(math.pi / 64), quad_segs=16)
@@ -262,7 +258,6 @@ class KeepOut:
     @cached_property
     def _solid(self) -> BaseGeometry:
         """Where a robot may be that leaves a zone: inside of the border, clear of what is solid."""
-        assert self.area is not None
         solid = shapely.union_all(list(map(level_shape, self.area.settings.obstacles)))
         inside = self.area.border.difference(solid.buffer(self.radius))
         shapely.prepare(inside)

@@ -7,7 +7,7 @@ from numba import njit
 from scipy.ndimage import distance_transform_edt
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_planner.obstacles import Nearby, from_centre
+from maasi_planner.obstacles import Felt, Nearby, crossed_walls, from_centre
 
 _FEW = 48  # so many circles need no grid
 _HALF = math.sqrt(0.5)  # of the diagonal of a cell, by its width
@@ -120,16 +120,12 @@ def _mark_rooms(
     size = head[2]
     for v in range(cells.shape[1]):
         y = head[1] + (v + 0.5) * size
+        met = Felt(circles, walls, np.zeros(0), starts[v], starts[v + 1], 0.0)
         for u in range(cells.shape[0]):
             if walls.shape[0] == 0:
                 continue
             if cells[u, v, 0] <= _HALF * size:
                 cells[u, v, 1] = 2.0
                 continue
-            x, odd = head[0] + (u + 0.5) * size, False
-            for n in range(starts[v], starts[v + 1]):
-                i = walls[n]
-                up, dx, dy = y - circles[i, 1], circles[i, 5], circles[i, 6]
-                if (up < 0.0) != (up < dy) and x - circles[i, 0] < dx * up / dy:
-                    odd = not odd
-            cells[u, v, 1] = 0.0 if odd else 1.0
+            middle = head[0] + (u + 0.5) * size, y, 0.0
+            cells[u, v, 1] = 0.0 if crossed_walls(middle, met)[1] else 1.0
