@@ -24,6 +24,7 @@ _SEARCH = (
     'maasi_drivers',
     'maasi_sim.scenario',
     'maasi_sim.simulation',
+    'maasi_sim.run.facts',
     'maasi_sim.run.log',
     'maasi_sim.run.scores',
     'maasi_sim.search',

@@ -17,7 +17,7 @@ from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_
 from maasi_planner.conversions import decision_to_ros
 from maasi_planner.planners.base import check_decision
 from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.messages import MessageEvents
+from maasi_sim.run.view.recording import facts_for
 
 CLEAR = 0.2  # radius of the robots [m]
 
@@ -74,9 +74,10 @@ def test_each_waypoint_has_a_reason_with_numbers_also_in_nodes(name, seed):
         decision.reason = f'tour: {decision.reason}'
     events = []
     made = decision_to_ros(decision, dict.fromkeys(decision.robots, 0), name, 0, 0.0, Header())
-    MessageEvents(EventMaker({'robots': {}}, events.append)).take(
-        '/decisions', 'maasi_msgs/msg/PlanDecision', made
-    )
+    maker = EventMaker({'robots': {}}, events.append)
+    facts = facts_for(maker.scene, waits=False)
+    for fact in facts.of('/decisions', 'maasi_msgs/msg/PlanDecision', made):
+        maker.add(fact)
     (plan,) = [event for event in events if event[1] == 'plan']
     told = {row[0]: row[5] for row in plan[7]}
     assert told == {robot: item.reason for robot, item in decision.robots.items()}

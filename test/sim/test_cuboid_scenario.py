@@ -15,6 +15,8 @@ from maasi_sim.run.buildings.building_mission import BuildingMission
 from maasi_sim.run.buildings.observer import CuboidRecord
 from maasi_sim.run.buildings.scenario import check_cuboid_scenario, load_cuboid_scenario
 from maasi_sim.run.buildings.simulation import CuboidSimulation
+from maasi_sim.run.facts import RobotAt
+from maasi_sim.run.log import RunEnd
 from maasi_sim.run.report_files import write_report
 from maasi_sim.run.run_options import Options
 from maasi_sim.scenario.layering import Layer
@@ -121,21 +123,11 @@ def test_a_robot_flies_the_velocity_that_a_plan_leads_to_and_brakes_without_one(
 def test_report_and_picture_of_a_run_that_went_wrong(tmp_path):
     scenario = load_cuboid_scenario('buildings_obstacles')
     mission = BuildingMission('buildings_obstacles', scenario)
-    ways = dict.fromkeys(scenario.names(), np.zeros((0, 4)))
+    record = CuboidRecord(scenario, 1, mission.name)
     # Through the building.
-    ways['red'] = np.array([[0.0, 240.0, 215.0, 10.0], [1.0, 330.0, 215.0, 10.0]])
-    record = CuboidRecord(
-        mission.name,
-        scenario,
-        1,
-        scenario.mission(),
-        trajectories=ways,
-        choices={'brake': 1},
-        active=np.array([[0.0, 2.0]]),
-        end_reason='time_limit',
-        end_time=1.0,
-        wall_time=2.0,
-    )
+    for time, x in ((0.0, 240.0), (1.0, 330.0)):
+        record.add(RobotAt(time, 'red', (x, 215.0, 10.0, 0.0)))
+    record.close(RunEnd('time_limit', 1.0, 2.0), 1.0)
     report = write_report(mission, record, tmp_path)
     assert check_report(json.loads((tmp_path / 'report.json').read_text())) == report
     assert (tmp_path / 'report.png').stat().st_size > 20_000

@@ -22,7 +22,7 @@ from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState, BatchMember, DetectionArray, FilterUpdate, LockstepStep
 from maasi_sim.run import recorder_node
 from maasi_sim.run.bag import Bag, BagWriter, load_types
-from maasi_sim.run.mission import RunEnd
+from maasi_sim.run.log import RunEnd
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.topics import STEP

@@ -19,7 +19,7 @@ from test_scenario import PLAIN
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs import msg
 from maasi_sim.run.bag import load_types
-from maasi_sim.run.mission import RunEnd
+from maasi_sim.run.log import RunEnd
 from maasi_sim.run.report_files import write_report
 from maasi_sim.run.scores import score, scoring_radius
 from maasi_sim.run.targets.mission import TargetMission
@@ -47,6 +47,7 @@ class Run:
         self.namespace = namespace
         self.found = []
         self.batch = 0
+        self.step(0.0, scenario.names())
 
     def send(self, topic, message, time):
         stamped = message.header if hasattr(message, 'header') else message
@@ -292,7 +293,6 @@ def test_planners_of_several_robots_are_done_together(two_filters):
 
 def test_planner_without_a_robot_is_not_waited_for(two_filters):
     one, two = two_filters
-    one.step(0.0, ['mambo', 'second'])
     one.give_up(1.0)
     # Without any robot, not everything is searched.
     for time, robots in ((1.2, ['mambo', 'second']), (1.3, []), (1.4, ['mambo', 'second'])):
@@ -341,13 +341,13 @@ def test_updates_alone_tell_what_was_found_and_refined_positions_win(run):
     run.update(0.4, latched=False)
     run.declare(0.5, [0.6, 0.5])
     run.update(0.5, latched=False)
-    assert run.observer.found == 1 and run.record().log.progress[-1].true_found == 1
+    assert run.observer.found == 1 and run.record().progress[-1].true_found == 1
     run.found[0].position.x = 0.501
     run.update(0.6)
     # A filter that was restarted publishes an update again.
     run.batch, run.found[0].position.x = 1, 0.6
     run.update(0.5, latched=False)
-    (found,) = run.record().log.found_targets
+    (found,) = run.record().found_targets
     assert found.position[0] == pytest.approx(0.501)
     assert run.observer.measurements == 3
 
@@ -399,7 +399,7 @@ def test_picture_in_space():
     for name in ('drone1', 'drone2'):
         run.state(0.0, name, [1.0, 1.0, 1.0])
         run.state(1.0, name, [100.0, 50.0, 30.0])
-    run.declare(0.5, list(run.observer.world.targets[0] + 0.5), 'drone1', deviation=1.0)
+    run.declare(0.5, list(run.observer.log.truth[0] + 0.5), 'drone1', deviation=1.0)
     run.update(0.5, ['drone1', 'drone2'])
     figure = plot_report(run.record())
     assert {'drone1', 'drone2', 'true target', 'found target'} <= labels_of(figure)

@@ -25,7 +25,7 @@ from maasi_sim.run.bag import BagWriter, load_types
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog, line, thin
 from maasi_sim.run.view.event_maker import ENDED, LEFT, SILENT, EventMaker
-from maasi_sim.run.view.messages import MessageEvents, read_events
+from maasi_sim.run.view.recording import facts_for, read_events
 from maasi_sim.run.view.scene import empty_scene, scene_of, scene_of_facts
 from maasi_sim.run.view.search_page import event_log
 from maasi_sim.search import search
@@ -41,14 +41,16 @@ def state(seconds, **fields):
 
 
 class Taken:
-    def __init__(self, scene=None, on_restart=None):
+    def __init__(self, scene=None, waits=False, on_restart=None):
         self.events = []
         self.maker = EventMaker(scene or empty_scene(), self.events.append)
-        self.messages = MessageEvents(self.maker, on_restart=on_restart)
+        self.facts = facts_for(self.maker.scene, waits, on_restart)
 
     def take(self, topic, message):
         package = type(message).__module__.split('.')[0]
-        self.messages.take(topic, f'{package}/msg/{type(message).__name__}', message)
+        kind = f'{package}/msg/{type(message).__name__}'
+        for fact in self.facts.of(topic, kind, message):
+            self.maker.add(fact)
 
     def of(self, kind):
         return [event for event in self.events if event[1] == kind]
@@ -102,8 +104,8 @@ def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_en
     assert said == [['walker', 'left'], ['crawler', 'not heard for 3 s']]
 
 
-def test_what_comes_before_the_first_step_is_taken_at_its_time(taken):
-    taken.messages = MessageEvents(taken.maker, waits=True)
+def test_what_comes_before_the_first_step_is_taken_at_its_time():
+    taken = Taken(waits=True)
     # A run with real robots may wait for minutes.
     for _ in range(2000):
         taken.take('/rover/state', state(9.0))
@@ -208,8 +210,8 @@ def test_time_that_jumps_back_begins_another_run():
     made = []
 
     def begin():
-        made.append(EventMaker(empty_scene(), taken.events.append))
-        return made[-1]
+        taken.maker = EventMaker(empty_scene(), taken.events.append)
+        made.append(taken.maker)
 
     taken = Taken(on_restart=begin)
     taken.take('/rover/state', state(100.0))

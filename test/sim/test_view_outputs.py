@@ -11,6 +11,7 @@ import pytest
 
 from maasi_filter import colours
 from maasi_sim.run.bag import load_types
+from maasi_sim.run.facts import Ended, Left, PathPlanned, RobotAt, Said
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.rviz_view import shown_topics
 from maasi_sim.run.view import video, view_run
@@ -124,12 +125,15 @@ def departing():
     """Return a run whose robot is on its way at 1 s, and leaves at 2 s."""
     events = []
     maker = EventMaker(scene_of('plane', load_mission('mambo').scenario), events.append)
-    maker.robot(0.0, 'mambo', (0.5, 0.5, 1.0, 0.0))
-    maker.way(0.0, 'mambo', [(0.5, 0.5, 1.0), (2.0, 2.0, 1.0)])
-    maker.robot(1.0, 'mambo', (0.6, 0.6, 1.0, 0.0))
-    maker.leave(2.0, 'mambo')
-    maker.message(3.0, 'team', 'team', 'continues')
-    maker.end('node_died', '/filter_node was killed by SIGKILL')
+    for fact in (
+        RobotAt(0.0, 'mambo', (0.5, 0.5, 1.0, 0.0)),
+        PathPlanned(0.0, 'mambo', [(0.5, 0.5, 1.0), (2.0, 2.0, 1.0)]),
+        RobotAt(1.0, 'mambo', (0.6, 0.6, 1.0, 0.0)),
+        Left(2.0, 'mambo'),
+        Said(3.0, 'team', 'team', 'continues'),
+        Ended(3.0, 'node_died', '/filter_node was killed by SIGKILL'),
+    ):
+        maker.add(fact)
     return EventLog(maker.scene, events)
 
 

@@ -10,11 +10,12 @@ from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.conversions import exploration_to_ros
+from maasi_sim.run.facts import Explored
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog, shades, shares
 from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.messages import MessageEvents
 from maasi_sim.run.view.page_file import FOLDER, write_replay
+from maasi_sim.run.view.recording import facts_for
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.scenario.schema import Scenario
 
@@ -61,9 +62,11 @@ def test_the_numbers_under_the_pointer_are_those_of_the_planner(chromium, tmp_pa
     if wire:
         message = exploration_to_ros(explored, Header(frame_id='map'))
         assert isinstance(message, OccupancyGrid)
-        MessageEvents(maker).take('/exploration', 'nav_msgs/msg/OccupancyGrid', message)
+        facts = facts_for(maker.scene, waits=False)
+        for fact in facts.of('/exploration', 'nav_msgs/msg/OccupancyGrid', message):
+            maker.add(fact)
     else:
-        maker.map(0.0, '', *explored.shown())
+        maker.add(Explored(0.0, '', *explored.shown()))
     (shown_map,) = [event for event in events if event[1] == 'map']
     assert shown_map[-1] == pytest.approx(explored.explored_fraction(), abs=0.02)
     path = tmp_path / 'page.html'
@@ -100,7 +103,8 @@ def test_ground_without_a_look_is_not_searched_however_unlikely_targets_are_ther
     scene = scene_of('field', load_mission('field').scenario)
     events = []
     maker = EventMaker(scene, events.append)
-    maker.map(0.0, '', *UnexploredMap(load_mission('field').scenario.world(1).area).shown())
+    unseen = UnexploredMap(load_mission('field').scenario.world(1).area)
+    maker.add(Explored(0.0, '', *unseen.shown()))
     known = shares(events[0][6])
     assert set(known) == {-1.0, 1.0} and events[0][7] == pytest.approx(0.0, abs=1e-9)
 

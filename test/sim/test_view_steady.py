@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from maasi_sim.run.facts import Ended, Found, RobotAt, Truth
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.event_maker import EventMaker
@@ -24,12 +25,15 @@ def ended(scene, found, truth):
     """Return the events of a run that finds something at 1 s and ends at 4 s."""
     events = []
     maker = EventMaker(scene, events.append)
-    maker.robot(0.0, 'mambo', (0.5, 0.5, 1.0, 0.0), 0.8)
-    maker.robot(0.0, 'turtlebot', (1.5, 0.5, 0.0, 0.0), 0.6)
-    maker.truth(0.0, truth)
-    maker.found(1.0, '', found)
-    maker.robot(4.0, 'mambo', (0.6, 0.5, 1.0, 0.0), 0.7)
-    maker.end('time_limit', 'the limit of 4 s')
+    for fact in (
+        RobotAt(0.0, 'mambo', (0.5, 0.5, 1.0, 0.0), 0.8),
+        RobotAt(0.0, 'turtlebot', (1.5, 0.5, 0.0, 0.0), 0.6),
+        Truth(0.0, truth),
+        Found(1.0, '', found, 0),
+        RobotAt(4.0, 'mambo', (0.6, 0.5, 1.0, 0.0), 0.7),
+        Ended(4.0, 'time_limit', 'the limit of 4 s'),
+    ):
+        maker.add(fact)
     return EventLog(maker.scene, events)
 
 

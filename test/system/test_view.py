@@ -14,12 +14,13 @@ from waiting import wait_until
 
 from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.run.bag import Bag, BagWriter, load_types
+from maasi_sim.run.message_facts import is_read
 from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.run.topics import message_class
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.live_view import RunPage
-from maasi_sim.run.view.messages import is_shown, read_events
 from maasi_sim.run.view.page_file import REPLAY, empty_page, write_replay
+from maasi_sim.run.view.recording import read_events
 from maasi_sim.run.view.scene import empty_scene
 from maasi_sim.run.view.view_node import ViewNode
 from maasi_sim.run.view.view_run import main
@@ -243,12 +244,12 @@ def test_a_run_leaves_its_page_which_is_made_again_of_its_bag_or_of_the_newest_r
 def shown_messages(run, without=None):
     """Return the topics of a bag that are shown, with their types, and their messages."""
     with Bag(run.bag) as bag:
-        kept = {name: kind for name, kind in bag.types.items() if is_shown(name, kind)}
+        kept = {name: kind for name, kind in bag.types.items() if is_read(name, kind)}
         kept.pop(without, None)
         return kept, list(bag.raw(kept))
 
 
-def test_a_recording_without_a_scenario_is_shown(run, tmp_path):
+def test_a_recording_without_a_scenario_is_read(run, tmp_path):
     kept, messages = shown_messages(run)
     writer = BagWriter(tmp_path / 'bag', load_types())
     for topic, kind in kept.items():

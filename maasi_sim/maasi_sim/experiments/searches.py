@@ -177,8 +177,8 @@ def run_among_obstacles(settings: dict[str, Any], seed: int) -> Outcome:
     area = Area(scenario.environment)
     share = np.linspace(0.0, 1.0, 5)[:, None, None]
     ways = [
-        (places[:-1] + share * np.diff(places, axis=0)).reshape(-1, 3)
-        for places in result.paths().values()
+        (path[:-1, 1:] + share * np.diff(path[:, 1:], axis=0)).reshape(-1, 3)
+        for path in result.trajectories.values()
     ]
     nearest = [area.distances(place).min(initial=np.inf) for way in ways for place in way]
     outcome.summary['clearance'] = float(min(nearest)) if scenario.environment.obstacles else None

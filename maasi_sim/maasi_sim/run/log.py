@@ -1,101 +1,54 @@
-"""The record of a search for targets: facts in their order, counted and scored once.
+"""The record of a run: the facts of it, what they count to, and their scores.
 
-Two adapters write it: `maasi_sim.search`, and `TargetObserver` from the messages of nodes.
+It is written by `maasi_sim.search`, and from the messages of nodes by an `Observer`.
 """
 
 from __future__ import annotations
 
+from array import array
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import chain
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.records import AgentMeasurement, Cluster, FoundTarget
+from maasi_filter.models.pose import Pose
+from maasi_filter.records import FoundTarget
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.motion import RobotState
 from maasi_planner.team import Decision
-from maasi_sim.run.scores import Scores, score, scoring_radius
+from maasi_sim.run.facts import (
+    Decided,
+    Explored,
+    Fact,
+    Joined,
+    Left,
+    Measured,
+    Present,
+    RobotAt,
+    Truth,
+    Updated,
+)
+from maasi_sim.run.scores import Scoreboard, Scores, numbered, scoring_radius
 from maasi_sim.run.view.event_log import STATE_PERIOD, shades
+from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.simulation.world import World
 
+UNAVAILABLE = 5  # goal status of `AgentState`
 _MAP_PERIOD = 1.0  # between two exploration functions without a decision [s]
 
 
 @dataclass(frozen=True)
-class Fact:
-    """Something that happened, at a time [s]."""
+class RunEnd:
+    """How a run ended."""
 
-    time: float
-
-
-@dataclass(frozen=True)
-class RobotAt(Fact):
-    """Where a robot is, by its odometry: x, y, z [m] and yaw [rad]."""
-
-    robot: str
-    pose: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Left(Fact):
-    """A robot left the team."""
-
-    robot: str
-
-
-@dataclass(frozen=True)
-class Decided(Fact):
-    """A joint decision; `indices` number the decisions of each robot."""
-
-    team: str
-    decision: Decision
-    indices: Mapping[str, int]
-    explored: float
-    duration: float = 0.0  # computation [s]
-
-
-@dataclass(frozen=True)
-class Measured(Fact):
-    """A measurement of a robot."""
-
-    measurement: AgentMeasurement
-
-
-@dataclass(frozen=True)
-class Updated(Fact):
-    """An update of a filter by measurements: robots and their index."""
-
-    step: int
-    team: str
-    members: Sequence[tuple[str, int]]
-    found: Sequence[FoundTarget] | None  # by this filter, all of them; None: as before
-    expected: float = 0.0
-    clusters: Sequence[Cluster] = ()
-    duration: float = 0.0  # computation [s]
-    #: Where all robots are, (3,) [m]: the truth, in a search in one process.
-    positions: Mapping[str, FloatArray] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Explored(Fact):
-    """The exploration function of a planner, in letters of `shades`, and the explored share."""
-
-    team: str
-    lower: FloatArray
-    step: FloatArray
-    letters: Any
-    share: float
-
-
-@dataclass(frozen=True)
-class Truth(Fact):
-    """The true targets, (n, d) [m]."""
-
-    targets: FloatArray
+    reason: str  # a key of `END_REASONS`
+    time: float  # simulated [s]
+    wall_time: float  # from the first step [s]
+    events: Sequence[dict[str, Any]] = ()
 
 
 @dataclass(frozen=True)
@@ -115,15 +68,91 @@ class Count:
     positions: Mapping[str, FloatArray]
 
 
-def numbered(found: Sequence[Sequence[FoundTarget]]) -> list[FoundTarget]:
-    """Return the found targets of several filters as one list, numbered in the order of time."""
-    if len(found) == 1:
-        return list(found[0])
-    every = sorted(chain(*found), key=lambda item: (item.time, item.robot, item.id))
-    return [replace(item, id=number) for number, item in enumerate(every, start=1)]
+class RunRecord:
+    """What is known of the robots in a run of any mission, and how it ended.
+
+    Attributes
+    ----------
+    name : str
+        Of the run.
+    scenario : BaseScenario
+        Of the run.
+    seed : int
+        Of its random numbers.
+    events : list of dict
+        Robots that were lost or joined, and what the run noted: 'time' [s], 'agent', 'event', ...
+    last_steps : dict
+        Step of the last state of each robot that has sent one.
+    distance : dict
+        Distance travelled of each robot [m]; of messages at the end only.
+    end_reason : str
+        A key of `END_REASONS`.
+    end_time, wall_time : float
+        Simulated, and of the clock on the wall [s].
+    """
+
+    def __init__(self, scenario: BaseScenario, seed: int, name: str = '') -> None:
+        self.name, self.scenario, self.seed = name, scenario, seed
+        self.events: list[dict[str, Any]] = []
+        self.last_steps: dict[str, int] = {}
+        self.distance = dict.fromkeys(scenario.names(), 0.0)
+        self.end_reason, self.end_time, self.wall_time = '', 0.0, 0.0
+        # Of each robot: time and position of its states. An hour of them has 2 MB.
+        self._path = {name: array('d') for name in scenario.names()}
+        self.team = set(scenario.names())  #: robots that take part
+        self._lost: set[str] = set()
+
+    def add(self, fact: Fact) -> None:
+        """Add a fact."""
+        match fact:
+            case RobotAt(time, robot, pose, _, status, reason, step) if robot in self._path:
+                self._path[robot].extend((time, *pose[:3]))
+                self.last_steps[robot] = step
+                if status == UNAVAILABLE or robot in self._lost:
+                    self._note_lost(time, robot, status == UNAVAILABLE, reason)
+            case Present(_, robots):
+                self.team = set(robots)
+            case Joined(time, robot):
+                self.team.add(robot)
+                self._note_lost(time, robot, False)
+            case Left(time, robot):
+                self.team.discard(robot)
+                self._note_lost(time, robot, True)
+
+    def _note_lost(self, time: float, robot: str, lost: bool, reason: str = '') -> None:
+        # A robot that left is not back by what its driver still publishes.
+        lost = lost or robot not in self.team
+        if lost != (robot in self._lost):
+            self._lost ^= {robot}
+            # Before the first step robots get ready.
+            if time >= 0.0:
+                because = {'reason': reason} if lost and reason else {}
+                self._note(time, robot, 'lost' if lost else 'joined', **because)
+
+    def _note(self, time: float, robot: str, event: str, **more: str) -> None:
+        self.events.append({'time': time, 'agent': robot, 'event': event, **more})
+
+    def takes_part(self, robot: str) -> bool:
+        """Return whether a robot is of the team, and can go on."""
+        return robot not in self._lost
+
+    @property
+    def trajectories(self) -> dict[str, FloatArray]:
+        """Where each robot was by its odometry: time [s], x, y, z [m], (n, 4)."""
+        return {name: np.array(path).reshape(-1, 4) for name, path in self._path.items()}
+
+    def close(self, end: RunEnd, until: float) -> None:
+        """Note the end of a run of nodes, and drop what came after a time [s]."""
+        self.end_reason, self.end_time, self.wall_time = end.reason, until, end.wall_time
+        for name, path in self.trajectories.items():
+            path = path[path[:, 0] <= until]
+            self._path[name] = array('d', path.ravel())
+            self.distance[name] = float(np.linalg.norm(np.diff(path[:, 1:], axis=0), axis=1).sum())
+        events = [event for event in self.events if event['time'] <= until]
+        self.events = sorted([*events, *end.events], key=lambda event: float(event['time']))
 
 
-class RunLog:
+class RunLog(RunRecord):
     """What happened in a search for targets, its counts and scores.
 
     Parameters
@@ -134,6 +163,8 @@ class RunLog:
         Of its random numbers.
     world : World, optional
         With the true targets; none: there are none.
+    name : str
+        Of the run.
     keeps : bool
         Whether facts are kept, which a replay needs.
 
@@ -143,8 +174,14 @@ class RunLog:
         In their order, if they are kept.
     listeners : list of callables
         Each is called with each fact.
-    measurements, distance : dict
-        Number of measurements, and distance travelled, of each robot [m].
+    measurements : dict
+        Number of measurements of each robot.
+    waypoints : dict
+        Step and position (3,) [m] of the chosen waypoints of each robot.
+    measured_from : dict
+        Time [s] and pose of the measurements of each robot.
+    explored : float
+        Share that is explored, by the planner that reports most of it.
     truth : (n, d) array
         True targets [m], now.
     scores : Scores
@@ -153,32 +190,44 @@ class RunLog:
         After each update.
     completed : Count or None
         When all was found, in a search that ends then.
-    end_reason : str
-        'all_found', 'planner_done', 'time_limit' or 'measurement_limit'.
     steps : int
-        Length of the search.
+        Length of a search in one process.
     """
 
+    scenario: Scenario
+    scores: Scores
+
     def __init__(
-        self, scenario: Scenario, seed: int, world: World | None = None, keeps: bool = True
+        self,
+        scenario: Scenario,
+        seed: int,
+        world: World | None = None,
+        name: str = '',
+        keeps: bool = True,
     ) -> None:
-        self.scenario, self.seed = scenario, seed
+        super().__init__(scenario, seed, name)
         self.facts: list[Fact] = []
         self.listeners: list[Callable[[Fact], None]] = []
-        self.measurements = dict.fromkeys(scenario.names(), 0)
-        self.distance = dict.fromkeys(scenario.names(), 0.0)
-        self.progress: list[Count] = []
-        self.completed: Count | None = None
-        self.end_reason, self.steps = '', 0
+        self.waypoints: dict[str, list[tuple[int, FloatArray]]] = defaultdict(list)
+        self.measured_from: dict[str, list[tuple[float, Pose]]] = defaultdict(list)
+        self._shares: dict[str, float] = {}
+        self.steps = 0
         self._world, self._keeps = world, keeps
-        # Also of a world without targets.
-        shape = (0, scenario.dimension)
-        self.truth = np.asarray(np.zeros(shape) if world is None else world.targets, dtype=float)
-        self._radius = scoring_radius(scenario, self.truth)
-        self._found: dict[str, Sequence[FoundTarget]] = dict.fromkeys(scenario.namespaces(), ())
-        self._counted: set[tuple[str, str, int]] = set()
         self._last_states = -np.inf
         self._last_maps: dict[str, float] = {}
+        self._begin_counts()
+
+    def _begin_counts(self) -> None:
+        # Also of a world without targets.
+        none = np.zeros((0, self.scenario.dimension))
+        self.truth = np.asarray(none if self._world is None else self._world.targets, dtype=float)
+        radius = scoring_radius(self.scenario, self.truth)
+        self._board = Scoreboard(radius, self.scenario.scoring.order, self.truth)
+        self._board.found = dict.fromkeys(self.scenario.namespaces(), ())
+        self.measurements = dict.fromkeys(self.scenario.names(), 0)
+        self.progress: list[Count] = []
+        self.completed: Count | None = None
+        self._counted: set[tuple[str, str, int]] = set()
         self.scores = self.scores_against(self.truth)
 
     def add(self, fact: Fact) -> None:
@@ -187,8 +236,17 @@ class RunLog:
             self.facts.append(fact)
         for listener in self.listeners:
             listener(fact)
-        if isinstance(fact, Updated):
-            self._count(fact)
+        super().add(fact)
+        match fact:
+            case Decided(team=team, decision=decision, explored=share):
+                self._shares[team] = share
+                for robot, choice in decision.robots.items():
+                    if choice.chosen >= 0:
+                        self.waypoints[robot].append((decision.step, choice.waypoint))
+            case Measured(time=time, robot=robot, pose=Pose() as pose, batch=batch) if batch:
+                self.measured_from[robot].append((time, pose))
+            case Updated():
+                self._count(fact)
 
     def add_states(self, time: float, states: Mapping[str, RobotState]) -> None:
         """Add where robots are, no more often than is shown."""
@@ -216,7 +274,7 @@ class RunLog:
                 self._counted.add((team, robot, index))
                 self.measurements[robot] = self.measurements.get(robot, 0) + 1
         if update.found is not None:
-            self._found[team] = update.found
+            self._board.found[team] = update.found
         if self._world is not None and self._world.walk > 0.0:
             self.truth = np.asarray(self._world.targets_at(update.step), dtype=float)
             if self._keeps:
@@ -228,7 +286,7 @@ class RunLog:
             update.time,
             update.step,
             sum(self.measurements.values()),
-            sum(map(len, self._found.values())),
+            sum(map(len, self._board.found.values())),
             self.scores.match.true_found,
             self.scores.match.rmse,
             tuple(robot for robot, _ in update.members),
@@ -239,27 +297,53 @@ class RunLog:
         if complete and self.completed is None:
             self.completed = now
 
+    def recount(self, updates: Sequence[Updated]) -> None:
+        """Count again, in the order of steps and teams instead of arrival, to the completion."""
+        self._begin_counts()
+        for update in sorted(updates, key=lambda item: (item.step, item.team, item.batch)):
+            if self.completed is not None and update.step > self.completed.step:
+                break
+            self._count(update)
+
     def found_by(self, team: str) -> Sequence[FoundTarget]:
         """Return the targets that a filter has found."""
-        return self._found[team]
+        return self._board.found[team]
 
     @property
     def found_targets(self) -> list[FoundTarget]:
         """Targets found so far, of all filters."""
-        return numbered(list(self._found.values()))
+        return numbered(list(self._board.found.values()))
 
     def scores_against(self, truth: FloatArray) -> Scores:
         """Return the scores of what is found against true targets (n, d) [m]."""
-        return score(self.found_targets, truth, self._radius, self.scenario.scoring.order)
+        scores = self._board.scores_against(truth)
+        assert scores is not None
+        return scores
 
     def end(self, step: int, reason: str) -> None:
-        """Note the last step of a search, and why it ended."""
+        """Note the last step of a search in one process, and why it ended."""
         self.steps, self.end_reason = step + 1, reason
         if self._world is not None:
             self.truth = np.asarray(self._world.targets_at(step), dtype=float)
         self.scores = self.scores_against(self.truth)
 
+    def close(self, end: RunEnd, until: float) -> None:
+        """See `RunRecord.close`; it ends with the update that completed it."""
+        last: float = np.inf
+        if self.completed is not None:
+            until, last = self.completed.time, self.completed.step
+        for robot, chosen in self.waypoints.items():
+            self.waypoints[robot] = [item for item in chosen if item[0] <= last]
+        for robot, poses in self.measured_from.items():
+            self.measured_from[robot] = [item for item in poses if item[0] <= until]
+        super().close(end, until)
+
     # ---- what is asked of it -----------------------------------------------------------------
+
+    @property
+    def explored(self) -> float:
+        """Share that is explored, by the planner that reports most of it."""
+        return max(self._shares.values(), default=0.0)
 
     @property
     def missed(self) -> int:
@@ -305,14 +389,6 @@ class RunLog:
     def filter_times(self) -> list[float]:
         """Wall time of each filter step [s]."""
         return [item.duration for item in self.facts if isinstance(item, Updated)]
-
-    def paths(self) -> dict[str, FloatArray]:
-        """Return where each robot was by its odometry, (n, 3) [m], ten times a second at most."""
-        paths: dict[str, list[tuple[float, ...]]] = {}
-        for item in self.facts:
-            if isinstance(item, RobotAt):
-                paths.setdefault(item.robot, []).append(item.pose[:3])
-        return {name: np.array(path) for name, path in paths.items()}
 
     def columns(self) -> dict[str, Any]:
         """Return the progress by columns, with places of robots and whether they measured."""

@@ -15,7 +15,8 @@ from maasi_filter.make_filter import make_filter
 from maasi_filter.records import AgentMeasurement
 from maasi_planner.coordinator import Coordinator
 from maasi_sim.run.ending import DONE
-from maasi_sim.run.log import Measured, RobotAt, RunLog, Updated
+from maasi_sim.run.facts import Measured, RobotAt, Updated
+from maasi_sim.run.log import RunLog
 from maasi_sim.run.run_folder import make_folder, write_text
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.tables import csv_text, found_rows
@@ -117,7 +118,7 @@ def search_measurements(scenario: Scenario, recorded: list[Placed]) -> tuple[Run
         coordinator.absorb({name: place.pose}, result.clusters)
         log.add(RobotAt(time, name, (*place.pose.position.tolist(), place.pose.yaw)))
         found = search_filter.found_targets if result.found_changed else None
-        log.add(Measured(time, measurement))
+        log.add(Measured.of(time, measurement))
         members = [(name, measurement.index)]
         expected, clusters = result.expected_number, result.clusters
         log.add(Updated(time, step, '', members, found, expected, clusters))

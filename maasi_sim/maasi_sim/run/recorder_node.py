@@ -28,10 +28,10 @@ from maasi_filter.ros.conversions import stamp_of_step, stamp_to_ros
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, reader_of
 from maasi_msgs.msg import LockstepDone, LockstepStep
 from maasi_sim.run.bag import BagError, BagWriter, topic_qos
+from maasi_sim.run.message_facts import is_read
 from maasi_sim.run.mission import Observer
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.topics import CLOCK, STEP, message_class, stamp_of, time_at, within
-from maasi_sim.run.view.messages import is_shown
 
 NAME = 'recorder'
 READY, DONE = '/lockstep/ready', '/lockstep/done'
@@ -163,7 +163,7 @@ class Recorder:
             topic = self.relative(full)
             if topic is None or topic in self._subscriptions or topic in self._refused:
                 continue
-            shown = self.listener is not None and is_shown(topic, types[0])
+            shown = self.listener is not None and is_read(topic, types[0])
             # A name with an underscore in front is hidden: the inner topics of actions.
             useless = topic in _SKIPPED or '/_' in topic or topic.endswith(_KEPT)
             wanted = not useless and (self.bag is not None or topic in self._wanted)

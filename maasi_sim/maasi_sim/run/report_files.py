@@ -7,10 +7,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from maasi_sim.machine import this_machine
-from maasi_sim.run.mission import Mission, RunRecord
+from maasi_sim.run.log import RunRecord
+from maasi_sim.run.mission import Mission
 from maasi_sim.run.run_folder import ResultsError, remove, write_text, write_whole
 
 REPORT_VERSION = 1  # of the format of `report.json`, see `report.schema.json`
@@ -25,12 +24,12 @@ END_REASONS = {
     'not_ready': 'the nodes did not get ready',
     'no_robot': 'no robot can go on',
 }
+MISSION_REASONS: dict[tuple[str, str], str] = {}  # of a mission, in place of those
 
 
 def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> dict[str, Any]:
     """Return a report: what was run, what came of it, how it ended; no number is infinite."""
     wall = record.wall_time
-    moves = {name: np.diff(way[:, 1:], axis=0) for name, way in record.trajectories.items()}
     return {
         'version': REPORT_VERSION,
         'mission': mission,
@@ -39,9 +38,7 @@ def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> di
         'planner': record.scenario.planner.name,
         'agents': record.scenario.names(),
         **content,
-        'distance': {
-            name: finite(np.linalg.norm(move, axis=1).sum()) for name, move in moves.items()
-        },
+        'distance': {name: finite(length) for name, length in record.distance.items()},
         'end_reason': record.end_reason,
         'wall_time': wall,
         'real_time_factor': record.end_time / wall if wall > 0.0 else None,
@@ -57,9 +54,8 @@ def finite(value: float) -> float | None:
 
 def reason_of_end(report: dict[str, Any]) -> str:
     """Return in words why a run ended."""
-    if report['end_reason'] == 'all_found' and report['mission'] == 'buildings':
-        return 'all cuboids visited'
-    return END_REASONS.get(report['end_reason'], report['end_reason'])
+    reason = report['end_reason']
+    return MISSION_REASONS.get((report['mission'], reason)) or END_REASONS.get(reason, reason)
 
 
 def summary(report: dict[str, Any], found: str, counts: str) -> str:

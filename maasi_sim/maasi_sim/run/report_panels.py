@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_sim.run.mission import RunRecord
+from maasi_sim.run.log import RunRecord
 
 PALE, GRID, UNSEEN = '#9A9A9A', '#E6E6E6', '#CFCFCF'
 MARGIN = 1.015  # of axes to the right of the last value, or a step at the end cannot be seen

@@ -23,7 +23,7 @@ from maasi_sim.run.ending import (
     Interruption,
     end_of_planners,
 )
-from maasi_sim.run.mission import RunEnd
+from maasi_sim.run.log import RunEnd
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.missions import checked_mission, send_warning
 from maasi_sim.run.processes import beside, stop, wait_for_server

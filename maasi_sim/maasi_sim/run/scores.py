@@ -1,7 +1,8 @@
 """Found targets against the truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,3 +63,45 @@ def score(
         match_targets(found, truth, radius),
         gospa(found, truth, cutoff=radius, power=order),
     )
+
+
+class Scoreboard:
+    """Found targets of all filters against the true ones, now.
+
+    Parameters
+    ----------
+    radius : float or None
+        Distance within which a found target is true [m]; None: nothing is scored.
+    order : float
+        p of GOSPA.
+    truth : (n, d) array or None
+        True targets [m], where they are known.
+
+    Attributes
+    ----------
+    found : dict
+        Targets that the filter of a team has found, by team.
+    """
+
+    def __init__(self, radius: float | None, order: float, truth: FloatArray | None) -> None:
+        self._radius, self._order, self.truth = radius, order, truth
+        self.found: dict[str, Sequence[FoundTarget]] = {}
+
+    def scores(self) -> Scores | None:
+        """Return the scores; None if there is nothing to score against."""
+        return None if self.truth is None else self.scores_against(self.truth)
+
+    def scores_against(self, truth: FloatArray) -> Scores | None:
+        """Return the scores of what is found against true targets (n, d) [m]."""
+        if self._radius is None:
+            return None
+        found = numbered(list(self.found.values()))
+        return score(found, truth, self._radius, self._order)
+
+
+def numbered(found: Sequence[Sequence[FoundTarget]]) -> list[FoundTarget]:
+    """Return the found targets of several filters as one list, numbered in the order of time."""
+    if len(found) == 1:
+        return list(found[0])
+    every = sorted(chain(*found), key=lambda item: (item.time, item.robot, item.id))
+    return [replace(item, id=number) for number, item in enumerate(every, start=1)]

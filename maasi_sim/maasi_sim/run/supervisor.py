@@ -125,7 +125,7 @@ class Supervisor:
         if step is None:
             return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
         steps = self.recorder.done_steps()
-        reached = self.recorder.observer.last_steps()
+        reached = self.recorder.observer.log.last_steps
         steps |= {
             name: reached.get(plan.namespace, -1)
             for name, plan in self.plans.items()

@@ -13,10 +13,10 @@ from maasi_drivers.settings.driver import DRIVERS, DrivenRobot, DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import unsuitable_lengths, unused_settings
+from maasi_sim.run.log import RunLog
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.observer import TargetObserver
-from maasi_sim.run.targets.record import TargetRecord
 from maasi_sim.run.targets.report import build_report, target_summary
 from maasi_sim.run.targets.tables import csv_text, found_geojson, found_rows, ways_geojson
 from maasi_sim.run.topics import BATCH, within
@@ -77,18 +77,17 @@ class TargetMission:
     report = staticmethod(build_report)
     summary = staticmethod(target_summary)
 
-    def tables(self, record: TargetRecord) -> dict[str, str]:
+    def tables(self, record: RunLog) -> dict[str, str]:
         """See `Mission.tables`."""
         origin = self.scenario.environment.origin
-        log = record.log
-        rows = found_rows(log.found_targets, log.truth, log.scores.match.pairs, origin)
+        rows = found_rows(record.found_targets, record.truth, record.pairs, origin)
         files = {'found_targets.csv': csv_text(rows, record.scenario.dimension, origin)}
         if origin is not None:
             files['found_targets.geojson'] = found_geojson(rows)
             files['ways.geojson'] = ways_geojson(record, origin)
         return files
 
-    def figure(self, record: TargetRecord) -> Figure:
+    def figure(self, record: RunLog) -> Figure:
         """See `Mission.figure`."""
         # Deferred: Matplotlib takes long to import.
         from maasi_sim.run.targets.report_figure import plot_report

@@ -7,13 +7,12 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import map_spacing
+from maasi_sim.run.log import RunLog
 from maasi_sim.run.report_files import finite, summary, whole_report
-from maasi_sim.run.targets.record import TargetRecord
 
 
-def build_report(record: TargetRecord) -> dict[str, Any]:
+def build_report(log: RunLog) -> dict[str, Any]:
     """Return the report of a run as plain values."""
-    log = record.log
     scores, total = log.scores, len(log.truth)
     # All targets were found, and stayed so, since the last of these.
     stayed = list(takewhile(lambda item: item.true_found == total, log.progress[::-1]))
@@ -46,23 +45,23 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
         'measurements': dict(sorted(log.measurements.items())),
         'measurements_to_find_all': complete.measurements if complete else None,
         'time_to_find_all': complete.time if complete else None,
-        'decisions': sum(map(len, record.waypoints.values())),
+        'decisions': sum(map(len, log.waypoints.values())),
         'scoring': {'radius': scores.radius, 'c': scores.radius, 'p': scores.order},
     }
-    return whole_report(record, 'targets', content)
+    return whole_report(log, 'targets', content)
 
 
-def explored_after(record: TargetRecord) -> UnexploredMap:
+def explored_after(log: RunLog) -> UnexploredMap:
     """Return what is unexplored after all measurements of the robots."""
-    scenario, area = record.scenario, Area(record.scenario.environment)
+    scenario, area = log.scenario, Area(log.scenario.environment)
     sensors = {
         name: robot.sensor.build(name, scenario.dimension)
         for name, robot in scenario.robots.items()
     }
     spacing, _ = map_spacing(area.bounds, sensors.values())
     explored = UnexploredMap(area, scenario.filter.exploration_spacing or spacing)
-    for name, poses in record.measured_from.items():
-        for pose in poses:
+    for name, poses in log.measured_from.items():
+        for _, pose in poses:
             explored.update(sensors[name].detection, pose)
     return explored
 

@@ -16,9 +16,9 @@ from maasi_filter.geometry.area import Area
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
+from maasi_sim.run.log import RunLog
 from maasi_sim.run.report_files import reason_of_end
 from maasi_sim.run.report_panels import MARGIN, PALE, UNSEEN, MapView, draw_report, ellipse
-from maasi_sim.run.targets.record import TargetRecord
 from maasi_sim.run.targets.report import build_report, explored_after, to_find_all
 
 _TRUE, _MISSED, _FALSE = '#222222', '#D62728', '#E6007E'
@@ -28,7 +28,7 @@ _LEAST = {2: 0.012, 3: 0.022}
 _VIEW_GRID = 160  # points on each axis where a field of view is evaluated
 
 
-def plot_report(record: TargetRecord) -> Figure:
+def plot_report(record: RunLog) -> Figure:
     """Return a figure: the search from above, in 3D also from the sides, and its progress."""
     scenario = record.scenario
     bounds = scenario.environment.array()
@@ -43,10 +43,10 @@ def plot_report(record: TargetRecord) -> Figure:
         _draw_explored(view, explored, bounds)
         _draw_obstacles(view, record, bounds)
         for name, colour in colours.items():
-            waypoints = view.points(record.waypoints[name])
+            waypoints = view.points([place for _, place in record.waypoints.get(name, ())])
             view.axes.plot(*waypoints, '+', color=colour, ms=8, mew=1.3)
             if record.measured_from.get(name):
-                pose = record.measured_from[name][-1]
+                _, pose = record.measured_from[name][-1]
                 _draw_field(view, detections[name], pose, colour, bounds)
         _draw_targets(view, record, bounds)
         view.axes.plot([], [], '+', color=PALE, ms=8, label='waypoint')
@@ -86,7 +86,7 @@ def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -
     view.axes.plot([], [], 's', color=UNSEEN, ms=9, label='not searched')
 
 
-def _draw_obstacles(view: MapView, record: TargetRecord, bounds: FloatArray) -> None:
+def _draw_obstacles(view: MapView, record: RunLog, bounds: FloatArray) -> None:
     style: dict[str, Any] = {'fc': '#C9C3B8', 'ec': '#8A8478', 'zorder': 1, 'label': 'obstacle'}
     area = Area(record.scenario.environment)
     for kind, shapes in area.shapes.items() if view.plane == (0, 1) else ():
@@ -124,10 +124,10 @@ def _draw_field(
         view.axes.contour(*grid, values, levels=[0.5 * values.max()], colors=[colour], **style)
 
 
-def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> None:
-    axes, width, found, truth = view.axes, len(bounds), record.log.found_targets, record.log.truth
+def _draw_targets(view: MapView, record: RunLog, bounds: FloatArray) -> None:
+    axes, width, found, truth = view.axes, len(bounds), record.found_targets, record.truth
     positions = np.array([item.position for item in found], float).reshape(-1, width)
-    pairs = record.log.scores.match.pairs
+    pairs = record.scores.match.pairs
     right = [index for index, _ in pairs]
     wrong = np.setdiff1d(np.arange(len(positions)), right)
     missed = np.setdiff1d(np.arange(len(truth)), [true for _, true in pairs])
@@ -153,9 +153,9 @@ def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> No
             axes.plot(*points, marker, ls='none', zorder=7, label=label, **style)
 
 
-def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
+def _draw_progress(axes: Axes, record: RunLog, by_time: bool) -> None:
     """Draw targets found over time, or over measurements."""
-    progress, number = record.log.progress, len(record.log.truth)
+    progress, number = record.progress, len(record.truth)
     places = [0.0, *(item.time if by_time else item.measurements for item in progress)]
     right = [0, *(item.true_found for item in progress)]
     every = [0, *(item.found for item in progress)]
@@ -175,7 +175,7 @@ def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
         axes.legend(**above, **close, fontsize=8.5, frameon=False)
 
 
-def _rows(record: TargetRecord) -> list[tuple[str, str]]:
+def _rows(record: RunLog) -> list[tuple[str, str]]:
     report = build_report(record)
     rmse = '-' if report['rmse'] is None else f'{report["rmse"]:.3g} m'
     found = f'{report["true_found"]} of {len(report["targets"])}'

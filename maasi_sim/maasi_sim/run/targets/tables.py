@@ -15,7 +15,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget
-from maasi_sim.run.targets.record import TargetRecord
+from maasi_sim.run.log import RunLog
 from maasi_sim.run.targets.report import explored_after
 
 Row = dict[str, Any]
@@ -86,20 +86,20 @@ def found_geojson(rows: Sequence[Row]) -> str:
     return _collection(features)
 
 
-def ways_geojson(record: TargetRecord, origin: OriginSettings) -> str:
+def ways_geojson(record: RunLog, origin: OriginSettings) -> str:
     """Return the ways of the robots, and what they have explored."""
     area = _area(record, origin)
     return _collection([*area, _explored(record, origin), *_ways(record, origin)])
 
 
-def _area(record: TargetRecord, origin: OriginSettings) -> Iterator[Row]:
+def _area(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
     """Return the area of the search and what in it is not to be entered."""
     for kind, shapes in Area(record.scenario.environment).shapes.items():
         for polygon in shapely.get_parts(shapes):
             yield _polygon(polygon, origin, {'kind': kind})
 
 
-def _explored(record: TargetRecord, origin: OriginSettings) -> Row:
+def _explored(record: RunLog, origin: OriginSettings) -> Row:
     """Return where less than half is unseen, in 3D of the whole height."""
     explored = explored_after(record)
     unseen = np.atleast_3d(explored.values).mean(axis=2)
@@ -123,7 +123,7 @@ def _polygon(polygon: BaseGeometry, origin: OriginSettings, properties: Row) -> 
     return _feature(mapping(placed), properties)
 
 
-def _ways(record: TargetRecord, origin: OriginSettings) -> Iterator[Row]:
+def _ways(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
     spacing = 1e-3 * np.linalg.norm(np.ptp(record.scenario.environment.array(), axis=1))
     for robot, states in sorted(record.trajectories.items()):
         way = states[np.isfinite(states).all(axis=1)]

@@ -1,26 +1,45 @@
-"""Makes the events of a run from what its filter, planner and robots say, as their records."""
+"""Makes the events of a page from the facts of a run."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.records import Cluster, FoundTarget
-from maasi_planner.team import Decision
-from maasi_sim.run.log import Decided, Explored, Fact, Left, Measured, RobotAt, Truth, Updated
-from maasi_sim.run.scores import score
-from maasi_sim.run.topics import point
+from maasi_filter.records import FoundTarget
+from maasi_sim.run.facts import (
+    Decided,
+    Ended,
+    Explored,
+    Fact,
+    Found,
+    Joined,
+    KeepOutsChanged,
+    Left,
+    Measured,
+    Modes,
+    PathPlanned,
+    Photographed,
+    Present,
+    RobotAt,
+    Said,
+    SceneFound,
+    Shown,
+    Truth,
+    Updated,
+)
+from maasi_sim.run.scores import Scoreboard
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning, shades
+from maasi_sim.run.view.pictures import picture
+from maasi_sim.run.view.scene import zones_as
 
 _NOT_ALLOWED = -1e29  # objectives below this stand for candidates that are not allowed
 # Status of a robot: of AgentState, and what only those who watch know.
 MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
-_ACTIVITIES = ('searching', 'returning', 'recharging')  # of a `CuboidDecision`
 _SILENCE = 3.0  # a robot is silent when others say where they are for so long without it [s]
-_MOST_POINTS = 40  # points of a planned way that are shown
+_MOST_POINTS = 40  # points of a planned path that are shown
 _MOST_PLACES = 400  # of a tour
 
 
@@ -56,42 +75,67 @@ class EventMaker:
         self._digits = max(0, 4 - math.floor(math.log10(max(extent, 1e-6))))
         self._thinning = Thinning(STATE_PERIOD)
         self._last: dict[tuple[str, str], float] = {}
-        self._truth: FloatArray | None = None
-        self._found: dict[str, dict[int, FloatArray]] = {}
+        order = scene.get('scoring_order', 2.0)
+        self._board = Scoreboard(scene.get('scoring_radius'), order, None)
+        self._team: set[str] | None = None
         self._status: dict[str, int] = {}
-        # Last time, place and battery of each robot.
-        self._heard: dict[str, tuple[float, list[float], float]] = {}
-        self._activity: dict[str, str] = {}
+        # Last time, position and battery of each robot.
+        self._states: dict[str, tuple[float, list[float], float]] = {}
         self._modes: dict[str, str] = {}
-        self._planned: dict[str, list[int]] = {}
         self._measured: set[tuple[str, str, int]] = set()
         self.latest = 0.0  #: latest time of an event [s]
 
-    def take(self, fact: Fact) -> None:
-        """Add the events of a fact of a search in one process."""
+    def add(self, fact: Fact) -> None:
+        """Add the events of a fact."""
+        time = fact.time
         match fact:
             case RobotAt():
-                self.robot(fact.time, fact.robot, fact.pose)
+                self._add_state(fact)
+            case Present():
+                self._team = set(fact.robots)
+            case Joined():
+                self._team = {*(self._team or ()), fact.robot}
+                self._say(time, fact.robot, 'team', 'joined')
             case Left():
-                self.leave(fact.time, fact.robot)
-            case Measured(time, item):
-                self.seen(time, item.robot, item.pose.position, item.values, item.covariances)
+                self._add_left(fact)
+            case Measured():
+                self._add_measurement(fact)
+            case Photographed():
+                self._add_picture(fact)
+            case Found():
+                self._add_found(time, fact.team, fact.targets)
             case Updated():
                 if fact.found is not None:
-                    self.found(fact.time, fact.team, fact.found)
-                self.filter(fact.time, fact.team, fact.expected, fact.clusters, fact.members)
+                    self._add_found(time, fact.team, fact.found)
+                self._add_update(fact)
             case Decided():
-                planner, decision = self.scene['planner'], fact.decision
-                self.plan(fact.time, fact.team, planner, decision, fact.indices, fact.explored)
+                self._add_decision(fact)
+            case PathPlanned():
+                self._add_path(time, fact.robot, fact.positions)
             case Explored():
-                self.map(fact.time, fact.team, fact.lower, fact.step, fact.letters, fact.share)
+                self._add_map(fact)
+            case KeepOutsChanged():
+                zones = [zone for zone in self.scene.get('zones', []) if zone['kind'] != 'keep_out']
+                self._put(time, 'zones', '', [*zones, *zones_as('keep_out', fact.shapes)])
             case Truth():
-                self.truth(fact.time, fact.targets)
+                self._add_truth(time, np.asarray(fact.targets, dtype=float))
+            case SceneFound():
+                # What a scenario says is better.
+                self._add_to_scene({k: v for k, v in fact.parts.items() if k not in self.scene})
+            case Said():
+                self._say(time, fact.source, fact.level, fact.text)
+            case Modes() if self._modes.get(fact.node) != fact.text:
+                self._modes[fact.node] = fact.text
+                self._put(time, 'mode', fact.node, fact.text)
+            case Shown():
+                self._put(time, fact.kind, fact.owner, *map(self._plain, fact.content))
+            case Ended():
+                self.end(fact.reason, fact.text)
 
     def _put(self, time: float, kind: str, owner: str, *content: Any) -> None:
         key = kind, owner
         # Times of a kind and owner rise, so that the last one before a time can be searched.
-        rising = max(round(time, 3), self._last.get(key, -math.inf))
+        rising = max(round(time, 3), self._last.get(key, 0.0))
         self._last[key] = rising
         self.latest = max(self.latest, rising)
         event: Event = [rising, kind, owner, *content]
@@ -102,125 +146,110 @@ class EventMaker:
         place = np.asarray(position, dtype=float).tolist()
         return [*(round(value, self._digits) for value in place), 0.0, 0.0][:3]
 
-    def robot(
-        self,
-        time: float,
-        name: str,
-        pose: Sequence[float],
-        battery: float = -1.0,
-        status: int = 1,
-        reason: str = '',
-    ) -> None:
-        """Add the state of a robot; pose is x, y, z [m] and yaw [rad]."""
-        place = [*self._place(pose[:3]), round(float(pose[3]), 3)]
-        # Its last time: after a jump of the clock the others have their turn first.
-        until = self._heard[name][0] if name in self._heard else time
-        self._heard[name] = time, place, round(float(battery), 3)
-        self._set_status(time, name, int(status), reason)
-        for other, (heard, *_) in self._heard.items():
-            if until - heard > _SILENCE and self._status[other] < LEFT:
-                self._set_status(time, other, SILENT, f'not heard for {_SILENCE:g} s')
-
-    def leave(self, time: float, name: str) -> None:
-        """Add that a robot leaves the team."""
-        self.message(time, name, 'team', 'left')
-        if name in self._heard:
-            self._set_status(time, name, LEFT, '')
+    def _plain(self, content: Any) -> Any:
+        """Return content with positions, which are arrays, as they are shown."""
+        if isinstance(content, np.ndarray):
+            return self._place(content)
+        if isinstance(content, (list, tuple)):
+            return [self._plain(item) for item in content]
+        return content
 
     def starting(self, ready: int, total: int) -> None:
         """Add how many nodes are ready before the first step."""
         self._put(0.0, 'start', '', ready, total)
 
-    def modes(self, time: float, node: str, words: str) -> None:
-        """Add the modes of the robots of a planner node, as it describes them."""
-        if self._modes.get(node) != words:
-            self._modes[node] = words
-            self._put(time, 'mode', node, words)
-
     def end(self, reason: str = '', text: str = '') -> None:
-        """Add that the run has ended, and why: nobody is on the way any more."""
+        """Add that the run has ended, and why: no robot is on its way any more."""
         if reason:
             self._put(self.latest, 'end', '', reason, text)
-        for name in self._heard:
+        for name in self._states:
             if self._status[name] < UNAVAILABLE:
                 self._set_status(self.latest, name, ENDED, '')
 
+    def _add_state(self, fact: RobotAt) -> None:
+        # The driver of a robot that left may publish for a while.
+        away = self._team is not None and fact.robot not in self._team
+        if away or not all(map(math.isfinite, fact.pose)):
+            return
+        time, name = max(fact.time, 0.0), fact.robot
+        place = [*self._place(fact.pose[:3]), round(float(fact.pose[3]), 3)]
+        # Its last time: after a jump of the clock the others have their turn first.
+        until = self._states[name][0] if name in self._states else time
+        self._states[name] = time, place, round(float(fact.battery), 3)
+        self._set_status(time, name, fact.status, fact.reason)
+        for other, (last, *_) in self._states.items():
+            if until - last > _SILENCE and self._status[other] < LEFT:
+                self._set_status(time, other, SILENT, f'not heard for {_SILENCE:g} s')
+
+    def _add_left(self, fact: Left) -> None:
+        if self._team is not None:
+            self._team.discard(fact.robot)
+        self._say(fact.time, fact.robot, 'team', 'left')
+        if fact.robot in self._states:
+            self._set_status(fact.time, fact.robot, LEFT, '')
+
     def _set_status(self, time: float, name: str, status: int, reason: str) -> None:
-        _, place, battery = self._heard[name]
+        _, place, battery = self._states[name]
         self._put(time, 'robot', name, place, battery, status, reason)
         before, self._status[name] = self._status.get(name), status
         words = {UNAVAILABLE: 'cannot go on: ', SILENT: ''}
         if status in words and status != before:
-            self.message(time, name, 'fault', words[status] + (reason or 'no reason given'))
+            self._say(time, name, 'fault', words[status] + (reason or 'no reason given'))
         elif before in words and status < UNAVAILABLE:
-            self.message(time, name, 'team', 'takes part again')
+            self._say(time, name, 'team', 'takes part again')
 
-    def seen(
-        self,
-        time: float,
-        robot: str,
-        position: ArrayLike,
-        values: Iterable[ArrayLike],
-        covariances: Sequence[ArrayLike | None] | FloatArray | None,
-    ) -> None:
-        """Add a measurement: range, bearing and elevation of detections, some with a covariance."""
+    def _add_measurement(self, fact: Measured) -> None:
         rows = []
-        for index, detection in enumerate(values):
-            own = None if covariances is None else covariances[index]
+        for index, detection in enumerate(fact.values):
+            own = None if fact.covariances is None else fact.covariances[index]
             if own is None:
-                deviations = self.scene.get('robots', {}).get(robot, {}).get('deviations', [0.0])
+                deviations = self._robot(fact.robot).get('deviations', [0.0])
             else:
                 deviations = np.sqrt(np.maximum(np.diag(np.asarray(own, dtype=float)), 0.0))
             row = (*padded(detection), *padded(deviations))
             rows.append([significant(value) for value in row])
-        self._put(time, 'seen', robot, self._place(position), rows)
+        self._put(fact.time, 'seen', fact.robot, self._place(fact.position), rows)
 
-    def picture(self, time: float, robot: str, content: Sequence[Any]) -> None:
-        """Add what a camera saw as its robot measured, see `maasi_sim.run.view.messages`."""
-        self._put(time, 'picture', robot, *content)
+    def _add_picture(self, fact: Photographed) -> None:
+        item = fact.measured
+        assert item.pose is not None
+        try:
+            content = picture(fact.image, self._robot(item.robot), item.pose, item.values)
+        except ValueError:
+            # One that cannot be decoded is not shown.
+            return
+        self._put(fact.time, 'picture', item.robot, *content)
 
-    def filter(
-        self,
-        time: float,
-        space: str,
-        expected: float,
-        clusters: Iterable[Cluster],
-        members: Iterable[tuple[str, int]],
-    ) -> None:
-        """Add an update of a filter; members are robots with the index of their measurement."""
-        self._measured.update((space, name, index) for name, index in members)
+    def _robot(self, name: str) -> dict[str, Any]:
+        facts: dict[str, Any] = self.scene.get('robots', {}).get(name, {})
+        return facts
+
+    def _add_update(self, fact: Updated) -> None:
+        team = fact.team
+        self._measured.update((team, name, index) for name, index in fact.members)
         rows = [
             [*self._place(item.position), significant(item.mass), *_upper(item.covariance)]
-            for item in clusters
+            for item in fact.clusters
         ]
-        self._put(time, 'filter', space, significant(expected), rows, len(self._measured))
+        content = significant(fact.expected), rows, len(self._measured)
+        self._put(fact.time, 'filter', team, *content)
 
-    def found(self, time: float, space: str, targets: Iterable[FoundTarget]) -> None:
+    def _add_found(self, time: float, team: str, targets: Sequence[FoundTarget]) -> None:
         """Add all found targets of a filter."""
-        # A filter that knows what others found counts only what it found itself.
-        shared = space in self.scene.get('robots', {})
-        own = [item for item in targets if not shared or item.robot == space]
-        before = self._found.get(space, {})
+        before = {item.id for item in self._board.found.get(team, ())}
         rows = []
-        for item in own:
+        for item in targets:
             place, when = self._place(item.position), round(max(item.time, 0.0), 3)
             rows.append([item.id, *place, _upper(item.covariance), item.robot, when])
             if item.id not in before:
-                self.message(time, item.robot, 'found', f'target {item.id} at {_words(place)} m')
-        self._found[space] = {item.id: padded(item.position) for item in own}
-        self._put(time, 'found', space, rows)
+                self._say(time, item.robot, 'found', f'target {item.id} at {_words(place)} m')
+        self._board.found[team] = targets
+        self._put(time, 'found', team, rows)
         self._score(time)
 
-    def plan(
-        self,
-        time: float,
-        space: str,
-        planner: str,
-        decision: Decision,
-        indices: Mapping[str, int],
-        explored: float,
-    ) -> None:
-        """Add a joint decision; `indices` number the decisions of each robot."""
+    def _add_decision(self, fact: Decided) -> None:
+        time, decision = fact.time, fact.decision
+        planner = fact.planner or self.scene.get('planner', '')
         rows = []
         for name, robot in sorted(decision.robots.items()):
             terms = robot.control_cost, robot.target_refinement, robot.exploration, robot.objective
@@ -234,52 +263,50 @@ class EventMaker:
                 ]
                 for values in np.column_stack(columns).tolist()
             ]
-            waypoint = self._place(robot.waypoint)
-            row = [name, indices[name], robot.chosen, waypoint, candidates, robot.reason]
+            waypoint, number = self._place(robot.waypoint), fact.indices[name]
+            row = [name, number, robot.chosen, waypoint, candidates, robot.reason]
             rows.append([*row, list(map(self._place, robot.tour[:_MOST_PLACES]))])
             words = f'to {_words(waypoint)}'
             if robot.stays:
                 words = f'stays: {robot.reason or decision.reason or "no candidate"}'
-            self.message(time, name, 'decision', f'decision {indices[name]}: {words}')
+            self._say(time, name, 'decision', f'decision {number}: {words}')
         if not rows and decision.reason:
-            self.message(time, space or planner, 'decision', decision.reason)
-        total = self._objective(decision.objective)
-        self._put(time, 'plan', space, planner, round(explored, 4), total, decision.reason, rows)
+            self._say(time, fact.team or planner, 'decision', decision.reason)
+        total, share = self._objective(decision.objective), round(fact.explored, 4)
+        self._put(time, 'plan', fact.team, planner, share, total, decision.reason, rows)
         for name, robot in sorted(decision.robots.items()):
             if len(robot.positions):
-                self.way(time, name, robot.positions)
+                self._add_path(time, name, robot.positions)
 
     @staticmethod
     def _objective(value: float) -> float | None:
         allowed = math.isfinite(value) and value > _NOT_ALLOWED
         return significant(value) if allowed else None
 
-    def way(self, time: float, robot: str, positions: Sequence[ArrayLike] | FloatArray) -> None:
-        """Add the planned way of a robot: places [m]."""
+    def _add_path(self, time: float, robot: str, positions: Sequence[Any] | FloatArray) -> None:
         count = len(positions)
         chosen = np.linspace(0, count - 1, min(count, _MOST_POINTS)).round().astype(int)
         self._put(time, 'way', robot, [self._place(positions[item]) for item in chosen])
 
-    def map(
-        self,
-        time: float,
-        space: str,
-        corner: Sequence[float] | FloatArray,
-        spacing: Sequence[float] | FloatArray,
-        values: NDArray[Any],
-        explored: float | None = None,
-    ) -> None:
-        """Add e on a grid of two or three axes, below 0 where no target may be, or its `shades`.
-
-        explored: the explored share, where it is known.
-        """
-        shape = [*values.shape, 1][:3]
+    def _add_map(self, fact: Explored) -> None:
+        lower, step, values = fact.lower, fact.step, fact.values
+        shape = np.array(values.shape)
+        if 'bounds' not in self.scene:
+            bounds = np.round(np.stack([lower, lower + step * (shape - 1)], axis=1), 4)
+            self._add_to_scene({'bounds': bounds.tolist()})
+        share = fact.share
+        if share is None and len(shape) == 2:
+            # The message of a grid has one resolution; nodes of the map are on all bounds.
+            low, high = np.array(self.scene['bounds'])[:2].T
+            exact = (high - low) / np.maximum(shape - 1, 1)
+            if np.allclose(exact, step, rtol=0.05):
+                lower, step = low, exact
+        if share is None:
+            share = 1.0 - self._unexplored(lower, step, values)
         text = values.tobytes().decode() if values.dtype.kind == 'S' else shades(values)
-        steps = [significant(value) for value in padded(spacing)]
-        if explored is None:
-            explored = 1.0 - self._unexplored(corner, spacing, values)
-        share = round(explored, 4)
-        self._put(time, 'map', space, self._place(corner), steps, shape, text, share)
+        steps = [significant(value) for value in padded(step)]
+        content = self._place(lower), steps, [*values.shape, 1][:3], text, round(share, 4)
+        self._put(fact.time, 'map', fact.team, *content)
 
     def _unexplored(self, corner: Any, spacing: Any, values: FloatArray) -> float:
         """Return the mean of e where targets may be, by the prior; ends of axes count half."""
@@ -303,58 +330,25 @@ class EventMaker:
             weights *= weighted.reshape(*weighted.shape, *[1] * (values.ndim - 2))
         return float((weights * np.maximum(values, 0.0)).sum() / max(weights.sum(), 1e-12))
 
-    def zones(self, time: float, zones: list[dict[str, Any]]) -> None:
-        """Add the zones of the area that hold from now on, see `scene.zones_of`."""
-        self._put(time, 'zones', '', zones)
+    def _add_truth(self, time: float, truth: FloatArray) -> None:
+        before, self._board.truth = self._board.truth, truth
+        if before is None or not np.array_equal(before, truth):
+            self._put(time, 'truth', '', [self._place(item) for item in truth])
+            self._score(time)
 
-    def truth(self, time: float, targets: ArrayLike) -> None:
-        """Add the true targets, (n, 2 or 3) [m]."""
-        now = np.asarray(targets, dtype=float)
-        if self._truth is not None and np.array_equal(self._truth, now):
-            return
-        self._truth = now
-        self._put(time, 'truth', '', [self._place(item) for item in now])
-        self._score(time)
-
-    def cuboid(self, time: float, message: Any) -> None:
-        """Add a `CuboidDecision` of a search of buildings."""
-        robot = message.robot
-        activity = _ACTIVITIES[min(int(message.activity), len(_ACTIVITIES) - 1)]
-        shots = []
-        for shot in message.snapshots:
-            chance = round(float(shot.detection_probability), 3)
-            shots.append([int(shot.cuboid), *self._place(point(shot.position)), chance])
-            self.message(time, robot, 'found', f'snapshot of cuboid {shot.cuboid}')
-        before, self._activity[robot] = self._activity.get(robot, activity), activity
-        if before != activity:
-            self.message(time, robot, 'team', activity)
-        planned = [int(item) for item in message.planned]
-        if self._planned.get(robot, []) != planned:
-            self._planned[robot] = planned
-            words = ', '.join(map(str, planned)) or 'none'
-            self.message(time, robot, 'decision', f'cuboids that it plans to visit: {words}')
-        lists = list(message.heard), planned, shots
-        target = self._place(point(message.target))
-        self._put(time, 'cuboid', robot, activity, message.how, target, *lists, bool(message.done))
-
-    def add_to_scene(self, part: Scene) -> None:
+    def _add_to_scene(self, parts: Scene) -> None:
         """Add to the scene what became known later."""
-        self.scene.update(part)
-        self._listener([round(self.latest, 3), 'scene', '', part])
+        if parts:
+            self.scene.update(parts)
+            self._listener([round(self.latest, 3), 'scene', '', parts])
 
-    def message(self, time: float, source: str, level: str, text: str) -> None:
-        """Add a line of the log."""
+    def _say(self, time: float, source: str, level: str, text: str) -> None:
         self._put(time, 'log', '', level, source, ' '.join(text.split())[:400])
 
     def _score(self, time: float) -> None:
-        radius = self.scene.get('scoring_radius')
-        if self._truth is None or radius is None:
-            return
-        size = len(self.scene['bounds'])
-        positions = [item for found in self._found.values() for item in found.values()]
-        found = np.array(positions).reshape(-1, 3)[:, :size]
-        scores = score(found, self._truth[:, :size], radius, self.scene.get('scoring_order', 2.0))
-        match = scores.match
-        rmse = significant(match.rmse) if math.isfinite(match.rmse) else None
-        numbers = match.true_found, match.missed, match.false_found
-        self._put(time, 'score', '', *map(int, numbers), rmse, significant(scores.gospa.total))
+        scores = self._board.scores()
+        if scores is not None:
+            match = scores.match
+            rmse = significant(match.rmse) if math.isfinite(match.rmse) else None
+            numbers = match.true_found, match.missed, match.false_found
+            self._put(time, 'score', '', *map(int, numbers), rmse, significant(scores.gospa.total))

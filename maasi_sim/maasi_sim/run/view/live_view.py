@@ -10,13 +10,15 @@ from collections.abc import Callable
 from typing import Any
 
 from maasi_sim.run.bag import load_types
+from maasi_sim.run.facts import Said
+from maasi_sim.run.message_facts import MARKERS
 from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.run.topics import time_at
 from maasi_sim.run.view.event_log import Scene
 from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.messages import MARKERS, MessageEvents
 from maasi_sim.run.view.page_file import open_browser
 from maasi_sim.run.view.pictures import IMAGES
+from maasi_sim.run.view.recording import facts_for
 from maasi_sim.run.view.server import Commander, Hub, ViewServer
 
 _FAREWELL = 2.0  # for browsers to take the last events [s]
@@ -74,11 +76,10 @@ class LiveView:
                 ):
                     function(self.maker, *arguments)
 
-    def restart(self) -> EventMaker:
+    def restart(self) -> None:
         """Forget all events: another run begins."""
         self.hub.restart(self._scene)
         self.maker = EventMaker(dict(self._scene), self.hub.put)
-        return self.maker
 
     def finish(self, text: str) -> None:
         """Show what waits, and say how the run ended; browsers that come now get all of it."""
@@ -86,7 +87,7 @@ class LiveView:
             return
         self._ended.set()
         self._feed.join(_PATIENCE)
-        self.maker.message(self.maker.latest, 'run', 'team', text)
+        self.maker.add(Said(self.maker.latest, 'run', 'team', text))
         self.hub.close()
 
     def wait_for_reader(self, say: Callable[[str], object]) -> None:
@@ -125,17 +126,21 @@ class RunPage(LiveView):
         self._waits = waits
         self._ready = -1
         self._known = 'bounds' in scene
-        self._messages = MessageEvents(self.maker, waits, None if waits else self.restart)
+        self._facts = facts_for(scene, waits, None if waits else self.restart)
 
     def put_message(self, topic: str, type_name: str, data: bytes) -> None:
         """Take a message of a topic that is shown; never waits."""
-        decode, take = self._types.deserialize_cdr, self._messages.take
+        decode = self._types.deserialize_cdr
         if type_name in IMAGES:
             # Not in the queue: most are never decoded.
             stamp = time_at(data, 4) / 1e9
-            self._messages.pictures.keep(topic, stamp, lambda: decode(data, type_name))
+            self._facts.pictures.keep(topic, stamp, lambda: decode(data, type_name))
         elif not (self._known and type_name == MARKERS):
-            self.put(lambda _: take(topic, type_name, decode(data, type_name)))
+            self.put(lambda _: self._add(topic, type_name, decode(data, type_name)))
+
+    def _add(self, topic: str, type_name: str, message: Any) -> None:
+        for fact in self._facts.of(topic, type_name, message):
+            self.maker.add(fact)
 
     def starting(self, ready: int, total: int) -> None:
         """Show how many nodes are ready."""

@@ -12,7 +12,7 @@ def event_log(log: RunLog, name: str = 'search') -> EventLog:
     events: list[Event] = []
     maker = EventMaker(scene_of(name, log.scenario, log.seed), events.append)
     for fact in log.facts:
-        maker.take(fact)
+        maker.add(fact)
     maker.end(log.end_reason)
     return EventLog(maker.scene, events)
 
@@ -25,8 +25,8 @@ class SearchPage:
         self._live = LiveView(scene_of('search', log.scenario, log.seed))
         self._live.announce(print)
         for fact in log.facts:
-            self._live.put(EventMaker.take, fact)
-        log.listeners.append(lambda fact: self._live.put(EventMaker.take, fact))
+            self._live.put(EventMaker.add, fact)
+        log.listeners.append(lambda fact: self._live.put(EventMaker.add, fact))
 
     def end(self) -> None:
         """Show how the search ended, and stop serving."""

@@ -13,12 +13,12 @@ from rclpy.utilities import remove_ros_args
 
 from maasi_filter.ros.qos import reader_of
 from maasi_sim.run.bag import IMAGE_TYPE
+from maasi_sim.run.message_facts import is_read
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.run_options import ViewOptions, add_view_options
 from maasi_sim.run.topics import message_class
 from maasi_sim.run.view.event_log import Scene
 from maasi_sim.run.view.live_view import RunPage
-from maasi_sim.run.view.messages import is_shown
 from maasi_sim.run.view.scene import empty_scene, scene_of
 from maasi_sim.scenario.layering import ScenarioError
 
@@ -33,7 +33,7 @@ class ViewNode(Node):
 
     Subscribes
     ----------
-    every topic of a type in `maasi_sim.run.view.messages.TOPICS`, as its publishers offer it
+    every topic of a type in `maasi_sim.run.message_facts.READERS`, as its publishers offer it
     """
 
     def __init__(self, put: Callable[[str, str, bytes], None]) -> None:
@@ -47,7 +47,7 @@ class ViewNode(Node):
         for topic, types in self.get_topic_names_and_types():
             # Raw images would load the network of real robots.
             unknown = topic not in self._known and types[0] != IMAGE_TYPE
-            if not (unknown and is_shown(topic, types[0])):
+            if not (unknown and is_read(topic, types[0])):
                 continue
             offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
             if not offers:

@@ -10,8 +10,8 @@ from maasi_sim.arguments import Parser
 from maasi_sim.run.bag import BagError
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.run_folder import ResultsError
-from maasi_sim.run.view.messages import read_events
 from maasi_sim.run.view.page_file import REPLAY, open_browser, write_replay
+from maasi_sim.run.view.recording import read_events
 
 DONE, WRONG_INPUT, NOT_WRITTEN = 0, 2, 4
 

@@ -1,0 +1,207 @@
+"""What happens in a run, as facts.
+
+Two adapters write them: `maasi_sim.search`, and `MessageFacts` from the messages of nodes. Of them
+live the log of a search (`RunLog`), its report, and its page (`EventMaker`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from shapely.geometry.base import BaseGeometry
+
+from maasi_filter.arrays import FloatArray
+from maasi_filter.models.pose import Pose
+from maasi_filter.records import AgentMeasurement, Cluster, FoundTarget
+from maasi_planner.team import Decision
+
+
+@dataclass(frozen=True)
+class Fact:
+    """Something that happened, at a time since the first step [s]."""
+
+    time: float
+
+
+@dataclass(frozen=True)
+class Present(Fact):
+    """The robots that take part from a step on."""
+
+    robots: Sequence[str]
+    step: int
+
+
+@dataclass(frozen=True)
+class Joined(Fact):
+    """A robot joined the team."""
+
+    robot: str
+
+
+@dataclass(frozen=True)
+class Left(Fact):
+    """A robot left the team."""
+
+    robot: str
+
+
+@dataclass(frozen=True)
+class RobotAt(Fact):
+    """Where a robot is, by its odometry: x, y, z [m] and yaw [rad].
+
+    battery: 0 to 1, negative where unknown; status: a constant of `AgentState`; step: -1, unknown.
+    """
+
+    robot: str
+    pose: tuple[float, ...]
+    battery: float = -1.0
+    status: int = 1
+    reason: str = ''
+    step: int = -1
+
+
+@dataclass(frozen=True)
+class Decided(Fact):
+    """A joint decision of a team; `indices` number the decisions of each robot."""
+
+    team: str
+    decision: Decision
+    indices: Mapping[str, int]
+    explored: float
+    planner: str = ''
+    duration: float = 0.0  # computation [s]
+
+
+@dataclass(frozen=True)
+class PathPlanned(Fact):
+    """The path that a robot is going to take, (n, 3) [m]."""
+
+    robot: str
+    positions: Sequence[Sequence[float]] | FloatArray
+
+
+@dataclass(frozen=True)
+class Measured(Fact):
+    """A measurement, from a position [m] at a pose; None: of which the attitude is unusable.
+
+    values: range [m], bearing and elevation [rad] of each detection; covariances: of each, or None.
+    """
+
+    robot: str
+    position: Sequence[float] | FloatArray
+    pose: Pose | None
+    values: Sequence[Any] | FloatArray
+    covariances: Sequence[FloatArray | None] | FloatArray | None
+    index: int
+    batch: int = 1  # 0: that nobody asked for
+
+    @classmethod
+    def of(cls, time: float, item: AgentMeasurement) -> Measured:
+        """Return the fact of a measurement for a filter."""
+        values, covariances, pose = item.values, item.covariances, item.pose
+        return cls(time, item.robot, pose.position, pose, values, covariances, item.index)
+
+
+@dataclass(frozen=True)
+class Photographed(Fact):
+    """The image, a message, of which the detections of a measurement are."""
+
+    measured: Measured
+    image: Any
+
+
+@dataclass(frozen=True)
+class Found(Fact):
+    """All targets that a filter has found itself, up to the update with a batch."""
+
+    team: str
+    targets: Sequence[FoundTarget]
+    batch: int
+
+
+@dataclass(frozen=True)
+class Updated(Fact):
+    """An update of a filter by measurements: robots and their index."""
+
+    step: int
+    team: str
+    members: Sequence[tuple[str, int]]
+    found: Sequence[FoundTarget] | None  # by this filter, all of them; None: as before
+    expected: float = 0.0
+    clusters: Sequence[Cluster] = ()
+    duration: float = 0.0  # computation [s]
+    #: Where all robots are, (3,) [m]: the truth, in a search in one process.
+    positions: Mapping[str, FloatArray] = field(default_factory=dict)
+    new: Sequence[FoundTarget] = ()  # newly found, where `found` comes as a message of its own
+    batch: int = 0
+
+
+@dataclass(frozen=True)
+class Explored(Fact):
+    """The exploration function of a planner on a grid: values, or letters of `shades`.
+
+    Values below 0: there may be no target. share: explored; None: not said.
+    """
+
+    team: str
+    lower: FloatArray
+    step: FloatArray
+    values: Any
+    share: float | None = None
+
+
+@dataclass(frozen=True)
+class KeepOutsChanged(Fact):
+    """The keep-out zones that hold from now on [m, map]."""
+
+    shapes: Sequence[BaseGeometry]
+
+
+@dataclass(frozen=True)
+class Truth(Fact):
+    """The true targets, (n, d) [m]."""
+
+    targets: FloatArray
+
+
+@dataclass(frozen=True)
+class SceneFound(Fact):
+    """Parts of a scene that became known by a message."""
+
+    parts: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Said(Fact):
+    """A line of a log: a level ('team', 'warning', 'fault', ...), whose it is, and its text."""
+
+    source: str
+    level: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Modes(Fact):
+    """The modes of the robots of a planner node, as it describes them."""
+
+    node: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Shown(Fact):
+    """An event of the page that only one kind of mission has: its kind, owner and content."""
+
+    kind: str
+    owner: str
+    content: Sequence[Any]
+
+
+@dataclass(frozen=True)
+class Ended(Fact):
+    """The end of a run: a key of `END_REASONS`, and what is known of it."""
+
+    reason: str
+    text: str = ''

@@ -1,0 +1,354 @@
+"""Facts of the messages of a run, as they come in a bag or a ROS graph."""
+
+import contextlib
+import math
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from maasi_filter.geometry.area import level_shape
+from maasi_filter.geometry.environment import Zone
+from maasi_filter.models.pose import Pose
+from maasi_filter.records import Cluster, FoundTarget, Label
+from maasi_planner.team import Decision, RobotDecision
+from maasi_sim.run.buildings.facts import READERS as BUILDINGS
+from maasi_sim.run.facts import (
+    Decided,
+    Ended,
+    Explored,
+    Fact,
+    Found,
+    Joined,
+    KeepOutsChanged,
+    Left,
+    Measured,
+    Modes,
+    PathPlanned,
+    Photographed,
+    Present,
+    RobotAt,
+    Said,
+    SceneFound,
+    Truth,
+    Updated,
+)
+from maasi_sim.run.topics import point, seconds
+from maasi_sim.run.view.pictures import IMAGES, Pictures
+
+STEP = 'maasi_msgs/msg/LockstepStep'
+MARKERS = 'visualization_msgs/msg/MarkerArray'
+# Fields of a `RobotDecision`, and of the message of a candidate.
+_SAME = ('control_cost', 'target_refinement', 'exploration', 'objective', 'measurements')
+_COLUMNS = {**dict(zip(_SAME, _SAME)), 'lengths': 'length'}
+# Levels of rcl_interfaces/msg/Log and of diagnostic_msgs/msg/DiagnosticStatus.
+_WARNING, _ERROR = 30, 40
+_FINE, _STALE = 0, 3
+_DIAGNOSTIC_WORDS = {0: 'well again', 1: 'warning', 2: 'error', 3: 'stale'}
+# Parts of a scene, by the last part of a topic of markers and of their namespace.
+_PARTS = {
+    ('markers', 'obstacles'): 'obstacles',
+    ('search_area', 'obstacles'): 'blocks',
+    ('search_area', 'objects'): 'objects',
+    ('markers', 'cuboids'): 'cuboids',
+}
+# A stamp that is earlier than the topic's last one by more than this begins another run [s].
+_REWIND = 10.0
+
+
+class MessageFacts:
+    """Turns messages, of `rosbags` or of ROS, into facts.
+
+    Parameters
+    ----------
+    waits : bool
+        Whether the run begins at its first step; else with the first state of a robot.
+    teams : collection of str
+        Robots with a filter of their own, of which messages say what others found, too.
+    dimension : int
+        Of the search, 2 or 3; of found targets.
+    on_restart : callable, optional
+        Called where the time jumps back, as in a bag that is played again.
+    """
+
+    def __init__(
+        self,
+        waits: bool = False,
+        teams: Collection[str] = (),
+        dimension: int = 3,
+        on_restart: Callable[[], object] | None = None,
+    ) -> None:
+        self._waits, self._teams, self._dimension = waits, teams, dimension
+        self._on_restart = on_restart
+        self._early: list[tuple[str, str, Any]] = []
+        self.begin: float | None = None  #: time of the first step, or state [s]
+        self._team: set[str] | None = None
+        self._latest = 0.0
+        # Time of the last message of each topic with the time of the run [s].
+        self._last: dict[str, float] = {}
+        self._levels: dict[str, int] = {}
+        self.pictures = Pictures()  #: images that wait for their detections
+        self.notes: dict[Any, Any] = {}  #: what readers of other missions remember
+
+    def of(self, topic: str, kind: str, message: Any) -> Iterator[Fact]:
+        """Return the facts of a message of a topic, for which `is_read` is true."""
+        if self._waits and kind != STEP:
+            self._early.append((topic, kind, message))
+            return
+        self._waits = False
+        for fact in READERS[kind][0](self, topic, message):
+            self._latest = max(self._latest, fact.time)
+            yield fact
+        early, self._early = self._early, []
+        for item in early:
+            yield from self.of(*item)
+
+    def _now(self, topic: str, message: Any) -> float:
+        """Return the run's time of a message; begin again if time jumps back on its topic."""
+        now = seconds(message.stamp if hasattr(message, 'stamp') else message.header.stamp)
+        if self.begin is None:
+            self.begin = now
+        if now < self._last.get(topic, now) - _REWIND and self._on_restart is not None:
+            self._on_restart()
+            self.begin, self._team, self._latest = now, None, 0.0
+            self._last.clear()
+            self.notes.clear()
+        self._last[topic] = now
+        return now - self.begin
+
+    def time(self, message: Any) -> float:
+        """Return the run's time of a message with a header [s]; 0 before the run has begun."""
+        return 0.0 if self.begin is None else seconds(message.header.stamp) - self.begin
+
+    def _step(self, topic: str, message: Any) -> Iterator[Fact]:
+        time = self._now(topic, message)
+        before, self._team = self._team, set(message.robots)
+        if before != self._team:
+            for name in sorted((before or set()) - self._team):
+                yield Left(time, name)
+            for name in sorted(self._team - (self._team if before is None else before)):
+                yield Joined(time, name)
+            yield Present(time, sorted(self._team), int(message.step))
+
+    def _state(self, topic: str, message: Any) -> Iterator[Fact]:
+        turn = message.pose.pose.orientation
+        yaw = math.atan2(
+            2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
+        )
+        pose = (*point(message.pose.pose.position), yaw)
+        battery = float(message.battery)
+        yield RobotAt(
+            self._now(topic, message),
+            message.robot,
+            pose,
+            battery if math.isfinite(battery) else -1.0,
+            int(message.goal_status),
+            message.reason,
+            int(message.step),
+        )
+
+    def _image(self, topic: str, message: Any) -> Iterator[Fact]:
+        self.pictures.keep(topic, seconds(message.header.stamp), lambda: message)
+        return iter(())
+
+    def _detections(self, topic: str, message: Any) -> Iterator[Fact]:
+        values, covariances = [], []
+        for item in message.detections:
+            own = np.asarray(item.covariance, dtype=float)
+            size = round(len(own) ** 0.5)
+            usable = size in (2, 3) and size**2 == len(own)
+            covariances.append(own.reshape(size, size) if usable else None)
+            values.append((item.range, item.bearing, item.elevation))
+        place, turn = point(message.pose.pose.position), message.pose.pose.orientation
+        pose = None
+        with contextlib.suppress(ValueError):
+            pose = Pose(np.array(place), np.array([turn.w, turn.x, turn.y, turn.z]))
+        index, batch = int(message.measurement), int(message.batch_id)
+        measured = Measured(
+            self.time(message), message.robot, place, pose, values, covariances, index, batch
+        )
+        yield measured
+        image = self.pictures.at(topic.rpartition('/')[0], seconds(message.header.stamp))
+        if image is not None and pose is not None:
+            yield Photographed(measured.time, measured, image)
+
+    def _update(self, topic: str, message: Any) -> Iterator[Fact]:
+        clusters = []
+        for item in message.clusters:
+            covariance = np.asarray(item.covariance, dtype=float).reshape(3, 3)
+            clusters.append(
+                Cluster(np.array(point(item.position)), covariance, item.radius, item.mass)
+            )
+        team = _space(topic)
+        yield Updated(
+            self.time(message),
+            int(message.step),
+            team,
+            [(item.robot, int(item.measurement)) for item in message.members],
+            None,
+            message.expected_number,
+            clusters,
+            new=self._targets(team, message.newly_found),
+            batch=int(message.batch_id),
+        )
+
+    def _found(self, topic: str, message: Any) -> Iterator[Fact]:
+        team = _space(topic)
+        targets = self._targets(team, message.targets)
+        yield Found(self.time(message), team, targets, int(message.batch_id))
+
+    def _targets(self, team: str, messages: Iterable[Any]) -> list[FoundTarget]:
+        """Return the targets that a filter found itself, not those that others told it."""
+        return [
+            self._target(item) for item in messages if team not in self._teams or item.robot == team
+        ]
+
+    def _target(self, item: Any) -> FoundTarget:
+        size = self._dimension
+        covariance = np.array(item.covariance, dtype=float).reshape(3, 3)
+        return FoundTarget(
+            int(item.id),
+            np.array(point(item.position))[:size],
+            covariance[:size, :size],
+            item.robot,
+            int(item.measurement),
+            seconds(item.stamp) - (self.begin or 0.0),
+            label=Label(item.class_id, item.score, item.identity),
+        )
+
+    def _keep_outs(self, _: str, message: Any) -> Iterator[Fact]:
+        shapes = [level_shape(Zone.model_validate(text)) for text in message.zones]
+        yield KeepOutsChanged(self.time(message), shapes)
+
+    def _plan(self, topic: str, message: Any) -> Iterator[Fact]:
+        robots, reasons = {}, _reasons(message)
+        for item in message.robots:
+            columns = {
+                name: np.array([getattr(row, field) for row in item.candidates])
+                for name, field in _COLUMNS.items()
+            }
+            places = np.array([point(row.position) for row in item.candidates]).reshape(-1, 3)
+            # Planned paths are messages of their own.
+            path, waypoint = np.zeros((0, 3)), np.array(point(item.waypoint))
+            # Recordings of earlier versions have no tours.
+            tour = np.array([point(place) for place in getattr(item, 'tour', ())]).reshape(-1, 3)
+            robots[item.robot] = RobotDecision(
+                int(item.chosen),
+                waypoint,
+                path,
+                path[:, 0],
+                places,
+                **columns,
+                reason=reasons.get(item.robot, ''),
+                tour=tour,
+            )
+        indices = {item.robot: int(item.decision) for item in message.robots}
+        decision = Decision(int(message.step), robots, message.objective, reason=message.reason)
+        team, share = _space(topic), float(message.explored)
+        yield Decided(self.time(message), team, decision, indices, share, message.planner)
+
+    def _path(self, topic: str, message: Any) -> Iterator[Fact]:
+        points = [point(item.pose.position) for item in message.poses]
+        yield PathPlanned(self.time(message), _space(topic).rpartition('/')[2], points)
+
+    def _grid(self, topic: str, message: Any) -> Iterator[Fact]:
+        info, step = message.info, float(message.info.resolution)
+        values = np.asarray(message.data, dtype=float).reshape(info.height, info.width).T / 100.0
+        values[values < 0.0] = -1.0
+        lower = np.add(point(info.origin.position)[:2], 0.5 * step)
+        yield Explored(self.time(message), _space(topic), lower, np.array([step, step]), values)
+
+    def _cloud(self, topic: str, message: Any) -> Iterator[Fact]:
+        rows = np.frombuffer(bytes(message.data), dtype='<f4').reshape(-1, message.point_step // 4)
+        axes = [np.unique(rows[:, axis]).astype(float) for axis in range(3)]
+        shape = [len(axis) for axis in axes]
+        if np.prod(shape) != len(rows) or min(shape) < 2:
+            return
+        lower, upper = (np.array([axis[end] for axis in axes]) for end in (0, -1))
+        step = (upper - lower) / (np.array(shape) - 1)
+        values = np.nan_to_num(rows[:, 3].reshape(shape).astype(float), nan=-1.0)
+        yield Explored(self.time(message), _space(topic), lower, step, values)
+
+    def _truth(self, _: str, message: Any) -> Iterator[Fact]:
+        points = [point(item.position) for item in message.poses]
+        yield Truth(self._latest, np.array(points).reshape(-1, 3)[:, : self._dimension])
+
+    def _scenery(self, topic: str, message: Any) -> Iterator[Fact]:
+        parts: dict[str, list[Any]] = {}
+        for item in message.markers:
+            part = _PARTS.get((topic.rpartition('/')[2], item.ns.rpartition('/')[2]), '')
+            place, size = point(item.pose.position), np.array(point(item.scale))
+            if part == 'obstacles':
+                parts.setdefault(part, []).append([*place[:2], 0.5 * float(size[0])])
+            elif part:
+                box = np.stack([place - 0.5 * size, place + 0.5 * size], axis=1)
+                parts.setdefault(part, []).append(box.tolist())
+        if parts:
+            yield SceneFound(self._latest, parts)
+
+    def _log(self, _: str, message: Any) -> Iterator[Fact]:
+        level = int(message.level)
+        if level >= _WARNING:
+            word = 'fault' if level >= _ERROR else 'warning'
+            yield Said(self._latest, message.name, word, message.msg)
+
+    def _diagnostics(self, _: str, message: Any) -> Iterator[Fact]:
+        for status in message.status:
+            raw = status.level
+            level = raw[0] if isinstance(raw, bytes) else int(raw)
+            before = self._levels.get(status.name, _FINE)
+            self._levels[status.name] = level
+            if level != before and _FINE <= level <= _STALE:
+                word = 'fault' if level > 1 else 'warning' if level else 'team'
+                text = f'{_DIAGNOSTIC_WORDS[level]}: {status.message}'
+                yield Said(self._latest, status.name, word, text)
+            for item in status.values:
+                if item.key == 'search':
+                    yield Modes(self._latest, status.name, item.value)
+
+    def _end(self, _: str, message: Any) -> Iterator[Fact]:
+        reason, _, text = message.data.partition('\n')
+        yield Ended(self._latest, reason, text)
+
+
+Reader = Callable[[MessageFacts, str, Any], Iterator[Fact]]
+# By type: what reads it, and the last parts that the name of its topic may have; none: any.
+READERS: dict[str, tuple[Reader, tuple[str, ...]]] = {
+    STEP: (MessageFacts._step, ()),
+    'maasi_msgs/msg/AgentState': (MessageFacts._state, ()),
+    'maasi_msgs/msg/DetectionArray': (MessageFacts._detections, ()),
+    'maasi_msgs/msg/FilterUpdate': (MessageFacts._update, ()),
+    'maasi_msgs/msg/FoundTargetArray': (MessageFacts._found, ('found_targets',)),
+    'maasi_msgs/msg/KeepOuts': (MessageFacts._keep_outs, ()),
+    'maasi_msgs/msg/PlanDecision': (MessageFacts._plan, ()),
+    'nav_msgs/msg/Path': (MessageFacts._path, ('plan',)),
+    'nav_msgs/msg/OccupancyGrid': (MessageFacts._grid, ('exploration',)),
+    'sensor_msgs/msg/PointCloud2': (MessageFacts._cloud, ('exploration',)),
+    'geometry_msgs/msg/PoseArray': (MessageFacts._truth, ('ground_truth/targets',)),
+    'std_msgs/msg/String': (MessageFacts._end, ('ending',)),
+    MARKERS: (MessageFacts._scenery, ('ground_truth/markers', 'search_area', 'markers')),
+    'rcl_interfaces/msg/Log': (MessageFacts._log, ('rosout',)),
+    'diagnostic_msgs/msg/DiagnosticArray': (MessageFacts._diagnostics, ('diagnostics',)),
+    **{kind: (MessageFacts._image, (name,)) for kind, name in IMAGES.items()},
+    **BUILDINGS,
+}
+
+
+def is_read(topic: str, kind: str) -> bool:
+    """Return whether there are facts in the messages of a topic of a type."""
+    if kind not in READERS or '/_' in topic:
+        return False
+    _, names = READERS[kind]
+    return not names or any(topic.endswith(f'/{name}') for name in names)
+
+
+def _reasons(message: Any) -> dict[str, str]:
+    """Return the reasons of a decision by robot, as `decision_to_ros` joins them."""
+    names = '|'.join(re.escape(item.robot) for item in message.robots)
+    parts = re.split(rf'(?:^|; )({names}): ', message.reason)[1:] if names else []
+    return dict(zip(parts[::2], parts[1::2]))
+
+
+def _space(topic: str) -> str:
+    return topic.rpartition('/')[0].strip('/')

@@ -1,0 +1,47 @@
+"""The events of a recording: what a page shows of it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from maasi_sim.run.bag import Bag, BagError
+from maasi_sim.run.message_facts import MARKERS, STEP, MessageFacts, is_read
+from maasi_sim.run.view.event_log import Event, EventLog, Scene
+from maasi_sim.run.view.event_maker import EventMaker
+from maasi_sim.run.view.scene import empty_scene, scene_of_facts
+
+_PROGRESS = 1000  # messages between two words on the progress
+
+
+def facts_for(
+    scene: Scene, waits: bool, on_restart: Callable[[], object] | None = None
+) -> MessageFacts:
+    """Return what makes facts of the messages of a run with a scene."""
+    dimension = len(scene.get('bounds') or (0, 0, 0))
+    return MessageFacts(waits, scene.get('robots', {}).keys(), dimension, on_restart)
+
+
+def read_events(path: Path, progress: Callable[[float], None] | None = None) -> EventLog:
+    """Return the event log of a recording or a run's folder; `progress` takes the share read."""
+    with Bag(path) as bag:
+        shown = {topic: kind for topic, kind in bag.types.items() if is_read(topic, kind)}
+        if not any(kind.startswith('maasi_msgs/') for kind in shown.values()):
+            raise BagError(f'{path}: holds no topic of a search')
+        try:
+            scene = scene_of_facts(bag.scenario())
+        except (BagError, ValueError, KeyError):
+            scene = empty_scene(bag.path.name)
+        events: list[Event] = []
+        maker = EventMaker(scene, events.append)
+        facts = facts_for(scene, STEP in {shown[topic] for topic in shown if bag.counts[topic]})
+        # Markers hold what a scenario says better.
+        known = 'bounds' in scene
+        topics = [topic for topic, kind in shown.items() if not (known and kind == MARKERS)]
+        total = sum(bag.counts[topic] for topic in topics)
+        for index, item in enumerate(bag.messages(topics)):
+            if progress is not None and index % _PROGRESS == 0:
+                progress(index / total)
+            for fact in facts.of(item.topic, item.type, item.message):
+                maker.add(fact)
+        maker.end()
+    # Parts that became known later belong to the scene of a replay.
+    return EventLog(maker.scene, [event for event in events if event[1] != 'scene'])
