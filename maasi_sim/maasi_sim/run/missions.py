@@ -1,17 +1,19 @@
 """The one place where a scenario file becomes a mission."""
 
+import importlib
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from maasi_filter.geometry.polygons import InputWarning
-from maasi_sim.run.buildings.building_mission import BuildingMission
-from maasi_sim.run.buildings.scenario import NAME, check_cuboid_scenario, is_cuboid_scenario
-from maasi_sim.run.mission import Mission
+from maasi_sim.run.mission import MISSIONS, Mission
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import check_scenario, find_scenario, read_scenario
+
+for module in sorted(Path(__file__).parent.glob('*/*_mission.py')):
+    importlib.import_module(f'{__package__}.{module.parent.name}.{module.stem}')
 
 
 def load_mission(
@@ -20,21 +22,21 @@ def load_mission(
     """Read a scenario file; parameters and errors as of `load_scenario`."""
     path = find_scenario(path)
     layer = read_scenario(path)
-    if is_cuboid_scenario(layer):
-        for origin, (key, value) in (overrides or {}).items():
-            if key == ('planner', 'name') and value != NAME:
-                raise ScenarioError(
-                    f"{origin}: read '{value}'; {path} is a search of buildings, for which only "
-                    f"'{NAME}' is allowed"
-                )
-        return BuildingMission(path.stem, check_cuboid_scenario(layer, overrides))
-    for origin, given in (overrides or {}).items():
-        if given == (('planner', 'name'), NAME):
+    planner = layer.data.get('planner')
+    name = str(planner.get('name')) if isinstance(planner, dict) else ''
+    mission = MISSIONS.get(name)
+    for origin, (key, value) in (overrides or {}).items():
+        if key == ('planner', 'name') and MISSIONS.get(str(value)) is not mission:
+            what, allowed = 'a search for targets', 'one that searches for them'
+            if mission is not None:
+                what, allowed = mission.what, f"'{name}'"
             raise ScenarioError(
-                f"{origin}: read '{NAME}', which searches buildings; {path} is a search for "
-                'targets, for which any other planner is allowed'
+                f"{origin}: read '{value}'; {path} is {what}, for which the allowed planner is "
+                f'{allowed}'
             )
-    return TargetMission(path.stem, check_scenario(layer, overrides))
+    if mission is None:
+        return TargetMission(path.stem, check_scenario(layer, overrides))
+    return mission.make(path.stem, layer, overrides)
 
 
 def checked_mission(

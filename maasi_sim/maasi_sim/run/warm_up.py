@@ -9,7 +9,6 @@ from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_planner.settings import PLANNERS
 from maasi_sim.compiling import compiling_said
-from maasi_sim.run.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.simulation.robots import Simulation
 
@@ -20,8 +19,11 @@ _SERVICES = ('lifecycle_msgs.srv', 'maasi_msgs.action', 'rcl_interfaces.srv', 's
 
 def warm_up() -> None:
     """Compile, or load from the cache, the kernels of simulations."""
+    from maasi_sim.run.missions import MISSIONS
+
     _simulate('mambo_turtlebot_obstacles', 'ranging_pair_3d')
-    mission_of(load_cuboid_scenario('buildings_four')).run(1)
+    for mission in MISSIONS.values():
+        mission.warm_up()
 
 
 def _simulate(*names: str) -> None:

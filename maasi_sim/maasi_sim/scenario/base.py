@@ -67,8 +67,8 @@ class BaseScenario(Settings):
     events: list[EventSettings] = Field(default_factory=list, description='Events of robots')
     stop: Literal['all_found', 'planner_done'] = Field(
         'all_found',
-        description='When the run ends well: all true targets are found, or all cuboids visited; '
-        'or every planner reports that nothing is left to gain',
+        description='When the run ends well: all true targets are found, or every planner reports '
+        'that nothing is left to gain',
     )
     on_exit: Literal['end', 'respawn'] = Field(
         'end', description='A node that dies ends the run, or is restarted'

@@ -70,9 +70,7 @@ class RobotTopics:
             power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
             present=True,
         )
-        # Robots that search buildings have no such setting.
-        unit = getattr(robot, 'battery_unit', 'fraction')
-        self._full = 100.0 if unit == 'percent' else 1.0
+        self._full = 100.0 if robot.battery_unit == 'percent' else 1.0
         self._battery.header.frame_id = f'{name}/base_link'
         self.needed: list[str] = []  #: full names of the topics that its driver needs
         if self._odometry_publisher is not None:

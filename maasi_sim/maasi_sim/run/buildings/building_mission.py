@@ -15,8 +15,14 @@ from maasi_sim.run.buildings.observer import (
     build_cuboid_report,
     cuboid_summary,
 )
-from maasi_sim.run.buildings.scenario import CuboidScenario
-from maasi_sim.run.mission import Mission
+from maasi_sim.run.buildings.scenario import (
+    NAME,
+    CuboidScenario,
+    check_cuboid_scenario,
+    load_cuboid_scenario,
+    mission_of,
+)
+from maasi_sim.run.mission import MISSIONS, Mission, MissionKind
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
 from maasi_sim.run.run_options import Options
 from maasi_sim.scenario.preflight import Preflight
@@ -72,6 +78,13 @@ class BuildingMission(Mission[CuboidRecord]):
         from maasi_sim.run.buildings.report_figure import plot_cuboid_report
 
         return plot_cuboid_report(record)
+
+
+MISSIONS[NAME] = MissionKind(
+    'a search of buildings',
+    lambda name, *values: BuildingMission(name, check_cuboid_scenario(*values)),
+    lambda: mission_of(load_cuboid_scenario('buildings_four')).run(1),
+)
 
 
 def _planner_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -> NodePlan:

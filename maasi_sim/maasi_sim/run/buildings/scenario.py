@@ -39,6 +39,7 @@ class SearchRobotSettings(SearcherSettings):
     )
 
     # The simulation moves it, and it flies from the start.
+    battery_unit: ClassVar[str] = 'fraction'
     external: ClassVar[bool] = False
     takes_off: ClassVar[bool] = False
 
