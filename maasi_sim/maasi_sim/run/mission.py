@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-import numpy as np
 from rosbags.typesys.store import Typestore
 
-from maasi_filter.arrays import FloatArray
-from maasi_sim.run.topics import STEP, seconds
+from maasi_sim.run.facts import Fact
+from maasi_sim.run.log import RunEnd, RunRecord
+from maasi_sim.run.message_facts import MessageFacts
+from maasi_sim.run.topics import STEP
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,35 +22,12 @@ if TYPE_CHECKING:
     from maasi_sim.run.run_options import Options
     from maasi_sim.scenario.preflight import Preflight
 
-UNAVAILABLE = 5  # goal status of `AgentState`
 
+class Observer:
+    """Writes the record of a run from serialised messages, and detects the end of the run.
 
-@dataclass(frozen=True)
-class RunEnd:
-    """How a run ended."""
-
-    reason: str  # a key of `END_REASONS`
-    time: float  # simulated [s]
-    wall_time: float  # from the first step [s]
-    events: list[dict[str, Any]] = field(default_factory=list)
-
-
-@dataclass
-class RunRecord:
-    """Data of the reports of all kinds of runs; trajectories are time [s], x, y, z [m], (n, 4)."""
-
-    name: str
-    scenario: Any
-    seed: int
-    trajectories: dict[str, FloatArray] = field(default_factory=dict, kw_only=True)
-    events: list[dict[str, Any]] = field(default_factory=list, kw_only=True)
-    end_reason: str = field(default='', kw_only=True)
-    end_time: float = field(default=0.0, kw_only=True)
-    wall_time: float = field(default=0.0, kw_only=True)
-
-
-class Observer(ABC):
-    """Gathers the data of a report from serialised messages, and detects the end of the run."""
+    Topics are those of `kinds`, by their type; further ones are not needed.
+    """
 
     #: Of the needed `topics`, filter updates: added after the messages they refer to.
     update_topics: Sequence[str] = ()
@@ -61,34 +38,30 @@ class Observer(ABC):
     completed: Any = None  #: time and step at which all was found, where the scenario stops then
     settled: str | None = None  #: the reason, once all planners report that nothing is left to gain
     end_step: int | None = None  #: step at which the search ended by itself
-    #: Time of the first step [s]: a clock that the run follows may start at any time.
-    begin: float | None = None
-    robots: list[str] | None = None  #: that take part, as the simulation says
 
-    def __init__(
-        self, name: str, scenario: Any, seed: int, types: Typestore, topics: Sequence[str]
-    ) -> None:
-        self.name, self.scenario, self.seed, self._types = name, scenario, seed, types
-        self._events: list[dict[str, Any]] = []
-        self._states: dict[str, list[bytes]] = {f'/{name}/state': [] for name in scenario.names()}
-        self.topics = [STEP, *topics, *self._states]
+    def __init__(self, log: RunRecord, types: Typestore, kinds: Mapping[str, str]) -> None:
+        self.log, self._types = log, types
+        scenario = log.scenario
+        states = {f'/{name}/state': 'AgentState' for name in scenario.names()}
+        self._kinds = {
+            topic: f'maasi_msgs/msg/{kind}'
+            for topic, kind in {STEP: 'LockstepStep', **kinds, **states}.items()
+        }
+        self.topics = list(self._kinds)
+        self._facts = MessageFacts(True, scenario.names(), len(scenario.environment.array()))
 
     def add(self, topic: str, data: bytes) -> None:
         """Add a serialised message; one of another topic is ignored."""
-        if topic in self._states:
-            self._states[topic].append(data)
-        elif topic == STEP and self.completed is None:
-            self._note_step(self.decode(data, 'LockstepStep'))
+        if topic in self._kinds:
+            kind = self._kinds[topic]
+            for fact in self._facts.of(topic, kind, self._types.deserialize_cdr(data, kind)):
+                self.handle(fact)
 
-    def last_steps(self) -> dict[str, int]:
-        """Return the step of the last state of each robot that has sent one."""
-        return {
-            name: int(self.decode(states[-1], 'AgentState').step)
-            for name, states in zip(self.scenario.names(), self._states.values())
-            if states
-        }
+    def handle(self, fact: Fact) -> None:
+        """Take a fact of a message."""
+        self.log.add(fact)
 
-    def settle(self) -> None:  # noqa: B027 - missions that evaluate at the end need none
+    def settle(self) -> None:
         """Evaluate the messages added since the last call."""
 
     def rests_on(self, topic: str, data: bytes, last_step: int) -> bool:
@@ -99,58 +72,10 @@ class Observer(ABC):
         """Return in words the measurements of updates up to a step that have not arrived."""
         return []
 
-    @abstractmethod
-    def record(self, end: RunEnd) -> Any:
+    def record(self, end: RunEnd) -> RunRecord:
         """Return the record of the run, up to the step at which all was found."""
-
-    def decode(self, data: bytes, name: str) -> Any:
-        """Return a message of `maasi_msgs`."""
-        return self._types.deserialize_cdr(data, f'maasi_msgs/msg/{name}')
-
-    def time(self, stamp: Any) -> float:
-        """Return the time since the first step [s]."""
-        return seconds(stamp) - (self.begin or 0.0)
-
-    def _note_step(self, step: Any) -> None:
-        if self.begin is None:
-            self.begin = seconds(step.stamp)
-        before, self.robots = self.robots, list(step.robots)
-        if before is not None:
-            now, time = set(self.robots), self.time(step.stamp)
-            for word, names in (('lost', set(before) - now), ('joined', now - set(before))):
-                for name in sorted(names):
-                    self._events.append({'time': time, 'agent': name, 'event': word})
-
-    def _until(self, kind: str, messages: Iterable[bytes], end: float) -> Iterator[Any]:
-        """Yield messages up to a time [s]; all at once would take much memory."""
-        for data in messages:
-            item = self.decode(data, kind)
-            if self.time(item.header.stamp) <= end:
-                yield item
-
-    def _complete(self, record: RunRecord, end: RunEnd) -> None:
-        record.end_reason, record.wall_time = end.reason, end.wall_time
-        # Several steps after the end may have been taken.
-        own = [event for event in self._events if event['time'] <= record.end_time]
-        events = [*record.events, *own]
-        for name, messages in zip(self.scenario.names(), self._states.values()):
-            way, away = [], False
-            for state in self._until('AgentState', messages, record.end_time):
-                time, place = self.time(state.header.stamp), state.pose.pose.position
-                way.append((time, place.x, place.y, place.z))
-                if self.robots is None and (state.goal_status == UNAVAILABLE) != away:
-                    away = not away
-                    word = 'lost' if away else 'joined'
-                    events.append({'time': time, 'agent': name, 'event': word})
-                    if away and state.reason:
-                        events[-1]['reason'] = state.reason
-            record.trajectories[name] = rows(way, 4)
-        record.events = sorted([*events, *end.events], key=lambda event: float(event['time']))
-
-
-def rows(values: list[Any], width: int) -> FloatArray:
-    """Return rows as an array, (0, width) without any."""
-    return np.array(values, dtype=float).reshape(-1, width)
+        self.log.close(end, end.time)
+        return self.log
 
 
 Record = TypeVar('Record', bound=RunRecord, contravariant=True)

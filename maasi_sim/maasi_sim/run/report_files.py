@@ -7,10 +7,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from maasi_sim.machine import this_machine
-from maasi_sim.run.mission import Mission, RunRecord
+from maasi_sim.run.log import RunRecord
+from maasi_sim.run.mission import Mission
 from maasi_sim.run.run_folder import ResultsError, remove, write_text, write_whole
 
 REPORT_VERSION = 1  # of the format of `report.json`, see `report.schema.json`
@@ -31,7 +30,6 @@ MISSION_REASONS: dict[tuple[str, str], str] = {}  # of a mission, in place of th
 def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> dict[str, Any]:
     """Return a report: what was run, what came of it, how it ended; no number is infinite."""
     wall = record.wall_time
-    moves = {name: np.diff(way[:, 1:], axis=0) for name, way in record.trajectories.items()}
     return {
         'version': REPORT_VERSION,
         'mission': mission,
@@ -40,9 +38,7 @@ def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> di
         'planner': record.scenario.planner.name,
         'agents': record.scenario.names(),
         **content,
-        'distance': {
-            name: finite(np.linalg.norm(move, axis=1).sum()) for name, move in moves.items()
-        },
+        'distance': {name: finite(length) for name, length in record.distance.items()},
         'end_reason': record.end_reason,
         'wall_time': wall,
         'real_time_factor': record.end_time / wall if wall > 0.0 else None,

@@ -1,6 +1,8 @@
 """Gathers the data of a search of buildings from its messages, and reports them."""
 
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Mapping
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,9 +11,13 @@ from rosbags.typesys.store import Typestore
 from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings.agent import Activity
 from maasi_planner.buildings.preplanning import CoveragePlan
+from maasi_sim.run.buildings.facts import CuboidsDecided
 from maasi_sim.run.buildings.scenario import CuboidScenario
-from maasi_sim.run.mission import Observer, RunEnd, RunRecord, rows
+from maasi_sim.run.facts import Fact
+from maasi_sim.run.log import RunEnd, RunRecord
+from maasi_sim.run.mission import Observer
 from maasi_sim.run.report_files import MISSION_REASONS, summary, whole_report
+from maasi_sim.run.topics import point
 
 MISSION_REASONS['buildings', 'all_found'] = 'all cuboids visited'
 
@@ -23,86 +29,80 @@ class Moment(NamedTuple):
     step: int
 
 
-@dataclass
 class CuboidRecord(RunRecord):
-    """The record of a search of buildings."""
+    """The record of a search of buildings.
 
-    mission: CoveragePlan
-    snapshots: list[dict[str, Any]] = field(default_factory=list)  # several may be of one cuboid
-    choices: dict[str, int] = field(default_factory=dict)  # decisions by how they were made
-    # Time [s] and robots that search.
-    active: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    solve_times: FloatArray = field(default_factory=lambda: np.zeros(0))  # of decisions [s]
-    most_heard: int = 0  # largest number of robots received at once
+    Attributes
+    ----------
+    mission : CoveragePlan
+        What is to be visited.
+    snapshots : list of dict
+        Of cuboids, in the order of time; several may be of one cuboid.
+    choices : dict
+        Number of decisions by how they were made.
+    active : (n, 2) array
+        Time [s], and number of robots that search.
+    solve_times : (n,) array
+        Of decisions [s].
+    most_heard : int
+        Largest number of robots received at once.
+    completed : Moment or None
+        When all was visited.
+    """
+
+    snapshots: list[dict[str, Any]]
+    choices: Mapping[str, int]
+    active: FloatArray
+    solve_times: FloatArray
+    most_heard: int
     completed: Moment | None = None
 
+    def __init__(self, scenario: CuboidScenario, seed: int, name: str = '') -> None:
+        super().__init__(scenario, seed, name)
+        self.mission: CoveragePlan = scenario.mission()
+        self.snapshots = []
+        self._decisions: list[tuple[float, Any]] = []
+        self.visited_at: dict[int, Moment] = {}
 
-class CuboidObserver(Observer):
-    """Gathers the data of a report from serialised messages, in the order of arrival."""
-
-    def __init__(self, name: str, scenario: CuboidScenario, seed: int, types: Typestore) -> None:
-        self._decisions: dict[str, list[Any]] = {
-            f'/{name}/decision': [] for name in scenario.names()
-        }
-        super().__init__(name, scenario, seed, types, list(self._decisions))
-        self.mission = scenario.mission()
-        self.total = len(self.mission.cells)
-        self._visited_at: dict[int, Moment] = {}
-        self._done: dict[str, int] = {}
-
-    def add(self, topic: str, data: bytes) -> None:
-        """See `Observer.add`."""
-        super().add(topic, data)
-        if topic not in self._decisions:
+    def add(self, fact: Fact) -> None:
+        """See `RunRecord.add`."""
+        super().add(fact)
+        if not isinstance(fact, CuboidsDecided):
             return
-        decision = self.decode(data, 'CuboidDecision')
-        self._decisions[topic].append(decision)
-        moment = Moment(self.time(decision.header.stamp), int(decision.step))
+        time, decision = fact.time, fact.message
+        self._decisions.append((time, decision))
+        moment = Moment(time, int(decision.step))
         for shot in decision.snapshots:
-            self.measurements += 1
-            known = self._visited_at.get(int(shot.cuboid))
-            self.news = self.news or known is None
+            self.snapshots.append(self._snapshot(shot, decision.robot, time))
+            known = self.visited_at.get(int(shot.cuboid))
             if known is None or moment.step < known.step:
-                self._visited_at[int(shot.cuboid)] = moment
-        self.found = len(self._visited_at)
-        self.explored = self.found / self.total
-        if decision.done:
-            self._done.setdefault(topic, moment.step)
-        if len(self._done) == len(self._decisions):
-            self.settled = 'every planner knows that all cuboids are visited'
-            self.end_step = max(self._done.values())
-        if self.scenario.stop == 'all_found' and self.found == self.total:
-            self.completed = max(self._visited_at.values())
-            self.end_step = self.completed.step
+                self.visited_at[int(shot.cuboid)] = moment
 
-    def record(self, end: RunEnd) -> CuboidRecord:
-        """See `Observer.record`."""
-        end_time = end.time if self.completed is None else self.completed.time
-        record = CuboidRecord(self.name, self.scenario, self.seed, self.mission, end_time=end_time)
-        if self.found == self.total:
-            record.completed = max(self._visited_at.values())
+    @property
+    def complete(self) -> bool:
+        """Whether all cuboids are visited."""
+        return len(self.visited_at) == len(self.mission.cells)
+
+    def close(self, end: RunEnd, until: float) -> None:
+        """See `RunRecord.close`."""
+        if self.complete:
+            self.completed = max(self.visited_at.values())
+        taken = [item for item in self._decisions if item[0] <= until]
         active: dict[float, int] = {}
-        times = []
-        for name, decisions in zip(self.scenario.names(), self._decisions.values()):
-            activity = Activity.SEARCHING
-            for item in decisions:
-                time = self.time(item.header.stamp)
-                if time > end_time:
-                    continue
-                record.choices[item.how] = record.choices.get(item.how, 0) + 1
-                record.most_heard = max(record.most_heard, len(item.heard))
-                times.append(float(item.solve_time))
-                before, activity = activity, Activity(item.activity)
-                active[time] = active.get(time, 0) + (activity is Activity.SEARCHING)
-                if activity is not before:
-                    word = activity.name.lower()
-                    record.events.append({'time': time, 'agent': name, 'event': word})
-                record.snapshots += [self._snapshot(shot, name, time) for shot in item.snapshots]
-        record.snapshots.sort(key=lambda shot: (shot['time'], shot['agent'], shot['cuboid']))
-        record.active = rows(sorted(active.items()), 2)
-        record.solve_times = np.array(times)
-        self._complete(record, end)
-        return record
+        before: dict[str, Activity] = {}
+        for time, item in sorted(taken, key=lambda pair: str(pair[1].robot)):
+            activity = Activity(item.activity)
+            active[time] = active.get(time, 0) + (activity is Activity.SEARCHING)
+            if activity is not before.get(item.robot, Activity.SEARCHING):
+                self._note(time, item.robot, activity.name.lower())
+            before[item.robot] = activity
+        self.choices = Counter(item.how for _, item in taken)
+        self.most_heard = max((len(item.heard) for _, item in taken), default=0)
+        self.active = np.array(sorted(active.items())).reshape(-1, 2)
+        self.solve_times = np.array([float(item.solve_time) for _, item in taken])
+        shots = [shot for shot in self.snapshots if shot['time'] <= until]
+        self.snapshots = sorted(shots, key=itemgetter('time', 'agent', 'cuboid'))
+        super().close(end, until)
 
     def _snapshot(self, shot: Any, agent: str, time: float) -> dict[str, Any]:
         cell = self.mission.cells[int(shot.cuboid)]
@@ -112,11 +112,48 @@ class CuboidObserver(Observer):
             'face': cell.face,
             'agent': agent,
             'time': time,
-            'position': [shot.position.x, shot.position.y, shot.position.z],
-            'direction': [shot.direction.x, shot.direction.y, shot.direction.z],
+            'position': list(point(shot.position)),
+            'direction': list(point(shot.direction)),
             'distance': float(shot.distance),
             'detection_probability': float(shot.detection_probability),
         }
+
+
+class CuboidObserver(Observer):
+    """See `Observer`; it ends when all is visited, or all robots know that."""
+
+    log: CuboidRecord
+
+    def __init__(self, name: str, scenario: CuboidScenario, seed: int, types: Typestore) -> None:
+        log = CuboidRecord(scenario, seed, name)
+        decisions = [f'/{name}/decision' for name in scenario.names()]
+        super().__init__(log, types, dict.fromkeys(decisions, 'CuboidDecision'))
+        self.total = len(log.mission.cells)
+        self._done: dict[str, int] = {}
+
+    def handle(self, fact: Fact) -> None:
+        """See `Observer.handle`."""
+        log, found = self.log, self.found
+        super().handle(fact)
+        if not isinstance(fact, CuboidsDecided):
+            return
+        decision = fact.message
+        self.found, self.measurements = len(log.visited_at), len(log.snapshots)
+        self.news = self.news or self.found > found
+        self.explored = self.found / self.total
+        if decision.done:
+            self._done.setdefault(decision.robot, int(decision.step))
+        if len(self._done) == len(log.scenario.names()):
+            self.settled = 'every planner knows that all cuboids are visited'
+            self.end_step = max(self._done.values())
+        if log.scenario.stop == 'all_found' and log.complete:
+            self.completed = max(log.visited_at.values())
+            self.end_step = self.completed.step
+
+    def record(self, end: RunEnd) -> CuboidRecord:
+        """See `Observer.record`."""
+        self.log.close(end, end.time if self.completed is None else self.completed.time)
+        return self.log
 
 
 def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
