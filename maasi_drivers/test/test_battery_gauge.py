@@ -39,5 +39,5 @@ def test_in_lockstep_a_reading_counts_from_the_step_after_its_own(order):
     )
     for second, expected in ((0.0, []), (1.0, [1.0]), (1.0, []), (2.5, [0.75, 0.5])):
         taken.clear()
-        topic.take_before(round(second * 1e9))
+        topic.receive_before(round(second * 1e9))
         assert taken == expected

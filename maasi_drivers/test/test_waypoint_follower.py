@@ -25,7 +25,7 @@ def test_a_ground_robot_reaches_its_goal_in_the_step_in_which_it_is_there():
     follower = follower_of()
     assert follower.update(at(0.3))[0].tolist() == [0.0] * 4 and follower.status == GoalStatus.IDLE
     target = goal(1.0)
-    assert follower.take(target) is None
+    assert follower.adopt(target) is None
     command, reached = follower.update(at(0.0))
     assert command[0] > 0.1 and reached is None and follower.status == GoalStatus.MOVING
     command, reached = follower.update(at(0.96))
@@ -43,7 +43,7 @@ def test_a_ground_robot_reaches_its_goal_in_the_step_in_which_it_is_there():
 )
 def test_a_goal_may_bring_its_own_tolerance(tolerance, place, status):
     follower = follower_of()
-    follower.take(goal(1.0, tolerance=tolerance))
+    follower.adopt(goal(1.0, tolerance=tolerance))
     follower.update(place)
     assert follower.status.name == status
 
@@ -54,14 +54,14 @@ def test_a_flying_robot_holds_where_it_was_where_it_arrived_or_where_its_goal_is
     for place, held in ((0.0, 0.0), (0.4, 0.0)):
         command = follower.update(at(place))[0]
         assert (command[0] < -0.01) == (place > held)
-    follower.take(goal(1.0))
+    follower.adopt(goal(1.0))
     follower.update(at(0.2))
     assert_array_equal(follower.target, [1.0, 0.0, 1.0])
     follower.end(GoalStatus.CANCELED, 'cancelled')
     assert_allclose(follower.update(at(0.4))[0], np.zeros(4), atol=1e-12)
     assert follower.update(at(0.5))[0][0] < 0.0
     assert_array_equal(follower.target, [0.4, 0.0, 1.0])
-    follower.take(goal(3.0))
+    follower.adopt(goal(3.0))
     follower.update(at(2.97))
     assert follower.status == GoalStatus.REACHED and follower.update(at(2.8))[0][0] > 0.05
     # `let_go` lets a robot that has reached its waypoint hold that, `stay` does not.

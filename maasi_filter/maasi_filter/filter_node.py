@@ -257,7 +257,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     def _on_detections(self, name: str, message: DetectionArray) -> None:
         if not self.active:
             return
-        late = self._batches.take(name, message)
+        late = self._batches.receive(name, message)
         if late is not None:
             late.step = max(late.step, self._progress.step or 0)
             self._process(late)

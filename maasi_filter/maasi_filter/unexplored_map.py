@@ -194,7 +194,7 @@ class UnexploredMap:
             lengths[[0, -1]] *= 0.5
             cells = np.multiply.outer(cells, lengths)
         self._cells = cells
-        self._take(area)
+        self._adopt(area)
         self.ground, self._ever_open = self._volumes, self._open
 
     def adopt_area(self, area: Area) -> None:
@@ -203,7 +203,7 @@ class UnexploredMap:
         Ground that is closed now still counts as ground, and what was never open before does from
         now on.
         """
-        self._take(area)
+        self._adopt(area)
         opened = np.broadcast_to(self._open > self._ever_open + _ROUNDING, self._values.shape)
         opened = opened.reshape(self.values.shape)
         if not opened.any():
@@ -217,7 +217,7 @@ class UnexploredMap:
         self.ground = np.where(opened, added, self.ground)
         self._ever_open = np.maximum(self._open, self._ever_open)
 
-    def _take(self, area: Area) -> None:
+    def _adopt(self, area: Area) -> None:
         self.area, self.volume = area, area.volume
         #: Prior times inside at the nodes, (nx, ny, 1), with mean 1 over the area; 1: uniform.
         self.density = np.ones((1, 1, 1))

@@ -140,7 +140,7 @@ class GuidedPlay(Play):
     def go_to(self, *position):
         """Send a goal."""
         goal = Goal(1, 0, np.array(position, dtype=float))
-        replaced = self.driver.follower.take(goal)
+        replaced = self.driver.follower.adopt(goal)
         assert replaced is None
         self.link.goal_taken(goal)
         return self

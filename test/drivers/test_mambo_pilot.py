@@ -94,7 +94,7 @@ def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
         if flight.where[2] > 0.05:
             flight.firmware.body.velocity[0] += 0.2 * STEP  # wind
         if pose == 'pose':
-            flight.pilot.take_pose(flight.time, flight.firmware.state)
+            flight.pilot.update_pose(flight.time, flight.firmware.state)
         flight.step()
         distances.append(flight.left)
     assert flight.pilot.phase is MamboPhase.FLYING and max(distances[-100:]) < 0.03
@@ -291,7 +291,7 @@ def test_a_permission_ends_with_the_link():
     assert flight.pilot.phase is MamboPhase.GROUND
     flight.is_silent(60)
     for _ in range(100):
-        flight.pilot.take_pose(flight.time, flight.firmware.state)
+        flight.pilot.update_pose(flight.time, flight.firmware.state)
         flight.step()
     assert UNTIL_ARM in flight.pilot.problem and flight.firmware.take_offs == 0
     # Nor is there one while it is not heard.

@@ -105,7 +105,7 @@ class Flight:
                 for name, chosen in decision.robots.items():
                     if not chosen.stays:
                         number = self.coordinator.robots[name].plan.goal_id
-                        self.followers[name].take(Goal(number, self.step, chosen.waypoint))
+                        self.followers[name].adopt(Goal(number, self.step, chosen.waypoint))
             members = self.coordinator.measure(self.step, robots)
             self.coordinator.absorb({m.robot: robots[m.robot].state.pose for m in members}, [])
             if until():

@@ -110,7 +110,7 @@ class AgentDriver(RobotNode):
         self._state = StatePublisher(self)
         self._watchdog = Watchdog(self, self.link, self.sensor_input, self._state)
         self._responder = MeasurementResponder(self, self.sensor_input, self._watchdog)
-        self.frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
+        self.frames = RobotFrames(self, self.robot, partial(self._handle_localised, 'tf'))
         self.goals = GoalServer(self, self.link)
         KeepOutTopic(self, self._adopt_area, keep=False)
         if self._stop_latched:
@@ -120,7 +120,7 @@ class AgentDriver(RobotNode):
         self.offer_service('stop', self._on_stop)
         self.offer_service('release', self._on_release)
         if settings.poses == 'pose':
-            PoseTopic(self, partial(self._take_localised, 'pose'))
+            PoseTopic(self, partial(self._handle_localised, 'pose'))
         self.sensor_input.set_up()
         if settings.lockstep:
             topic = self.team_topic('lockstep/robots')
@@ -213,7 +213,7 @@ class AgentDriver(RobotNode):
         self._state.repeat()
         self.link.repeat()
 
-    def _take_localised(self, topic: str, stamp: int, pose: Pose) -> None:
+    def _handle_localised(self, topic: str, stamp: int, pose: Pose) -> None:
         if self.active and self.is_new_pose(topic, stamp):
             self.take_pose(self._pose_speed.place(stamp, pose))
 
@@ -235,11 +235,11 @@ class AgentDriver(RobotNode):
 
     def take_charge(self, charge: float) -> None:
         """Take the charge of the battery, 0 to 1; anything else is unknown."""
-        self._watchdog.take_charge(charge)
+        self._watchdog.update_charge(charge)
 
-    def take_frame(self, topic: str, stamp: int, data: Any, *, repeated: bool = False) -> None:
-        """Take an image or sweep; see `RobotNode.take_frame`."""
-        self._responder.take_frame(topic, stamp, data, repeated)
+    def receive_frame(self, topic: str, stamp: int, data: Any, *, repeated: bool = False) -> None:
+        """Take an image or sweep; see `RobotNode.receive_frame`."""
+        self._responder.receive_frame(topic, stamp, data, repeated)
 
     def end_goal(self, status: GoalStatus, reason: str) -> None:
         """End the present goal, if there is one."""

@@ -108,7 +108,7 @@ class GoalServer:
             goal.status, goal.reason = GoalStatus.ABORTED, problem
             self.finish(goal)
             return
-        replaced = self._driver.follower.take(goal)
+        replaced = self._driver.follower.adopt(goal)
         # Before the end of the other: the link must not stop the robot in between.
         self._link.goal_taken(goal)
         if replaced is not None:

@@ -116,8 +116,8 @@ class MeasurementResponder:
         self.queue.clear()
         self._answer = self._frame = None
 
-    def take_frame(self, topic: str, stamp: int, data: Any, repeated: bool) -> None:
-        """Take an image or sweep; see `RobotNode.take_frame`."""
+    def receive_frame(self, topic: str, stamp: int, data: Any, repeated: bool) -> None:
+        """Take an image or sweep; see `RobotNode.receive_frame`."""
         driver = self._driver
         if not driver.active or self._is_ahead('image stamp', f'{topic}.header.stamp', stamp):
             return

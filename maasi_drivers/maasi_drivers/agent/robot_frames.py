@@ -203,9 +203,9 @@ class RobotFrames:
                     f'{error}',
                 )
         if topic == 'tf' and self._settings.poses == 'tf':
-            self._take_pose()
+            self._handle_pose()
 
-    def _take_pose(self) -> None:
+    def _handle_pose(self) -> None:
         settings = self._settings
         try:
             stamp = self._buffer.latest(settings.frame, self._base)

@@ -183,7 +183,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         """Take the charge of the battery, 0 to 1; anything else is unknown."""
 
     @abstractmethod
-    def take_frame(self, topic: str, stamp: int, data: Any, *, repeated: bool = False) -> None:
+    def receive_frame(self, topic: str, stamp: int, data: Any, *, repeated: bool = False) -> None:
         """Take an image or sweep.
 
         Parameters

@@ -94,9 +94,9 @@ class PoseTopic:
         self, node: LockstepLifecycleNode[DriverSettings], on_pose: Callable[[int, Pose], None]
     ) -> None:
         self._node, self._on_pose = node, on_pose
-        node.create_subscription(PoseStamped, 'pose', self._take, sensor_reader(False))
+        node.create_subscription(PoseStamped, 'pose', self._receive, sensor_reader(False))
 
-    def _take(self, message: PoseStamped) -> None:
+    def _receive(self, message: PoseStamped) -> None:
         frame, wanted = message.header.frame_id.strip('/'), self._node.settings.frame
         try:
             if frame != wanted:
@@ -134,9 +134,9 @@ class BatteryTopic:
         if self._driver.settings.lockstep:
             self._waiting.append((stamp_from_ros(message.header.stamp), message.percentage))
         else:
-            self._take(message.percentage)
+            self._receive(message.percentage)
 
-    def _take(self, percentage: float) -> None:
+    def _receive(self, percentage: float) -> None:
         unit = self._driver.settings.battery_unit
         charge = charge_of(percentage, unit)
         if charge < 0.0 and not math.isnan(percentage):
@@ -147,7 +147,7 @@ class BatteryTopic:
             )
         self._driver.take_charge(charge)
 
-    def take_before(self, stamp: int) -> None:
+    def receive_before(self, stamp: int) -> None:
         """In lockstep: take the readings before a stamp [ns], which have arrived in any case."""
         handle = self._subscription.handle
         while (taken := handle.take_message(BatteryState, False)) is not None:
@@ -155,4 +155,4 @@ class BatteryTopic:
         ready = sorted(item for item in self._waiting if item[0] < stamp)
         self._waiting = [item for item in self._waiting if item[0] >= stamp]
         for _, reading in ready:
-            self._take(reading)
+            self._receive(reading)

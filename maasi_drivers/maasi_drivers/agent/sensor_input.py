@@ -23,7 +23,7 @@ DataT = TypeVar('DataT')
 class SensorInput(ABC, Generic[DataT]):
     """Where images or sweeps come from, and how targets are detected in them.
 
-    Each image or sweep goes to `driver.take_frame`.
+    Each image or sweep goes to `driver.receive_frame`.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class RangingInput(SensorInput[Sweep]):
         kept = [text is None for text in problems]
         labels = labels_of([item for item, good in zip(message.ranges, kept) if good])
         sweep = Sweep(values[np.array(kept, dtype=bool)], labels)
-        self.driver.take_frame('ranges', stamp_from_ros(message.header.stamp), sweep)
+        self.driver.receive_frame('ranges', stamp_from_ros(message.header.stamp), sweep)
 
     def detect(self, data: Sweep, pose: StampedPose) -> SensorReading:
         """Return the measurements of one sweep, relative to the robot's position in the map."""

@@ -124,7 +124,7 @@ class Watchdog:
             # Without a fault: the simulated clock is slow or stands, which real robots do not.
             self._link.hold()
 
-    def take_charge(self, charge: float) -> None:
+    def update_charge(self, charge: float) -> None:
         """Take a charge, 0 to 1; anything else is unknown and leaves a fault as it is."""
         self._state.charge = charge if 0.0 <= charge <= 1.0 else -1.0
         if self._state.charge < 0.0:
@@ -154,7 +154,7 @@ class Watchdog:
             )
 
     def note_frame(self, topic: str, repeated: bool) -> None:
-        """Note an image or sweep; see `RobotNode.take_frame`."""
+        """Note an image or sweep; see `RobotNode.receive_frame`."""
         latest, health = self._driver.history.latest, self._driver.health
         if latest is None:
             return

@@ -160,7 +160,7 @@ class TopicLink(RobotLink):
 
     def begin_step(self, stamp: int) -> None:
         """Take the readings of the battery before this step."""
-        self._battery.take_before(stamp)
+        self._battery.receive_before(stamp)
 
     def hold_step(self, stamp: int) -> None:
         """Publish zeros with the stamp of the step."""

@@ -250,11 +250,11 @@ class CameraInput(SensorInput[Picture]):
 
     def _poll_source(self) -> None:
         if isinstance(self._source, VideoSource):
-            self._take_video(self._source)
+            self._receive_video(self._source)
         elif self._source is not None:
-            self._take_feed(self._source)
+            self._receive_feed(self._source)
 
-    def _take_video(self, source: VideoSource) -> None:
+    def _receive_video(self, source: VideoSource) -> None:
         if source.error:
             self.driver.warn_throttled('video', source.error)
         frame = source.take()
@@ -267,11 +267,11 @@ class CameraInput(SensorInput[Picture]):
         except ValueError as error:
             self.driver.drop('image', f'video: {error}')
             return
-        self.driver.take_frame(
+        self.driver.receive_frame(
             'video', stamp, lambda: image, repeated=self._is_repeated(image.tobytes())
         )
 
-    def _take_feed(self, feed: FeedReceiver) -> None:
+    def _receive_feed(self, feed: FeedReceiver) -> None:
         peer = self.driver.feed_peer
         for packet, taken in feed.take():
             if (stamp := self.driver.arrivals.stamp(taken)) is None:
@@ -283,7 +283,7 @@ class CameraInput(SensorInput[Picture]):
                 continue
             if packet.pose is not None and peer is not None:
                 peer.on_pose(stamp, packet.pose)
-            self.driver.take_frame('feed', stamp, lambda blobs=packet.blobs: blobs)
+            self.driver.receive_frame('feed', stamp, lambda blobs=packet.blobs: blobs)
 
     # ---- image source: topic ------------------------------------------------------------------
 
@@ -323,7 +323,7 @@ class CameraInput(SensorInput[Picture]):
         except ValueError as error:
             self.driver.drop('image', f'camera/image_raw: {error}')
             return
-        self.driver.take_frame(
+        self.driver.receive_frame(
             'camera/image_raw',
             stamp_from_ros(message.header.stamp),
             lambda: image,
@@ -331,7 +331,7 @@ class CameraInput(SensorInput[Picture]):
         )
 
     def _on_compressed(self, message: CompressedImage) -> None:
-        self.driver.take_frame(
+        self.driver.receive_frame(
             'camera/image_raw/compressed',
             stamp_from_ros(message.header.stamp),
             lambda: decode_image(message),
@@ -344,7 +344,7 @@ class CameraInput(SensorInput[Picture]):
         if problems:
             self.driver.drop('box', f'camera/detections: {problems[0]}', len(problems))
         stamp = stamp_from_ros(message.header.stamp)
-        self.driver.take_frame('camera/detections', stamp, lambda: blobs)
+        self.driver.receive_frame('camera/detections', stamp, lambda: blobs)
 
     def _watch_classes(self, message: Any) -> None:
         """Warn of each new class while there was no box of the classes that are looked for."""

@@ -89,9 +89,9 @@ class BatchAssembly:
                 early is not None
                 and 0 <= stamp_from_ros(early.header.stamp) - stamp <= _STAMP_AHEAD
             ):
-                self._take(pending, early)
+                self._receive(pending, early)
 
-    def take(self, name: str, message: DetectionArray) -> PendingBatch | None:
+    def receive(self, name: str, message: DetectionArray) -> PendingBatch | None:
         """Take detections; return a batch of their own if they are late or were not asked for."""
         node = self._node
         number = int(message.batch_id)
@@ -108,7 +108,7 @@ class BatchAssembly:
             return None  # duplicate: drivers also republish
         self._progress.heard[name] = key
         if expected is not None:
-            self._take(expected, message)
+            self._receive(expected, message)
         elif number > self._progress.batch and pending is None:
             # Its batch has not arrived yet.
             self._early[(number, name)] = message
@@ -190,7 +190,7 @@ class BatchAssembly:
             drop('bad detections', f'pose.{error}')
             return None
 
-    def _take(self, pending: PendingBatch, message: DetectionArray) -> None:
+    def _receive(self, pending: PendingBatch, message: DetectionArray) -> None:
         measurement = self._measurement(message)
         if measurement is None:
             pending.failed.add(message.robot)

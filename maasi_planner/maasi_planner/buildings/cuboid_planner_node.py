@@ -143,7 +143,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         )
         self.create_subscription(SearchLinkArray, 'link/rx', self._on_heard, RELIABLE)
         self.expect_publisher(self._odometry.topic_name)
-        offer_services(self, [self.name], self._take_command)
+        offer_services(self, [self.name], self._handle_command)
         if not lockstep:
             self.create_wall_timer(0.02, self._check_link)
         for cell, reason in self._mission.lost:
@@ -173,7 +173,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
     def _searching(self) -> bool:
         return self.modes.of[self.name] is Mode.SEARCHING
 
-    def _take_command(self, word: str, _: list[str] | None) -> tuple[bool, str]:
+    def _handle_command(self, word: str, _: list[str] | None) -> tuple[bool, str]:
         if not self.active:
             return False, 'the planner is not active'
         if word == 'home':

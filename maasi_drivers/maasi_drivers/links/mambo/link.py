@@ -192,18 +192,18 @@ class MamboLink:
 
             def update(self, name: str, value: Any, sensor_enum: Any) -> None:
                 super().update(name, value, sensor_enum)
-                link._take(name, value, self)
+                link._receive(name, value, self)
 
         drone = minidrone.Mambo(address=self.address, use_wifi=self.kind == 'wifi')
         drone.sensors = Sensors()
         received = drone.drone_connection._set_command_received
 
-        def take_answer(channel: str, value: bool, *sequence: int) -> None:
+        def handle_answer(channel: str, value: bool, *sequence: int) -> None:
             received(channel, value, *sequence)
             if value:
                 link.heard_at = time.monotonic()
 
-        drone.drone_connection._set_command_received = take_answer
+        drone.drone_connection._set_command_received = handle_answer
         if self.kind == 'wifi':
             connection = drone.drone_connection
             # With its own name for the type it would know no other address than 192.168.99.3.
@@ -303,7 +303,7 @@ class MamboLink:
         if steering is not None:
             self._drone.fly_direct(*steering)
 
-    def _take(self, name: str, value: Any, sensors: Any) -> None:
+    def _receive(self, name: str, value: Any, sensors: Any) -> None:
         if self.kind == 'ble':
             self.heard_at = time.monotonic()
             self._fresh_until = self.heard_at + _TOGETHER

@@ -79,7 +79,7 @@ class MamboRobotLink(RobotLink):
         if self._mambo.pose == 'odometry':
             OdometryTopic(driver)
         elif self._mambo.pose == 'pose':
-            PoseTopic(driver, self._take_pose)
+            PoseTopic(driver, self._handle_pose)
         driver.expect(lambda: self._pilot.phase is MamboPhase.FLYING)
 
     def close(self) -> None:
@@ -172,11 +172,11 @@ class MamboRobotLink(RobotLink):
     def observe(self, placed: StampedPose) -> None:
         """Hand a pose of another system to the pilot."""
         if self._mambo.pose != 'events':
-            self._pilot.take_pose(
+            self._pilot.update_pose(
                 time.monotonic(), RobotState(placed.pose, placed.velocity, placed.angular_velocity)
             )
 
-    def _take_pose(self, stamp: int, pose: Pose) -> None:
+    def _handle_pose(self, stamp: int, pose: Pose) -> None:
         driver = self.driver
         if not driver.active or not driver.is_new_pose('pose.header.stamp', stamp):
             return

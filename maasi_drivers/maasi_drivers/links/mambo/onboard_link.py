@@ -76,7 +76,7 @@ class OnboardLink(RobotLink):
                 f'parameter image_source: read {settings.image_source!r}, allowed with link '
                 'mambo_feed is feed'
             )
-        driver.feed_peer = FeedPeer(mambo.address, self._take_feed_pose)
+        driver.feed_peer = FeedPeer(mambo.address, self._handle_feed_pose)
         area, height = driver.volume.area, settings.start[2]
         driver.volume = flight_volume(area, settings.radius, height, mambo)
         # Positions of the feed are relative to this.
@@ -167,7 +167,7 @@ class OnboardLink(RobotLink):
             text = f'orders to {address}: {error.strerror or error}'
             self.driver.warn_throttled('orders', text)
 
-    def _take_feed_pose(self, stamp: int, pose: FeedPose) -> None:
+    def _handle_feed_pose(self, stamp: int, pose: FeedPose) -> None:
         driver = self.driver
         if not driver.active or not driver.is_new_pose('feed', stamp):
             return

@@ -97,11 +97,11 @@ class MamboPilot:
         """Whether the position is known, and new enough to fly by."""
         return math.isfinite(self._placed_at) and self._lost_since is None
 
-    def take_pose(self, now: float, state: RobotState) -> None:
+    def update_pose(self, now: float, state: RobotState) -> None:
         """Take a pose of another system."""
         self._now = now
         self._note_place(now, state.pose.position)
-        self.reckoning.take(state, now, self.flying)
+        self.reckoning.update(state, now, self.flying)
 
     def _note_place(self, now: float, place: FloatArray) -> None:
         commanded = float(np.abs(self._command[:3]).max()) > _LEAST_SPEED

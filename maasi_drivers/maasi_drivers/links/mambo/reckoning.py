@@ -166,7 +166,7 @@ class DeadReckoning:
                 course = self.model.advance(course, shares, h, self.push)
         return course
 
-    def take(self, state: RobotState, now: float, flying: bool) -> None:
+    def update(self, state: RobotState, now: float, flying: bool) -> None:
         """Take the pose of another system, of `now`."""
         self._now = now
         if flying:

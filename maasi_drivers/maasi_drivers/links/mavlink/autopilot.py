@@ -84,7 +84,7 @@ class Autopilot:
     def on_restart(self) -> None:
         """Take note that the autopilot was restarted."""
 
-    def take(self, message: Any, now: float) -> tuple[bool, int] | None:
+    def receive(self, message: Any, now: float) -> tuple[bool, int] | None:
         """Take a message; of a heartbeat return whether it was armed before, and the mode then."""
         kind, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         if self._shows_own_id(message):
@@ -109,7 +109,7 @@ class Autopilot:
         elif kind == 'FENCE_STATUS':
             self.breached_at = now if message.breach_status else self.breached_at
         elif kind == 'PARAM_VALUE':
-            self._take_parameter(message)
+            self._handle_parameter(message)
         elif kind == 'COMMAND_ACK':
             if self.commands and self.commands[0].number == message.command:
                 if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
@@ -117,11 +117,11 @@ class Autopilot:
                 else:
                     self._conclude(int(message.result))
         elif self.firmware is not None:
-            self.fence.take(message, now)
-            self.estimate.take(message, now, self.armed)
+            self.fence.update(message, now)
+            self.estimate.update(message, now, self.armed)
             if kind == 'POSITION_TARGET_LOCAL_NED':
                 place = swap_enu_ned((message.x, message.y, message.z))
-                self.setpoints.take(message, place, now)
+                self.setpoints.update(message, place, now)
         return None
 
     def _shows_own_id(self, message: Any) -> bool:
@@ -151,14 +151,14 @@ class Autopilot:
         self.log.add(INFO, f'{firmware.name} is there as system {self.settings.system}')
         return True
 
-    def _take_parameter(self, message: Any) -> None:
+    def _handle_parameter(self, message: Any) -> None:
         if self.firmware is None or self.failsafes is None:
             return
         value = float(message.param_value)
         if self.firmware.px4 and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:
             # PX4 sends the bytes of an integer in the place of a float.
             value = float(struct.unpack('<i', struct.pack('<f', value))[0])
-        self.failsafes.take(message.param_id.rstrip('\0'), value)
+        self.failsafes.update(message.param_id.rstrip('\0'), value)
 
     def send_heartbeat(self, now: float) -> None:
         """Send the driver's heartbeat if it is due."""

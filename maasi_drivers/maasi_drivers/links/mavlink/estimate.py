@@ -198,12 +198,12 @@ class Estimate:
             return f'GNSS is lost ({", ".join(receivers)})'
         return ''
 
-    def take(self, message: Any, now: float, armed: bool) -> None:
+    def update(self, message: Any, now: float, armed: bool) -> None:
         """Take a message; those of other kinds are left out."""
         kind = message.get_type()
         self._now = now
         if kind == 'LOCAL_POSITION_NED':
-            self._take_position(message, now, armed)
+            self._update_position(message, now, armed)
         elif kind == 'ATTITUDE_QUATERNION':
             quaternion = np.array([message.q1, message.q2, message.q3, message.q4])
             rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
@@ -241,7 +241,7 @@ class Estimate:
             self.heard_at = now
         self._boot_time = max(milliseconds, self._boot_time or 0)
 
-    def _take_position(self, message: Any, now: float, armed: bool) -> None:
+    def _update_position(self, message: Any, now: float, armed: bool) -> None:
         values = (message.x, message.y, message.z, message.vx, message.vy, message.vz)
         if not all(map(math.isfinite, values)):
             self.dropped['LOCAL_POSITION_NED that is not finite'] += 1

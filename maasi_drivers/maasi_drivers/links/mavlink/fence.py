@@ -79,7 +79,7 @@ class FenceUpload:
             self._tries, self._due = self._tries + 1, now + _PATIENCE
             self._send()
 
-    def take(self, message: Any, now: float) -> None:
+    def update(self, message: Any, now: float) -> None:
         """Take a message; what is no answer is left out."""
         expected = {'target_system': self._sender.srcSystem, 'mission_type': _FENCE}
         ours = all(getattr(message, key, value) == value for key, value in expected.items())

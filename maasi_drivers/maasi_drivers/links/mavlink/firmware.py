@@ -162,7 +162,7 @@ class FailsafeCheck:
         self._asked: Counter[str] = Counter()
         self._asked_at = self._foreign_at = -math.inf
 
-    def take(self, name: str, value: float) -> None:
+    def update(self, name: str, value: float) -> None:
         """Take the value of a parameter."""
         if name in self._names:
             self.values[name] = value

@@ -257,7 +257,7 @@ class MavlinkRobotLink(RobotLink):
                 vehicle.finish('land', reason)
         if telemetry is not None and telemetry is not self._telemetry:
             self._telemetry = telemetry
-            self._take_telemetry(telemetry)
+            self._handle_telemetry(telemetry)
 
     def _judge_setpoint(self, rejected: FloatArray | None) -> None:
         """Begin or end the fault of a set-point (3,), local, that the autopilot rejects."""
@@ -306,7 +306,7 @@ class MavlinkRobotLink(RobotLink):
             else:
                 logger.debug(text)
 
-    def _take_telemetry(self, telemetry: Telemetry) -> None:
+    def _handle_telemetry(self, telemetry: Telemetry) -> None:
         driver = self.driver
         stamp = driver.arrivals.stamp(telemetry.arrival - self._mavlink.latency)
         if stamp is None:

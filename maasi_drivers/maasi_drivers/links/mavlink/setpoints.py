@@ -64,7 +64,7 @@ class SetpointCheck:
         else:
             self._standing_since = math.inf
 
-    def take(self, message: Any, position: FloatArray, now: float) -> None:
+    def update(self, message: Any, position: FloatArray, now: float) -> None:
         """Take POSITION_TARGET_LOCAL_NED, the present target: its position, unless left out."""
         if now - self._since < _PATIENCE:
             return

@@ -228,7 +228,7 @@ class Vehicle(Autopilot):
 
     def handle(self, message: Any, now: float) -> None:
         """Take a message."""
-        before = self.take(message, now)
+        before = self.receive(message, now)
         if before is not None:
             self._judge_mode(*before, now)
         elif self.refusal and self.phase is not VehiclePhase.REFUSED:
@@ -362,7 +362,7 @@ class Vehicle(Autopilot):
         work = {
             VehiclePhase.PREPARING: self._prepare,
             VehiclePhase.WAITING: self._wait,
-            VehiclePhase.STARTING: self._take_mode,
+            VehiclePhase.STARTING: self._request_mode,
             VehiclePhase.ARMING: self._arm,
             VehiclePhase.RISING: self._rise,
             VehiclePhase.ENDING: self._end,
@@ -427,7 +427,7 @@ class Vehicle(Autopilot):
                 return
             self._detail = f'{problem}, {UNTIL_ARM}' if problem else UNTIL_ARM
 
-    def _take_mode(self, now: float) -> None:
+    def _request_mode(self, now: float) -> None:
         if self._firmware.px4 and now - self._phase_at < _STREAM_AHEAD:
             return
         if self.in_external_mode:
