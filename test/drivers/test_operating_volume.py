@@ -49,7 +49,7 @@ def test_all_that_ask_where_a_robot_may_be_agree(seed):
     low, high = np.pad(area.bounds, ((0, 3 - dimension), (0, 0)), constant_values=1.0).T
     reach = 3.0 * MARGIN + volume.radius
     for position in rng.uniform(low - reach, high + reach, (300, 3)):
-        accepted = volume.contains(position.tolist())
+        accepted = not volume.goal_problem(position.tolist())
         outside, overhang = volume.beyond_border(position)
         gap, nearest = volume.distance_outside(position), volume.nearest_inside(position)
         drift, breached = volume.drift_problem(position), fence.breach(position, 0.0)

@@ -24,10 +24,6 @@ class OperatingVolume:
     radius: float
     limits: FloatArray = field(default_factory=lambda: np.tile([-math.inf, math.inf], (3, 1)))
 
-    def contains(self, position: Sequence[float]) -> bool:
-        """Return whether a robot may be sent to a position (3,)."""
-        return not self.goal_problem(position)
-
     def goal_problem(self, position: Sequence[float]) -> str:
         """Return why a robot is not sent to a position (3,), or nothing."""
         bounds = self.area.bounds + np.array([-self.radius, self.radius])

@@ -87,14 +87,18 @@ class CoveragePlan:
 
     def hits(self, position: ArrayLike) -> bool:
         """Return whether a position (3,) is inside an object or obstacle."""
-        place = np.asarray(position, dtype=float)
-        solids = self.solids
-        return bool(((solids[:, :, 0] < place) & (place < solids[:, :, 1])).all(axis=1).any())
+        return bool(_inside(np.asarray(position, dtype=float), self.solids).all(axis=1).any())
 
     def way_hits(self, begin: ArrayLike, end: ArrayLike) -> bool:
         """Return whether the segment between two positions (3,) cuts an object or obstacle."""
         ends = np.asarray(begin, dtype=float), np.asarray(end, dtype=float)
         return bool(segment_cuts(*ends, self.solids).any())
+
+
+def _inside(position: FloatArray, boxes: FloatArray) -> BoolArray:
+    """Return whether positions (..., 3) are inside boxes (n, 3, 2) on each axis, (..., n, 3)."""
+    place = position[..., None, :]
+    return np.asarray((boxes[:, :, 0] < place) & (place < boxes[:, :, 1]))
 
 
 def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolArray:
@@ -104,7 +108,7 @@ def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolA
         first = (boxes[:, :, 0] - begin[..., None, :]) / way[..., None, :]
         second = (boxes[:, :, 1] - begin[..., None, :]) / way[..., None, :]
     still = np.broadcast_to(way[..., None, :] == 0.0, first.shape)
-    within = (boxes[:, :, 0] < begin[..., None, :]) & (begin[..., None, :] < boxes[:, :, 1])
+    within = _inside(begin, boxes)
     enter = np.where(still, np.where(within, -np.inf, np.inf), np.minimum(first, second))
     leave = np.where(still, np.where(within, np.inf, -np.inf), np.maximum(first, second))
     start = np.maximum(enter.max(axis=-1), 0.0)
@@ -295,7 +299,5 @@ class WayFinder:
             ]
         )
         free = ((points >= self.area[:, 0]) & (points <= self.area[:, 1])).all(axis=1)
-        low = points[:, None, :] > self.solids[None, :, :, 0]
-        high = points[:, None, :] < self.solids[None, :, :, 1]
-        free &= ~np.all(low & high, axis=2).any(axis=1)
+        free &= ~np.all(_inside(points, self.solids), axis=2).any(axis=1)
         return np.asarray(points[free])
