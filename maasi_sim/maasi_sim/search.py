@@ -24,7 +24,7 @@ from maasi_planner.planners import Planner
 from maasi_planner.robot_plan import PresentRobot
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.compiling import compiling_said
-from maasi_sim.run.log import Decided, Left, Measured, Truth, Updated
+from maasi_sim.run.facts import Decided, Left, Measured, Truth, Updated
 from maasi_sim.run.view.search_page import SearchPage
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
 from maasi_sim.search_result import SearchResult
@@ -167,7 +167,8 @@ class _Search:
             duration = perf_counter() - begin
             indices = {name: robots[name].plan.decision for name in decision.robots}
             explored = coordinator.exploration.explored_fraction()
-            self.log.add(Decided(self.time, group.space, decision, indices, explored, duration))
+            made = Decided(self.time, group.space, decision, indices, explored, duration=duration)
+            self.log.add(made)
             self.log.add_map(self.time, group.space, coordinator.exploration, now=True)
             for name, chosen in decision.robots.items():
                 if not chosen.stays:
@@ -198,7 +199,7 @@ class _Search:
         known = result.found_changed or bool(others)
         found = group.filter.own_found_targets() if known else None
         for item in measurements:
-            self.log.add(Measured(self.time, item))
+            self.log.add(Measured.of(self.time, item))
         update = Updated(
             self.time,
             self.step,
