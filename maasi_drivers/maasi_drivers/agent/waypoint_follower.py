@@ -107,8 +107,7 @@ class WaypointFollower:
     def _resting(self, position: FloatArray) -> FloatArray:
         """Return where a robot holds: where it is, or inside of the border if it is far outside."""
         keep_out = self.motion.keep_out
-        area = keep_out.area
-        if area is not None and area.outside_by(position) > MARGIN + keep_out.radius:
+        if keep_out.area.outside_by(position) > MARGIN + keep_out.radius:
             inside = keep_out.exit_from(position)
             if inside is not None:
                 return inside
@@ -117,7 +116,7 @@ class WaypointFollower:
     def exit_from(self, position: FloatArray) -> FloatArray | None:
         """Return where a robot leaves a closed zone that it is in, (3,); None outside of zones."""
         keep_out = self.motion.keep_out
-        if not len(keep_out) or keep_out.area is None or keep_out.area.outside_by(position):
+        if not len(keep_out) or keep_out.area.outside_by(position):
             return None
         return keep_out.exit_from(position)
 
