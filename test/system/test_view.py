@@ -228,16 +228,16 @@ def test_a_run_leaves_its_page_which_is_made_again_of_its_bag_or_of_the_newest_r
     assert run.code in (0, 1) and 'replay:' in run.output, run.output
     page = (run.folder / REPLAY).read_text()
     assert 10_000 < len(page) < 5_000_000
-    assert main([str(tmp_path / 'nothing'), '--no-open']) == 2
+    assert main([str(tmp_path / 'nothing'), '--no-browser']) == 2
     assert 'there is no such recording' in capsys.readouterr().err
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match='2'):
-        main(['--no-open'])
+        main(['--no-browser'])
     assert 'there is no run in runs' in capsys.readouterr().err
     (tmp_path / 'runs').mkdir()
     (tmp_path / 'runs' / 'mine').symlink_to(run.folder)
     for recording in ([str(run.bag)], []):
-        assert main([*recording, '--no-open', '--out', 'page.html']) == 0
+        assert main([*recording, '--no-browser', '--out', 'page.html']) == 0
         assert (tmp_path / 'page.html').read_text() == page
 
 

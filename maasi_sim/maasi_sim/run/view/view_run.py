@@ -34,7 +34,7 @@ def build_parser() -> argparse.ArgumentParser:
     add('--out', type=Path, metavar='FILE', help=f'page (default: {REPLAY} beside the recording)')
     add('--video', type=Path, metavar='FILE', help='a video instead: FILE.mp4 or FILE.gif')
     add('--speed', type=float, default=5.0, metavar='X', help='of the video (default: 5)')
-    add('--no-open', action='store_true', help='do not open a browser')
+    add('--no-browser', dest='browser', action='store_false', help='do not open the page')
     return parser
 
 
@@ -84,7 +84,7 @@ def main(arguments: list[str] | None = None) -> int:
     finally:
         display.close()
     print(file)
-    if not options.no_open:
+    if options.browser:
         open_browser(file.resolve().as_uri())
     return DONE
 
