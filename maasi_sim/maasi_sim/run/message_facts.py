@@ -1,9 +1,11 @@
 """Facts of the messages of a run, as they come in a bag or a ROS graph."""
 
 import contextlib
+import importlib
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,6 @@ from maasi_filter.geometry.environment import Zone
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster, FoundTarget, Label
 from maasi_planner.team import Decision, RobotDecision
-from maasi_sim.run.buildings.facts import READERS as BUILDINGS
 from maasi_sim.run.facts import (
     Decided,
     Ended,
@@ -51,7 +52,6 @@ _PARTS = {
     ('markers', 'obstacles'): 'obstacles',
     ('search_area', 'obstacles'): 'blocks',
     ('search_area', 'objects'): 'objects',
-    ('markers', 'cuboids'): 'cuboids',
 }
 # A stamp that is earlier than the topic's last one by more than this begins another run [s].
 _REWIND = 10.0
@@ -331,8 +331,12 @@ READERS: dict[str, tuple[Reader, tuple[str, ...]]] = {
     'rcl_interfaces/msg/Log': (MessageFacts._log, ('rosout',)),
     'diagnostic_msgs/msg/DiagnosticArray': (MessageFacts._diagnostics, ('diagnostics',)),
     **{kind: (MessageFacts._image, (name,)) for kind, name in IMAGES.items()},
-    **BUILDINGS,
 }
+# Those of a mission's own messages stand in its folder.
+for path in sorted(Path(__file__).parent.glob('*/facts.py')):
+    module = importlib.import_module(f'{__package__}.{path.parent.name}.facts')
+    READERS |= module.READERS
+    _PARTS |= module.PARTS
 
 
 def is_read(topic: str, kind: str) -> bool:

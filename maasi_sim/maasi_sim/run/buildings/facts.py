@@ -42,4 +42,6 @@ def _decision(facts: Any, _: str, message: Any) -> Iterator[Fact]:
     yield Shown(time, 'cuboid', robot, content)
 
 
+#: Parts of a scene, and readers of messages, which `MessageFacts` has in addition to its own.
+PARTS = {('markers', 'cuboids'): 'cuboids'}
 READERS = {'maasi_msgs/msg/CuboidDecision': (_decision, ())}
