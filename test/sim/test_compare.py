@@ -35,7 +35,7 @@ def executed(monkeypatch):
 
 
 def command(scenario, out, *more, seeds=2):
-    arguments = [str(scenario), '--planner', ','.join(PLANNERS), '--seeds', str(seeds)]
+    arguments = [str(scenario), '--planner', ','.join(PLANNERS), '--runs', str(seeds)]
     if out is not None:
         arguments += ['--out', str(out)]
     return compare.main([*arguments, '--jobs', '1', *more])
@@ -43,7 +43,7 @@ def command(scenario, out, *more, seeds=2):
 
 def test_comparison_is_written_and_not_made_twice(scenario, tmp_path, executed, capsys):
     out = tmp_path / 'out'
-    assert command(scenario, out, '--first-seed', '7') == 0
+    assert command(scenario, out, '--seed', '7') == 0
     assert sorted(executed) == sorted((name, seed) for name in PLANNERS for seed in (7, 8))
     assert 'lawnmower minus nearest_widest' in capsys.readouterr().out
     facts = json.loads((out / 'comparison.json').read_text())
@@ -66,7 +66,7 @@ def test_comparison_is_written_and_not_made_twice(scenario, tmp_path, executed, 
     runs = list(csv.DictReader((out / 'field' / 'runs.csv').open()))
     assert [run['seed'] for run in runs] == ['7', '8'] * 2
     del executed[:]
-    assert command(scenario, out, '--first-seed', '7', seeds=3) == 0
+    assert command(scenario, out, '--seed', '7', seeds=3) == 0
     assert sorted(executed) == [('lawnmower', 9), ('nearest_widest', 9)]
 
 
@@ -115,7 +115,7 @@ def test_planner_of_ones_own_is_compared_and_its_changes_are_noticed(
         'from maasi_planner.planners import NearestWidest\n\nclass Mine(NearestWidest):\n    pass\n'
     )
     module.write_text(text)
-    arguments = [str(scenario), '--planner', f'lawnmower,{name}:Mine', '--seeds', '1']
+    arguments = [str(scenario), '--planner', f'lawnmower,{name}:Mine', '--runs', '1']
     arguments += ['--jobs', '1', '--out', str(tmp_path / 'out')]
     assert compare.main(arguments) == 0
     assert executed == [('lawnmower', 1), (f'{name}:Mine', 1)]
@@ -158,8 +158,8 @@ def test_filters_are_compared_with_each_planner(scenario):
         (['field.yaml', '--planner', 'maasi,maasi'], 'different names'),
         (['field.yaml', '--filter', 'kalman'], 'pmb'),
         (['field.yaml', 'field.yaml'], 'different names'),
-        (['field.yaml', '--seeds', '0'], 'from 1 to 9999'),
-        (['field.yaml', '--first-seed', '1.5'], 'whole numbers'),
+        (['field.yaml', '--runs', '0'], 'from 1 to 9999'),
+        (['field.yaml', '--seed', '1.5'], 'whole numbers'),
         (['field.yaml', '--time-limit', '-1'], 'above 0'),
         (['buildings_one'], 'searches for targets'),
     ],

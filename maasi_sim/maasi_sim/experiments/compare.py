@@ -53,13 +53,13 @@ def build_parser() -> argparse.ArgumentParser:
         metavar='NAME,...',
         help="filters, each with each planner (default: the scenario's)",
     )
-    add('--seeds', type=count, default=30, metavar='N', help='how many (default: %(default)s)')
+    add('--runs', type=count, default=30, metavar='N', help='of each (default: %(default)s)')
     add(
-        '--first-seed',
+        '--seed',
         type=partial(whole, most=2**32),
         default=1,
         metavar='N',
-        help='the first (default: %(default)s)',
+        help='of the first run; others follow (default: %(default)s)',
     )
     add('--time-limit', type=positive, metavar='S', help="of a search [s], not the scenario's")
     add_worker_options(parser)
@@ -102,15 +102,15 @@ def compare(options: argparse.Namespace) -> int:
     if len(set(names)) < len(names):
         raise WrongInput(f'SCENARIO: read {", ".join(names)}, allowed are different names')
     wanted = {
-        'first_seed': options.first_seed,
-        'seeds': options.seeds,
+        'first_seed': options.seed,
+        'seeds': options.runs,
         'scenarios': {
             item.name: {case.name: case.digest() for case in item.cases(False)}
             for item in comparisons
         },
     }
     out = options.out or _unfinished(wanted) or _new_folder()
-    campaigns = [plan(item, out, options.seeds, first=options.first_seed) for item in comparisons]
+    campaigns = [plan(item, out, options.runs, first=options.seed) for item in comparisons]
     if not options.again:
         _refuse_others(campaigns, out)
     print(f'results: {out}', file=sys.stderr)
@@ -118,7 +118,7 @@ def compare(options: argparse.Namespace) -> int:
     problems = carry_out_all(campaigns, options.jobs, options.cluster, options.mixed_workers)
     tables = [SearchTable(work.results()) for work in campaigns if work.done]
     if tables:
-        seeds = range(options.first_seed, options.first_seed + options.seeds)
+        seeds = range(options.seed, options.seed + options.runs)
         _write(out, tables, seeds)
         for table in tables:
             print(f'\n{table.name}', *table.verdicts(), sep='\n  ')
