@@ -1,5 +1,7 @@
 """Where a robot may be: goals, faults, the geofence and an autopilot's fence agree."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import shapely
@@ -33,7 +35,8 @@ def random_volume(rng):
     fence = [[-0.5 * size, 0.6 * size]] * 2 + [[0.5, 3.0]] if rng.integers(2) else None
     settings = FlightSettings(geofence=fence, ground=rng.uniform(-1.0, 1.0))
     area = Area(EnvironmentSettings.model_validate(place))
-    return flight_volume(area, rng.uniform(0.05, 0.6), rng.uniform(-2.0, 3.0), settings)
+    robot = SimpleNamespace(radius=rng.uniform(0.05, 0.6), start=[0.0, 0.0, rng.uniform(-2.0, 3.0)])
+    return flight_volume(area, robot, settings)
 
 
 @pytest.mark.parametrize('seed', range(40))

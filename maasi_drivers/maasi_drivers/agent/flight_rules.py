@@ -9,6 +9,7 @@ from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.operating_volume import OperatingVolume
+from maasi_planner.settings import RobotModel
 
 UNTIL_ARM = 'until the service arm is called'  # reason in `state` while a vehicle waits for it
 
@@ -85,18 +86,17 @@ class HomeLanding:
 _HEIGHT = 1.0  # between the heights of start and ground and the geofence, where none is given [m]
 
 
-def flight_volume(
-    area: Area, radius: float, start: float, flight: FlightSettings
-) -> OperatingVolume:
-    """Return where a robot may fly that starts at a height [m, map].
+def flight_volume(area: Area, robot: RobotModel, flight: FlightSettings) -> OperatingVolume:
+    """Return where a robot may fly.
 
     Without a geofence the limits are the bounds with the radius; in the plane from 1 m below the
     lower to 1 m above the higher one of ground and start. What starts above the ground is not sent
     below it.
     """
     if flight.geofence is not None:
-        return OperatingVolume(area, radius, np.array(flight.geofence))
-    ground, limits = flight.ground, np.zeros((3, 2))
+        return OperatingVolume(area, robot.radius, np.array(flight.geofence))
+    ground, start, radius = flight.ground, robot.start[2], robot.radius
+    limits = np.zeros((3, 2))
     limits[2] = min(ground, start) - _HEIGHT, max(ground, start) + _HEIGHT
     limits[: area.dimension] = area.bounds + np.array([-radius, radius])
     if start > ground:

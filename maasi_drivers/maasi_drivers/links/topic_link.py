@@ -101,8 +101,7 @@ class TopicLink(RobotLink):
         settings = driver.settings
         if settings.motion.model != 'unicycle':
             # In the plane the bounds of the environment have no heights.
-            height, flight = settings.start[2], FlightSettings()
-            driver.volume = flight_volume(driver.volume.area, settings.radius, height, flight)
+            driver.volume = flight_volume(driver.volume.area, settings, FlightSettings())
         self._commands = CommandPublisher(
             driver, 'cmd_vel', settings.command_type, settings.lockstep
         )

@@ -54,8 +54,7 @@ class MamboRobotLink(RobotLink):
     def prepare(self) -> None:
         """Make link and geofence; check that a connection is possible."""
         driver, mambo, settings = self.driver, self._mambo, self.driver.settings
-        area, height = driver.volume.area, settings.start[2]
-        driver.volume = flight_volume(area, settings.radius, height, mambo)
+        driver.volume = flight_volume(driver.volume.area, settings, mambo)
         if settings.motion.model == 'unicycle':
             raise SettingsError(
                 f"parameter motion.model: read 'unicycle', allowed with link {settings.link} "

@@ -77,8 +77,7 @@ class OnboardLink(RobotLink):
                 'mambo_feed is feed'
             )
         driver.feed_peer = FeedPeer(mambo.address, self._handle_feed_pose)
-        area, height = driver.volume.area, settings.start[2]
-        driver.volume = flight_volume(area, settings.radius, height, mambo)
+        driver.volume = flight_volume(driver.volume.area, settings, mambo)
         # Positions of the feed are relative to this.
         self._origin = Pose.from_yaw([*settings.start[:2], mambo.ground], settings.yaw)
 

@@ -64,8 +64,7 @@ class MavlinkRobotLink(RobotLink):
         # Whether a set-point was rejected since the last goal.
         self._rejected = False
         self._landing = HomeLanding(driver.settings, self._mavlink.home_timeout)
-        area, height = driver.volume.area, settings.start[2]
-        driver.volume = flight_volume(area, settings.radius, height, self._mavlink)
+        driver.volume = flight_volume(driver.volume.area, settings, self._mavlink)
 
     def prepare(self) -> None:
         """Make the link; it remembers the origin of a flight."""

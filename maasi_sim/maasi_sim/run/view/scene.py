@@ -149,8 +149,7 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
         # As its driver makes it.
         flies = robot.link == 'mambo_wifi'
         limits = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
-        area = Area(scenario.environment.bounds)
-        volume = flight_volume(area, robot.radius, robot.start[2], limits)
+        volume = flight_volume(Area(scenario.environment.bounds), robot, limits)
         fence = {'fence': rounded(volume.limits)}
     return {
         'type': robot.type,
