@@ -25,7 +25,6 @@ from maasi_planner.robot_plan import PresentRobot
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.compiling import compiling_said
 from maasi_sim.run.facts import Decided, Left, Measured, Truth, Updated
-from maasi_sim.run.view.search_page import SearchPage
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
 from maasi_sim.search_result import SearchResult
 from maasi_sim.simulation.robots import SimulatedRobot, Simulation
@@ -78,6 +77,9 @@ def search(
         running = _Search(scenario, seed, planner)
         page = None
         if view:
+            # Deferred: only a page needs a web server.
+            from maasi_sim.run.view.search_page import SearchPage
+
             page = SearchPage(running.log)
         result = running.run(most_measurements)
     if page is not None:

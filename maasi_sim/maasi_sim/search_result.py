@@ -6,8 +6,6 @@ from typing import Any
 
 from maasi_sim.run.log import RunLog
 from maasi_sim.run.targets.tables import columns, found_rows
-from maasi_sim.run.view.page_file import write_replay
-from maasi_sim.run.view.search_page import event_log
 
 
 class SearchResult(RunLog):
@@ -21,6 +19,10 @@ class SearchResult(RunLog):
         ResultsError
             If it cannot be written.
         """
+        # Deferred: only a page needs a web server.
+        from maasi_sim.run.view.page_file import write_replay
+        from maasi_sim.run.view.search_page import event_log
+
         path = Path(path)
         write_replay(event_log(self, path.stem), path)
 

@@ -13,6 +13,8 @@ import numpy as np
 from scipy import stats
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_sim.experiments.experiment import Results, Run
 from maasi_sim.experiments.statistics import mean_interval
 from maasi_sim.experiments.tables import COMPLETE, TIME, SearchTable, interval, shown
@@ -133,6 +135,9 @@ def _mark_published(axes: Axes, results: Results, styles: Mapping[str, str]) -> 
 
 
 def _draw_path(figure: Figure, place: tuple[int, int, int], results: Results, run: Run) -> None:
+    # Deferred: Matplotlib takes long to import.
+    from maasi_sim.run.report_panels import MapView, draw_ground
+
     scenario = results.case(run.case).settings['scenario']
     bounds = np.array(scenario['environment']['bounds'], dtype=float)
     dimension = len(bounds)
@@ -150,8 +155,12 @@ def _draw_path(figure: Figure, place: tuple[int, int, int], results: Results, ru
         axes.plot(*places.T, '-', color=colour, lw=1.0, label=name)
         measured = run.columns[f'{name}_measures'] > 0.0
         axes.plot(*places[1:][measured].T, '.', color=colour, ms=2.5)
-    for obstacle in scenario['environment']['obstacles']:
-        _obstacle(axes, np.array(obstacle['centre'], float), float(obstacle['radius']), dimension)
+    area = Area(EnvironmentSettings.model_validate(scenario['environment']))
+    if dimension == 2:
+        draw_ground(MapView(axes, (0, 1)), area, bounds)
+    for *centre, radius, is_sphere in area.solid:
+        if dimension == 3 and is_sphere:
+            _sphere(axes, np.array(centre), radius)
     truth = np.array(run.details['truth'], float).reshape(-1, dimension)
     found = np.array(run.details['found'], float).reshape(-1, dimension)
     axes.plot(*truth.T, 'D', mfc='none', mec=_TRUE, ms=6, label='true target')
@@ -167,12 +176,7 @@ def _draw_path(figure: Figure, place: tuple[int, int, int], results: Results, ru
     axes.set_title(run.case, fontsize=9)
 
 
-def _obstacle(axes: Any, centre: FloatArray, radius: float, dimension: int) -> None:
-    from matplotlib.patches import Circle
-
-    if dimension == 2:
-        axes.add_patch(Circle((centre[0], centre[1]), radius, fc='#C9C3B8', ec='#8A8478'))
-        return
+def _sphere(axes: Any, centre: FloatArray, radius: float) -> None:
     around = np.linspace(0.0, 2.0 * np.pi, 17)[:, None]
     down = np.linspace(0.0, np.pi, 9)[None, :]
     axes.plot_surface(

@@ -6,17 +6,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import shapely
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec, SubplotSpec
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Circle, Ellipse, Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.colours import KEEP_OUT
+from maasi_filter.geometry.area import Area
 from maasi_sim.run.log import RunRecord
 
 PALE, GRID, UNSEEN = '#9A9A9A', '#E6E6E6', '#CFCFCF'
@@ -47,6 +50,29 @@ def ellipse(
     widths = 2.0 * np.maximum(sigmas * np.sqrt(np.maximum(values, 0.0)), least)
     angle = math.degrees(math.atan2(directions[1, 0], directions[0, 0]))
     return Ellipse(place, *widths, angle=angle, fill=False, **style)
+
+
+def draw_ground(view: MapView, area: Area, bounds: FloatArray) -> None:
+    """Draw zones and obstacles of an area with bounds (d, 2) [m]."""
+    style: dict[str, Any] = {'fc': '#C9C3B8', 'ec': '#8A8478', 'zorder': 1, 'label': 'obstacle'}
+    for kind, shapes in area.shapes.items() if view.plane == (0, 1) else ():
+        for ring in shapely.get_rings(shapely.get_parts(shapes)):
+            colour = {'area': '#1B1F24', 'keep_out': KEEP_OUT, 'obstacle': '#8A8478'}[kind]
+            label = kind.replace('_', '-')
+            view.axes.plot(*shapely.get_coordinates(ring).T, color=colour, lw=1.2, label=label)
+    for *centre, radius, is_sphere in area.solid.tolist():
+        centre = centre if is_sphere else centre[:2]
+        if max(view.plane) < len(centre):
+            place = (centre[view.plane[0]], centre[view.plane[1]])
+            view.axes.add_patch(Circle(place, radius, **style))
+            continue
+        # An upright cylinder from the side.
+        low, high = bounds[2]
+        if view.plane[0] == 2:
+            corner, size = (low, centre[1] - radius), (high - low, 2.0 * radius)
+        else:
+            corner, size = (centre[0] - radius, low), (2.0 * radius, high - low)
+        view.axes.add_patch(Rectangle(corner, *size, **style))
 
 
 # A plot of counts beside the map: label of its axis to the right, relative height, what draws it.

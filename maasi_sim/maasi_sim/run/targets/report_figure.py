@@ -4,21 +4,28 @@ import math
 from typing import Any
 
 import numpy as np
-import shapely
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Rectangle
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.colours import FOUND, KEEP_OUT, robot_colours
+from maasi_filter.colours import FOUND, robot_colours
 from maasi_filter.geometry.area import Area
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.log import RunLog
 from maasi_sim.run.report_files import reason_of_end
-from maasi_sim.run.report_panels import MARGIN, PALE, UNSEEN, MapView, draw_report, ellipse
+from maasi_sim.run.report_panels import (
+    MARGIN,
+    PALE,
+    UNSEEN,
+    MapView,
+    draw_ground,
+    draw_report,
+    ellipse,
+)
 from maasi_sim.run.targets.report import build_report, explored_after, to_find_all
 
 _TRUE, _MISSED, _FALSE = '#222222', '#D62728', '#E6007E'
@@ -31,7 +38,8 @@ _VIEW_GRID = 160  # points on each axis where a field of view is evaluated
 def plot_report(record: RunLog) -> Figure:
     """Return a figure: the search from above, in 3D also from the sides, and its progress."""
     scenario = record.scenario
-    bounds = scenario.environment.array()
+    area = Area(scenario.environment)
+    bounds = area.bounds
     colours = robot_colours(scenario.names())
     detections = {
         name: scenario.robots[name].sensor.build(name, scenario.dimension).detection
@@ -41,7 +49,7 @@ def plot_report(record: RunLog) -> Figure:
 
     def draw_map(view: MapView) -> None:
         _draw_explored(view, explored, bounds)
-        _draw_obstacles(view, record, bounds)
+        draw_ground(view, area, bounds)
         for name, colour in colours.items():
             waypoints = view.points([place for _, place in record.waypoints.get(name, ())])
             view.axes.plot(*waypoints, '+', color=colour, ms=8, mew=1.3)
@@ -84,29 +92,6 @@ def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -
         frame = Rectangle((low[0], low[1]), *(high - low), fc='none', ec='#B0B0B0', lw=1.0)
         view.axes.add_patch(frame)
     view.axes.plot([], [], 's', color=UNSEEN, ms=9, label='not searched')
-
-
-def _draw_obstacles(view: MapView, record: RunLog, bounds: FloatArray) -> None:
-    style: dict[str, Any] = {'fc': '#C9C3B8', 'ec': '#8A8478', 'zorder': 1, 'label': 'obstacle'}
-    area = Area(record.scenario.environment)
-    for kind, shapes in area.shapes.items() if view.plane == (0, 1) else ():
-        for ring in shapely.get_rings(shapely.get_parts(shapes)):
-            colour = {'area': '#1B1F24', 'keep_out': KEEP_OUT, 'obstacle': '#8A8478'}[kind]
-            label = kind.replace('_', '-')
-            view.axes.plot(*shapely.get_coordinates(ring).T, color=colour, lw=1.2, label=label)
-    for *centre, radius, is_sphere in area.solid.tolist():
-        centre = centre if is_sphere else centre[:2]
-        if max(view.plane) < len(centre):
-            place = (centre[view.plane[0]], centre[view.plane[1]])
-            view.axes.add_patch(Circle(place, radius, **style))
-            continue
-        # An upright cylinder from the side.
-        low, high = bounds[2]
-        if view.plane[0] == 2:
-            corner, size = (low, centre[1] - radius), (high - low, 2.0 * radius)
-        else:
-            corner, size = (centre[0] - radius, low), (2.0 * radius, high - low)
-        view.axes.add_patch(Rectangle(corner, *size, **style))
 
 
 def _draw_field(
