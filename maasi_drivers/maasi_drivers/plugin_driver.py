@@ -17,11 +17,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the driver; exit code 2 if it cannot be loaded."""
     words = sys.argv[1:] if arguments is None else arguments
     end = words.index('--ros-args') if '--ros-args' in words else len(words)
-    own = [word for word in words[:end] if not word.startswith('-')]
-    if not own:
+    given = [word for word in words[:end] if not word.startswith('-')]
+    if not given:
         print(_USAGE, file=sys.stdout if {'-h', '--help'} & set(words) else sys.stderr)
         return 0 if {'-h', '--help'} & set(words) else 2
-    name, *folders = own
+    name, *folders = given
     add_folders(folders)
     try:
         driver = DRIVERS.load(name)

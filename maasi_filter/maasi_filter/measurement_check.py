@@ -34,7 +34,7 @@ class CheckedMeasurement:
     sensor: Sensor
     values: FloatArray
     covariances: FloatArray
-    own: bool  # Whether the covariances are the detections' own
+    has_covariances: bool  # Whether the detections have covariances
     index: int
     #: Standard deviation of the robot's position error per axis, as far as the covariances do
     #: not include it [m].
@@ -96,13 +96,13 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
         raise ValueError(f'{name}: values: got {values.tolist()}, allowed are finite numbers')
     covariances = np.repeat(sensor.covariance[None], len(values), axis=0)
     given = measurement.covariances if settings.use_detection_covariances else None
-    own = given is not None
+    has_covariances = given is not None
     if given is not None:
         covariances = _own_covariances(name, given, len(values), d)
     pose_error = pose_error_of(sensor, settings, d)
     if measurement.position_covariance is not None:
         reported = _reported_error(name, measurement.position_covariance, d)
-        if settings.pose_error is None and not own:
+        if settings.pose_error is None and not has_covariances:
             pose_error = max(pose_error, reported)
     labels = tuple(measurement.labels)
     if len(labels) not in (0, len(values)):
@@ -115,7 +115,7 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
         sensor,
         values[order],
         covariances[order],
-        own,
+        has_covariances,
         measurement.index,
         pose_error,
         tuple(labels[i] for i in order.tolist()) if labels else (),

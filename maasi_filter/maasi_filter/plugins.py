@@ -65,11 +65,11 @@ class PluginGroup:
     group: str  # Name of the group of entry points
     what: str  # What one of them is called in messages
     base: str  # Class that all are subclasses of, as `module:Class`
-    own: Mapping[str, str] = field(hash=False)  # Those of the suite: name to `module:Class`
+    built_in: Mapping[str, str] = field(hash=False)  # Those of the suite: name to `module:Class`
 
     def names(self) -> list[str]:
         """Return all names: the suite's, then those of installed packages."""
-        return [*sorted(self.own), *sorted(set(self._installed()) - set(self.own))]
+        return [*sorted(self.built_in), *sorted(set(self._installed()) - set(self.built_in))]
 
     def load(self, name: str) -> type:
         """Return a class by one of `names`, or `module:Class`.
@@ -77,8 +77,8 @@ class PluginGroup:
         Modules beside the scenario file and in the current folder are found too. PluginError: it is
         not known, cannot be imported, or is no subclass of `base`.
         """
-        if name in self.own:
-            return _attribute(self.own[name])
+        if name in self.built_in:
+            return _attribute(self.built_in[name])
         if is_reference(name):
             add_folders([*_folders, Path.cwd()])
             found = _attribute(name, named=True)
@@ -100,19 +100,19 @@ class PluginGroup:
 
     def check(self, name: str) -> str:
         """Return a name that can be loaded; a validator for settings."""
-        if name not in self.own:
+        if name not in self.built_in:
             self.load(name)
         return name
 
     def check_known(self, name: str) -> str:
         """Return a name that stands for something, without importing it; a validator."""
-        if name not in self.own and not is_reference(name) and name not in self._installed():
+        if name not in self.built_in and not is_reference(name) and name not in self._installed():
             raise PluginError(self._unknown(name, self.names()))
         return name
 
     def settings(self, name: str) -> type[BaseModel] | None:
         """Return the model of a plugin's own settings: its attribute `Settings`, if it has one."""
-        if name in self.own:
+        if name in self.built_in:
             return None
         model = getattr(self.load(name), 'Settings', None)
         if model is None:

@@ -107,7 +107,7 @@ class DetectionSettings(Settings):
 
     def build(self, dimension: int = 3) -> DetectionModel:
         """Return the model; ValueError if one of a user's own is wrong."""
-        if self.kind not in DETECTIONS.own:
+        if self.kind not in DETECTIONS.built_in:
             found = DETECTIONS.load(self.kind)(self.settings, self.probability, dimension)
             assert isinstance(found, DetectionModel)
             return found
@@ -413,7 +413,7 @@ def unused_settings(settings: FilterSettings) -> str:
             if not isinstance(mark, _Only) or mark.method == method:
                 continue
             given = getattr(settings, name) != info.get_default(call_default_factory=True)
-            if given and not (mark.plugins and method not in FILTERS.own):
+            if given and not (mark.plugins and method not in FILTERS.built_in):
                 unused.setdefault(mark.method, []).append(name)
     return '\n'.join(
         f'filter: {", ".join(names)}: of method {other}; {method} does not use them'

@@ -26,7 +26,7 @@ class MarkerDetector:
         self._model = RangeAndAngles(dimension)
         rule = settings.segmentation.rule
         self._own: Detector | None = None
-        if rule not in DETECTORS.own:
+        if rule not in DETECTORS.built_in:
             self._own = DETECTORS.load(rule)(settings.segmentation.settings)
         self._pose_covariance: FloatArray | None = None
         if settings.position_noise > 0 or settings.orientation_noise > 0:

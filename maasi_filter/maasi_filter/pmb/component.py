@@ -176,14 +176,14 @@ class Component:
         """
         r, detected, density = self.existence, view.detected, self.density
         nothing = missed * r * (1.0 - detected) / (1.0 - r * detected)
-        own = caused[view.gated]
-        detections = sum(own.tolist())
+        causes = caused[view.gated]
+        detections = sum(causes.tolist())
         self.existence = min(nothing + detections, 1.0)
         if self.foreign or not self.existence > 0.0:
             return False
         self.hits += detections / self.existence
         add_look(self.answers, detected, nothing / self.existence)
-        share = own / self.existence
+        share = causes / self.existence
         taken = (share > LEAST_SHARE).nonzero()[0]
         head = scan.head.copy()
         head[MISS] = nothing / ((1.0 - detected) * self.existence)

@@ -66,11 +66,11 @@ def associate_by_identity(
     for j, label in enumerate(labels):
         if label.identity in identities and label.identity:
             owner = identities.index(label.identity)
-            own = odds[owner, j]
-            odds[:, j], odds[owner, j], known[j] = 0.0, own, True
+            owned = odds[owner, j]
+            odds[:, j], odds[owner, j], known[j] = 0.0, owned, True
             # Out of its gate it is a misread identity: clutter.
-            if own > 0.0:
-                other[j] = min(other[j], MISREAD * own)
+            if owned > 0.0:
+                other[j] = min(other[j], MISREAD * owned)
         elif label.identity:
             odds[[bool(identity) for identity in identities], j] = 0.0
     return known

@@ -107,8 +107,8 @@ class Offsets:
         """Add a robot that is new; let the error of another one drift with its way."""
         d = self.dimension
         if robot not in self.keys:
-            own = self.settings.deviation**2 * np.eye(d)
-            self._append(robot, np.zeros(d), np.zeros((d, len(self.mean))), own)
+            block = self.settings.deviation**2 * np.eye(d)
+            self._append(robot, np.zeros(d), np.zeros((d, len(self.mean))), block)
             self.last[robot], self.way[robot] = position, 0.0
         step = position[:2] - self.last[robot][:2]
         way = math.sqrt(float(step @ step))
@@ -162,10 +162,12 @@ class Offsets:
         first = self.dimension * self.keys.index(key)
         return slice(first, first + self.dimension)
 
-    def _append(self, key: str | int, mean: FloatArray, cross: FloatArray, own: FloatArray) -> None:
+    def _append(
+        self, key: str | int, mean: FloatArray, cross: FloatArray, block: FloatArray
+    ) -> None:
         self.keys.append(key)
         self.mean = np.concatenate([self.mean, mean])
-        self.covariance = np.block([[self.covariance, cross.T], [cross, own]])
+        self.covariance = np.block([[self.covariance, cross.T], [cross, block]])
 
 
 def _moved(pose: Pose, way: FloatArray) -> Pose:

@@ -97,13 +97,13 @@ def make_scan(
     distance = np.abs(values[:, 0])
     level = distance * np.abs(np.cos(values[:, 2])) if d == 3 else distance
     covariances = member.covariances * factor
-    own = member.pose_error**2
-    covariances[:, 0, 0] += own
-    covariances[:, 1, 1] += own / np.maximum(level * level, 1e-12)
+    pose_variance = member.pose_error**2
+    covariances[:, 0, 0] += pose_variance
+    covariances[:, 1, 1] += pose_variance / np.maximum(level * level, 1e-12)
     if d == 3:
-        covariances[:, 2, 2] += own / np.maximum(distance * distance, 1e-12)
+        covariances[:, 2, 2] += pose_variance / np.maximum(distance * distance, 1e-12)
     deviations = np.sqrt(covariances[:, 0, 0])
-    near = member.own & (distance < POLE_DEVIATIONS * deviations)
+    near = member.has_covariances & (distance < POLE_DEVIATIONS * deviations)
     centres = member.sensor.measurement.inverse(values, pose)
     cap = np.sqrt(np.minimum(MOST_VARIANCES[:d] / np.diagonal(covariances, axis1=1, axis2=2), 1.0))
     used = covariances * cap[:, :, None] * cap[:, None, :]
@@ -114,7 +114,7 @@ def make_scan(
         safe = np.where(jacobian < LEAST_VOLUME, 1e-6, 0.0)
         frames = _derivatives(values + safe[:, None])
         # Unknown angles spread no farther than the distance allows.
-        floor = (own + 0.01 * covariances[:, 0, 0])[:, None, None] * np.eye(d)
+        floor = (pose_variance + 0.01 * covariances[:, 0, 0])[:, None, None] * np.eye(d)
         space = floor + frames @ covariances @ frames.swapaxes(1, 2)
         used[near] = space[near]
     origins = np.where(near[:, None], centres, values)

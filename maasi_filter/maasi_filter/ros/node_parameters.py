@@ -44,12 +44,12 @@ class NodeParameters(Generic[SettingsT]):
         self._node, self._model = node, model
         # Settings in use, until `release`.
         self._settings: SettingsT | None = None
-        self._own_change = False
+        self._changing = False
         # Parameters of rclpy, such as use_sim_time and start_type_description_service.
         self._foreign = ('qos_overrides.', *node.list_parameters([], 0).names)
         #: Values of the parameters that were set, by a file or at run time.
         self._given: dict[str, Any] = {}
-        given = self._with(self._own(node._parameter_overrides.values()))
+        given = self._with(self._ours(node._parameter_overrides.values()))
         add_folders(given.get('plugin_path') or [])
         known = {item.name for item in parameter_fields(model, given)}
         self._given = {name: value for name, value in given.items() if name in known}
@@ -77,7 +77,7 @@ class NodeParameters(Generic[SettingsT]):
     def _complete(self, resolved: SettingsT | None = None) -> None:
         """Declare what is missing, such as parameters of a new robot; show resolved settings."""
         _, problems = check(self._model, self._given)
-        self._own_change = True
+        self._changing = True
         for item in parameter_fields(self._model, self._given):
             present = self._node.has_parameter(item.name)
             if not present and (item.default is not None or item.name in self._given):
@@ -87,21 +87,21 @@ class NodeParameters(Generic[SettingsT]):
         if resolved is not None:
             flat = {k: v for k, v in flatten(resolved).items() if k not in self._given}
             self._node.set_parameters_atomically([Parameter(k, value=v) for k, v in flat.items()])
-        self._own_change = False
+        self._changing = False
 
-    def _own(self, parameters: Iterable[Parameter]) -> list[Parameter]:
+    def _ours(self, parameters: Iterable[Parameter]) -> list[Parameter]:
         return [item for item in parameters if not item.name.startswith(self._foreign)]
 
     def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
-        objections = self._objections(self._own(parameters))
-        reason = '' if self._own_change else next(objections, '')
+        objections = self._objections(self._ours(parameters))
+        reason = '' if self._changing else next(objections, '')
         return SetParametersResult(successful=not reason, reason=reason)
 
-    def _objections(self, own: Sequence[Parameter]) -> Iterator[str]:
-        values = self._with(own)
+    def _objections(self, ours: Sequence[Parameter]) -> Iterator[str]:
+        values = self._with(ours)
         known = {item.name for item in parameter_fields(self._model, values)}
         _, problems = check(self._model, values)
-        for item in own:
+        for item in ours:
             if item.name not in known and not self._node.has_parameter(item.name):
                 yield f'parameter {item.name}: is not known'
             elif self._settings is not None and item.name not in self._model.live:
@@ -115,21 +115,21 @@ class NodeParameters(Generic[SettingsT]):
                 yield from (problems[name] for name in wrong if name in problems)
 
     def _note(self, parameters: list[Parameter]) -> None:
-        if self._own_change:
+        if self._changing:
             return
-        own = self._own(parameters)
-        self._given = self._with(own)
+        ours = self._ours(parameters)
+        self._given = self._with(ours)
         if self._settings is None:
             self._complete()
             return
         # Change settings in use in place.
         changed, _ = check(self._model, self._given)
-        for *path, last in (item.name.split('.') for item in own):
+        for *path, last in (item.name.split('.') for item in ours):
             target, source = (reduce(getattr, path, item) for item in (self._settings, changed))
             setattr(target, last, getattr(source, last))
 
-    def _with(self, own: Sequence[Parameter]) -> dict[str, Any]:
-        values = self._given | {item.name: item.value for item in own}
+    def _with(self, ours: Sequence[Parameter]) -> dict[str, Any]:
+        values = self._given | {item.name: item.value for item in ours}
         return {name: value for name, value in values.items() if value is not None}
 
 

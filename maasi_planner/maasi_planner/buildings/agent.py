@@ -40,8 +40,8 @@ class Broadcast:
     predicted: FloatArray  # (3,): position at t + tau* + 1 in the plan before [m]
 
 
-def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntArray) -> int | None:
-    """Return the cuboid assigned to robot `own` of robots at places (m, 3): (10); None: too few."""
+def assigned(places: FloatArray, row: int, centres: FloatArray, unvisited: IntArray) -> int | None:
+    """Return the cuboid assigned to robot `row` of robots at places (m, 3): (10); None: too few."""
     if not len(unvisited):
         return None
     # Deferred: SciPy takes long to import, and searches for targets do not need it.
@@ -49,7 +49,7 @@ def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntAr
 
     cost = np.sqrt(((places[:, None, :] - centres[unvisited][None, :, :]) ** 2).sum(axis=2))
     rows, columns = linear_sum_assignment(cost)
-    chosen = np.flatnonzero(rows == own)
+    chosen = np.flatnonzero(rows == row)
     return int(unvisited[columns[chosen[0]]]) if len(chosen) else None
 
 
@@ -62,8 +62,8 @@ def rewards(
 ) -> BoolArray:
     """Return r(n) for all cuboids, (N,): (11) to (14), from as many numbers drawn from 0 to 1."""
     result = np.ones(len(draws), dtype=bool)
-    own = hazard.failure(flight_steps + settings.horizon)
-    low = own <= 0.5
+    failing = hazard.failure(flight_steps + settings.horizon)
+    low = failing <= 0.5
     holds = low if settings.condition == 'low_hazard' else not low
     for n in {n for message in heard for n in message.plan}:
         product, expected = 1.0, 0.0
@@ -72,7 +72,7 @@ def rewards(
                 fails = message.hazard.failure(message.flight_steps + message.plan[n] - 1)  # (11)
                 product *= fails
                 expected += 1.0 - fails
-        missed = (1.0 - own) * product  # (12)
+        missed = (1.0 - failing) * product  # (12)
         grown = settings.alpha * math.exp(-settings.beta * (expected - settings.alpha))
         joins = 1.0 - 1.0 / (1.0 + grown) if holds else 0.0
         result[n] = draws[n] < max(missed, joins)  # (13), (14)

@@ -275,7 +275,7 @@ def search_settings(scenario: Scenario, planner: str | None = None) -> dict[str,
 def code_of(scenario: Scenario) -> str:
     """Return a hash of the code of a search, with the files of a user's own planner and filter."""
     chosen = (PLANNERS, scenario.planner.name), (FILTERS, scenario.filter.method)
-    classes = [group.load(name) for group, name in chosen if name not in group.own]
+    classes = [group.load(name) for group, name in chosen if name not in group.built_in]
     if not classes:
         return code_digest()
     files = filter(None, map(inspect.getsourcefile, classes))

@@ -201,7 +201,7 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
             )
     if robot.driver in _RANGING and robot.camera is not None:
         yield f"camera: read one, but driver '{robot.driver}' has none; allowed is null"
-    if robot.driver in DRIVERS.own and robot.driver not in _RANGING and robot.camera is None:
+    if robot.driver in DRIVERS.built_in and robot.driver not in _RANGING and robot.camera is None:
         yield f"camera: is missing, driver '{robot.driver}' needs it"
 
 

@@ -137,7 +137,7 @@ def _team_plans(
 
 def _plugin(name: str, driver: str, scenario: Scenario) -> tuple[str, ...]:
     """Return the arguments of `plugin_driver` for a driver of a user's own."""
-    if driver in DRIVERS.own:
+    if driver in DRIVERS.built_in:
         return ()
     arguments = (driver, *scenario.plugin_path)
     command = [sys.executable, '-m', 'maasi_drivers.plugin_driver', '--check', *arguments]
@@ -167,7 +167,7 @@ def _robot_plans(
     plans = [
         NodePlan(
             'maasi_drivers',
-            robot.driver if robot.driver in DRIVERS.own else 'plugin_driver',
+            robot.driver if robot.driver in DRIVERS.built_in else 'plugin_driver',
             'driver',
             name,
             {**flatten(settings), **SIMULATED},

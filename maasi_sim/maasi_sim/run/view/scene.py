@@ -139,7 +139,7 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
     if detection.kind == 'box':
         corners = {'lower': list(detection.lower), 'upper': list(detection.upper)}
         view |= corners | {'edge': detection.edge}
-    elif detection.kind not in DETECTIONS.own:
+    elif detection.kind not in DETECTIONS.built_in:
         view['size'] = [1.0 / float(parameters[1])] * scenario.dimension
     else:
         view['size'] = list(detection.size)[: scenario.dimension]
