@@ -1,5 +1,7 @@
 """Shortest paths around obstacles: a graph of the corners that see each other."""
 
+from heapq import heapify, heappop, heappush
+
 import numpy as np
 from numba import njit
 from scipy.sparse import csr_array
@@ -73,51 +75,15 @@ def _last_legs(goal: Vector, around: Surroundings) -> FloatArray:
 def _shortest(first: IntArray, ends: IntArray, lengths: FloatArray, last: FloatArray) -> FloatArray:
     """Return the shortest lengths from all vertices, (m,), by Dijkstra's algorithm on a heap."""
     out = last.copy()
-    number = out.shape[0]
-    heap = np.empty(number, np.int64)  # vertices; the nearest on top
-    where = np.full(number, -1)
-    size = 0
-    for vertex in range(number):
-        if out[vertex] < np.inf:
-            heap[size], where[vertex] = vertex, size
-            size += 1
-            _rise(heap, where, out, size - 1)
-    while size:
-        vertex = heap[0]
-        size -= 1
-        heap[0] = heap[size]
-        where[heap[0]] = 0
-        _sink(heap, where, out, size)
-        where[vertex] = -2
+    heap = [(out[vertex], vertex) for vertex in range(len(out)) if out[vertex] < np.inf]
+    heapify(heap)
+    while heap:
+        length, vertex = heappop(heap)
+        if length > out[vertex]:
+            continue  # a shorter path was found meanwhile
         for edge in range(first[vertex], first[vertex + 1]):
-            end, total = ends[edge], out[vertex] + lengths[edge]
+            end, total = ends[edge], length + lengths[edge]
             if total < out[end]:
                 out[end] = total
-                if where[end] < 0:
-                    heap[size], where[end] = end, size
-                    size += 1
-                _rise(heap, where, out, where[end])
+                heappush(heap, (total, end))
     return out
-
-
-@njit(cache=True)
-def _rise(heap: IntArray, where: IntArray, keys: FloatArray, place: int) -> None:
-    while place > 0 and keys[heap[place]] < keys[heap[(place - 1) // 2]]:
-        above = (place - 1) // 2
-        heap[place], heap[above] = heap[above], heap[place]
-        where[heap[place]], where[heap[above]] = place, above
-        place = above
-
-
-@njit(cache=True)
-def _sink(heap: IntArray, where: IntArray, keys: FloatArray, size: int) -> None:
-    place = 0
-    while 2 * place + 1 < size:
-        below = 2 * place + 1
-        if below + 1 < size and keys[heap[below + 1]] < keys[heap[below]]:
-            below += 1
-        if keys[heap[place]] <= keys[heap[below]]:
-            return
-        heap[place], heap[below] = heap[below], heap[place]
-        where[heap[place]], where[heap[below]] = place, below
-        place = below
