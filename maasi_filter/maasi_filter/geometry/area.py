@@ -90,7 +90,7 @@ class Area:
         self.circles = _circles([*environment.obstacles, *environment.keep_outs])
         #: (n, 5): The same of solid ones.
         self.solid = _circles(environment.obstacles)
-        self._solid_polygons = _polygons(environment.obstacles)
+        self._solid_polygons = [item.polygon for item in environment.obstacles if item.polygon]
         #: Level shape in which robots stay: the area, or its bounds.
         self.border: BaseGeometry = environment.area or box(*self.bounds[:2].T.ravel())
         closed = list(map(level_shape, environment.keep_outs))
@@ -205,8 +205,9 @@ class Area:
     @cached_property
     def _zone_polygons(self) -> dict[bool, BaseGeometry]:
         """Polygons of obstacles in one shape, and (True) with those of keep-outs."""
-        closed = [*self._solid_polygons, *_polygons(self.settings.keep_outs)]
-        return {False: shapely.union_all(self._solid_polygons), True: shapely.union_all(closed)}
+        closed = [item.polygon for item in self.settings.keep_outs if item.polygon]
+        whole = shapely.union_all([*self._solid_polygons, *closed])
+        return {False: shapely.union_all(self._solid_polygons), True: whole}
 
     @cached_property
     def _rasterised(self) -> Density:
@@ -359,7 +360,3 @@ def _circles(zones: Iterable[Zone]) -> FloatArray:
         if zone.centre is not None
     ]
     return np.array(rows, dtype=float).reshape(-1, 5)
-
-
-def _polygons(zones: Iterable[Zone]) -> list[BaseGeometry]:
-    return [zone.polygon for zone in zones if zone.polygon is not None]

@@ -20,7 +20,6 @@ from maasi_filter.geometry.geodesy import OriginSettings, to_map
 from maasi_filter.geometry.polygons import short, sound, warn
 
 _FILES = ('.json', '.geojson')
-_LARGEST = 10_000.0  # of an area in degrees [km2]; larger ones are mistakes
 _ROLES = ('area', 'keep_out', 'prior')  # of polygons
 _POINT_ROLES = ('start', 'home', 'charger')
 _BEYOND = 10.0  # degrees by which areas across 180 degrees, as drawn on the page, go on
@@ -153,15 +152,6 @@ def _centre_of(features: Sequence[Feature]) -> dict[str, float]:
     longitude = 0.5 * (west + east)
     longitude -= 360.0 if longitude > 180.0 else 0.0
     return {'latitude': 0.5 * (south + north), 'longitude': longitude}
-
-
-def check_size(found: BaseGeometry) -> None:
-    """Raise ValueError if an area in degrees is larger than any search."""
-    if found.area > 1e6 * _LARGEST:
-        raise ValueError(
-            f'covers {found.area / 1e6:,.0f} km2, allowed are {_LARGEST:,.0f}: are these metres, '
-            'or is the latitude first? GeoJSON has the longitude first, in degrees'
-        )
 
 
 def points_of(value: Any) -> list[tuple[str, str, list[float]]]:

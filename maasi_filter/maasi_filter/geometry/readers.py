@@ -19,7 +19,6 @@ from maasi_filter.geometry.geodesy import OriginSettings
 from maasi_filter.geometry.geojson import (
     Feature,
     by_role,
-    check_size,
     features_of,
     is_geojson,
     origin_of,
@@ -38,6 +37,7 @@ _IMAGES = ('.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff')
 FILES = ('.geojson', '.json', *_MAPS, *_IMAGES)
 _ROLE_OF = {'keep_outs': 'keep_out', 'obstacles': 'keep_out', 'prior': 'prior'}  # by key
 _DEGREES = 0.1  # an area that is shorter is not in metres, but in degrees [m]
+_LARGEST = 10e9  # of an area in degrees; larger ones are mistakes [m^2]
 _FARTHEST = 100e3  # of an area from the origin of its map, which is flat [m]
 
 
@@ -81,11 +81,7 @@ def environment_in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     if area:
         found = values['area'] = read(roles.get('area', area), 'area')
         with errors_at(area, 'area'):
-            if roles:
-                _check_distance(found, given.get('origin'))
-                check_size(found)
-            else:
-                _check_metres(found)
+            _check_area(found, bool(roles), given.get('origin'))
         west, south, east, north = found.bounds
         values['bounds'] = [[west, east], [south, north]]
         if values.get('altitude') is not None:
@@ -177,23 +173,27 @@ def errors_at(value: Any, *key: str | int) -> Iterator[None]:
     raise ValidationError.from_exception_data('environment', problems) from None
 
 
-def _check_distance(area: BaseGeometry, origin: Any) -> None:
-    """Raise ValueError if an origin that was given lies far from an area [m]."""
-    gap = area.distance(shapely.Point(0.0, 0.0))
-    if origin and gap > _FARTHEST:
+def _check_area(area: BaseGeometry, drawn: bool, origin: Any) -> None:
+    """Raise ValueError if an area is so far away, large or small that it has other units.
+
+    drawn: whether it is of GeoJSON; origin: that was given.
+    """
+    west, south, east, north = area.bounds
+    gap, length = area.distance(shapely.Point(0.0, 0.0)), max(east - west, north - south)
+    if drawn and origin and gap > _FARTHEST:
         raise ValueError(
             f'lies {gap / 1e3:,.0f} km from environment.origin, allowed are {_FARTHEST / 1e3:g}: '
             'is the latitude first in one of them? GeoJSON has the longitude first'
         )
-
-
-def _check_metres(area: BaseGeometry) -> None:
-    """Raise ValueError if an area in metres is so small that it is in degrees."""
-    west, south, east, north = area.bounds
-    if max(east - west, north - south) < _DEGREES:
+    if drawn and area.area > _LARGEST:
         raise ValueError(
-            f'is {max(east - west, north - south):.2g} m long, and corners are in metres of the '
-            'map: are these degrees? Write them as GeoJSON'
+            f'covers {area.area / 1e6:,.0f} km2, allowed are {_LARGEST / 1e6:,.0f}: are these '
+            'metres, or is the latitude first? GeoJSON has the longitude first, in degrees'
+        )
+    if not drawn and length < _DEGREES:
+        raise ValueError(
+            f'is {length:.2g} m long, and corners are in metres of the map: are these degrees? '
+            'Write them as GeoJSON'
         )
 
 
