@@ -16,7 +16,7 @@ from maasi_filter.ros.parameters import flatten, parameter_fields, unflatten
 from maasi_filter.settings import unused_settings
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
-from maasi_planner.settings import PLANNERS, PlannerSettings
+from maasi_planner.settings import PLANNERS, planner_settings
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario import ScenarioError, load_scenario
@@ -209,7 +209,7 @@ def test_parameters_of_a_plugin(folder):
     assert flatten(settings)['planner.settings.stride'] == 2
     with pytest.raises(PluginError):
         PLANNERS.load('one_by_one:Nothing')
-    assert PlannerSettings(name='one_by_one:OneByOne').settings.stride == 1
+    assert planner_settings(name='one_by_one:OneByOne').settings.stride == 1
 
 
 def test_filter_of_ones_own(folder):

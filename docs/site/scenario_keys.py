@@ -6,7 +6,7 @@ import re
 import textwrap
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from shapely.geometry.base import BaseGeometry
 
+from maasi_filter.plugins import ChosenSettings
 from maasi_filter.ros.parameters import ParameterField
 from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.scenario.schema import Scenario
@@ -49,22 +50,30 @@ class Sections:
         """Return the section of a kind of scenario, with those of the settings inside."""
         return '\n'.join([f'## {title}\n\n{text}\n', *self._inside(model, '', mark)])
 
-    def _inside(self, model: type[BaseModel], path: str, mark: str) -> Iterator[str]:
+    def _inside(
+        self, model: type[BaseModel], path: str, mark: str, known: Collection[str] = ()
+    ) -> Iterator[str]:
         rows, inner = [], []
         for name, info in model.model_fields.items():
             key = info.alias or name
+            if key in known:
+                continue
             for kind, step in _models(info):
                 if kind not in self._places:
                     place = f'{path}{key}{step}'
                     self._places[kind] = f'{place}{mark}'
-                    inner.append((kind, place, info.description))
+                    inner.append((kind, place, info.description, ()))
+            for kind, titles in _chosen(info):
+                text = f'Further keys with {titles}'
+                common = info.annotation.model_fields
+                inner.append((kind, f'{path}{key} of {titles}', text, common))
             meaning, unit = _unit(info.description or '')
             shown = ' or '.join(dict.fromkeys(self._type(part) for part in _members(info)))
             rows.append((code(key), shown + unit, _default(info), _allowed(info), meaning))
         yield table(COLUMNS, rows)
-        for kind, place, description in inner:
+        for kind, place, description, common in inner:
             yield f'### {place}{mark}\n\n{textwrap.fill(f"{description}.", 110)}\n'
-            yield from self._inside(kind, f'{place}.', mark)
+            yield from self._inside(kind, f'{place}.', mark, common)
 
     def _type(self, info: FieldInfo, many: bool = False) -> str:
         """Return a type in words, with a link where it is described."""
@@ -121,6 +130,18 @@ def _models(info: FieldInfo) -> Iterator[tuple[type[BaseModel], str]]:
         for inner in _members(FieldInfo.from_annotation(kind)):
             if _is_model(inner.annotation):
                 yield inner.annotation, steps.get(origin, '')
+
+
+def _chosen(info: FieldInfo) -> Iterator[tuple[type[BaseModel], str]]:
+    """Yield the settings that a field may have by its values, and what chooses them."""
+    titles: dict[type[BaseModel], list[str]] = {}
+    for mark in info.metadata:
+        if isinstance(mark, ChosenSettings):
+            for title, kind in mark.models().items():
+                titles.setdefault(kind, []).append(title)
+    for kind, chosen_by in titles.items():
+        if kind is not info.annotation:
+            yield kind, ', '.join(chosen_by)
 
 
 def _length(info: FieldInfo) -> str:

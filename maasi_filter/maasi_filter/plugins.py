@@ -7,7 +7,7 @@ import inspect
 import re
 import sys
 import traceback
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.machinery import PathFinder
@@ -148,13 +148,32 @@ class OwnSettings:
         return None
 
 
-def own_settings(info: FieldInfo, values: Mapping[str, Any], prefix: str = '') -> Any:
-    """Return the model of a field marked with `OwnSettings`, or None."""
+@dataclass(frozen=True)
+class ChosenSettings:
+    """Marks the field of settings whose model is chosen by its own values."""
+
+    choose: Callable[[Mapping[str, Any]], type[BaseModel]]  # ValueError: they choose none
+    models: Callable[[], Mapping[str, type[BaseModel]]]  # Those of the suite, by what chooses them
+
+    def check(self, value: Any) -> Any:
+        """Return the settings of values; a validator of the marked field, before its own."""
+        if not isinstance(value, Mapping):
+            return value
+        # null: the default.
+        given = {key: item for key, item in value.items() if item is not None}
+        return self.choose(given).model_validate(given, strict=True)
+
+
+def own_settings(
+    info: FieldInfo, beside: Callable[[str], Any], values: Callable[[], Mapping[str, Any]]
+) -> Any:
+    """Return the model of a marked field by its values and a value beside it; None: no mark."""
     for mark in info.metadata:
-        name = values.get(prefix + mark.selector) if isinstance(mark, OwnSettings) else None
-        if isinstance(name, str):
-            # An error is reported where the name is checked.
-            with contextlib.suppress(PluginError):
+        # An error is reported where the values are checked.
+        with contextlib.suppress(ValueError):
+            if isinstance(mark, ChosenSettings):
+                return mark.choose(values())
+            if isinstance(mark, OwnSettings) and isinstance(name := beside(mark.selector), str):
                 return mark.group.settings(name)
     return None
 

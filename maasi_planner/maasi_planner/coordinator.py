@@ -59,7 +59,6 @@ class Coordinator:
         self._ended = False
         # Robots that have not been planned since ground was opened.
         self._unasked: set[str] = set()
-        self._live = _live(settings.planner)
 
     def _planner(self) -> Planner | None:
         """Return the planner; None: the robots that decide first choose it."""
@@ -71,7 +70,7 @@ class Coordinator:
         motion = make_motion(robot.motion, self.area, robot.radius)
         period = max(1, round(robot.sensor.period / step))
         radius = arrival_radius(motion, sensor, planner)
-        separate = planner.name in ('maas', 'as') and planner.agent_exploration == 'own'
+        separate = getattr(planner, 'agent_exploration', 'shared') == 'own'
         battery = robot.endurance
         return PlannedRobot(
             RobotFacts(motion, sensor, period, robot.radius, radius),
@@ -159,8 +158,7 @@ class Coordinator:
         present: the robots that take part, by name; taken: final positions (3,) of robots of other
         planners [m], and their radii.
         """
-        # Live settings, charges, and whether batteries still allow anything.
-        self._adopt_settings()
+        # Charges, and whether batteries still allow anything.
         self.homing.update(step, present)
         self._check_batteries(step, present)
         # Robots that have to move or to wait, and robots that the planner decides for.
@@ -184,14 +182,6 @@ class Coordinator:
         if changed or not decision.reason:
             explain(decision)
         return decision if decision.robots else self._end(step, present)
-
-    def _adopt_settings(self) -> None:
-        """Hand settings that were changed while the search runs to the planner."""
-        settings = self.settings.planner
-        if (live := _live(settings)) != self._live:
-            self._live = live
-            if self.planner is not None:
-                self.planner.take_settings(settings.renamed(self.planner.settings.name))
 
     def _check_batteries(self, step: int, present: Mapping[str, PresentRobot]) -> None:
         """Finish the search where batteries leave no robot anything to do."""
@@ -232,8 +222,7 @@ class Coordinator:
             return self._conclude(team, present, asked, conclusion)
         decision = planner.decide(team)
         check_decision(planner, team, decision)
-        if planner.settings.name != settings.name:
-            decision.reason = f'{planner.settings.name}: {decision.reason}'
+        decision.reason = planner.prefix + decision.reason
         decided = dict(decision.robots)
         self.homing.check(team, decision, [name for name in decided if present[name].free])
         if any(decision.robots[name] is not chosen for name, chosen in decided.items()):
@@ -322,13 +311,6 @@ class Coordinator:
         self.clusters = clusters
 
 
-def _live(settings: PlannerSettings) -> tuple[object, ...]:
-    """Return the values that may change while a search runs."""
-    names = sorted(PlannerNodeSettings.live)
-    parts = [name.removeprefix('planner.') for name in names if name.startswith('planner.')]
-    return tuple(getattr(settings, part) for part in parts)
-
-
 def arrival_radius(motion: MotionModel, sensor: Sensor, settings: PlannerSettings) -> float:
     """Return the distance from its waypoint at which a robot takes its next decision [m].
 
@@ -341,6 +323,6 @@ def arrival_radius(motion: MotionModel, sensor: Sensor, settings: PlannerSetting
     if given is not None:
         return given
     planner: type[Planner] = PLANNERS.load(settings.name)
-    if settings.objective == 'paper' or not planner.measures_underway:
+    if settings.stops or not planner.measures_underway:
         return 0.0
     return min(motion.braking_distance(), half_view(sensor))

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import ClassVar
 
 from pydantic import Field, model_validator
-from typing_extensions import Self
 
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.settings import NotNegative, Positive, Settings, Vector3
 from maasi_planner.endurance import EnduranceSettings
-from maasi_planner.settings import CandidateSettings, PlannerSettings, RobotModel
+from maasi_planner.settings import AnyPlanner, CandidateSettings, RobotModel, planner_settings
 
 
 class PlannedRobotSettings(RobotModel):
@@ -50,7 +49,7 @@ class PlannerNodeSettings(NodeSettings):
     )
 
     environment: EnvironmentSettings = Field(description='Where the targets are')
-    planner: PlannerSettings = Field(default_factory=PlannerSettings, description='The planner')
+    planner: AnyPlanner = Field(default_factory=planner_settings, description='The planner')
     robots: dict[str, PlannedRobotSettings] = Field(min_length=1, description='Robots, by name')
     others: dict[str, OtherRobotSettings] = Field(
         {}, description='Robots that plan for themselves, by name; where they go is kept clear'
@@ -76,20 +75,6 @@ class PlannerNodeSettings(NodeSettings):
     views_rate: NotNegative = Field(
         1.0, description='Most publications of exploration and markers [1/s]'
     )
-
-    def resolved(self) -> Self:
-        """Return a copy with the values of the objective."""
-        planner, weights = self.planner, self.planner.weights()
-        clusters = planner.cluster_candidates
-        values = {
-            'beta': weights.beta,
-            'control_weight': weights.control,
-            'measure_at_arrival': weights.arrival,
-            'count_present': weights.present,
-            'own_measurement': weights.own,
-            'cluster_candidates': weights.information if clusters is None else clusters,
-        }
-        return self.model_copy(update={'planner': planner.model_copy(update=values)})
 
     @model_validator(mode='after')
     def _others_are_others(self) -> PlannerNodeSettings:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, NamedTuple
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
-from maasi_filter.plugins import OwnSettings, PluginGroup
+from maasi_filter.plugins import ChosenSettings, OwnSettings, PluginError, PluginGroup
 from maasi_filter.settings import (
     Finite,
     NotNegative,
@@ -199,85 +201,17 @@ class RobotModel(Settings):
         return {key: getattr(robot, key) for key in cls.model_fields}
 
 
-class Weights(NamedTuple):
-    """Weights and choices of the objective, with the defaults of the objective in use."""
-
-    information: bool
-    alpha: float
-    beta: float
-    control: float
-    per_distance: bool
-    arrival: bool
-    present: bool
-    own: bool
-    extend: bool
-
-
 class PlannerSettings(Settings):
-    """Choice of planner, and its parameters. None means the default of the objective."""
+    """What all planners have; own planners have this and `settings`."""
+
+    #: Whether robots stop at each waypoint, unless their `arrival_radius` says otherwise.
+    stops: ClassVar[bool] = False
 
     name: Annotated[str, PLANNERS, AfterValidator(PLANNERS.check)] = Field(
         'auto', description='Planner, or module:Class of your own'
     )
     settings: Annotated[Any, _PLANNER, AfterValidator(_PLANNER.check)] = Field(
         None, validate_default=True, description='Settings of a planner of your own'
-    )
-    objective: Literal['paper', 'information'] = Field(
-        'information',
-        description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
-        'expected new targets of all measurements of the team together',
-    )
-    alpha: NotNegative = Field(
-        0.5, description='Weight of target refinement T (001: of exploration) [1]'
-    )
-    beta: float | None = Field(
-        None, ge=0.0, description='Weight of exploration E; none: 0.5 paper, 1 information [1]'
-    )
-    control_weight: float | None = Field(
-        None,
-        ge=0.0,
-        description='Weight of the control cost C; none: 1 paper, 1e-6 information [1]',
-    )
-    normalisation: Literal['steps', 'distance'] = Field(
-        'steps', description='What J is divided by: steps K, or metres of the trajectory'
-    )
-    measure_at_arrival: bool | None = Field(
-        None,
-        description='Whether T and E count the measurement at the waypoint itself; none: only '
-        'information does',
-    )
-    count_present: bool | None = Field(
-        None,
-        description='Whether T and E count the measurement at the present place, the same for all '
-        'candidates; none: only paper does',
-    )
-    own_measurement: bool | None = Field(
-        None,
-        description='Whether e in E at a measurement includes that measurement itself, as (21), '
-        '(22) do; none: true. With pi = 1 around the robot that makes E vanish',
-    )
-    extension: Literal['measuring', 'silent'] = Field(
-        'measuring',
-        description='Whether robots that wait at the end of a predicted trajectory go on measuring',
-    )
-    cluster_candidates: bool | None = Field(
-        None, description='Whether cluster centres are candidates too; none: only information'
-    )
-    exploration_nodes: int = Field(
-        1000, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
-    )
-    enumeration_limit: int = Field(
-        50_000,
-        ge=1,
-        description='Most joint candidates searched exactly; above, robots choose in turn [1]',
-    )
-    improvement_rounds: int = Field(
-        3, ge=0, le=100, description='Most rounds of improvement when robots choose in turn [1]'
-    )
-    pair_budget: int = Field(
-        1000,
-        ge=0,
-        description='Most evaluations of moves of two robots when up to 5 choose in turn [1]',
     )
     measurement: Literal['periodic', 'event'] = Field(
         'periodic', description='Measure at every period, or only when worth it (24), (33)'
@@ -303,62 +237,68 @@ class PlannerSettings(Settings):
         'the search may end: of all (tour), of those that the candidates showed at most (maasi '
         'with information) [1]',
     )
-    horizon: int = Field(1, ge=1, le=3, description='maas: waypoints planned ahead [1]')
-    agent_exploration: Literal['own', 'shared'] = Field(
-        'own',
-        description='maas: whether e of a robot has its own measurements only (002, eq. 12, 16) or '
-        'those of the whole team',
-    )
-    refinement: Literal['centres', 'mutual_information'] = Field(
-        'centres', description='maas: T by centre probabilities or by mutual information'
-    )
     coordination: Literal['centralized', 'independent'] = Field(
         'centralized',
         description='All robots with one filter and joint choices, or each for itself with a '
         'filter of its own, sharing only what is found',
     )
-    lane_spacing: float | None = Field(
-        None, gt=0.0, description='lawnmower: distance of lanes; none: size of the view [m]'
-    )
-    layer_spacing: float | None = Field(
-        None, gt=0.0, description='lawnmower: distance of layers in 3D; none: as lanes [m]'
-    )
-    margin: float | None = Field(
-        None,
-        ge=0.0,
-        description='lawnmower: distance of the outer lanes from the bounds; none: half a lane [m]',
-    )
+
+    @classmethod
+    def chosen_by(cls, values: Any) -> type[PlannerSettings]:
+        """Return the model for these values: this one, or one of its kind."""
+        return cls
 
     def renamed(self, name: str) -> PlannerSettings:
-        """Return the settings of a planner by name, with the same numbers."""
+        """Return the settings of a planner by name, with what is set here and it has too."""
         if name == self.name:
             return self
-        return PlannerSettings.model_validate({**dict(self), 'name': name, 'settings': None})
+        given = {key: getattr(self, key) for key in self.model_fields_set}
+        return planner_settings(**{**kept_by(name, given), 'name': name})
 
-    def weights(self) -> Weights:
-        """Return the weights of the objective."""
-        information = self.objective == 'information'
 
-        def given(value: float | None, paper: float, other: float) -> float:
-            return value if value is not None else other if information else paper
+class JointSettings(PlannerSettings):
+    """Settings of a planner whose robots choose jointly."""
 
-        return Weights(
-            information=information,
-            alpha=self.alpha,
-            beta=given(self.beta, 0.5, 1.0),
-            control=given(self.control_weight, 1.0, 1e-6),
-            per_distance=self.normalisation == 'distance',
-            arrival=bool(given(self.measure_at_arrival, False, True)),
-            present=bool(given(self.count_present, True, False)),
-            own=self.own_measurement is not False,
-            extend=self.extension == 'measuring',
-        )
+    enumeration_limit: int = Field(
+        50_000,
+        ge=1,
+        description='Most joint candidates searched exactly; above, robots choose in turn [1]',
+    )
+    improvement_rounds: int = Field(
+        3, ge=0, le=100, description='Most rounds of improvement when robots choose in turn [1]'
+    )
 
-    @model_validator(mode='after')
-    def _lanes_are_shared_out(self) -> PlannerSettings:
-        if self.name == 'lawnmower' and self.coordination == 'independent':
-            raise ValueError(
-                "coordination: got 'independent', allowed with lawnmower is 'centralized': its "
-                'robots share the lanes'
-            )
-        return self
+
+def settings_model(values: Mapping[str, Any]) -> type[PlannerSettings]:
+    """Return the model of the keys under `planner`, by its name; ValueError: there is none."""
+    name = values.get('name', 'auto')
+    try:
+        planner: Any = PLANNERS.load(name)
+    except (PluginError, TypeError):
+        PlannerSettings.model_validate({'name': name}, strict=True)  # raises, with the key
+        raise
+    model: type[PlannerSettings] = planner.keys.chosen_by(values)
+    return model
+
+
+def kept_by(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a planner that another one has too, but for its own settings."""
+    known = PlannerSettings.model_fields
+    with suppress(ValueError):  # of a name that is not found yet, or refused later
+        known = settings_model({**values, 'name': name}).model_fields
+    return {key: value for key, value in values.items() if key in known and key != 'settings'}
+
+
+def planner_settings(name: str = 'auto', **values: Any) -> PlannerSettings:
+    """Return the settings of a planner; those that it has not are refused."""
+    values['name'] = name
+    return settings_model(values).model_validate(values, strict=True)
+
+
+def _models() -> dict[str, type[PlannerSettings]]:
+    paper = {'maasi, objective: paper': settings_model({'objective': 'paper'})}
+    return {name: settings_model({'name': name}) for name in sorted(PLANNERS.built_in)} | paper
+
+
+_CHOSEN = ChosenSettings(settings_model, _models)
+AnyPlanner = Annotated[PlannerSettings, SerializeAsAny(), _CHOSEN, BeforeValidator(_CHOSEN.check)]

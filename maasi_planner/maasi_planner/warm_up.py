@@ -12,16 +12,16 @@ from maasi_planner.measurement_schedule import MeasurementSchedule
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.objective.joint_search import PAIRS_LIMIT
 from maasi_planner.planners import make_planner
-from maasi_planner.settings import MotionSettings, PlannerSettings
+from maasi_planner.settings import MotionSettings, planner_settings
 from maasi_planner.team import RobotView, TeamView
 
 
 def _decide(team: TeamView) -> None:
     """Run every planner for all robots together, and for the first one alone."""
     for settings in (
-        PlannerSettings(objective='paper'),
-        PlannerSettings(objective='information'),
-        PlannerSettings(objective='information', enumeration_limit=1),
+        planner_settings(objective='paper'),
+        planner_settings(objective='information'),
+        planner_settings(objective='information', enumeration_limit=1),
     ):
         make_planner('maasi', settings).decide(team)
     make_planner('mutual_information').decide(team)
@@ -32,10 +32,10 @@ def _decide(team: TeamView) -> None:
     last.planning = False
     start = np.array(last.state.pose.position)
     last.remaining_path = np.stack([start, start + 0.1])
-    for settings in (PlannerSettings(objective='paper'), PlannerSettings()):
+    for settings in (planner_settings(objective='paper'), planner_settings()):
         make_planner('maasi', settings).decide(team)
     view = team.robots[team.names()[0]]
-    settings = PlannerSettings(measurement='event')
+    settings = planner_settings(measurement='event')
     schedule = MeasurementSchedule(view.motion, view.sensor, view.period_steps, settings)
     schedule.is_of_use(view.state.pose, team.clusters, team.exploration)
     team.exploration.update(view.sensor.detection, view.state.pose)
@@ -72,4 +72,4 @@ def warm_up() -> None:
             many = {f'{index}': view for index in range(PAIRS_LIMIT + 1)}
             for objective in ('paper', 'information'):
                 large = TeamView(0, 0.05, many, clusters, exploration)
-                make_planner('maasi', PlannerSettings(objective=objective)).decide(large)
+                make_planner('maasi', planner_settings(objective=objective)).decide(large)

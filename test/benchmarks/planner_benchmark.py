@@ -13,12 +13,12 @@ from maasi_planner import (
     CandidateSet,
     CandidateSettings,
     MotionSettings,
-    PlannerSettings,
     RobotState,
     RobotView,
     TeamView,
     make_motion,
     make_planner,
+    planner_settings,
     warm_up,
 )
 from maasi_planner.endurance import Endurance, EnduranceSettings
@@ -26,7 +26,7 @@ from maasi_planner.planners.options import options_of
 
 CUBE = np.array([[0.0, 260.0]] * 3)
 FLOOR = np.array([[-0.3, 2.4]] * 2)
-PAPER = PlannerSettings(objective='paper', alpha=0.5, beta=0.5, control_weight=0.01)
+PAPER = planner_settings(objective='paper', alpha=0.5, beta=0.5, control_weight=0.01)
 
 
 def robot(place, bounds, grid, motion, size, noise, period=10, radius=0.1):
@@ -119,7 +119,7 @@ def run(share=1.0):
     warm_up()
     single, pair, floor = drones(1), drones(2), floor_pair()
     whole = median_time(lambda: whole_grid_decision(single), 3)
-    information = PlannerSettings()
+    information = planner_settings()
     for name, team, repeats, settings in (
         ('asi_decision', single, 200, PAPER),
         ('asi_decision_mambo', drones(1, 'mambo'), 50, PAPER),

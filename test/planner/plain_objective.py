@@ -15,13 +15,13 @@ class Shot(NamedTuple):
     counts: bool
 
 
-def shots_of(team, name, options, choice, weights, horizon):
+def shots_of(team, name, options, choice, settings, horizon):
     """Return the measurements of one robot until a horizon."""
     view = team.robots[name]
     if view.planning:
         way, w = options[name].prediction, choice[name]
         positions, yaws, last = way.positions[w], way.yaws[w], int(way.lengths[w])
-        phase, arrives = 0, weights.arrival
+        phase, arrives = 0, settings.measure_at_arrival
     else:
         positions, yaws, phase = view.remaining_path, view.remaining_yaws, view.phase
         if positions is None:
@@ -35,24 +35,25 @@ def shots_of(team, name, options, choice, weights, horizon):
         k = min(step, last)
         regular = step >= phase and (step - phase) % view.period_steps == 0
         own = (regular and step < last) or (arrives and step == last)
-        if own or (regular and weights.extend):
+        if own or (regular and settings.extension == 'measuring'):
             out.append(Shot(step, Pose.from_yaw(positions[k], yaws[k]), own))
     return out
 
 
-def objective_of(team, weights, options, choice, name, refinement, exploration):
+def objective_of(team, settings, options, choice, name, refinement, exploration):
     way, w = options[name].prediction, choice[name]
-    norm = way.distances()[w] if weights.per_distance else way.lengths[w]
-    gain = weights.alpha * refinement + weights.beta * exploration
-    return refinement, exploration, (gain - weights.control * way.control_cost[w]) / norm
+    norm = way.distances()[w] if settings.normalisation == 'distance' else way.lengths[w]
+    gain = settings.alpha * refinement + settings.beta * exploration
+    return refinement, exploration, (gain - settings.control_weight * way.control_cost[w]) / norm
 
 
 def plain_terms(team, settings, options, choice):
     """Return {robot: (T, E, J)} of a joint choice under the objective `paper`."""
-    weights = settings.weights()
     planning = team.planning()
     horizon = max(int(options[name].prediction.lengths.max()) for name in planning)
-    shots = {name: shots_of(team, name, options, choice, weights, horizon) for name in team.names()}
+    shots = {
+        name: shots_of(team, name, options, choice, settings, horizon) for name in team.names()
+    }
     detections = {name: team.robots[name].sensor.detection for name in team.names()}
     explored = team.exploration.copy()
     terms = {name: [0.0, 0.0] for name in planning}
@@ -62,11 +63,11 @@ def plain_terms(team, settings, options, choice):
         for name, shot in now:
             explored.update(detections[name], shot.pose)
         for name, shot in now:
-            if name in planning and shot.counts and (k > 0 or weights.present):
+            if name in planning and shot.counts and (k > 0 or settings.count_present):
                 terms[name][0] += float(detections[name].probability(centres, shot.pose).sum())
                 terms[name][1] += float(explored.at(shot.pose.position)[0])
     return {
-        name: objective_of(team, weights, options, choice, name, *terms[name]) for name in planning
+        name: objective_of(team, settings, options, choice, name, *terms[name]) for name in planning
     }
 
 
@@ -88,17 +89,16 @@ def information(team, name, shots):
 
 def plain_information_terms(team, settings, options, choice):
     """Return {robot: (T, E, J)} of a joint choice under the objective `information`."""
-    weights = settings.weights()
     planning = team.planning()
     lengths = {name: int(options[name].prediction.lengths[choice[name]]) for name in planning}
     known, base, measured, own = team.exploration.copy(), 0.0, {}, {}
     for name in team.names():
         path = team.robots[name].remaining_path
         horizon = lengths[name] if name in lengths else 0 if path is None else len(path) - 1
-        shots = shots_of(team, name, options, choice, weights, horizon)
+        shots = shots_of(team, name, options, choice, settings, horizon)
         shots = [shot for shot in shots if shot.counts]
         if name in lengths:
-            first = 0 if weights.present else 1
+            first = 0 if settings.count_present else 1
             measured[name] = shots[first:]
             own[name] = information(team, name, measured[name])
             shots = shots[:first]
@@ -128,5 +128,5 @@ def plain_information_terms(team, settings, options, choice):
             missed *= 1.0 - detection.probability(explored.nodes(), shot.pose)
         share = (explored.cell_volumes() * explored.values).ravel() / explored.volume
         exploration = team.area.expected_targets * float(share @ (1.0 - missed))
-        out[name] = objective_of(team, weights, options, choice, name, refinement, exploration)
+        out[name] = objective_of(team, settings, options, choice, name, refinement, exploration)
     return out

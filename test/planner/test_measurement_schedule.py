@@ -5,7 +5,7 @@ import pytest
 from planner_helpers import random_team
 
 from maasi_filter.models.pose import Pose
-from maasi_planner import MeasurementSchedule, PlannerSettings
+from maasi_planner import MeasurementSchedule, planner_settings
 from maasi_planner.measurement_schedule import expected_use
 
 
@@ -28,7 +28,7 @@ def test_it_measures_at_waypoints_and_where_the_use_is_above_the_threshold(kind)
 
     # Relative to the mean along the way.
     threshold = float(np.median(uses)) if kind == 'absolute' else 0.8
-    settings = PlannerSettings(measurement='event', trigger=kind, threshold=threshold, gamma=1.7)
+    settings = planner_settings(measurement='event', trigger=kind, threshold=threshold, gamma=1.7)
     schedule = MeasurementSchedule(view.motion, sensor, 5, settings)
     schedule.turn(0, positions[0], None)
     schedule.predict(positions, np.zeros(40), *knowledge)

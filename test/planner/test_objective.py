@@ -17,12 +17,12 @@ from maasi_planner import (
     CandidateSet,
     CandidateSettings,
     MotionSettings,
-    PlannerSettings,
     RobotState,
     RobotView,
     TeamView,
     make_motion,
     make_planner,
+    planner_settings,
 )
 from maasi_planner.objective import team_objective
 from maasi_planner.objective.candidate_table import total_value
@@ -89,7 +89,7 @@ CASES = [
     ],
 )
 def test_terms_are_those_of_the_plain_objective(case, kind, change):
-    settings = PlannerSettings(
+    settings = planner_settings(
         objective=kind, alpha=0.7, beta=0.4, exploration_nodes=1_000_000, **change
     )
     plain = plain_terms if kind == 'paper' else plain_information_terms
@@ -114,7 +114,7 @@ def test_search_is_enumeration(case, kind):
     for seed in range(4):
         rng = np.random.default_rng(1000 + seed)
         team = random_team(rng, candidates=6, radius=0.05, **case)
-        settings = PlannerSettings(objective=kind)
+        settings = planner_settings(objective=kind)
         objective, options = built(team, settings)
         best = max(
             (
@@ -133,14 +133,14 @@ def test_search_is_enumeration(case, kind):
 def test_bound_prunes():
     rng = np.random.default_rng(5)
     team = random_team(rng, dimension=2, planning=2, waiting=0, candidates=40)
-    _, _, exact, evaluated = best_of(team, PlannerSettings(objective='paper'))
+    _, _, exact, evaluated = best_of(team, planner_settings(objective='paper'))
     assert exact
     assert evaluated < 1600 / 2
 
 
 @pytest.mark.parametrize('kind', ['paper', 'information'])
 def test_choice_in_turn_is_within_two_percent_of_the_optimum(kind):
-    settings = PlannerSettings(objective=kind, control_weight=0.0)
+    settings = planner_settings(objective=kind, control_weight=0.0)
     few = settings.model_copy(update={'enumeration_limit': 1})
     for seed in range(25):
         rng = np.random.default_rng(3000 + seed)
@@ -154,7 +154,7 @@ def test_choice_in_turn_is_within_two_percent_of_the_optimum(kind):
 @pytest.mark.parametrize('kind', ['paper', 'information'])
 def test_large_teams_choose_what_all_values_lead_to(kind):
     """The choice in turn with the others summed up is that with every value computed anew."""
-    settings = PlannerSettings(objective=kind, enumeration_limit=1)
+    settings = planner_settings(objective=kind, enumeration_limit=1)
     for seed in range(6):
         rng = np.random.default_rng(4000 + seed)
         team = random_team(
@@ -223,7 +223,7 @@ def test_few_candidates_cost_little(kind, monkeypatch):
     """Where memory limits the candidates of each robot, those that are best alone are enough."""
     best = make_planner('maasi').decide(field_team(8, 10, kind)).objective
     monkeypatch.setattr(team_objective, 'MOST_ENTRIES', 100_000)
-    objective, _ = built(field_team(8, 10, kind), PlannerSettings())
+    objective, _ = built(field_team(8, 10, kind), planner_settings())
     assert 8 * team_objective.LEAST_KEPT <= objective.kept.sum() < 0.7 * objective.kept.size
     few = make_planner('maasi').decide(field_team(8, 10, kind)).objective
     assert few >= 0.97 * best
@@ -235,18 +235,18 @@ def test_own_measurement_with_certain_view():
     team = random_team(rng, dimension=2, planning=1, waiting=0, candidates=5, kinds=('box',))
     name = team.planning()[0]
     team.robots[name].sensor.detection = BoxDetection([-0.3, -0.3], [0.3, 0.3])
-    for own in (None, False):
-        settings = PlannerSettings(objective='paper', own_measurement=own)
+    for own in (True, False):
+        settings = planner_settings(objective='paper', own_measurement=own)
         decision = make_planner('maasi', settings).decide(team)
-        assert (decision.robots[name].exploration > 0.0).any() == (own is False)
+        assert (decision.robots[name].exploration > 0.0).any() != own
 
 
 def test_blocks_keep_what_is_unseen():
     """Coarser nodes leave the expected new targets about the same where pi is smooth."""
     rng = np.random.default_rng(12)
     team = random_team(rng, dimension=3, planning=1, waiting=0, candidates=5, spacing=10.0)
-    fine = built(team, PlannerSettings(exploration_nodes=1_000_000))[0].alone[:, 1]
-    coarse = built(team, PlannerSettings(exploration_nodes=3000))[0].alone[:, 1]
+    fine = built(team, planner_settings(exploration_nodes=1_000_000))[0].alone[:, 1]
+    coarse = built(team, planner_settings(exploration_nodes=3000))[0].alone[:, 1]
     assert coarse == pytest.approx(fine, rel=0.02)
 
 
@@ -266,7 +266,7 @@ def test_order_of_robots_does_not_matter():
 def test_reported_terms_belong_to_the_choice():
     rng = np.random.default_rng(22)
     team = random_team(rng, dimension=2, planning=2, waiting=1, candidates=6)
-    settings = PlannerSettings(objective='paper', alpha=0.3, beta=0.9, control_weight=0.2)
+    settings = planner_settings(objective='paper', alpha=0.3, beta=0.9, control_weight=0.2)
     decision = make_planner('maasi', settings).decide(team)
     for robot in decision.robots.values():
         expected = (

@@ -36,7 +36,7 @@ from maasi_planner.conversions import checked_state, checked_update
 from maasi_planner.node.filter_guard import FilterWatch
 from maasi_planner.node_settings import OtherRobotSettings
 from maasi_planner.planner_node import PlannerNode
-from maasi_planner.settings import PlannerSettings
+from maasi_planner.settings import planner_settings
 
 
 def changed(message, changes):
@@ -340,7 +340,7 @@ def test_silence_is_that_of_heartbeats_and_of_the_oldest_open_batch():
 )
 def test_robots_are_held_until_the_filter_answers_again(silent, planner):
     # Long enough for a heartbeat of each second on a busy machine.
-    with running(filter_timeout=4.0, planner=PlannerSettings(name=planner)) as team:
+    with running(filter_timeout=4.0, planner=planner_settings(name=planner)) as team:
         beats = team.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         beat = DiagnosticArray(status=[DiagnosticStatus(name='/team')])
         guard = team.tested._guard

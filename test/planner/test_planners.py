@@ -16,10 +16,10 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,
-    PlannerSettings,
     RobotState,
     make_motion,
     make_planner,
+    planner_settings,
 )
 from maasi_planner.endurance import Endurance, EnduranceSettings
 from maasi_planner.planners.lawnmower import lanes
@@ -132,7 +132,7 @@ def detected(team, name, way, points):
 def test_active_search_is_brute_force(planning, horizon, kind):
     """001, eq. (10) to (13) of mutual information: what empty measurements tell together."""
     alpha = 0.8 if kind == 'centres' else 0.1
-    settings = PlannerSettings(name='maas', alpha=alpha, horizon=horizon, refinement=kind)
+    settings = planner_settings(name='maas', alpha=alpha, horizon=horizon, refinement=kind)
     for seed in range(3):
         team = ring_team(seed, planning)
         points, weights = intensity(team)
@@ -156,7 +156,7 @@ def test_active_search_in_turn_is_close_to_the_optimum():
     """Where sequences are too many to compare jointly, robots choose in turn."""
     for seed in range(6):
         team = ring_team(seed, 3)
-        settings = PlannerSettings(name='maas', alpha=0.8, horizon=2)
+        settings = planner_settings(name='maas', alpha=0.8, horizon=2)
         exact = make_planner('maas', settings).decide(team)
         few = settings.model_copy(update={'enumeration_limit': 10})
         decision = make_planner('maas', few).decide(team)

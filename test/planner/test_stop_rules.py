@@ -13,12 +13,12 @@ from maasi_planner import (
     CandidateSet,
     CandidateSettings,
     MotionSettings,
-    PlannerSettings,
     RobotState,
     RobotView,
     TeamView,
     make_motion,
     make_planner,
+    planner_settings,
 )
 from maasi_planner.candidates import map_spacing, swath_of
 
@@ -145,7 +145,7 @@ def test_ground_behind_a_wall_does_not_keep_a_search_alive(name, expected):
 def test_the_share_at_which_a_tour_ends_is_set():
     lengths = []
     for share in (0.3, 0.03, 1e-3):
-        settings = PlannerSettings(name='tour', gain_threshold=share)
+        settings = planner_settings(name='tour', gain_threshold=share)
         team, planner = walled(), make_planner('tour', settings)
         legs = 0
         while planner.finished(team) is None:
@@ -184,19 +184,19 @@ def test_live_settings_end_a_search_earlier():
         numbers = []
         for share in (None, 0.7):
             team = walled(size, swath)
-            planner = make_planner('auto', team=team)
-            assert planner.settings.name == name
+            settings = planner_settings()
+            planner = make_planner('auto', settings, team)
+            assert planner.prefix == f'{name}: '
             planner.decide(team)
             if share is not None:
-                settings = PlannerSettings(name=name, gain_threshold=share, mass_threshold=0.7)
-                planner.take_settings(settings)
+                settings.gain_threshold, settings.mass_threshold = share, 0.7
             numbers.append(0)
             while planner.finished(team) is None:
                 follow(team, planner.decide(team))
                 numbers[-1] += 1
         assert 0 < numbers[1] < 0.5 * numbers[0]
     with pytest.raises(ValueError, match='gain_threshold'):
-        PlannerSettings(gain_threshold=1.0)
+        planner_settings(gain_threshold=1.0)
 
 
 def test_all_robots_are_asked_for_what_is_left():

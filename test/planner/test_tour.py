@@ -165,7 +165,7 @@ def test_the_default_takes_tours_where_the_area_has_many_squares(size, name):
     planner = make_planner('auto', team=team)
     decision = planner.decide(team)
     check_decision(planner, team, decision)
-    assert planner.settings.name == name and planner.finished(team) is None
+    assert planner.prefix == f'{name}: ' and planner.finished(team) is None
     same = make_planner(name).decide(team)
     np.testing.assert_array_equal(
         decision.robots['robot0'].waypoint, same.robots['robot0'].waypoint

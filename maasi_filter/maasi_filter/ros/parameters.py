@@ -13,6 +13,7 @@ import textwrap
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
@@ -20,7 +21,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from shapely.geometry.base import BaseGeometry
 
-from maasi_filter.plugins import PluginGroup, own_settings
+from maasi_filter.plugins import ChosenSettings, PluginGroup, own_settings
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,9 @@ def parameter_fields(
     for name, info in model.model_fields.items():
         key = info.alias or name
         full, place = prefix + key, (*keys, key)
-        nested = _nested(info.annotation) or own_settings(info, given, prefix)
+        inside = partial(_inside, given, f'{full}.')
+        nested = own_settings(info, lambda selector: given.get(prefix + selector), inside)
+        nested = nested or _nested(info.annotation)
         if nested is None:
             yield ParameterField(full, place, info)
             if by_name := _by_name(info.annotation):
@@ -77,6 +80,11 @@ def parameter_fields(
             item.startswith(f'{full}.') for item in given
         ):
             yield from parameter_fields(nested, given, f'{full}.', place)
+
+
+def _inside(given: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Return the values whose names begin with a prefix, without it."""
+    return {key.removeprefix(prefix): given[key] for key in given if key.startswith(prefix)}
 
 
 def flatten(settings: BaseModel, prefix: str = '') -> dict[str, Any]:
@@ -190,7 +198,10 @@ def _by_name(annotation: Any) -> type[BaseModel] | None:
 
 
 def parameters_of(node: type) -> Iterator[ParameterField]:
-    """Yield the parameters of a class of nodes, its type argument; each robot's as of NAME."""
+    """Yield the parameters of a class of nodes, its type argument; each robot's as of NAME.
+
+    Where values choose a model, those of all models are yielded.
+    """
     model = next(
         argument
         for kind in node.__mro__
@@ -199,7 +210,13 @@ def parameters_of(node: type) -> Iterator[ParameterField]:
         if inspect.isclass(argument) and issubclass(argument, BaseModel)
     )
     tables = (item.name for item in parameter_fields(model, {}) if _by_name(item.info.annotation))
-    return parameter_fields(model, {key: ['NAME'] for key in tables})
+    fields = {i.name: i for i in parameter_fields(model, {key: ['NAME'] for key in tables})}
+    for name, info in model.model_fields.items():
+        for mark in info.metadata:
+            for chosen in mark.models().values() if isinstance(mark, ChosenSettings) else ():
+                found = parameter_fields(chosen, {}, f'{name}.', (name,))
+                fields = {item.name: item for item in found} | fields
+    yield from fields.values()
 
 
 def node_help(node: type, name: str, base: type) -> str:

@@ -18,8 +18,8 @@ from maasi_planner.objective.predicted_measurements import (
     part_of,
     parts_of,
 )
+from maasi_planner.objective.settings import InformationSettings
 from maasi_planner.objective.terms import IndexArray, Terms
-from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import RobotView, TeamView
 
 # Up to so many numbers rows have all nodes, which is faster where robots are few.
@@ -86,7 +86,7 @@ def _information(
     return out
 
 
-def _nodes(team: TeamView, settings: PlannerSettings, every_node: bool) -> Nodes:
+def _nodes(team: TeamView, settings: InformationSettings, every_node: bool) -> Nodes:
     """Return the nodes of e, or blocks of them, with the targets that are unseen there."""
     values, lower, step = team.exploration.kernel()
     volumes = team.exploration.cell_volumes().reshape(values.shape)
@@ -206,7 +206,7 @@ class InformationTerms:
     ----------
     team : TeamView
         The team.
-    settings : PlannerSettings
+    settings : InformationSettings
         Of the planner.
     settled : sequence of RobotView, and Measurements
         Robots whose measurements do not depend on the choice, and these.
@@ -217,7 +217,7 @@ class InformationTerms:
     def __init__(
         self,
         team: TeamView,
-        settings: PlannerSettings,
+        settings: InformationSettings,
         settled: tuple[Sequence[RobotView], Measurements],
         kinds: IntArray,
     ) -> None:

@@ -14,7 +14,7 @@ from maasi_planner.objective.candidate_table import (
     total_value,
 )
 from maasi_planner.objective.large_teams import search_in_turn
-from maasi_planner.settings import PlannerSettings
+from maasi_planner.objective.settings import InformationSettings
 
 PAIRS_LIMIT = 5  # moves of two robots at once are tried in teams up to this size
 
@@ -130,7 +130,7 @@ def ranking_of(table: CandidateTable, alone: FloatArray) -> Ranking:
 
 
 def search(
-    table: CandidateTable, alone: FloatArray, settings: PlannerSettings
+    table: CandidateTable, alone: FloatArray, settings: InformationSettings
 ) -> tuple[IntArray, float, bool, int]:
     """Return the best joint choice, its value, whether it is exact, and choices evaluated.
 

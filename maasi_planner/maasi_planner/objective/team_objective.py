@@ -10,8 +10,8 @@ from maasi_planner.objective.information_terms import InformationTerms, joined, 
 from maasi_planner.objective.joint_search import PAIRS_LIMIT
 from maasi_planner.objective.paper_terms import paper_terms
 from maasi_planner.objective.predicted_measurements import planned_way, predicted, remaining_way
+from maasi_planner.objective.settings import InformationSettings
 from maasi_planner.objective.terms import Terms
-from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import RobotView, TeamView, UsableCandidates
 
 # Above this number of pairs of a candidate and another robot, reported values of candidates that
@@ -34,44 +34,44 @@ class TeamObjective:
     """
 
     def __init__(
-        self, team: TeamView, settings: PlannerSettings, options: Mapping[str, UsableCandidates]
+        self, team: TeamView, settings: InformationSettings, options: Mapping[str, UsableCandidates]
     ) -> None:
-        weights = settings.weights()
+        informed = settings.objective == 'information'
         self.names = [name for name in team.planning() if name in options]
         choices = [options[name] for name in self.names]
         self.start = np.array([0, *(len(option.points) for option in choices)]).cumsum()
         views = [team.robots[name] for name in self.names]
         ways = [
-            planned_way(view, option.prediction, weights.arrival)
+            planned_way(view, option.prediction, settings.measure_at_arrival)
             for view, option in zip(views, choices)
         ]
         rest = [remaining_way(team.robots[name]) for name in team.names() if name not in self.names]
         # The first measurement that counts: the present one does not depend on the choice.
-        first = 0 if weights.present else 1
-        if first and weights.information:
+        first = 0 if settings.count_present else 1
+        if first and informed:
             rest += map(remaining_way, views)
         lengths = np.concatenate([way.lengths for way in ways])
         cost = np.concatenate([option.prediction.control_cost for option in choices])
         # By information, what a robot measures at its end counts for nobody.
-        extend = weights.extend and not weights.information
+        extend = settings.extension == 'measuring' and not informed
         planned = predicted(ways, int(lengths.max()), extend)
         settled = predicted(rest, int(lengths.max()), extend)
         norm = lengths.astype(float)
-        if weights.per_distance:
+        if settings.normalisation == 'distance':
             norm = np.concatenate([option.prediction.distances() for option in choices])
         self.kept: BoolArray = np.ones(len(norm), np.bool_)
         table = CandidateTable(
             allowed=np.concatenate([option.allowed for option in choices]),
             waypoints=np.concatenate([option.points for option in choices]),
             radii=np.array([view.radius for view in views], float),
-            cost=weights.control * cost,
+            cost=settings.control_weight * cost,
             norm=np.maximum(norm, 1e-9),
-            alpha=float(weights.alpha),
-            beta=float(weights.beta),
+            alpha=float(settings.alpha),
+            beta=float(settings.beta),
             planned=planned,
-            terms=Terms(weights.information, np.zeros(0), np.zeros(1, np.int64)),
+            terms=Terms(informed, np.zeros(0), np.zeros(1, np.int64)),
         )
-        if weights.information:
+        if informed:
             others = [way.view for way in rest], settled
             build = InformationTerms(team, settings, others, planned.kind)
             self.table, self.alone = self._by_robot(table, build, views, first)
@@ -80,7 +80,7 @@ class TeamObjective:
         for centre, cluster in zip(centres, team.clusters):
             centre[: team.dimension] = cluster.position[: team.dimension]
         grid = team.exploration.kernel()
-        terms = paper_terms(planned, settled, first, weights.own, centres, grid)
+        terms = paper_terms(planned, settled, first, settings.own_measurement, centres, grid)
         self.table = table._replace(terms=terms)
         nobody = np.full(len(self.names), -1, np.int64)
         self.alone = values_given(self.table, 0, len(norm), nobody)

@@ -7,7 +7,7 @@ from maasi_planner.planners.lattice import lanes_of
 from maasi_planner.planners.lawnmower import Lawnmower
 from maasi_planner.planners.mutual_information import MutualInformation
 from maasi_planner.planners.nearest_widest import NearestWidest
-from maasi_planner.settings import PLANNERS, PlannerSettings
+from maasi_planner.settings import PLANNERS, PlannerSettings, planner_settings
 from maasi_planner.team import TeamView
 
 __all__ = [
@@ -49,10 +49,14 @@ def make_planner(
     ValueError
         If there is no planner of that name, its own settings are wrong, or `auto` has no team.
     """
-    if name == 'auto':
-        if team is None:
-            raise ValueError('planner auto: got no team, which it is chosen by')
-        many = takes_tour(team.exploration.volume, lanes_of(team)[0], team.dimension)
-        name = 'tour' if many else 'maasi'
-    planner: Planner = PLANNERS.load(name)((settings or PlannerSettings()).renamed(name))
+    own = planner_settings(name) if settings is None else settings.renamed(name)
+    if name != 'auto':
+        planner: Planner = PLANNERS.load(name)(own)
+        return planner
+    if team is None:
+        raise ValueError('planner auto: got no team, which it is chosen by')
+    many = takes_tour(team.exploration.volume, lanes_of(team)[0], team.dimension)
+    chosen = 'tour' if many else 'maasi'
+    planner = PLANNERS.load(chosen)(own)
+    planner.prefix = f'{chosen}: '
     return planner

@@ -9,8 +9,10 @@ prediction.
 """
 
 import math
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
@@ -19,6 +21,7 @@ from maasi_planner.planners.joint_choice import search_jointly
 from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
 from maasi_planner.planners.options import usable_options
 from maasi_planner.planners.separation import all_apart
+from maasi_planner.settings import JointSettings, NotNegative
 from maasi_planner.team import (
     Decision,
     RobotDecision,
@@ -28,6 +31,21 @@ from maasi_planner.team import (
     single_choice,
     stay,
 )
+
+
+class ActiveSearchSettings(JointSettings):
+    """Settings of `maas`."""
+
+    alpha: NotNegative = Field(0.5, description='Weight of exploration [1]')
+    horizon: int = Field(1, ge=1, le=3, description='Waypoints planned ahead [1]')
+    agent_exploration: Literal['own', 'shared'] = Field(
+        'own',
+        description='Whether e of a robot has its own measurements only (002, eq. 12, 16) or those '
+        'of the whole team',
+    )
+    refinement: Literal['centres', 'mutual_information'] = Field(
+        'centres', description='T by centre probabilities or by mutual information'
+    )
 
 
 class Sequences:
@@ -116,6 +134,8 @@ class ActiveSearch(Planner):
     """
 
     measures_underway = False
+    keys = ActiveSearchSettings
+    settings: ActiveSearchSettings
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""

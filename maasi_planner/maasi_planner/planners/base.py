@@ -27,13 +27,17 @@ class Planner(ABC):
     ----------
     measures_underway : bool
         Whether robots measure on their way, or only at their waypoints.
+    keys : type
+        Model of its settings, the keys under `planner`.
     Settings : type or None
-        Model of the planner's own settings; with it, `settings.settings` is an instance.
+        Model of the settings of a planner of your own; with it, `settings.settings` is an instance.
     own : BaseModel or None
         That instance.
     """
 
     measures_underway = True
+    keys: ClassVar[type[PlannerSettings]] = PlannerSettings
+    prefix = ''  # of the reasons of its decisions
     Settings: ClassVar[type[BaseModel] | None] = None
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -43,10 +47,6 @@ class Planner(ABC):
     def own(self) -> Any:
         """The planner's own settings."""
         return self.settings.settings
-
-    def take_settings(self, settings: PlannerSettings) -> None:
-        """Take other numbers while it plans; they are used from its next decision on."""
-        self.settings = settings
 
     @abstractmethod
     def decide(self, team: TeamView) -> Decision:

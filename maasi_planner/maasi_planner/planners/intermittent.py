@@ -7,11 +7,11 @@ from maasi_filter.geometry.area import Area
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.objective.joint_search import PAIRS_LIMIT, search
 from maasi_planner.objective.predicted_measurements import CoarseTrajectories
+from maasi_planner.objective.settings import InformationSettings
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.objective.terms import Terms
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.options import centres_of, usable_options
-from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, TeamView, single_choice, stay
 
 
@@ -23,7 +23,10 @@ class Intermittent(Planner):
     states.
     """
 
-    def __init__(self, settings: PlannerSettings) -> None:
+    keys = InformationSettings
+    settings: InformationSettings
+
+    def __init__(self, settings: InformationSettings) -> None:
         super().__init__(settings)
         # Of each robot, how many unseen targets its candidates show together: at its last decision,
         # and at most until now.
@@ -45,14 +48,14 @@ class Intermittent(Planner):
         options = usable_options(team, decision, lambda name: self._centres(team, name), kept)
         if not options:
             return explain(decision)
-        objective, weights = TeamObjective(team, self.settings, options), self.settings.weights()
+        objective = TeamObjective(team, self.settings, options)
         chosen, decision.objective, decision.exact, decision.evaluated = search(
             objective.table, objective.bounds, self.settings
         )
         for index, name in enumerate(objective.names):
             option, terms = options[name], objective.given(index, chosen)
             first, last = objective.start[index : index + 2].tolist()
-            if weights.information:
+            if self.settings.objective == 'information':
                 shown = _shown_by(objective.table.terms, first, last, option.allowed)
                 self._prospects[name] = shown
                 self._most[name] = max(shown, self._most.get(name, 0.0))
@@ -85,10 +88,7 @@ class Intermittent(Planner):
 
     def _centres(self, team: TeamView, name: str) -> FloatArray | None:
         """Return the cluster centres as further candidates of a robot, if enabled."""
-        wanted = self.settings.cluster_candidates
-        if wanted is None:
-            wanted = self.settings.objective == 'information'
-        heavy = self.heavy(team) if wanted else []
+        heavy = self.heavy(team) if self.settings.cluster_candidates else []
         return centres_of(team, team.robots[name], heavy) if heavy else None
 
     def finished(self, team: TeamView) -> str | None:

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 
 from maasi_filter.arrays import FloatArray
 from maasi_planner.planners.separation import all_apart
-from maasi_planner.settings import PlannerSettings
+from maasi_planner.settings import JointSettings
 from maasi_planner.team import TeamView
 
 
 def search_jointly(
     team: TeamView,
-    settings: PlannerSettings,
+    settings: JointSettings,
     indices: Mapping[str, Sequence[int]],
     points: Mapping[str, FloatArray],
     value: Callable[[dict[str, int]], float],

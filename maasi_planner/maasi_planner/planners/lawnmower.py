@@ -6,8 +6,10 @@ two to a block.
 
 import itertools
 import math
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
@@ -26,6 +28,25 @@ from maasi_planner.team import (
     single_choice,
     stay,
 )
+
+
+class LawnmowerSettings(PlannerSettings):
+    """Settings of `lawnmower`; its robots share the lanes."""
+
+    coordination: Literal['centralized'] = Field(
+        'centralized', description='All robots with one filter and joint choices'
+    )
+    lane_spacing: float | None = Field(
+        None, gt=0.0, description='Distance of lanes; none: size of the view [m]'
+    )
+    layer_spacing: float | None = Field(
+        None, gt=0.0, description='Distance of layers in 3D; none: as lanes [m]'
+    )
+    margin: float | None = Field(
+        None,
+        ge=0.0,
+        description='Distance of the outer lanes from the bounds; none: half a lane [m]',
+    )
 
 
 def lanes(
@@ -64,7 +85,10 @@ class Lawnmower(Planner):
     A robot takes its next lane when it has finished one, so that a faster robot takes more.
     """
 
-    def __init__(self, settings: PlannerSettings) -> None:
+    keys = LawnmowerSettings
+    settings: LawnmowerSettings
+
+    def __init__(self, settings: LawnmowerSettings) -> None:
         super().__init__(settings)
         # Lanes by block: all of them, and those that no robot has begun yet.
         self._all: list[list[FloatArray]] = []

@@ -21,7 +21,7 @@ from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.joint_choice import search_jointly
 from maasi_planner.planners.options import usable_options
-from maasi_planner.settings import PlannerSettings
+from maasi_planner.settings import JointSettings
 from maasi_planner.team import Decision, RobotView, TeamView, single_choice, stay
 
 EXACT_TERMS = 48
@@ -130,7 +130,10 @@ class MutualInformation(Planner):
 
     measures_underway = False
 
-    def __init__(self, settings: PlannerSettings) -> None:
+    keys = JointSettings
+    settings: JointSettings
+
+    def __init__(self, settings: JointSettings) -> None:
         super().__init__(settings)
         self._headings: dict[str, FloatArray] = {}
 

@@ -6,6 +6,7 @@ import typing
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -224,7 +225,8 @@ def _known_keys(model: Any, key: Key, data: Any) -> list[str]:
     for step in key:
         if hasattr(model, 'model_fields'):
             fields = {info.alias or name: info for name, info in model.model_fields.items()}
-            model = own_settings(fields[str(step)], data) or fields[str(step)].annotation
+            info = fields[str(step)]
+            model = own_settings(info, data.get, partial(data.get, step)) or info.annotation
         else:
             model = typing.get_args(model)[-1]
         model = next(item for item in choices(model) if item is not type(None))

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.readers import FILES
 from maasi_filter.plugins import is_reference, unknown
+from maasi_planner.settings import kept_by
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.checks import (
     Problems,
@@ -154,9 +155,11 @@ def checked(
         # What wins over the file hides none of its errors.
         validate(model, layer)
         for origin, (key, value) in overrides.items():
-            if key in (('planner', 'name'), ('filter', 'method')):
-                # Of the planner or filter that this one replaces.
-                layer.data.get(key[0], {}).pop('settings', None)
+            # Of the planner or filter that this one replaces.
+            if key == ('filter', 'method'):
+                layer.data.get('filter', {}).pop('settings', None)
+            elif key == ('planner', 'name') and model is Scenario:
+                layer.data['planner'] = kept_by(value, layer.data.get('planner', {}))
             layer = merge(layer, under(key, value, {key: origin}, layer.folder))
         layer = _with_folders(layer)
     scenario = validate(model, layer)

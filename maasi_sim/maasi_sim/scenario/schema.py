@@ -20,7 +20,8 @@ from maasi_filter.settings import (
     Vector3,
 )
 from maasi_planner.node_settings import PlannedRobotSettings, PlannerNodeSettings
-from maasi_planner.settings import MotionSettings, PlannerSettings
+from maasi_planner.settings import AnyPlanner, MotionSettings
+from maasi_planner.settings import planner_settings as default_planner
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
@@ -199,7 +200,7 @@ class Scenario(BaseScenario):
     targets: TargetSettings = Field(description='The truth, for the simulation and the report')
     robots: dict[str, RobotSettings] = Field(min_length=1, description='Robots by name')
     filter: FilterSettings = Field(default_factory=FilterSettings, description='Search filter')
-    planner: PlannerSettings = Field(default_factory=PlannerSettings, description='Planner')
+    planner: AnyPlanner = Field(default_factory=default_planner, description='Planner')
     floor: RenderSettings = Field(
         default_factory=lambda: RenderSettings.model_validate({}),
         description='Images of simulated cameras',

@@ -14,6 +14,7 @@ from maasi_filter.geometry.area import Area
 from maasi_filter.settings import DETECTIONS
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.buildings.settings import FACES
+from maasi_planner.objective.settings import InformationSettings
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.run.buildings.scenario import NAME as BUILDINGS
 from maasi_sim.run.buildings.scenario import CuboidScenario
@@ -124,10 +125,14 @@ def rounded(values: ArrayLike) -> list[Any]:
 def _objective(settings: PlannerSettings) -> Scene:
     """Return what J is made of, for planners whose J is that of `PlannerSettings`."""
     # Planners that choose by (17).
-    if settings.name not in ('asi', 'maasi'):
+    if settings.name == 'auto' or not isinstance(settings, InformationSettings):
         return {}
-    names = ('control', 'alpha', 'beta', 'per_distance')
-    weights = {name: getattr(settings.weights(), name) for name in names}
+    weights = {
+        'control': settings.control_weight,
+        'alpha': settings.alpha,
+        'beta': settings.beta,
+        'per_distance': settings.normalisation == 'distance',
+    }
     return {'objective': settings.objective, 'weights': weights}
 
 

@@ -1,0 +1,78 @@
+"""Settings of `maasi`: the objective, its candidates and the joint choice."""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from maasi_planner.settings import JointSettings, NotNegative, PlannerSettings
+
+Objective = Annotated[
+    Literal['paper', 'information'],
+    Field(
+        description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
+        'expected new targets of all measurements of the team together'
+    ),
+]
+Beta = Annotated[NotNegative, Field(description='Weight of exploration E [1]')]
+Control = Annotated[NotNegative, Field(description='Weight of the control cost C [1]')]
+AtArrival = Annotated[
+    bool, Field(description='Whether T and E count the measurement at the waypoint itself')
+]
+Present = Annotated[
+    bool,
+    Field(
+        description='Whether T and E count the measurement at the present place, the same for all '
+        'candidates'
+    ),
+]
+Centres = Annotated[bool, Field(description='Whether cluster centres are candidates too')]
+
+
+class InformationSettings(JointSettings):
+    """Settings of `maasi` with the objective `information`, and of `auto`."""
+
+    objective: Objective = 'information'
+    alpha: NotNegative = Field(0.5, description='Weight of target refinement T [1]')
+    beta: Beta = 1.0
+    control_weight: Control = 1e-6
+    normalisation: Literal['steps', 'distance'] = Field(
+        'steps', description='What J is divided by: steps K, or metres of the trajectory'
+    )
+    measure_at_arrival: AtArrival = True
+    count_present: Present = False
+    own_measurement: bool = Field(
+        True,
+        description='Whether e in E at a measurement includes that measurement itself, as (21), '
+        '(22) do. With pi = 1 around the robot that makes E vanish',
+    )
+    extension: Literal['measuring', 'silent'] = Field(
+        'measuring',
+        description='Whether robots that wait at the end of a predicted trajectory go on measuring',
+    )
+    cluster_candidates: Centres = True
+    exploration_nodes: int = Field(
+        1000, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
+    )
+    pair_budget: int = Field(
+        1000,
+        ge=0,
+        description='Most evaluations of moves of two robots when up to 5 choose in turn [1]',
+    )
+
+    @classmethod
+    def chosen_by(cls, values: Any) -> type[PlannerSettings]:
+        """See `PlannerSettings.chosen_by`."""
+        return PaperSettings if values.get('objective') == 'paper' else InformationSettings
+
+
+class PaperSettings(InformationSettings):
+    """Settings of `maasi` with the objective `paper`, and of `auto`."""
+
+    stops: ClassVar[bool] = True
+
+    objective: Objective = 'paper'
+    beta: Beta = 0.5
+    control_weight: Control = 1.0
+    measure_at_arrival: AtArrival = False
+    count_present: Present = True
+    cluster_candidates: Centres = False
