@@ -13,7 +13,7 @@ from browsers import chromium, needs_chromium
 from maasi_sim.run.buildings.scenario import load_cuboid_scenario
 from maasi_sim.scenario.loading import load_scenario
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SITE = ROOT / 'docs' / 'site'
 
 

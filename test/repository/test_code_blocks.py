@@ -20,7 +20,7 @@ from maasi_sim.scenario.layering import merge, to_yaml
 from maasi_sim.scenario.loading import find_scenario, load_scenario, read_layer
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md']
 DOCUMENTS += [path for name in ('docs', 'examples') for path in sorted((ROOT / name).rglob('*.md'))]
 NODES = {'filter_node': FilterNodeSettings, '/**': DriverSettings}

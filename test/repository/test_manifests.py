@@ -11,7 +11,7 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FACTS = yaml.safe_load((ROOT / 'test' / 'data' / 'noble.yaml').read_text())
 PACKAGES = sorted(path.parent for path in ROOT.glob('*/setup.py'))
 MANIFESTS = sorted(ROOT.glob('*/package.xml'))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from test_code_blocks import BLOCKS
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ('config', 'maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
 BLOCKED = (
     *('ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'maasi_msgs', 'rclpy'),

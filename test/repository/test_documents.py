@@ -9,7 +9,7 @@ from maasi_sim.experiments.claims import BEGIN, END, summary, with_summary
 from maasi_sim.experiments.outputs import claims_text, stored_section
 from maasi_sim.experiments.papers import experiments
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 COLUMNS = 120
 # Folders at the root: what begins with one of them in backticks is a path in this repository.

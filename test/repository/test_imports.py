@@ -8,7 +8,7 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 # Each imports only those before it.
 PACKAGES = ('msgs', 'filter', 'planner', 'drivers', 'sim')
 # Folders and files that may import ROS.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_prefix
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_each_package_has_tests_that_colcon_runs_by_pytest():
