@@ -132,5 +132,4 @@ class MeasurementSchedule:
 
     def begin_again(self) -> None:
         """Begin a new search; measurement indices continue."""
-        self.cancel()
         self._mean = 0.0
