@@ -250,9 +250,9 @@ class PlannerSettings(Settings):
 
     def renamed(self, name: str) -> PlannerSettings:
         """Return the settings of a planner by name, with what is set here and it has too."""
-        if name == self.name:
-            return self
         given = {key: getattr(self, key) for key in self.model_fields_set}
+        if name == self.name and isinstance(self, settings_model({**given, 'name': name})):
+            return self
         return planner_settings(**{**kept_by(name, given), 'name': name})
 
 

@@ -1,45 +1,34 @@
 """Settings of `maasi`: the objective, its candidates and the joint choice."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
 from maasi_planner.settings import JointSettings, NotNegative, PlannerSettings
 
-Objective = Annotated[
-    Literal['paper', 'information'],
-    Field(
-        description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
-        'expected new targets of all measurements of the team together'
-    ),
-]
-Beta = Annotated[NotNegative, Field(description='Weight of exploration E [1]')]
-Control = Annotated[NotNegative, Field(description='Weight of the control cost C [1]')]
-AtArrival = Annotated[
-    bool, Field(description='Whether T and E count the measurement at the waypoint itself')
-]
-Present = Annotated[
-    bool,
-    Field(
-        description='Whether T and E count the measurement at the present place, the same for all '
-        'candidates'
-    ),
-]
-Centres = Annotated[bool, Field(description='Whether cluster centres are candidates too')]
-
 
 class InformationSettings(JointSettings):
     """Settings of `maasi` with the objective `information`, and of `auto`."""
 
-    objective: Objective = 'information'
+    objective: Literal['paper', 'information'] = Field(
+        'information',
+        description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
+        'expected new targets of all measurements of the team together',
+    )
     alpha: NotNegative = Field(0.5, description='Weight of target refinement T [1]')
-    beta: Beta = 1.0
-    control_weight: Control = 1e-6
+    beta: NotNegative = Field(1.0, description='Weight of exploration E [1]')
+    control_weight: NotNegative = Field(1e-6, description='Weight of the control cost C [1]')
     normalisation: Literal['steps', 'distance'] = Field(
         'steps', description='What J is divided by: steps K, or metres of the trajectory'
     )
-    measure_at_arrival: AtArrival = True
-    count_present: Present = False
+    measure_at_arrival: bool = Field(
+        True, description='Whether T and E count the measurement at the waypoint itself'
+    )
+    count_present: bool = Field(
+        False,
+        description='Whether T and E count the measurement at the present place, the same for all '
+        'candidates',
+    )
     own_measurement: bool = Field(
         True,
         description='Whether e in E at a measurement includes that measurement itself, as (21), '
@@ -49,7 +38,7 @@ class InformationSettings(JointSettings):
         'measuring',
         description='Whether robots that wait at the end of a predicted trajectory go on measuring',
     )
-    cluster_candidates: Centres = True
+    cluster_candidates: bool = Field(True, description='Whether cluster centres are candidates too')
     exploration_nodes: int = Field(
         1000, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
     )
@@ -65,14 +54,18 @@ class InformationSettings(JointSettings):
         return PaperSettings if values.get('objective') == 'paper' else InformationSettings
 
 
+def _like(name: str, default: Any) -> Any:
+    return Field(default, description=InformationSettings.model_fields[name].description)
+
+
 class PaperSettings(InformationSettings):
     """Settings of `maasi` with the objective `paper`, and of `auto`."""
 
     stops: ClassVar[bool] = True
 
-    objective: Objective = 'paper'
-    beta: Beta = 0.5
-    control_weight: Control = 1.0
-    measure_at_arrival: AtArrival = False
-    count_present: Present = True
-    cluster_candidates: Centres = False
+    objective: Literal['paper', 'information'] = _like('objective', 'paper')
+    beta: NotNegative = _like('beta', 0.5)
+    control_weight: NotNegative = _like('control_weight', 1.0)
+    measure_at_arrival: bool = _like('measure_at_arrival', False)
+    count_present: bool = _like('count_present', True)
+    cluster_candidates: bool = _like('cluster_candidates', False)
