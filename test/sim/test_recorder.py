@@ -153,6 +153,7 @@ def test_topics_of_each_step_that_are_missing_or_begin_late_are_gaps(session):
         (False, {STEP: 0}, [f'the recording lacks {STATE}']),
         (True, {STEP: 30, STATE: 31}, []),
         (True, {STEP: 30, STATE: 36}, [LATE]),
+        (True, {STEP: 30, STATE: 0}, []),
         # Without any step its robots are unknown.
         (True, {}, [f'the recording lacks {STEP}']),
     ):

@@ -65,8 +65,8 @@ def teams(tmp_path_factory):
     with beside(Mover) as mover, ExitStack() as ends:
         runs = {}
         for team, target, begin in (
-            ('team_a', [1.5, 1.5], (1.9, 1.9, 1.0)),
-            ('team_b', [0.6, 0.6], (0.3, 0.3, 1.0)),
+            ('team_a', [1.6, 1.8], (1.9, 1.9, 1.0)),
+            ('team_b', [0.5, 0.4], (0.3, 0.3, 1.0)),
         ):
             path = write(folder / f'{team}.yaml', target, begin)
             mover.add(team, path)
@@ -115,7 +115,7 @@ def test_a_recording_holds_its_own_team_from_its_first_measurement_on(teams, tea
 
 
 def test_a_run_ends_where_the_clock_of_another_program_stands_still(tmp_path):
-    limits = {'time': 120.0, 'silence': 4.0}
+    limits = {'time': 120.0, 'silence': 2.0}
     path = write(tmp_path / 'far.yaml', [0.0, 0.0], limits=limits)
     with beside(Mover) as mover:
         mover.add('', path)
@@ -124,7 +124,7 @@ def test_a_run_ends_where_the_clock_of_another_program_stands_still(tmp_path):
             mover.until(lambda: file.exists() and file.stat().st_size > 100_000, 'the run moves')
             run.finish()
     assert run.code == 3, run.output
-    assert '/clock, which another program publishes, stands still for 4 s' in run.output
+    assert '/clock, which another program publishes, stands still for 2 s' in run.output
     assert run.report['end_reason'] == 'clock_stopped'
     with Bag(run.folder) as recorded:
         *_, last = recorded.messages(['/mambo/cmd_vel'])

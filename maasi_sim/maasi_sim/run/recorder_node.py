@@ -349,7 +349,8 @@ class Recorder:
         """Return topics of every step that are missing, or late by more than `patience` [s]."""
         topics = [STEP, *(f'/{name}/state' for name in self.robots)]
         times = [self.first.get(topic, self.time) for topic in topics]
-        begin = min(times) if joined else 0
+        # Robots that another program moves may be there long before the first step.
+        begin = times[0] if joined else 0
         gaps = []
         for topic, time_ in zip(topics, times):
             missed = (time_ - begin) * 1e-9
