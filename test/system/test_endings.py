@@ -12,11 +12,11 @@ from scenario_runs import command, run_scenario, start, started, wait_for, write
 from maasi_filter.ros import middleware
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.ending import NOT_WRITTEN
+from maasi_sim.run.missions import checked_mission
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.run_folder import make_folder
 from maasi_sim.run.run_options import Options, parse
 from maasi_sim.run.run_scenario import main
-from maasi_sim.run.scenario_run import checked
 from maasi_sim.scenario.layering import ScenarioError
 
 pytestmark = pytest.mark.system
@@ -211,7 +211,7 @@ def test_wrong_options_are_named(options, words, capsys):
 )
 def test_what_does_not_fit_the_scenario_is_named_with_the_option(options, words):
     with pytest.raises(ScenarioError, match=re.escape(words)):
-        checked(Options('mambo', **options), ProgressDisplay())
+        checked_mission(Options('mambo', **options), ProgressDisplay())
 
 
 def test_a_run_gets_a_folder_of_its_own(tmp_path, monkeypatch):

@@ -8,6 +8,8 @@ from typing import Any
 
 from maasi_filter.geometry.polygons import InputWarning
 from maasi_sim.run.mission import MISSIONS, Mission
+from maasi_sim.run.progress import ProgressDisplay
+from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import check_scenario, find_scenario, read_scenario
@@ -39,15 +41,23 @@ def load_mission(
     return mission.make(path.stem, layer, overrides)
 
 
-def checked_mission(
-    path: str | Path, overrides: Mapping[str, tuple[Key, Any]]
-) -> tuple[Mission[Any], list[str]]:
-    """Read a scenario file; return what is hardly meant in it as well."""
+def checked_mission(options: Options, display: ProgressDisplay) -> Mission[Any]:
+    """Return the mission of a run; say what it will take, and what is hardly meant in its file."""
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter('always', InputWarning)
-        mission = load_mission(path, overrides)
+        mission = load_mission(options.scenario, options.overrides())
+    forecast = mission.preflight()
+    for line in forecast.lines:
+        display.say(line)
     # A file with overrides is read twice.
-    return mission, list(dict.fromkeys(str(doubt.message) for doubt in doubts))
+    display.warn(*dict.fromkeys(str(doubt.message) for doubt in doubts), *forecast.warnings)
+    # A node in the namespace of a robot belongs to that robot.
+    if options.namespace.rpartition('/')[2] in mission.scenario.names():
+        raise ScenarioError(
+            f"--namespace: read '{options.namespace}', allowed is a name that is none of "
+            'a robot of the scenario'
+        )
+    return mission
 
 
 def send_warning(mission: Mission[Any], send: Callable[[str], None]) -> None:

@@ -54,17 +54,16 @@ def main(arguments: list[str] | None = None) -> int:
 def check(options: Options) -> int:
     """Check the scenario, print what its search takes, and return the exit code."""
     from maasi_sim.run.missions import checked_mission
+    from maasi_sim.run.progress import ProgressDisplay
     from maasi_sim.scenario.layering import ScenarioError
 
+    display = ProgressDisplay(sys.stdout)
     try:
-        mission, doubts = checked_mission(options.scenario, options.overrides())
+        mission = checked_mission(options, display)
     except ScenarioError as error:
         _print_errors(error)
         return WRONG_INPUT
-    forecast = mission.preflight()
-    warnings = [*doubts, *forecast.warnings, *mission.warning().splitlines()]
-    with contextlib.suppress(OSError):
-        print('\n'.join([*forecast.lines, *(f'warning: {text}' for text in warnings)]))
+    display.warn(*mission.warning().splitlines())
     return DONE
 
 

@@ -39,7 +39,7 @@ from maasi_sim.run.view.live_view import RunPage
 from maasi_sim.run.view.page_file import REPLAY
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.view_run import send_replay
-from maasi_sim.scenario.layering import ScenarioError, to_yaml
+from maasi_sim.scenario.layering import to_yaml
 
 # Between two checks of processes and topics; while the nodes start, and while they run [s].
 _START_POLL, _POLL = 0.02, 0.05
@@ -51,7 +51,7 @@ _START_PATIENCE = 10.0  # wall time between two messages about missing nodes [s]
 def execute(options: Options, interruption: Interruption) -> int:
     """Run a scenario and return the exit code; in a terminal its page stays until it is read."""
     display = ProgressDisplay()
-    mission = checked(options, display)
+    mission = checked_mission(options, display)
     # Teams of robots that another program moves have its clock in common.
     shared = mission.scenario.external_clock and options.domain_id is not None
     with contextlib.ExitStack() as served:
@@ -67,22 +67,6 @@ def execute(options: Options, interruption: Interruption) -> int:
             with interruption.at_once():
                 running.page.wait_for_reader(display.say)
         return code
-
-
-def checked(options: Options, display: ProgressDisplay) -> Mission[Any]:
-    """Return the mission of the options, and say what it will take."""
-    mission, doubts = checked_mission(options.scenario, options.overrides())
-    forecast = mission.preflight()
-    for line in forecast.lines:
-        display.say(line)
-    display.warn(*doubts, *forecast.warnings)
-    # A node in the namespace of a robot belongs to that robot.
-    if options.namespace.rpartition('/')[2] in mission.scenario.names():
-        raise ScenarioError(
-            f"--namespace: read '{options.namespace}', allowed is a name that is none of "
-            'a robot of the scenario'
-        )
-    return mission
 
 
 def prepare(mission: Mission[Any], options: Options) -> Path:
@@ -157,9 +141,7 @@ class RunningRun:
             'scenario': self.scenario.content(),
             'nodes': {
                 plan.full_name: {
-                    'package': plan.package,
-                    'executable': plan.executable,
-                    'parameters': plan.parameters,
+                    key: getattr(plan, key) for key in ('package', 'executable', 'parameters')
                 }
                 for plan in self.supervisor.plans.values()
             },
