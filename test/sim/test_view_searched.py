@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import Header
 
@@ -63,12 +64,16 @@ def test_the_numbers_under_the_pointer_are_those_of_the_planner(chromium, tmp_pa
         message = exploration_to_ros(explored, Header(frame_id='map'))
         assert isinstance(message, OccupancyGrid)
         facts = facts_for(maker.scene, waits=False)
-        for fact in facts.of('/exploration', 'nav_msgs/msg/OccupancyGrid', message):
-            maker.add(fact)
+        values = [KeyValue(key='explored', value=f'{explored.explored_fraction():.3f}')]
+        report = DiagnosticArray(status=[DiagnosticStatus(name='/planner_node', values=values)])
+        for topic, item in (('/diagnostics', report), ('/exploration', message)):
+            package = type(item).__module__.split('.')[0]
+            for fact in facts.of(topic, f'{package}/msg/{type(item).__name__}', item):
+                maker.add(fact)
     else:
-        maker.add(Explored(0.0, '', *explored.shown()))
+        maker.add(Explored(0.0, '', *explored.shown(), explored.explored_fraction()))
     (shown_map,) = [event for event in events if event[1] == 'map']
-    assert shown_map[-1] == pytest.approx(explored.explored_fraction(), abs=0.02)
+    assert shown_map[-1] == pytest.approx(explored.explored_fraction(), abs=1e-3)
     path = tmp_path / 'page.html'
     write_replay(EventLog(maker.scene, events), path)
     nodes = explored.nodes()
@@ -104,7 +109,7 @@ def test_ground_without_a_look_is_not_searched_however_unlikely_targets_are_ther
     events = []
     maker = EventMaker(scene, events.append)
     unseen = UnexploredMap(load_mission('field').scenario.world(1).area)
-    maker.add(Explored(0.0, '', *unseen.shown()))
+    maker.add(Explored(0.0, '', *unseen.shown(), unseen.explored_fraction()))
     known = shares(events[0][6])
     assert set(known) == {-1.0, 1.0} and events[0][7] == pytest.approx(0.0, abs=1e-9)
 

@@ -142,7 +142,8 @@ class Updated(Fact):
 class Explored(Fact):
     """The exploration function of a planner on a grid: values, or letters of `shades`.
 
-    Values below 0: there may be no target. share: explored; None: not said.
+    Values below 0: there may be no target. share: explored, None: not said; rounded: by a message
+    with one step for both axes.
     """
 
     team: str
@@ -150,6 +151,7 @@ class Explored(Fact):
     step: FloatArray
     values: Any
     share: float | None = None
+    rounded: bool = False
 
 
 @dataclass(frozen=True)

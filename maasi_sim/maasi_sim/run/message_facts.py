@@ -88,6 +88,8 @@ class MessageFacts:
         # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
+        # Explored share by team, as its planner last reported it.
+        self._shares: dict[str, float] = {}
         self.pictures = Pictures()  #: images that wait for their detections
         self.notes: dict[Any, Any] = {}  #: what readers of other missions remember
 
@@ -114,6 +116,7 @@ class MessageFacts:
             self.begin, self._team, self._latest = now, None, 0.0
             self._last.clear()
             self.notes.clear()
+            self._shares.clear()
         self._last[topic] = now
         return now - self.begin
 
@@ -246,6 +249,7 @@ class MessageFacts:
         indices = {item.robot: int(item.decision) for item in message.robots}
         decision = Decision(int(message.step), robots, message.objective, reason=message.reason)
         team, share = _space(topic), float(message.explored)
+        self._shares[team] = share
         yield Decided(self.time(message), team, decision, indices, share, message.planner)
 
     def _path(self, topic: str, message: Any) -> Iterator[Fact]:
@@ -257,7 +261,9 @@ class MessageFacts:
         values = np.asarray(message.data, dtype=float).reshape(info.height, info.width).T / 100.0
         values[values < 0.0] = -1.0
         lower = np.add(point(info.origin.position)[:2], 0.5 * step)
-        yield Explored(self.time(message), _space(topic), lower, np.array([step, step]), values)
+        share = self._shares.get(team := _space(topic))
+        steps = np.array([step, step])
+        yield Explored(self.time(message), team, lower, steps, values, share, rounded=True)
 
     def _cloud(self, topic: str, message: Any) -> Iterator[Fact]:
         rows = np.frombuffer(bytes(message.data), dtype='<f4').reshape(-1, message.point_step // 4)
@@ -268,7 +274,8 @@ class MessageFacts:
         lower, upper = (np.array([axis[end] for axis in axes]) for end in (0, -1))
         step = (upper - lower) / (np.array(shape) - 1)
         values = np.nan_to_num(rows[:, 3].reshape(shape).astype(float), nan=-1.0)
-        yield Explored(self.time(message), _space(topic), lower, step, values)
+        share = self._shares.get(team := _space(topic))
+        yield Explored(self.time(message), team, lower, step, values, share)
 
     def _truth(self, _: str, message: Any) -> Iterator[Fact]:
         points = [point(item.position) for item in message.poses]
@@ -306,6 +313,9 @@ class MessageFacts:
             for item in status.values:
                 if item.key == 'search':
                     yield Modes(self._latest, status.name, item.value)
+                elif item.key == 'explored':
+                    with contextlib.suppress(ValueError):
+                        self._shares[_space(status.name)] = float(item.value)
 
     def _end(self, _: str, message: Any) -> Iterator[Fact]:
         reason, _, text = message.data.partition('\n')

@@ -294,41 +294,17 @@ class EventMaker:
         if 'bounds' not in self.scene:
             bounds = np.round(np.stack([lower, lower + step * (shape - 1)], axis=1), 4)
             self._add_to_scene({'bounds': bounds.tolist()})
-        share = fact.share
-        if share is None and len(shape) == 2:
-            # The message of a grid has one resolution; nodes of the map are on all bounds.
+        if fact.rounded:
+            # Nodes of the map are on all bounds.
             low, high = np.array(self.scene['bounds'])[:2].T
             exact = (high - low) / np.maximum(shape - 1, 1)
             if np.allclose(exact, step, rtol=0.05):
                 lower, step = low, exact
-        if share is None:
-            share = 1.0 - self._unexplored(lower, step, values)
+        share = None if fact.share is None else round(fact.share, 4)
         text = values.tobytes().decode() if values.dtype.kind == 'S' else shades(values)
         steps = [significant(value) for value in padded(step)]
-        content = self._place(lower), steps, [*values.shape, 1][:3], text, round(share, 4)
+        content = self._place(lower), steps, [*values.shape, 1][:3], text, share
         self._put(fact.time, 'map', fact.team, *content)
-
-    def _unexplored(self, corner: Any, spacing: Any, values: FloatArray) -> float:
-        """Return the mean of e where targets may be, by the prior; ends of axes count half."""
-        weights = (values >= 0.0).astype(float)
-        for axis, count in enumerate(values.shape):
-            ends = np.isin(np.arange(count), (0, count - 1))
-            weights *= np.where(ends, 0.5, 1.0).reshape([-1] + [1] * (values.ndim - 1 - axis))
-        if 'prior' in self.scene:
-            low, step, shape, likely = self.scene['prior']
-            rows, columns = (
-                np.clip(
-                    np.rint(
-                        (corner[axis] + spacing[axis] * np.arange(count) - low[axis]) / step[axis]
-                    ),
-                    0,
-                    shape[axis] - 1,
-                ).astype(int)
-                for axis, count in enumerate(values.shape[:2])
-            )
-            weighted = np.reshape(likely, shape)[np.ix_(rows, columns)]
-            weights *= weighted.reshape(*weighted.shape, *[1] * (values.ndim - 2))
-        return float((weights * np.maximum(values, 0.0)).sum() / max(weights.sum(), 1e-12))
 
     def _add_truth(self, time: float, truth: FloatArray) -> None:
         before, self._board.truth = self._board.truth, truth

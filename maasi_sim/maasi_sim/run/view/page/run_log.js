@@ -148,7 +148,7 @@ export class RunLog {
       this.potential.add(time, Math.max(...this.potentialBy.values()));
       this.expect(time);
     } else if (kind === 'map') {
-      this.explore(time, owner, event[7]);
+      if (event[7] !== null) this.explore(time, owner, event[7]);
     } else if (kind === 'plan') {
       this.explore(time, owner, event[4]);
       for (const robot of event[7]) {
