@@ -19,7 +19,6 @@ setup(
         'pydantic>=2.7',
         'scipy>=1.11.4',
         'shapely>=2.0.3',
-        'typing_extensions>=4.10',
     ],
     extras_require={'test': ['pytest>=7.4']},
     zip_safe=True,
