@@ -126,7 +126,6 @@ class MissionKind:
 
     what: str
     make: Callable[..., Mission[Any]]  #: of a name, a layer of a scenario, and overrides
-    warm_up: Callable[[], object]  #: compiles the kernels of its simulation
 
 
 #: By the name of their planner; each registers itself in its module `<folder>/<name>_mission.py`.

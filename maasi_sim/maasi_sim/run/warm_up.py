@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+from pathlib import Path
 
 import numpy as np
 
@@ -19,11 +20,10 @@ _SERVICES = ('lifecycle_msgs.srv', 'maasi_msgs.action', 'rcl_interfaces.srv', 's
 
 def warm_up() -> None:
     """Compile, or load from the cache, the kernels of simulations."""
-    from maasi_sim.run.missions import MISSIONS
-
     _simulate('mambo_turtlebot_obstacles', 'ranging_pair_3d')
-    for mission in MISSIONS.values():
-        mission.warm_up()
+    # Of missions that have scenarios of their own: without messages, which may not be built yet.
+    for path in sorted(Path(__file__).parent.glob('*/scenario.py')):
+        importlib.import_module(f'{__package__}.{path.parent.name}.scenario').warm_up()
 
 
 def _simulate(*names: str) -> None:

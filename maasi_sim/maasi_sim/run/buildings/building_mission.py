@@ -19,8 +19,6 @@ from maasi_sim.run.buildings.scenario import (
     NAME,
     CuboidScenario,
     check_cuboid_scenario,
-    load_cuboid_scenario,
-    mission_of,
 )
 from maasi_sim.run.mission import MISSIONS, Mission, MissionKind
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
@@ -83,7 +81,6 @@ class BuildingMission(Mission[CuboidRecord]):
 MISSIONS[NAME] = MissionKind(
     'a search of buildings',
     lambda name, *values: BuildingMission(name, check_cuboid_scenario(*values)),
-    lambda: mission_of(load_cuboid_scenario('buildings_four')).run(1),
 )
 
 

@@ -124,3 +124,8 @@ def mission_of(scenario: CuboidScenario) -> CuboidMission:
     """Return a search of buildings in this process, as its nodes carry it out."""
     area = scenario.environment.array()
     return CuboidMission(scenario.planner, area, scenario.robots, scenario.step, scenario.seed)
+
+
+def warm_up() -> None:
+    """Compile, or load from the cache, the kernels of a search of buildings."""
+    mission_of(load_cuboid_scenario('buildings_four')).run(1)
