@@ -5,6 +5,7 @@ It is written by `maasi_sim.search`, and from the messages of nodes by an `Obser
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -106,16 +107,17 @@ class RunRecord:
         """Add a fact."""
         match fact:
             case RobotAt(time, robot, pose, _, status, reason, step) if robot in self._path:
-                self._path[robot].extend((time, *pose[:3]))
+                if math.isfinite(sum(pose)):
+                    self._path[robot].extend((time, *pose[:3]))
                 self.last_steps[robot] = step
                 if status == UNAVAILABLE or robot in self._lost:
                     self._note_lost(time, robot, status == UNAVAILABLE, reason)
             case Present(_, robots):
                 self.team = set(robots)
-            case Joined(time, robot):
+            case Joined(time, robot) if robot in self._path:
                 self.team.add(robot)
                 self._note_lost(time, robot, False)
-            case Left(time, robot):
+            case Left(time, robot) if robot in self._path:
                 self.team.discard(robot)
                 self._note_lost(time, robot, True)
 
@@ -241,10 +243,11 @@ class RunLog(RunRecord):
             case Decided(team=team, decision=decision, explored=share):
                 self._shares[team] = share
                 for robot, choice in decision.robots.items():
-                    if choice.chosen >= 0:
+                    if choice.chosen >= 0 and robot in self._path:
                         self.waypoints[robot].append((decision.step, choice.waypoint))
-            case Measured(time=time, robot=robot, pose=Pose() as pose, batch=batch) if batch:
-                self.measured_from[robot].append((time, pose))
+            case Measured(time=time, robot=robot, pose=Pose() as pose, batch=batch):
+                if batch and robot in self._path:
+                    self.measured_from[robot].append((time, pose))
             case Updated():
                 self._count(fact)
 
@@ -270,9 +273,9 @@ class RunLog(RunRecord):
         team = update.team
         for robot, index in update.members:
             # A restarted filter republishes its last update.
-            if (team, robot, index) not in self._counted:
+            if robot in self._path and (team, robot, index) not in self._counted:
                 self._counted.add((team, robot, index))
-                self.measurements[robot] = self.measurements.get(robot, 0) + 1
+                self.measurements[robot] += 1
         if update.found is not None:
             self._board.found[team] = update.found
         if self._world is not None and self._world.walk > 0.0:

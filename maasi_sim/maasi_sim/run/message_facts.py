@@ -4,6 +4,7 @@ import contextlib
 import importlib
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ from maasi_sim.run.facts import (
     Truth,
     Updated,
 )
-from maasi_sim.run.topics import point, seconds
+from maasi_sim.run.topics import finite_numbers, place, point, seconds
 from maasi_sim.run.view.pictures import IMAGES, Pictures
 
 STEP = 'maasi_msgs/msg/LockstepStep'
@@ -90,21 +91,34 @@ class MessageFacts:
         self._levels: dict[str, int] = {}
         # Explored share by team, as its planner last reported it.
         self._shares: dict[str, float] = {}
+        self.dropped = Counter[str]()  #: messages with values that cannot be used, by topic
         self.pictures = Pictures()  #: images that wait for their detections
         self.notes: dict[Any, Any] = {}  #: what readers of other missions remember
 
     def of(self, topic: str, kind: str, message: Any) -> Iterator[Fact]:
-        """Return the facts of a message of a topic, for which `is_read` is true."""
+        """Return the facts of a message of a topic, for which `is_read` is true.
+
+        A message with values that cannot be used is dropped; a fact says so, the first time.
+        """
         if self._waits and kind != STEP:
             self._early.append((topic, kind, message))
             return
         self._waits = False
-        for fact in READERS[kind][0](self, topic, message):
-            self._latest = max(self._latest, fact.time)
-            yield fact
+        try:
+            for fact in READERS[kind][0](self, topic, message):
+                self._latest = max(self._latest, fact.time)
+                yield fact
+        except (ValueError, ArithmeticError) as error:
+            yield from self.drop(topic, str(error))
         early, self._early = self._early, []
         for item in early:
             yield from self.of(*item)
+
+    def drop(self, topic: str, why: str) -> Iterator[Fact]:
+        """Count a message that cannot be used, and say so, the first time."""
+        self.dropped[topic] += 1
+        if self.dropped[topic] == 1:
+            yield Said(self._latest, topic, 'warning', f'messages are dropped, the first: {why}')
 
     def _now(self, topic: str, message: Any) -> float:
         """Return the run's time of a message; begin again if time jumps back on its topic."""
@@ -139,7 +153,10 @@ class MessageFacts:
         yaw = math.atan2(
             2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
         )
-        pose = (*point(message.pose.pose.position), yaw)
+        # Also a robot without a usable pose has a status.
+        pose = (math.nan,) * 4
+        with contextlib.suppress(ValueError):
+            pose = (*place('pose', message.pose.pose.position), yaw)
         battery = float(message.battery)
         yield RobotAt(
             self._now(topic, message),
@@ -163,13 +180,13 @@ class MessageFacts:
             usable = size in (2, 3) and size**2 == len(own)
             covariances.append(own.reshape(size, size) if usable else None)
             values.append((item.range, item.bearing, item.elevation))
-        place, turn = point(message.pose.pose.position), message.pose.pose.orientation
+        at, turn = place('pose', message.pose.pose.position), message.pose.pose.orientation
         pose = None
         with contextlib.suppress(ValueError):
-            pose = Pose(np.array(place), np.array([turn.w, turn.x, turn.y, turn.z]))
+            pose = Pose(np.array(at), np.array([turn.w, turn.x, turn.y, turn.z]))
         index, batch = int(message.measurement), int(message.batch_id)
         measured = Measured(
-            self.time(message), message.robot, place, pose, values, covariances, index, batch
+            self.time(message), message.robot, at, pose, values, covariances, index, batch
         )
         yield measured
         image = self.pictures.at(topic.rpartition('/')[0], seconds(message.header.stamp))
@@ -179,10 +196,9 @@ class MessageFacts:
     def _update(self, topic: str, message: Any) -> Iterator[Fact]:
         clusters = []
         for item in message.clusters:
-            covariance = np.asarray(item.covariance, dtype=float).reshape(3, 3)
-            clusters.append(
-                Cluster(np.array(point(item.position)), covariance, item.radius, item.mass)
-            )
+            numbers = finite_numbers('clusters.covariance', *map(float, item.covariance))
+            middle = np.array(place('clusters.position', item.position))
+            clusters.append(Cluster(middle, np.reshape(numbers, (3, 3)), item.radius, item.mass))
         team = _space(topic)
         yield Updated(
             self.time(message),
@@ -209,10 +225,11 @@ class MessageFacts:
 
     def _target(self, item: Any) -> FoundTarget:
         size = self._dimension
-        covariance = np.array(item.covariance, dtype=float).reshape(3, 3)
+        position = np.array(place('position', item.position))[:size]
+        covariance = np.reshape(finite_numbers('covariance', *map(float, item.covariance)), (3, 3))
         return FoundTarget(
             int(item.id),
-            np.array(point(item.position))[:size],
+            position,
             covariance[:size, :size],
             item.robot,
             int(item.measurement),
@@ -231,36 +248,36 @@ class MessageFacts:
                 name: np.array([getattr(row, field) for row in item.candidates])
                 for name, field in _COLUMNS.items()
             }
-            places = np.array([point(row.position) for row in item.candidates]).reshape(-1, 3)
+            places = [place('candidates.position', row.position) for row in item.candidates]
             # Planned paths are messages of their own.
-            path, waypoint = np.zeros((0, 3)), np.array(point(item.waypoint))
+            path, waypoint = np.zeros((0, 3)), np.array(place('waypoint', item.waypoint))
             # Recordings of earlier versions have no tours.
-            tour = np.array([point(place) for place in getattr(item, 'tour', ())]).reshape(-1, 3)
+            tour = [place('tour', corner) for corner in getattr(item, 'tour', ())]
             robots[item.robot] = RobotDecision(
                 int(item.chosen),
                 waypoint,
                 path,
                 path[:, 0],
-                places,
+                np.reshape(places, (-1, 3)),
                 **columns,
                 reason=reasons.get(item.robot, ''),
-                tour=tour,
+                tour=np.reshape(tour, (-1, 3)),
             )
         indices = {item.robot: int(item.decision) for item in message.robots}
         decision = Decision(int(message.step), robots, message.objective, reason=message.reason)
-        team, share = _space(topic), float(message.explored)
+        team, (share,) = _space(topic), finite_numbers('explored', float(message.explored))
         self._shares[team] = share
         yield Decided(self.time(message), team, decision, indices, share, message.planner)
 
     def _path(self, topic: str, message: Any) -> Iterator[Fact]:
-        points = [point(item.pose.position) for item in message.poses]
+        points = [place('poses', item.pose.position) for item in message.poses]
         yield PathPlanned(self.time(message), _space(topic).rpartition('/')[2], points)
 
     def _grid(self, topic: str, message: Any) -> Iterator[Fact]:
         info, step = message.info, float(message.info.resolution)
         values = np.asarray(message.data, dtype=float).reshape(info.height, info.width).T / 100.0
         values[values < 0.0] = -1.0
-        lower = np.add(point(info.origin.position)[:2], 0.5 * step)
+        lower = np.add(place('info.origin', info.origin.position)[:2], 0.5 * step)
         share = self._shares.get(team := _space(topic))
         steps = np.array([step, step])
         yield Explored(self.time(message), team, lower, steps, values, share, rounded=True)
@@ -278,18 +295,18 @@ class MessageFacts:
         yield Explored(self.time(message), team, lower, step, values, share)
 
     def _truth(self, _: str, message: Any) -> Iterator[Fact]:
-        points = [point(item.position) for item in message.poses]
+        points = [place('poses', item.position) for item in message.poses]
         yield Truth(self._latest, np.array(points).reshape(-1, 3)[:, : self._dimension])
 
     def _scenery(self, topic: str, message: Any) -> Iterator[Fact]:
         parts: dict[str, list[Any]] = {}
         for item in message.markers:
             part = _PARTS.get((topic.rpartition('/')[2], item.ns.rpartition('/')[2]), '')
-            place, size = point(item.pose.position), np.array(point(item.scale))
+            at, size = point(item.pose.position), np.array(point(item.scale))
             if part == 'obstacles':
-                parts.setdefault(part, []).append([*place[:2], 0.5 * float(size[0])])
+                parts.setdefault(part, []).append([*at[:2], 0.5 * float(size[0])])
             elif part:
-                box = np.stack([place - 0.5 * size, place + 0.5 * size], axis=1)
+                box = np.stack([at - 0.5 * size, at + 0.5 * size], axis=1)
                 parts.setdefault(part, []).append(box.tolist())
         if parts:
             yield SceneFound(self._latest, parts)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
+from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
-from maasi_sim.run.facts import Fact
+from maasi_sim.run.facts import Fact, Said
 from maasi_sim.run.log import RunEnd, RunRecord
 from maasi_sim.run.message_facts import MessageFacts
 from maasi_sim.run.topics import STEP
@@ -48,13 +49,26 @@ class Observer:
             for topic, kind in {STEP: 'LockstepStep', **kinds, **states}.items()
         }
         self.topics = list(self._kinds)
+        self.complaints: list[str] = []  #: messages that were dropped, in words
         self._facts = MessageFacts(True, scenario.names(), len(scenario.environment.array()))
+
+    def kind(self, topic: str) -> str:
+        """Return the type of the messages of a topic."""
+        return self._kinds[topic]
 
     def add(self, topic: str, data: bytes) -> None:
         """Add a serialised message; one of another topic is ignored."""
         if topic in self._kinds:
             kind = self._kinds[topic]
-            for fact in self._facts.of(topic, kind, self._types.deserialize_cdr(data, kind)):
+            try:
+                message = self._types.deserialize_cdr(data, kind)
+            except SerdeError:
+                facts = self._facts.drop(topic, f'it is no {kind}')
+            else:
+                facts = self._facts.of(topic, kind, message)
+            for fact in facts:
+                if isinstance(fact, Said) and fact.level == 'warning':
+                    self.complaints.append(f'{fact.source}: {fact.text}')
                 self.handle(fact)
 
     def handle(self, fact: Fact) -> None:

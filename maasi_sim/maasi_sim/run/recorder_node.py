@@ -225,8 +225,9 @@ class Recorder:
         return beats
 
     def take_complaints(self) -> list[str]:
-        """Return what became wrong since the last call: of the recording, and of planners."""
-        complaints, self._complaints = self._complaints, []
+        """Return what became wrong since the last call: of recording, messages and planners."""
+        complaints = self._complaints + self.observer.complaints
+        self._complaints, self.observer.complaints = [], []
         return complaints
 
     def publish_ready(self) -> None:

@@ -1,11 +1,13 @@
 """Names of topics; times and classes of messages, also of serialised ones (CDR)."""
 
 import importlib
+import math
 import struct
 from functools import cache
 from typing import Any
 
 CLOCK = '/clock'
+_FARTHEST = 1e8  # position [m]
 UPDATE, FOUND, DECISIONS = '/filter_update', '/found_targets', '/decisions'
 BATCH = '/measurement_batch'
 STEP = '/lockstep/step'
@@ -24,6 +26,22 @@ def seconds(stamp: Any) -> float:
 def point(item: Any) -> tuple[float, float, float]:
     """Return the coordinates of a `geometry_msgs/Point`."""
     return float(item.x), float(item.y), float(item.z)
+
+
+def finite_numbers(field: str, *values: float) -> tuple[float, ...]:
+    """Return the numbers of a field; ValueError: one is not finite."""
+    if not all(map(math.isfinite, values)):
+        read = ', '.join(f'{value:g}' for value in values)
+        raise ValueError(f'{field}: read {read}, allowed are finite numbers')
+    return values
+
+
+def place(field: str, item: Any) -> tuple[float, float, float]:
+    """Return the coordinates of a `geometry_msgs/Point`; ValueError: one is not on this earth."""
+    x, y, z = finite_numbers(field, *point(item))
+    if max(abs(x), abs(y), abs(z)) > _FARTHEST:
+        raise ValueError(f'{field}: read {x:g}, {y:g}, {z:g}, allowed are up to {_FARTHEST:g} m')
+    return x, y, z
 
 
 def stamp_of(topic: str, kind: Any, data: bytes) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from maasi_sim.run.facts import Fact, Said, Shown
-from maasi_sim.run.topics import point
+from maasi_sim.run.topics import finite_numbers, place, point
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,14 @@ _ACTIVITIES = ('searching', 'returning', 'recharging')  # of a `CuboidDecision`
 
 def _decision(facts: Any, _: str, message: Any) -> Iterator[Fact]:
     robot, time = message.robot, facts.time(message)
-    activity = _ACTIVITIES[min(int(message.activity), len(_ACTIVITIES) - 1)]
+    if int(message.activity) >= len(_ACTIVITIES):
+        raise ValueError(f'activity: read {message.activity}, allowed are 0 to 2')
+    activity = _ACTIVITIES[int(message.activity)]
+    target = np.array(place('target', message.target))
+    finite_numbers('solve_time', float(message.solve_time))
+    for shot in message.snapshots:
+        numbers = float(shot.distance), float(shot.detection_probability)
+        finite_numbers('snapshots', *numbers, *point(shot.position), *point(shot.direction))
     yield CuboidsDecided(time, message)
     shots = []
     for shot in message.snapshots:
@@ -37,9 +44,8 @@ def _decision(facts: Any, _: str, message: Any) -> Iterator[Fact]:
         facts.notes['planned', robot] = planned
         words = ', '.join(map(str, planned)) or 'none'
         yield Said(time, robot, 'decision', f'cuboids that it plans to visit: {words}')
-    target, heard = np.array(point(message.target)), list(message.heard)
-    content = (activity, message.how, target, heard, planned, shots, bool(message.done))
-    yield Shown(time, 'cuboid', robot, content)
+    content = (activity, message.how, target, list(message.heard), planned, shots)
+    yield Shown(time, 'cuboid', robot, (*content, bool(message.done)))
 
 
 #: Parts of a scene, and readers of messages, which `MessageFacts` has in addition to its own.

@@ -73,6 +73,9 @@ class CuboidRecord(RunRecord):
         self._decisions.append((time, decision))
         moment = Moment(time, int(decision.step))
         for shot in decision.snapshots:
+            # Of another mission.
+            if int(shot.cuboid) >= len(self.mission.cells):
+                continue
             self.snapshots.append(self._snapshot(shot, decision.robot, time))
             known = self.visited_at.get(int(shot.cuboid))
             if known is None or moment.step < known.step:
