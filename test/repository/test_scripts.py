@@ -2,7 +2,9 @@
 
 import os
 import re
+import runpy
 import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -110,3 +112,12 @@ def test_property_tests_draw_the_same_examples_each_time(tmp_path):
     assert result.returncode == 0, result.stdout
     first, second = (re.findall(rf'{file.stem} drew (.*)', result.stdout) for file in files)
     assert len(first) > 50 and first == second
+
+
+def test_kernels_are_compiled_before_messages_are_built():
+    # Both are made at the same time.
+    code = "import sys; sys.modules['maasi_msgs'] = sys.modules['rclpy'] = None; sys.argv[1:] = {}"
+    parts = runpy.run_path(str(SCRIPTS / 'compile_kernels.py'))
+    for names in parts['PARTS']:
+        result = call(sys.executable, '-c', f'{code.format(list(names))}\n{parts["PART"]}')
+        assert result.returncode == 0, result.stderr
