@@ -18,6 +18,7 @@ from maasi_drivers.calibration.sensor_calibration import SensorNoise, sensor_noi
 from maasi_drivers.settings.camera import load_calibration
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.parameters import parameter_fields, unflatten
+from maasi_filter.wording import problems
 
 _CLEAR = 4.0  # mean errors above this multiple of their standard deviation are significant
 
@@ -89,9 +90,7 @@ def read_parameters(path: Path) -> DriverSettings:
     try:
         settings = DriverSettings.model_validate(unflatten(DriverSettings, flat))
     except ValidationError as error:
-        first = error.errors()[0]
-        key = '.'.join(map(str, first['loc']))
-        raise ValueError(f'{path}: {key}: read {first["input"]!r}; {first["msg"]}') from error
+        raise ValueError(f'{path}: {problems(error)}') from None
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from error
     if settings.camera is not None and settings.calibration_file:

@@ -13,6 +13,7 @@ from maasi_drivers.settings.camera import SegmentationSettings
 from maasi_drivers.vision.images import ImageSourceError, VideoSource
 from maasi_drivers.vision.measurement_feed import MOST, FeedPacket, encode
 from maasi_drivers.vision.segmentation import segment
+from maasi_filter.wording import problems
 
 _ROUND = 0.002
 
@@ -58,7 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
         settings = SegmentationSettings.model_validate({'rule': options.rule})
         source = VideoSource(options.video)
     except (ImageSourceError, ValidationError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        text = problems(error) if isinstance(error, ValidationError) else str(error)
+        print(f'error: {text}', file=sys.stderr)
         return 2
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

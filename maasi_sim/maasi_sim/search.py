@@ -18,6 +18,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.make_filter import make_filter
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import AgentMeasurement, FoundTarget
+from maasi_filter.wording import reason
 from maasi_planner.coordinator import Coordinator
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planners import Planner
@@ -69,8 +70,8 @@ def search(
             renamed = scenario.planner.renamed(planner)
         except ValidationError as error:
             # One line, without the type of error and the address that pydantic adds.
-            reasons = [item.get('ctx', {}).get('error', item['msg']) for item in error.errors()]
-            raise ValueError('planner: ' + '; '.join(map(str, reasons))) from None
+            reasons = '; '.join(map(reason, error.errors()))
+            raise ValueError(f'planner: {reasons}') from None
         scenario = scenario.model_copy(update={'planner': renamed})
         planner = None
     with compiling_said():

@@ -34,7 +34,7 @@ class Run:
         self.recorder = SimpleNamespace(
             elapsed=0.0, step=None, time=0, ready={PLANNER}, take_heartbeats=self.take
         )
-        self.recorder.observer = SimpleNamespace(last_steps=dict)
+        self.recorder.observer = SimpleNamespace(log=SimpleNamespace(last_steps={}))
         self.supervisor = Supervisor(mission, Options(), folder, ProgressDisplay())
         self.supervisor.recorder = self.recorder
         self.supervisor.running = True

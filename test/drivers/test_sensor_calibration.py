@@ -209,7 +209,7 @@ def test_a_wrong_stamp_offset_and_a_target_at_the_wrong_place_show(recording, wh
         (['--least-range', '5'], ['seen 0 times', 'at least 10']),
         ('- 1\n', ['not a parameter file']),
         ('/**: {ros__parameters: {camera.widht: 5}}\n', ['widht: there is no such parameter']),
-        ('/**: {ros__parameters: {camera.width: 5}}\n', ['environment.bounds: read']),
+        ('/**: {ros__parameters: {camera.width: 5}}\n', ['camera.width: read 5', 'allowed is']),
         (None, ['driver.yaml']),
     ],
 )

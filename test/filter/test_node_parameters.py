@@ -159,7 +159,7 @@ def test_missing_and_wrong_parameters_are_named_with_what_was_read(process):
     assert last.startswith('error: parameters environment.bounds, robots: needed, but not set')
     code, said = ended(process(flatten(SETTINGS) | {'step': -0.5, 'filter.particles': 'many'}))
     assert code == 2
-    assert 'parameter step: Input should be greater than 0, read -0.5' in said
+    assert 'parameter step: read -0.5, allowed is greater than 0' in said
     assert 'parameter filter.particles: ' in said and "read 'many'" in said
 
 

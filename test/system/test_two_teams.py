@@ -9,7 +9,8 @@ from rosgraph_msgs.msg import Clock
 from scenario_runs import Operator, beside, check_replay, start, write_scenario
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
-from maasi_filter.ros.qos import SENSOR
+from maasi_filter.ros.qos import LATCHED_ALL, SENSOR
+from maasi_msgs.msg import LockstepDone
 from maasi_sim.run.bag import Bag
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.simulation.robots import Simulation
@@ -35,7 +36,14 @@ class Mover(Operator):
         simulation = Simulation(load_scenario(path, moved), 1)
         node = Node('mover', namespace=team, context=self.context)
         self.executor.add_node(node)
-        self.teams.append((simulation, RobotTopics(node, simulation, 'mambo', SENSOR)))
+        topics = RobotTopics(node, simulation, 'mambo', SENSOR)
+
+        def ready(message):
+            # From now on all is recorded.
+            if message.node.endswith('/recorder'):
+                self.teams.append((simulation, topics))
+
+        node.create_subscription(LockstepDone, 'lockstep/ready', ready, LATCHED_ALL)
 
         def command(message):
             linear, turn = message.twist.linear, message.twist.angular.z

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from maasi_filter.plugins import OwnSettings, PluginGroup
 from maasi_filter.settings import Finite, Settings, Vector3
+from maasi_filter.wording import problems
 
 # Beyond these limits a camera cannot be one.
 Focal = Annotated[Finite, Field(gt=0.0, le=1e6)]
@@ -267,12 +268,7 @@ class CameraSettings(Settings):
         try:
             return CameraSettings.model_validate(self.model_dump() | given)
         except ValidationError as error:
-            # One line, without the type of error and the address that pydantic adds.
-            texts = [
-                ': '.join([*map(str, item['loc']), item['msg'].removeprefix('Value error, ')])
-                for item in error.errors()
-            ]
-            raise ValueError('; '.join(texts)) from None
+            raise ValueError(problems(error)) from None
 
 
 def load_calibration(path: str | Path, settings: CameraSettings) -> CameraSettings:

@@ -12,6 +12,7 @@ from maasi_filter.geometry.readers import shapes_of_texts
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
+from maasi_filter.wording import problems
 from maasi_msgs.msg import KeepOuts
 
 # Most zones and corners of their polygons in a request.
@@ -80,12 +81,5 @@ def with_keep_outs(environment: EnvironmentSettings, zones: Sequence[str]) -> Ar
     try:
         given = {**dict(environment), 'keep_outs': shapes_of_texts(zones)}
         return Area(EnvironmentSettings.model_validate(given))
-    except ValueError as error:
-        # One line, without the type of error and the address that pydantic adds.
-        if not isinstance(error, ValidationError):
-            raise
-        parts = [
-            (*map(str, item['loc']), item['msg'].removeprefix('Value error, '))
-            for item in error.errors()
-        ]
-        raise ValueError('; '.join(map(': '.join, parts))) from None
+    except ValidationError as error:
+        raise ValueError(problems(error)) from None

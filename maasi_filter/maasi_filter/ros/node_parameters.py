@@ -25,6 +25,7 @@ from maasi_filter.ros.parameters import (
     parameter_fields,
     unflatten,
 )
+from maasi_filter.wording import reason
 
 SettingsT = TypeVar('SettingsT', bound=NodeSettings)
 
@@ -154,8 +155,7 @@ def check(
         if item['type'] == 'missing' or not values:
             missing.append(name)
         else:
-            text = item['msg'].removeprefix('Value error, ')
-            problems[name] = f'parameter {name}: {text}, read {item["input"]!r}'
+            problems[name] = f'parameter {name}: {reason(item)}'
     if missing:
         several = 's' if len(missing) > 1 else ''
         problems[missing[0]] = (

@@ -1,6 +1,5 @@
 """YAML files in layers: read, merged and checked, with errors that name file, line and key."""
 
-import json
 import re
 import typing
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 from maasi_filter.geometry.polygons import InputWarning
 from maasi_filter.plugins import own_settings, unknown
 from maasi_filter.ros.parameters import choices
+from maasi_filter.wording import reason, shown
 
 Key = tuple[str | int, ...]
 Model = TypeVar('Model', bound=BaseModel)
@@ -101,7 +101,7 @@ class _Loader(yaml.SafeLoader):
             inner, place = (*key, name), self.place(key_node)
             if not isinstance(name, str):
                 raise ScenarioError(
-                    f'{place}: {dotted(key)}: read {_show(name)} as a key, allowed is text'
+                    f'{place}: {dotted(key)}: read {shown(name)} as a key, allowed is text'
                 )
             if name in mapping:
                 raise ScenarioError(f'{place}: {dotted(inner)}: stands there twice')
@@ -140,7 +140,7 @@ def read_layer(path: Path, key: Key = ()) -> Layer:
     except RecursionError:
         raise ScenarioError(f'{path}: is nested too deeply') from None
     if not isinstance(data, dict):
-        raise ScenarioError(f'{path}: read {_show(data)}, a mapping of keys is needed at the top')
+        raise ScenarioError(f'{path}: read {shown(data)}, a mapping of keys is needed at the top')
     return under(key, data, loader.origins, path.parent)
 
 
@@ -192,16 +192,6 @@ def _key(item: Any, data: Any) -> Key:
     return (*key, item['loc'][-1]) if item['type'] == 'missing' else tuple(key)
 
 
-# Names of types in pydantic's messages.
-_PLAIN = {
-    'boolean': 'true or false',
-    'string': 'text',
-    'integer': 'a whole number',
-    'number': 'a number',
-    'list': 'a list',
-}
-
-
 def _explain(item: Any, key: Key, model: type[BaseModel], data: Any) -> str:
     kind, context = item['type'], item.get('ctx', {})
     if kind == 'extra_forbidden':
@@ -211,13 +201,7 @@ def _explain(item: Any, key: Key, model: type[BaseModel], data: Any) -> str:
     if kind == 'literal_error':
         expected = re.findall(r"'([^']*)'", context['expected']) or [context['expected']]
         return unknown(item['input'], expected, 'value')
-    if kind == 'value_error':
-        return str(context['error'])
-    text = item['msg'].replace('Input should be', 'allowed is').replace(' after validation', '')
-    text = re.sub(r'a valid dictionary( or .*)?', 'a mapping of keys', text)
-    for name, plain in _PLAIN.items():
-        text = text.replace(f'a valid {name}', plain)
-    return f'read {_show(item["input"])}, {text[0].lower()}{text[1:]}'
+    return reason(item)
 
 
 def _known_keys(model: Any, key: Key, data: Any) -> list[str]:
@@ -238,10 +222,3 @@ def dotted(key: Key) -> str:
     """Return a key as text: `robots.mambo.start[2]`."""
     text = ''.join(f'[{step}]' if isinstance(step, int) else f'.{step}' for step in key)
     return text.removeprefix('.') or 'the whole'
-
-
-def _show(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return 'a mapping of keys'
-    text = repr(value) if isinstance(value, str) else json.dumps(value, default=str)
-    return text if len(text) <= 60 else f'{text[:57]}...'
