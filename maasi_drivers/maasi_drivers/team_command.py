@@ -23,7 +23,7 @@ from maasi_msgs.msg import AgentState
 from maasi_planner.node.search_modes import COMMANDS
 
 # Until rclpy (7.1) deletes an executor that Ctrl-C interrupted in its constructor without a word.
-SingleThreadedExecutor._sigint_gc = None
+SingleThreadedExecutor._sigint_gc = None  # type: ignore[assignment]
 
 DONE, FAILED, ABSENT, INTERRUPTED = 0, 1, 2, 130
 # Commands that only drivers have.
