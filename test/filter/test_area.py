@@ -420,7 +420,7 @@ def test_zones_that_are_received_name_no_files(tmp_path):
     assert len(kept) == 5 and all(shape.equals_exact(kept[1], 1e-3) for shape in kept[2:])
     names = [str(file), f'../{file.name}', '/etc/hosts', 'room.yaml', '1.geojson', '', '{', '[']
     for name in [*names, json.dumps({'polygon': str(file)}), json.dumps([str(file)]), '[[]]']:
-        with pytest.raises(ValueError, match='keep_outs: 1: ') as caught:
+        with pytest.raises(ValueError, match=r'keep_outs(: |\.)1: ') as caught:
             with_keep_outs(field, [wkt, name])
         message = str(caught.value)
         assert '\n' not in message and 'No such file' not in message, message

@@ -80,7 +80,7 @@ def test_page_of_keys_is_that_of_the_settings(monkeypatch: pytest.MonkeyPatch) -
     written, place = set(), ''
     for line in page.splitlines():
         if line.startswith('#'):
-            place = line.removesuffix(' of buildings').partition('### ')[2]
+            place = re.sub(' of [a-z_,: ]+$', '', line).partition('### ')[2]
         elif found := re.match(r'\| `(\w+)` ', line):
             written.add(f'{place}.{found[1]}'.strip('.'))
     folder = ROOT / 'config' / 'scenarios'

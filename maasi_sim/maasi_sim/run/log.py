@@ -20,18 +20,7 @@ from maasi_filter.records import FoundTarget
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.motion import RobotState
 from maasi_planner.team import Decision
-from maasi_sim.run.facts import (
-    Decided,
-    Explored,
-    Fact,
-    Joined,
-    Left,
-    Measured,
-    Present,
-    RobotAt,
-    Truth,
-    Updated,
-)
+from maasi_sim.run import facts
 from maasi_sim.run.scores import Scoreboard, Scores, numbered, scoring_radius
 from maasi_sim.run.view.event_log import STATE_PERIOD, shades
 from maasi_sim.scenario.base import BaseScenario
@@ -103,21 +92,21 @@ class RunRecord:
         self.team = set(scenario.names())  #: robots that take part
         self._lost: set[str] = set()
 
-    def add(self, fact: Fact) -> None:
+    def add(self, fact: facts.Fact) -> None:
         """Add a fact."""
         match fact:
-            case RobotAt(time, robot, pose, _, status, reason, step) if robot in self._path:
+            case facts.RobotAt(time, robot, pose, _, status, reason, step) if robot in self._path:
                 if math.isfinite(sum(pose)):
                     self._path[robot].extend((time, *pose[:3]))
                 self.last_steps[robot] = step
                 if status == UNAVAILABLE or robot in self._lost:
                     self._note_lost(time, robot, status == UNAVAILABLE, reason)
-            case Present(_, robots):
+            case facts.Present(_, robots):
                 self.team = set(robots)
-            case Joined(time, robot) if robot in self._path:
+            case facts.Joined(time, robot) if robot in self._path:
                 self.team.add(robot)
                 self._note_lost(time, robot, False)
-            case Left(time, robot) if robot in self._path:
+            case facts.Left(time, robot) if robot in self._path:
                 self.team.discard(robot)
                 self._note_lost(time, robot, True)
 
@@ -172,7 +161,7 @@ class RunLog(RunRecord):
 
     Attributes
     ----------
-    facts : list of Fact
+    facts : list of facts.Fact
         In their order, if they are kept.
     listeners : list of callables
         Each is called with each fact.
@@ -208,8 +197,8 @@ class RunLog(RunRecord):
         keeps: bool = True,
     ) -> None:
         super().__init__(scenario, seed, name)
-        self.facts: list[Fact] = []
-        self.listeners: list[Callable[[Fact], None]] = []
+        self.facts: list[facts.Fact] = []
+        self.listeners: list[Callable[[facts.Fact], None]] = []
         self.waypoints: dict[str, list[tuple[int, FloatArray]]] = defaultdict(list)
         self.measured_from: dict[str, list[tuple[float, Pose]]] = defaultdict(list)
         self._shares: dict[str, float] = {}
@@ -232,7 +221,7 @@ class RunLog(RunRecord):
         self._counted: set[tuple[str, str, int]] = set()
         self.scores = self.scores_against(self.truth)
 
-    def add(self, fact: Fact) -> None:
+    def add(self, fact: facts.Fact) -> None:
         """Add a fact."""
         if self._keeps:
             self.facts.append(fact)
@@ -240,15 +229,15 @@ class RunLog(RunRecord):
             listener(fact)
         super().add(fact)
         match fact:
-            case Decided(team=team, decision=decision, explored=share):
+            case facts.Decided(team=team, decision=decision, explored=share):
                 self._shares[team] = share
                 for robot, choice in decision.robots.items():
                     if choice.chosen >= 0 and robot in self._path:
                         self.waypoints[robot].append((decision.step, choice.waypoint))
-            case Measured(time=time, robot=robot, pose=Pose() as pose, batch=batch):
+            case facts.Measured(time=time, robot=robot, pose=Pose() as pose, batch=batch):
                 if batch and robot in self._path:
                     self.measured_from[robot].append((time, pose))
-            case Updated():
+            case facts.Updated():
                 self._count(fact)
 
     def add_states(self, time: float, states: Mapping[str, RobotState]) -> None:
@@ -257,7 +246,7 @@ class RunLog(RunRecord):
             self._last_states = time
             for name, state in states.items():
                 pose = (*state.pose.position.tolist(), float(state.pose.yaw))
-                self.add(RobotAt(time, name, pose))
+                self.add(facts.RobotAt(time, name, pose))
 
     def add_map(self, time: float, team: str, exploration: UnexploredMap, now: bool) -> None:
         """Add an exploration function as a planner node does: once a second, and if `now`."""
@@ -267,9 +256,9 @@ class RunLog(RunRecord):
             lower, step, shown = exploration.shown()
             letters = np.frombuffer(shades(shown).encode(), 'S1').reshape(shown.shape)
             share = exploration.explored_fraction()
-            self.add(Explored(time, team, lower, step, letters, share))
+            self.add(facts.Explored(time, team, lower, step, letters, share))
 
-    def _count(self, update: Updated) -> None:
+    def _count(self, update: facts.Updated) -> None:
         team = update.team
         for robot, index in update.members:
             # A restarted filter republishes its last update.
@@ -281,7 +270,7 @@ class RunLog(RunRecord):
         if self._world is not None and self._world.walk > 0.0:
             self.truth = np.asarray(self._world.targets_at(update.step), dtype=float)
             if self._keeps:
-                self.add(Truth(update.time, self.truth))
+                self.add(facts.Truth(update.time, self.truth))
             self.scores = self.scores_against(self.truth)
         elif update.found is not None:
             self.scores = self.scores_against(self.truth)
@@ -300,7 +289,7 @@ class RunLog(RunRecord):
         if complete and self.completed is None:
             self.completed = now
 
-    def recount(self, updates: Sequence[Updated]) -> None:
+    def recount(self, updates: Sequence[facts.Updated]) -> None:
         """Count again, in the order of steps and teams instead of arrival, to the completion."""
         self._begin_counts()
         for update in sorted(updates, key=lambda item: (item.step, item.team, item.batch)):
@@ -381,17 +370,17 @@ class RunLog(RunRecord):
     @property
     def decisions(self) -> list[Decision]:
         """Joint decisions."""
-        return [item.decision for item in self.facts if isinstance(item, Decided)]
+        return [item.decision for item in self.facts if isinstance(item, facts.Decided)]
 
     @property
     def planning_times(self) -> list[float]:
         """Wall time of each decision [s]."""
-        return [item.duration for item in self.facts if isinstance(item, Decided)]
+        return [item.duration for item in self.facts if isinstance(item, facts.Decided)]
 
     @property
     def filter_times(self) -> list[float]:
         """Wall time of each filter step [s]."""
-        return [item.duration for item in self.facts if isinstance(item, Updated)]
+        return [item.duration for item in self.facts if isinstance(item, facts.Updated)]
 
     def columns(self) -> dict[str, Any]:
         """Return the progress by columns, with places of robots and whether they measured."""

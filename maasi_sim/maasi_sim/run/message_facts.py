@@ -16,26 +16,7 @@ from maasi_filter.geometry.environment import Zone
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster, FoundTarget, Label
 from maasi_planner.team import Decision, RobotDecision
-from maasi_sim.run.facts import (
-    Decided,
-    Ended,
-    Explored,
-    Fact,
-    Found,
-    Joined,
-    KeepOutsChanged,
-    Left,
-    Measured,
-    Modes,
-    PathPlanned,
-    Photographed,
-    Present,
-    RobotAt,
-    Said,
-    SceneFound,
-    Truth,
-    Updated,
-)
+from maasi_sim.run import facts
 from maasi_sim.run.topics import finite_numbers, place, point, seconds
 from maasi_sim.run.view.pictures import IMAGES, Pictures
 
@@ -89,13 +70,13 @@ class MessageFacts:
         # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
-        # Explored share by team, as its planner last reported it.
+        # facts.Explored share by team, as its planner last reported it.
         self._shares: dict[str, float] = {}
         self.dropped = Counter[str]()  #: messages with values that cannot be used, by topic
         self.pictures = Pictures()  #: images that wait for their detections
         self.notes: dict[Any, Any] = {}  #: what readers of other missions remember
 
-    def of(self, topic: str, kind: str, message: Any) -> Iterator[Fact]:
+    def of(self, topic: str, kind: str, message: Any) -> Iterator[facts.Fact]:
         """Return the facts of a message of a topic, for which `is_read` is true.
 
         A message with values that cannot be used is dropped; a fact says so, the first time.
@@ -114,11 +95,13 @@ class MessageFacts:
         for item in early:
             yield from self.of(*item)
 
-    def drop(self, topic: str, why: str) -> Iterator[Fact]:
+    def drop(self, topic: str, why: str) -> Iterator[facts.Fact]:
         """Count a message that cannot be used, and say so, the first time."""
         self.dropped[topic] += 1
         if self.dropped[topic] == 1:
-            yield Said(self._latest, topic, 'warning', f'messages are dropped, the first: {why}')
+            yield facts.Said(
+                self._latest, topic, 'warning', f'messages are dropped, the first: {why}'
+            )
 
     def _now(self, topic: str, message: Any) -> float:
         """Return the run's time of a message; begin again if time jumps back on its topic."""
@@ -138,17 +121,17 @@ class MessageFacts:
         """Return the run's time of a message with a header [s]; 0 before the run has begun."""
         return 0.0 if self.begin is None else seconds(message.header.stamp) - self.begin
 
-    def _step(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _step(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         time = self._now(topic, message)
         before, self._team = self._team, set(message.robots)
         if before != self._team:
             for name in sorted((before or set()) - self._team):
-                yield Left(time, name)
+                yield facts.Left(time, name)
             for name in sorted(self._team - (self._team if before is None else before)):
-                yield Joined(time, name)
-            yield Present(time, sorted(self._team), int(message.step))
+                yield facts.Joined(time, name)
+            yield facts.Present(time, sorted(self._team), int(message.step))
 
-    def _state(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _state(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         turn = message.pose.pose.orientation
         yaw = math.atan2(
             2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
@@ -158,7 +141,7 @@ class MessageFacts:
         with contextlib.suppress(ValueError):
             pose = (*place('pose', message.pose.pose.position), yaw)
         battery = float(message.battery)
-        yield RobotAt(
+        yield facts.RobotAt(
             self._now(topic, message),
             message.robot,
             pose,
@@ -168,11 +151,11 @@ class MessageFacts:
             int(message.step),
         )
 
-    def _image(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _image(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         self.pictures.keep(topic, seconds(message.header.stamp), lambda: message)
         return iter(())
 
-    def _detections(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _detections(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         values, covariances = [], []
         for item in message.detections:
             own = np.asarray(item.covariance, dtype=float)
@@ -185,22 +168,22 @@ class MessageFacts:
         with contextlib.suppress(ValueError):
             pose = Pose(np.array(at), np.array([turn.w, turn.x, turn.y, turn.z]))
         index, batch = int(message.measurement), int(message.batch_id)
-        measured = Measured(
+        measured = facts.Measured(
             self.time(message), message.robot, at, pose, values, covariances, index, batch
         )
         yield measured
         image = self.pictures.at(topic.rpartition('/')[0], seconds(message.header.stamp))
         if image is not None and pose is not None:
-            yield Photographed(measured.time, measured, image)
+            yield facts.Photographed(measured.time, measured, image)
 
-    def _update(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _update(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         clusters = []
         for item in message.clusters:
             numbers = finite_numbers('clusters.covariance', *map(float, item.covariance))
             middle = np.array(place('clusters.position', item.position))
             clusters.append(Cluster(middle, np.reshape(numbers, (3, 3)), item.radius, item.mass))
         team = _space(topic)
-        yield Updated(
+        yield facts.Updated(
             self.time(message),
             int(message.step),
             team,
@@ -212,10 +195,10 @@ class MessageFacts:
             batch=int(message.batch_id),
         )
 
-    def _found(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _found(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         team = _space(topic)
         targets = self._targets(team, message.targets)
-        yield Found(self.time(message), team, targets, int(message.batch_id))
+        yield facts.Found(self.time(message), team, targets, int(message.batch_id))
 
     def _targets(self, team: str, messages: Iterable[Any]) -> list[FoundTarget]:
         """Return the targets that a filter found itself, not those that others told it."""
@@ -237,11 +220,11 @@ class MessageFacts:
             label=Label(item.class_id, item.score, item.identity),
         )
 
-    def _keep_outs(self, _: str, message: Any) -> Iterator[Fact]:
+    def _keep_outs(self, _: str, message: Any) -> Iterator[facts.Fact]:
         shapes = [level_shape(Zone.model_validate(text)) for text in message.zones]
-        yield KeepOutsChanged(self.time(message), shapes)
+        yield facts.KeepOutsChanged(self.time(message), shapes)
 
-    def _plan(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _plan(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         robots, reasons = {}, _reasons(message)
         for item in message.robots:
             columns = {
@@ -267,22 +250,22 @@ class MessageFacts:
         decision = Decision(int(message.step), robots, message.objective, reason=message.reason)
         team, (share,) = _space(topic), finite_numbers('explored', float(message.explored))
         self._shares[team] = share
-        yield Decided(self.time(message), team, decision, indices, share, message.planner)
+        yield facts.Decided(self.time(message), team, decision, indices, share, message.planner)
 
-    def _path(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _path(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         points = [place('poses', item.pose.position) for item in message.poses]
-        yield PathPlanned(self.time(message), _space(topic).rpartition('/')[2], points)
+        yield facts.PathPlanned(self.time(message), _space(topic).rpartition('/')[2], points)
 
-    def _grid(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _grid(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         info, step = message.info, float(message.info.resolution)
         values = np.asarray(message.data, dtype=float).reshape(info.height, info.width).T / 100.0
         values[values < 0.0] = -1.0
         lower = np.add(place('info.origin', info.origin.position)[:2], 0.5 * step)
         share = self._shares.get(team := _space(topic))
         steps = np.array([step, step])
-        yield Explored(self.time(message), team, lower, steps, values, share, rounded=True)
+        yield facts.Explored(self.time(message), team, lower, steps, values, share, rounded=True)
 
-    def _cloud(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _cloud(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         rows = np.frombuffer(bytes(message.data), dtype='<f4').reshape(-1, message.point_step // 4)
         axes = [np.unique(rows[:, axis]).astype(float) for axis in range(3)]
         shape = [len(axis) for axis in axes]
@@ -292,13 +275,13 @@ class MessageFacts:
         step = (upper - lower) / (np.array(shape) - 1)
         values = np.nan_to_num(rows[:, 3].reshape(shape).astype(float), nan=-1.0)
         share = self._shares.get(team := _space(topic))
-        yield Explored(self.time(message), team, lower, step, values, share)
+        yield facts.Explored(self.time(message), team, lower, step, values, share)
 
-    def _truth(self, _: str, message: Any) -> Iterator[Fact]:
+    def _truth(self, _: str, message: Any) -> Iterator[facts.Fact]:
         points = [place('poses', item.position) for item in message.poses]
-        yield Truth(self._latest, np.array(points).reshape(-1, 3)[:, : self._dimension])
+        yield facts.Truth(self._latest, np.array(points).reshape(-1, 3)[:, : self._dimension])
 
-    def _scenery(self, topic: str, message: Any) -> Iterator[Fact]:
+    def _scenery(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         parts: dict[str, list[Any]] = {}
         for item in message.markers:
             part = _PARTS.get((topic.rpartition('/')[2], item.ns.rpartition('/')[2]), '')
@@ -309,15 +292,15 @@ class MessageFacts:
                 box = np.stack([at - 0.5 * size, at + 0.5 * size], axis=1)
                 parts.setdefault(part, []).append(box.tolist())
         if parts:
-            yield SceneFound(self._latest, parts)
+            yield facts.SceneFound(self._latest, parts)
 
-    def _log(self, _: str, message: Any) -> Iterator[Fact]:
+    def _log(self, _: str, message: Any) -> Iterator[facts.Fact]:
         level = int(message.level)
         if level >= _WARNING:
             word = 'fault' if level >= _ERROR else 'warning'
-            yield Said(self._latest, message.name, word, message.msg)
+            yield facts.Said(self._latest, message.name, word, message.msg)
 
-    def _diagnostics(self, _: str, message: Any) -> Iterator[Fact]:
+    def _diagnostics(self, _: str, message: Any) -> Iterator[facts.Fact]:
         for status in message.status:
             raw = status.level
             level = raw[0] if isinstance(raw, bytes) else int(raw)
@@ -326,20 +309,20 @@ class MessageFacts:
             if level != before and _FINE <= level <= _STALE:
                 word = 'fault' if level > 1 else 'warning' if level else 'team'
                 text = f'{_DIAGNOSTIC_WORDS[level]}: {status.message}'
-                yield Said(self._latest, status.name, word, text)
+                yield facts.Said(self._latest, status.name, word, text)
             for item in status.values:
                 if item.key == 'search':
-                    yield Modes(self._latest, status.name, item.value)
+                    yield facts.Modes(self._latest, status.name, item.value)
                 elif item.key == 'explored':
                     with contextlib.suppress(ValueError):
                         self._shares[_space(status.name)] = float(item.value)
 
-    def _end(self, _: str, message: Any) -> Iterator[Fact]:
+    def _end(self, _: str, message: Any) -> Iterator[facts.Fact]:
         reason, _, text = message.data.partition('\n')
-        yield Ended(self._latest, reason, text)
+        yield facts.Ended(self._latest, reason, text)
 
 
-Reader = Callable[[MessageFacts, str, Any], Iterator[Fact]]
+Reader = Callable[[MessageFacts, str, Any], Iterator[facts.Fact]]
 # By type: what reads it, and the last parts that the name of its topic may have; none: any.
 READERS: dict[str, tuple[Reader, tuple[str, ...]]] = {
     STEP: (MessageFacts._step, ()),

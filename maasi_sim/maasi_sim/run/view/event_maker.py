@@ -9,27 +9,7 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
-from maasi_sim.run.facts import (
-    Decided,
-    Ended,
-    Explored,
-    Fact,
-    Found,
-    Joined,
-    KeepOutsChanged,
-    Left,
-    Measured,
-    Modes,
-    PathPlanned,
-    Photographed,
-    Present,
-    RobotAt,
-    Said,
-    SceneFound,
-    Shown,
-    Truth,
-    Updated,
-)
+from maasi_sim.run import facts
 from maasi_sim.run.scores import Scoreboard
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning, shades
 from maasi_sim.run.view.pictures import picture
@@ -85,51 +65,51 @@ class EventMaker:
         self._measured: set[tuple[str, str, int]] = set()
         self.latest = 0.0  #: latest time of an event [s]
 
-    def add(self, fact: Fact) -> None:
+    def add(self, fact: facts.Fact) -> None:
         """Add the events of a fact."""
         time = fact.time
         match fact:
-            case RobotAt():
+            case facts.RobotAt():
                 self._add_state(fact)
-            case Present():
+            case facts.Present():
                 self._team = set(fact.robots)
-            case Joined():
+            case facts.Joined():
                 self._team = {*(self._team or ()), fact.robot}
                 self._say(time, fact.robot, 'team', 'joined')
-            case Left():
+            case facts.Left():
                 self._add_left(fact)
-            case Measured():
+            case facts.Measured():
                 self._add_measurement(fact)
-            case Photographed():
+            case facts.Photographed():
                 self._add_picture(fact)
-            case Found():
+            case facts.Found():
                 self._add_found(time, fact.team, fact.targets)
-            case Updated():
+            case facts.Updated():
                 if fact.found is not None:
                     self._add_found(time, fact.team, fact.found)
                 self._add_update(fact)
-            case Decided():
+            case facts.Decided():
                 self._add_decision(fact)
-            case PathPlanned():
+            case facts.PathPlanned():
                 self._add_path(time, fact.robot, fact.positions)
-            case Explored():
+            case facts.Explored():
                 self._add_map(fact)
-            case KeepOutsChanged():
+            case facts.KeepOutsChanged():
                 zones = [zone for zone in self.scene.get('zones', []) if zone['kind'] != 'keep_out']
                 self._put(time, 'zones', '', [*zones, *zones_as('keep_out', fact.shapes)])
-            case Truth():
+            case facts.Truth():
                 self._add_truth(time, np.asarray(fact.targets, dtype=float))
-            case SceneFound():
+            case facts.SceneFound():
                 # What a scenario says is better.
                 self._add_to_scene({k: v for k, v in fact.parts.items() if k not in self.scene})
-            case Said():
+            case facts.Said():
                 self._say(time, fact.source, fact.level, fact.text)
-            case Modes() if self._modes.get(fact.node) != fact.text:
+            case facts.Modes() if self._modes.get(fact.node) != fact.text:
                 self._modes[fact.node] = fact.text
                 self._put(time, 'mode', fact.node, fact.text)
-            case Shown():
+            case facts.Shown():
                 self._put(time, fact.kind, fact.owner, *map(self._plain, fact.content))
-            case Ended():
+            case facts.Ended():
                 self.end(fact.reason, fact.text)
 
     def _put(self, time: float, kind: str, owner: str, *content: Any) -> None:
@@ -166,7 +146,7 @@ class EventMaker:
             if self._status[name] < UNAVAILABLE:
                 self._set_status(self.latest, name, ENDED, '')
 
-    def _add_state(self, fact: RobotAt) -> None:
+    def _add_state(self, fact: facts.RobotAt) -> None:
         # The driver of a robot that left may publish for a while.
         away = self._team is not None and fact.robot not in self._team
         if away or not all(map(math.isfinite, fact.pose)):
@@ -181,7 +161,7 @@ class EventMaker:
             if until - last > _SILENCE and self._status[other] < LEFT:
                 self._set_status(time, other, SILENT, f'not heard for {_SILENCE:g} s')
 
-    def _add_left(self, fact: Left) -> None:
+    def _add_left(self, fact: facts.Left) -> None:
         if self._team is not None:
             self._team.discard(fact.robot)
         self._say(fact.time, fact.robot, 'team', 'left')
@@ -198,7 +178,7 @@ class EventMaker:
         elif before in words and status < UNAVAILABLE:
             self._say(time, name, 'team', 'takes part again')
 
-    def _add_measurement(self, fact: Measured) -> None:
+    def _add_measurement(self, fact: facts.Measured) -> None:
         rows = []
         for index, detection in enumerate(fact.values):
             own = None if fact.covariances is None else fact.covariances[index]
@@ -210,7 +190,7 @@ class EventMaker:
             rows.append([significant(value) for value in row])
         self._put(fact.time, 'seen', fact.robot, self._place(fact.position), rows)
 
-    def _add_picture(self, fact: Photographed) -> None:
+    def _add_picture(self, fact: facts.Photographed) -> None:
         item = fact.measured
         assert item.pose is not None
         try:
@@ -224,7 +204,7 @@ class EventMaker:
         facts: dict[str, Any] = self.scene.get('robots', {}).get(name, {})
         return facts
 
-    def _add_update(self, fact: Updated) -> None:
+    def _add_update(self, fact: facts.Updated) -> None:
         team = fact.team
         self._measured.update((team, name, index) for name, index in fact.members)
         rows = [
@@ -247,7 +227,7 @@ class EventMaker:
         self._put(time, 'found', team, rows)
         self._score(time)
 
-    def _add_decision(self, fact: Decided) -> None:
+    def _add_decision(self, fact: facts.Decided) -> None:
         time, decision = fact.time, fact.decision
         planner = fact.planner or self.scene.get('planner', '')
         rows = []
@@ -288,7 +268,7 @@ class EventMaker:
         chosen = np.linspace(0, count - 1, min(count, _MOST_POINTS)).round().astype(int)
         self._put(time, 'way', robot, [self._place(positions[item]) for item in chosen])
 
-    def _add_map(self, fact: Explored) -> None:
+    def _add_map(self, fact: facts.Explored) -> None:
         lower, step, values = fact.lower, fact.step, fact.values
         shape = np.array(values.shape)
         if 'bounds' not in self.scene:
