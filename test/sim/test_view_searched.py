@@ -81,6 +81,8 @@ def test_the_numbers_under_the_pointer_are_those_of_the_planner(chromium, tmp_pa
     chosen = rng.choice(len(nodes), 60, replace=False)
     with chromium() as shown:
         shown.open(path.as_uri())
+        # The map is drawn with the next frame.
+        shown.page.wait_for_function('maasi.map.unexplored.searched !== undefined')
         seen = shown.page.evaluate(
             """(places) => places.map((place) => {
               const [x, y] = maasi.camera.project([...place, 0]);
