@@ -24,7 +24,6 @@ FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
 # Fast DDS asks the ports of the first 32 participants of a host. Those beyond are named as peers,
 # with some that are started next to a run (a display, commands of ROS).
 _FOUND, _OTHERS, _LAST = 28, 8, 119
-_TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 _PEERS = '<initialPeersList>{}</initialPeersList>'
 _PEER = '<locator><udpv4><address>127.0.0.1</address><port>{}</port></udpv4></locator>'
 # First word of a memory that its creator has made ready (Boost.Interprocess).
@@ -103,10 +102,6 @@ class Domain(contextlib.AbstractContextManager['Domain']):
             last = min(participants + _OTHERS, _LAST)
             peers = range(_FOUND, last + 1) if participants + _OTHERS > _FOUND else ()
             variables[_PROFILES] = self._with_peers(profiles, peers) if peers else str(profiles)
-            if peers:
-                # With so many on a busy machine Fast DDS 2.14 takes a port in shared memory for
-                # dead, and locks while it makes it again: nodes then hang as they start.
-                variables[_TRANSPORTS] = os.environ.get(_TRANSPORTS, 'UDPv4')
         return variables
 
     def _with_peers(self, profiles: Path, peers: Iterable[int]) -> str:
