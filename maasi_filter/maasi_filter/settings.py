@@ -62,42 +62,42 @@ class DetectionSettings(Settings):
 
     kind: Annotated[str, DETECTIONS, AfterValidator(DETECTIONS.check)] = Field(
         'exponential',
-        description='Form of pi: G exp(-|zeta|/2), G exp(-|zeta|^2/2), G inside a box, or '
-        'module:Class of your own',
+        description='Shape of the probability of detection pi: G exp(-|zeta|/2), G '
+        'exp(-|zeta|^2/2), G inside a box, or your own module:Class',
     )
     settings: Annotated[Any, _DETECTION, AfterValidator(_DETECTION.check)] = Field(
-        None, validate_default=True, description='Settings of a form of your own'
+        None, validate_default=True, description='Settings of your own detection model'
     )
     probability: float = Field(
         0.98,
         ge=0.0,
         le=1.0,
-        description='G, the largest probability of detection; a form of your own is multiplied '
-        'with it [1]',
+        description='G, the largest probability of detection; scales your own model [1]',
     )
     size: list[Positive] = Field(
         [25.0, 25.0, 25.0],
         min_length=2,
         max_length=3,
-        description='F, size of the field of view on each map axis, exponential or gaussian [m]',
+        description='F, size of the field of view on each map axis; exponential and gaussian only '
+        '[m]',
     )
     lower: list[Finite] = Field(
         [-0.2, -0.2],
         min_length=2,
         max_length=3,
-        description='Lower corner of a box as offset from the robot [m]',
+        description='Lower corner of the box, relative to the robot [m]',
     )
     upper: list[Finite] = Field(
         [0.2, 0.2],
         min_length=2,
         max_length=3,
-        description='Upper corner of a box as offset from the robot [m]',
+        description='Upper corner of the box, relative to the robot [m]',
     )
     frame: Literal['robot', 'world'] = Field(
-        'robot', description='Whether a box turns with the robot or stays aligned with the map'
+        'robot', description='Whether the box turns with the robot or stays aligned with the map'
     )
     edge: NotNegative = Field(
-        0.0, description='Half width of a ramp across the faces of a box; 0 is hard [m]'
+        0.0, description='Half the width of the ramp across the faces of the box; 0: a step [m]'
     )
 
     @model_validator(mode='after')
@@ -125,12 +125,13 @@ class NoiseSettings(Settings):
         0.175, description='Noise of the bearing [unit of `angles`, squared as variance]'
     )
     elevation: NotNegative = Field(
-        0.295, description='Noise of the elevation, 3D only [unit of `angles`, or squared]'
+        0.295,
+        description='Noise of the elevation, only in 3D [unit of `angles`, squared as variance]',
     )
     as_: Literal['deviation', 'variance'] = Field(
         'deviation',
         alias='as',
-        description='Whether the numbers are standard deviations or variances',
+        description='Whether these numbers are standard deviations or variances',
     )
     angles: Literal['radians', 'degrees'] = Field('radians', description='Unit of the angles')
 
@@ -162,11 +163,13 @@ class SensorSettings(Settings):
     clutter: NotNegative = Field(
         0.0, description='Intensity of false detections [1/(m rad) in 2D, 1/(m rad^2) in 3D]'
     )
-    period: NotNegative = Field(0.0, description='Time between possible measurements [s]')
+    period: NotNegative = Field(
+        0.0, description='Time from one possible measurement to the next; 0: every step [s]'
+    )
     resolution: NotNegative = Field(
         1.0,
-        description='pmb: detections of one scan that are closer are of one target; 0: none are '
-        '[deviations of the noise]',
+        description='pmb: detections of one scan that are closer than this count as one target; 0 '
+        'disables this [standard deviations of the noise]',
     )
 
     def build(self, name: str, dimension: int) -> Sensor:
@@ -183,11 +186,12 @@ class OffsetSettings(Settings):
     """Errors of the robots' positions that last; both 0: their errors are independent."""
 
     deviation: NotNegative = Field(
-        0.0, description='Deviation of a constant offset on each axis [m]'
+        0.0, description='Standard deviation of the constant position offset on each axis [m]'
     )
     drift: NotNegative = Field(
         0.0,
-        description='Deviation of the drift of x and y after one metre; grows with its root [m]',
+        description='Standard deviation of the drift of x and y after 1 m of travel; it grows '
+        'with the square root of the distance [m]',
     )
 
 
@@ -195,13 +199,13 @@ class PmbSettings(Settings):
     """Settings of the Poisson multi-Bernoulli filter."""
 
     particles: int = Field(
-        300, ge=50, le=100_000, description='Particles of each potential target [1]'
+        300, ge=50, le=100_000, description='Number of particles of each potential target [1]'
     )
     found_probability: float = Field(
         0.99,
         gt=0.5,
         lt=1.0,
-        description='Existence probability above which a target can be found [1]',
+        description='Existence probability above which a target can be reported as found [1]',
     )
     withdrawn_probability: float = Field(
         0.5,
@@ -211,12 +215,12 @@ class PmbSettings(Settings):
     )
     walk: NotNegative = Field(
         0.0,
-        description='Standard deviation of a random walk of the targets on each axis after one '
-        'second; 0: they stand still [m/sqrt(s)]',
+        description='Standard deviation of the random walk of targets on each axis after 1 s; 0: '
+        'targets do not move [m/sqrt(s)]',
     )
     offset: OffsetSettings = Field(
         default_factory=OffsetSettings,
-        description='Errors of the robots that last, which the filter estimates',
+        description='Lasting errors of robot positions, which the filter estimates',
     )
 
 
@@ -289,23 +293,26 @@ class FilterSettings(Settings):
 
     method: Annotated[str, FILTERS, AfterValidator(FILTERS.check)] = Field(
         'ic_phd',
-        description="The papers' PHD, a Poisson multi-Bernoulli filter, or module:Class of your "
-        'own',
+        description='Particle PHD filter of the papers, Poisson multi-Bernoulli filter, or your '
+        'own module:Class',
     )
     settings: Annotated[Any, _FILTER, AfterValidator(_FILTER.check)] = Field(
-        None, validate_default=True, description='Settings of a filter of your own'
+        None, validate_default=True, description='Settings of your own filter'
     )
     preset: Annotated[Preset, _IC_PHD] = Field(
-        'paper_000', description='ic_phd: where values left None come from'
+        'paper_000', description='ic_phd: paper that provides the values of keys that are not set'
     )
     found_radius: float | None = Field(
-        None, gt=0.0, description='T_r, largest root mean square radius of what is found [m]'
+        None, gt=0.0, description='T_r, largest root mean square radius of a found target [m]'
     )
     exploration_spacing: float | None = Field(
         None, gt=0.0, description='Spacing of the exploration grid [m]'
     )
     threads: int | None = Field(
-        None, ge=1, le=256, description='Threads for large particle sets; results do not depend [1]'
+        None,
+        ge=1,
+        le=256,
+        description='Threads for large particle sets; results do not depend on it [1]',
     )
     particles: Annotated[int | None, _IC_PHD] = Field(
         None,
@@ -316,47 +323,58 @@ class FilterSettings(Settings):
     particles_minimum: Annotated[int | None, _IC_PHD] = Field(
         None,
         ge=0,
-        description='ic_phd: smallest number of particles after resampling, if any mass [1]',
+        description='ic_phd: smallest number of particles after resampling, unless the mass is 0 '
+        '[1]',
     )
     particles_per_target: Annotated[int | None, _IC_PHD] = Field(
         None,
         ge=1,
-        description='ic_phd: l, particles for each expected target, within the bounds [1]',
+        description='ic_phd: l, particles per expected target, within both bounds [1]',
     )
     survival_probability: Annotated[float | None, _IC_PHD] = Field(
         None,
         ge=0.0,
         le=1.0,
-        description='ic_phd: p_s, that a target still exists after one step [1]',
+        description='ic_phd: p_s, probability that a target still exists one step later [1]',
     )
     births: Annotated[Literal['measurement', 'uniform', 'gaussian'] | None, _IC_PHD] = Field(
-        None, description='ic_phd: births at each measurement, anywhere (001), or as in 003'
+        None,
+        description='ic_phd: particles are born at each measurement, uniformly, or from one '
+        'Gaussian over all measurements',
     )
     birth_particles: Annotated[int | None, _IC_PHD] = Field(
         None,
         ge=1,
         le=1_000_000,
-        description='ic_phd: J, particles of a birth (measurement: for each) [1]',
+        description='ic_phd: J, particles per birth; with births at measurements, per measurement '
+        '[1]',
     )
     birth_targets: Annotated[float | None, _IC_PHD] = Field(
         None,
         ge=0.0,
-        description='ic_phd: Y V, targets expected to appear at a batch (not at z) [1]',
+        description='ic_phd: Y V, expected number of new targets in a batch; not for births at '
+        'measurements [1]',
     )
     jitter_deviation: Annotated[float | None, _IC_PHD] = Field(
         None,
         ge=0.0,
-        description='ic_phd: deviation of the noise that moves copies of a particle apart [m]',
+        description='ic_phd: standard deviation of the noise that separates copies of a particle '
+        '[m]',
     )
     found_mass: Annotated[float | None, _IC_PHD] = Field(
-        None, ge=0.0, description='ic_phd: T_m, smallest mass of a cluster that is found [1]'
+        None, ge=0.0, description='ic_phd: T_m, smallest mass of a found cluster [1]'
     )
     removal: Annotated[Literal['closest', 'every'] | None, _IC_PHD] = Field(
-        None, description='ic_phd: which measurements near a found target are removed (000, or 003)'
+        None,
+        description='ic_phd: whether the closest or every measurement near a found target is '
+        'removed',
     )
     # Without mark: T_z is also the length by which found targets are scored.
     removal_distance: float | None = Field(
-        None, gt=0.0, description='ic_phd: T_z, largest distance of a removed measurement [m]'
+        None,
+        gt=0.0,
+        description='ic_phd: T_z, largest distance of a removed measurement from a found target '
+        '[m]',
     )
     kmeans_iterations: Annotated[int | None, _IC_PHD] = Field(
         None, ge=1, le=1000, description='ic_phd: largest number of K-means iterations [1]'
@@ -364,14 +382,14 @@ class FilterSettings(Settings):
     pose_error: Annotated[float | None, _CHECKED] = Field(
         None,
         ge=0.0,
-        description='pmb: deviation of the error of a robot position, per axis; none: as it says '
-        '[m]',
+        description='pmb: standard deviation of the robot position error on each axis; default: '
+        'as the robot reports [m]',
     )
     use_detection_covariances: Annotated[bool | None, _CHECKED] = Field(
         None, description='pmb: whether covariances of detections replace that of the sensor'
     )
     pmb: Annotated[PmbSettings, _PMB_ONLY] = Field(
-        default_factory=PmbSettings, description='pmb: what only it has'
+        default_factory=PmbSettings, description='Settings that only pmb uses'
     )
 
     @field_validator('preset', mode='before')

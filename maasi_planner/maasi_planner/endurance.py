@@ -37,23 +37,27 @@ class EnduranceSettings(Settings):
     """What the battery is used for, as shares of a full one, and where it is charged."""
 
     per_second: NotNegative = Field(
-        0.0, description='Use at rest or hovering; of a flight of 20 minutes: 0.00083 [1/s]'
+        0.0,
+        description='Share of the battery used per second at rest or hovering; a flight time of '
+        '20 minutes is 0.00083 [1/s]',
     )
-    per_metre: NotNegative = Field(0.0, description='Use of a metre on top of it [1/m]')
+    per_metre: NotNegative = Field(0.0, description='Additional share used per metre [1/m]')
     reserve: float = Field(
-        0.25, ge=0.0, lt=1.0, description='Charge that is left when it is home [1]'
+        0.25, ge=0.0, lt=1.0, description='Charge with which the robot arrives home [1]'
     )
-    full: float = Field(0.95, gt=0.0, le=1.0, description='Charge at which it goes out again [1]')
+    full: float = Field(
+        0.95, gt=0.0, le=1.0, description='Charge at which the robot leaves the charger [1]'
+    )
     chargers: list[Vector3] = Field(
         default_factory=list,
-        description='Where it is charged; none: at its start; in 2D their height is that of the '
+        description='Positions of chargers; default: the start; in 2D their height is that of the '
         'start [m, map]',
     )
     return_factor: float = Field(
         1.0,
         ge=1.0,
         le=5.0,
-        description='Factor on the predicted use of the path home, as for wind against it [1]',
+        description='Factor on the predicted use of the path home, for example for headwind [1]',
     )
 
 

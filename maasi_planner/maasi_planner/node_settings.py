@@ -16,21 +16,23 @@ from maasi_planner.settings import AnyPlanner, CandidateSettings, RobotModel, pl
 class PlannedRobotSettings(RobotModel):
     """Settings of a robot for the planner."""
 
-    radius: NotNegative = Field(0.1, description='Of a circle around the robot [m]')
+    radius: NotNegative = Field(0.1, description='Radius of a circle around the robot [m]')
     candidates: CandidateSettings = Field(
-        description='Waypoints to choose from; left out in a scenario: a grid from which it sees '
-        'everything'
+        description='Waypoints that the planner picks from; default in a scenario: a grid from '
+        'which the robot sees the whole area'
     )
     endurance: EnduranceSettings | None = Field(
-        None, description='So that it is home before its battery is empty; none: no matter'
+        None,
+        description='Battery model, which brings the robot home before its battery is empty; '
+        'default: unlimited battery',
     )
 
 
 class OtherRobotSettings(Settings):
     """Settings of a robot with its own planner."""
 
-    radius: NotNegative = Field(0.1, description='Of a circle around the robot [m]')
-    start: Vector3 = Field(description='Position at the start [m, map]')
+    radius: NotNegative = Field(0.1, description='Radius of a circle around the robot [m]')
+    start: Vector3 = Field(description='Start position [m, map]')
 
 
 class PlannerNodeSettings(NodeSettings):
@@ -48,32 +50,36 @@ class PlannerNodeSettings(NodeSettings):
         }
     )
 
-    environment: EnvironmentSettings = Field(description='Where the targets are')
-    planner: AnyPlanner = Field(default_factory=planner_settings, description='The planner')
-    robots: dict[str, PlannedRobotSettings] = Field(min_length=1, description='Robots, by name')
+    environment: EnvironmentSettings = Field(
+        description='Search area, keep-outs, obstacles and prior'
+    )
+    planner: AnyPlanner = Field(default_factory=planner_settings, description='Planner')
+    robots: dict[str, PlannedRobotSettings] = Field(min_length=1, description='Robots by name')
     others: dict[str, OtherRobotSettings] = Field(
-        {}, description='Robots that plan for themselves, by name; where they go is kept clear'
+        {},
+        description='Robots with their own planner, by name; this planner avoids their '
+        'destinations',
     )
     exploration_spacing: float | None = Field(
-        None, gt=0.0, description='Spacing of the exploration grid; none: as the filter has it [m]'
+        None, gt=0.0, description='Spacing of the exploration grid; default: that of the filter [m]'
     )
     search_on_start: bool = Field(
         False,
-        description='Whether the search starts as soon as the planner is active; otherwise with '
-        'the service search/start or a goal of the action search',
+        description='Whether the search starts as soon as the planner is active; otherwise it '
+        'starts with the service search/start or a goal of the action search',
     )
     state_timeout: Positive = Field(
         1.0,
-        description='Time without a state after which a robot is planned without; not in '
+        description='Time without a state after which the planner plans without the robot; not in '
         'lockstep [s]',
     )
     filter_timeout: NotNegative = Field(
         4.0,
         description='Wall time without a heartbeat of the filter, or without the update of a '
-        'batch, after which all robots are held; 0: never; not in lockstep [s]',
+        'batch, after which all robots are held; 0 disables this; not in lockstep [s]',
     )
     views_rate: NotNegative = Field(
-        1.0, description='Most publications of exploration and markers [1/s]'
+        1.0, description='Highest rate of exploration and marker messages [1/s]'
     )
 
     @model_validator(mode='after')

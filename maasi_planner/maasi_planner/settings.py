@@ -57,24 +57,27 @@ class CandidateSettings(Settings):
     """Candidate waypoints of a robot: exactly one of `grid`, `ring` and `points`."""
 
     grid: list[PositiveInt] | None = Field(
-        None, min_length=2, max_length=3, description='Waypoints on each map axis [1]'
+        None, min_length=2, max_length=3, description='Number of waypoints on each map axis [1]'
     )
     spacing: Positive | list[Positive] | None = Field(
-        None, description='Distance of neighbours in the grid, one or one per axis [m]'
+        None, description='Distance between neighbours of the grid, one number or one per axis [m]'
     )
     corner: list[Finite] | None = Field(
         None,
         min_length=2,
         max_length=3,
-        description='First waypoint of the grid; left out, the grid is centred [m, map]',
+        description='First waypoint of the grid; default: the grid is centred [m, map]',
     )
     ring: Literal[4, 6, 8] | None = Field(
         None,
-        description='Waypoints around the robot: 4 or 8 level directions, or 6 with up and down',
+        description='Number of waypoints around the robot: 4 or 8 at its height, or 6 with one '
+        'above and one below',
     )
-    distance: Positive | None = Field(None, description='Distance of the ring from the robot [m]')
+    distance: Positive | None = Field(
+        None, description="Distance of the ring's waypoints from the robot [m]"
+    )
     points: list[Annotated[list[Finite], Field(min_length=2, max_length=3)]] | None = Field(
-        None, min_length=1, description='Waypoints, one by one [m, map]'
+        None, min_length=1, description='List of waypoints [m, map]'
     )
 
     @model_validator(mode='after')
@@ -103,14 +106,14 @@ class MotionSettings(Settings):
     """How a robot moves to a waypoint: model, limits and controller."""
 
     model: Annotated[str, MOTIONS, AfterValidator(MOTIONS.check)] = Field(
-        'constant_speed', description='Motion model and controller, or module:Class of your own'
+        'constant_speed', description='Motion model and controller, or your own module:Class'
     )
     settings: Annotated[Any, _MOTION, AfterValidator(_MOTION.check)] = Field(
-        None, validate_default=True, description='Settings of a model of your own'
+        None, validate_default=True, description='Settings of your own motion model'
     )
-    speed: float = Field(0.4, gt=0.0, le=100.0, description='Largest speed [m/s]')
+    speed: float = Field(0.4, gt=0.0, le=100.0, description='Highest speed [m/s]')
     acceleration: float | None = Field(
-        None, gt=0.0, le=100.0, description='Largest acceleration; none: no limit [m/s^2]'
+        None, gt=0.0, le=100.0, description='Highest acceleration; default: unlimited [m/s^2]'
     )
     tolerance: Positive = Field(
         0.05, description='Distance at which a waypoint counts as reached [m]'
@@ -118,58 +121,61 @@ class MotionSettings(Settings):
     arrival_radius: float | None = Field(
         None,
         ge=0.0,
-        description='Distance from the waypoint at which the next one is decided, so that the '
-        'robot passes without slowing down; 0: it stops at each waypoint, as in the papers; none: '
-        'where it begins to brake, at most what the sensor sees to each side [m]',
+        description='Distance from the waypoint at which the planner picks the next one, so that '
+        'the robot passes without slowing down; 0: the robot stops at each waypoint, as in the '
+        'papers; default: its braking distance, at most half the width of its field of view [m]',
     )
     approach_rate: float | None = Field(
         None,
         gt=0.0,
         le=20.0,
-        description='Speed per metre left near the waypoint; none: of the controller [1/s]',
+        description='Speed per metre of remaining distance near the waypoint; default: that of '
+        'the controller [1/s]',
     )
     heading: Literal['keep', 'travel'] = Field(
         'keep',
-        description='Whether a robot that can move sideways keeps its heading or faces its travel',
+        description='Whether a robot that can move sideways keeps its heading or turns into its '
+        'direction of travel',
     )
-    yaw_rate: float = Field(1.5, gt=0.0, le=20.0, description='Largest turn rate [rad/s]')
+    yaw_rate: float = Field(1.5, gt=0.0, le=20.0, description='Highest turn rate [rad/s]')
     yaw_acceleration: float | None = Field(
-        None, gt=0.0, description='Largest change of the turn rate; none: no limit [rad/s^2]'
+        None, gt=0.0, description='Highest angular acceleration; default: unlimited [rad/s^2]'
     )
     tilt: float = Field(
-        0.5, gt=0.0, lt=1.5, description='Largest tilt of a flying robot, each axis [rad]'
+        0.5, gt=0.0, lt=1.5, description='Largest roll and pitch of a flying robot [rad]'
     )
     state_weights: list[NotNegative] = Field(
         [1.0] * 12,
         min_length=12,
         max_length=12,
-        description='LQR weights of position, roll pitch yaw, velocity, angular velocity [1]',
+        description='LQR weights of position, roll, pitch and yaw, velocity, and angular velocity '
+        '[1]',
     )
     input_weights: list[Positive] = Field(
         [1000.0, 1000.0, 1000.0, 100.0],
         min_length=4,
         max_length=4,
-        description='LQR weights of roll, pitch and yaw torque and of the collective force [1]',
+        description='LQR weights of roll, pitch and yaw torque, and of the collective force [1]',
     )
     control_inputs: Literal['all', 'torques'] = Field(
-        'all', description='Inputs of a flying robot that the control cost C counts'
+        'all', description='Inputs of a flying robot that count in the control cost C'
     )
     clearance: Positive = Field(
-        0.05, description='Kept from obstacles beyond the radius of the robot [m]'
+        0.05, description='Distance kept from obstacles in addition to the radius of the robot [m]'
     )
     obstacle_term: Literal['none', 'printed', 'away'] = Field(
         'none',
-        description='001, eq. (14), (15), in place of ways around obstacles: none, as printed, or '
-        'pushing away from the obstacle',
+        description='Obstacle term of paper 001 (eq. 14, 15) in place of paths around obstacles: '
+        'none, as printed, or directed away from the obstacle',
     )
     obstacle_distance: Positive = Field(
-        0.12, description='d_l, distance to an obstacle below which the term acts [m]'
+        0.12, description='d_l, distance to an obstacle below which the obstacle term acts [m]'
     )
     obstacle_gain: NotNegative = Field(
-        0.002, description='k_obs, gain of the term [unit of the input]'
+        0.002, description='k_obs, gain of the obstacle term [unit of the input]'
     )
     avoidance: Literal['steer', 'dynamic_window'] = Field(
-        'steer', description='How a ground robot gets around obstacles'
+        'steer', description='How a ground robot avoids obstacles'
     )
 
     @model_validator(mode='after')
@@ -187,12 +193,14 @@ class RobotModel(Settings):
 
     start: Vector3 = Field(
         [0.0, 0.0, 0.0],
-        description='Position at the start; its height is that of the waypoints in 2D [m, map]',
+        description='Start position; in 2D its height is that of the waypoints [m, map]',
     )
-    radius: Positive = Field(0.1, description='Of a circle around the robot [m]')
-    motion: MotionSettings = Field(default_factory=MotionSettings, description='How it moves')
+    radius: Positive = Field(0.1, description='Radius of a circle around the robot [m]')
+    motion: MotionSettings = Field(
+        default_factory=MotionSettings, description='Motion model, limits and controller'
+    )
     sensor: SensorSettings = Field(
-        default_factory=SensorSettings, description='Its sensor, as filter and planner believe'
+        default_factory=SensorSettings, description='Sensor model that filter and planner use'
     )
 
     @classmethod
@@ -208,39 +216,46 @@ class PlannerSettings(Settings):
     stops: ClassVar[bool] = False
 
     name: Annotated[str, PLANNERS, AfterValidator(PLANNERS.check)] = Field(
-        'auto', description='Planner, or module:Class of your own'
+        'auto', description='Planner, or your own module:Class'
     )
     settings: Annotated[Any, _PLANNER, AfterValidator(_PLANNER.check)] = Field(
-        None, validate_default=True, description='Settings of a planner of your own'
+        None, validate_default=True, description='Settings of your own planner'
     )
     measurement: Literal['periodic', 'event'] = Field(
-        'periodic', description='Measure at every period, or only when worth it (24), (33)'
+        'periodic',
+        description='Measure at every period, or only if the trigger of paper 000 (eq. 24, 33) '
+        'fires',
     )
     trigger: Literal['absolute', 'relative'] = Field(
         'absolute',
-        description='Compare (24) with the threshold, or with the threshold times its mean along '
-        'the trajectory',
+        description='Compare the trigger with the threshold, or with the threshold times the mean '
+        'of the trigger along the trajectory',
     )
-    gamma: NotNegative = Field(1.0, description='Weight of e in the trigger [1]')
+    gamma: NotNegative = Field(
+        1.0, description='Weight of the unexplored share e in the trigger [1]'
+    )
     threshold: NotNegative = Field(4.0, description='T_delta, threshold of the trigger [1]')
     explored_threshold: float = Field(
-        0.999, gt=0.0, le=1.0, description='Explored share at which the search may end [1]'
+        0.999,
+        gt=0.0,
+        le=1.0,
+        description='Explored share of the area above which the search can end [1]',
     )
     mass_threshold: Positive = Field(
-        0.1, description='Mass of a cluster that is still worth a visit [1]'
+        0.1, description='Mass above which a cluster is worth a visit [1]'
     )
     gain_threshold: float = Field(
         1e-4,
         ge=0.0,
         lt=1.0,
-        description='Share of the expected targets that are unseen where robots can go on at which '
-        'the search may end: of all (tour), of those that the candidates showed at most (maasi '
-        'with information) [1]',
+        description='The search can end when this share of the expected targets, or less, is '
+        'unseen where robots can still go: of all targets (tour), or of the most that the '
+        'candidates ever showed (maasi with objective information) [1]',
     )
     coordination: Literal['centralized', 'independent'] = Field(
         'centralized',
-        description='All robots with one filter and joint choices, or each for itself with a '
-        'filter of its own, sharing only what is found',
+        description='Whether all robots share one filter and choose jointly, or each robot has '
+        'its own filter, chooses alone and shares only found targets',
     )
 
     @classmethod
@@ -262,7 +277,8 @@ class JointSettings(PlannerSettings):
     enumeration_limit: int = Field(
         50_000,
         ge=1,
-        description='Most joint candidates searched exactly; above, robots choose in turn [1]',
+        description='Largest number of joint candidates that is searched exactly; with more, '
+        'robots choose in turn [1]',
     )
     improvement_rounds: int = Field(
         3, ge=0, le=100, description='Most rounds of improvement when robots choose in turn [1]'

@@ -21,12 +21,12 @@ class Zone(Settings):
     """A zone: a polygon, a cylinder (2D: a disc) or, with three coordinates, a sphere."""
 
     centre: list[Finite] | None = Field(
-        None, min_length=2, max_length=3, description='Centre of a round one [m, map]'
+        None, min_length=2, max_length=3, description='Centre of a round zone [m, map]'
     )
-    radius: Positive | None = Field(None, description='Radius of a round one [m]')
+    radius: Positive | None = Field(None, description='Radius of a round zone [m]')
     polygon: Shape | None = Field(
         None,
-        description='Corners [m, map], GeoJSON or the name of its file; kept as well-known text',
+        description='Corners [m, map], GeoJSON or the name of its file; stored as well-known text',
     )
 
     @model_validator(mode='before')
@@ -58,8 +58,10 @@ class Zone(Settings):
 class PriorPart(Settings):
     """A polygon in which targets are more or less likely than elsewhere."""
 
-    polygon: Shape = Field(description='As of a zone')
-    weight: float = Field(ge=0.0, description='How likely, against 1 outside of all polygons [1]')
+    polygon: Shape = Field(description='Corners [m, map], GeoJSON or the name of its file')
+    weight: float = Field(
+        ge=0.0, description='Density of targets inside, relative to 1 outside of all polygons [1]'
+    )
 
     @model_validator(mode='before')
     @classmethod
@@ -78,25 +80,28 @@ class PriorSettings(Settings):
 
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
-        None, description='File of densities: .npy or an image, first row north; or GeoTIFF'
+        None,
+        description='File of target densities: .npy or an image, first row in the north; or '
+        'GeoTIFF',
     )
     band: str | None = Field(
         None,
-        description='What of the raster counts: grey, red, green, blue or alpha of an image, or '
-        'the number of a band of a GeoTIFF; none: grey, the first band',
+        description='Band of the raster that holds the densities: grey, red, green, blue or alpha '
+        'of an image, or the number of a GeoTIFF band; default: grey, the first band',
     )
     extent: Intervals | None = Field(
         None,
         min_length=2,
         max_length=2,
-        description='Lower and upper bound of the raster on x and y; none: of the area; GeoTIFF '
-        'has its own [m, map]',
+        description='Lower and upper bound of the raster on x and y; default: those of the area; '
+        'a GeoTIFF has its own [m, map]',
     )
     floor: float = Field(
         0.02,
         ge=0.0,
         le=1.0,
-        description='Share of the targets that may be anywhere, whatever the prior promises [1]',
+        description='Share of the targets that is spread evenly over the area, whatever the prior '
+        'says [1]',
     )
 
 
@@ -104,13 +109,14 @@ class BackgroundSettings(Settings):
     """A picture that is shown under the map; nothing is planned or filtered with it."""
 
     file: str | None = Field(
-        None, description='GeoTIFF, or an image with a world file or an extent; none: no picture'
+        None, description='GeoTIFF, or an image with a world file or an extent; default: no picture'
     )
     extent: Intervals | None = Field(
         None,
         min_length=2,
         max_length=2,
-        description='Lower and upper bound of an image on x and y; none: by its file [m, map]',
+        description='Lower and upper bound of an image on x and y; default: those of its world '
+        'file [m, map]',
     )
 
     @model_validator(mode='before')
@@ -128,30 +134,33 @@ class EnvironmentSettings(Settings):
     area: Shape | None = Field(
         None,
         description='Polygons in place of bounds: corners or rings [m, map], GeoJSON or its file; '
-        'kept as well-known text',
+        'stored as well-known text',
     )
     altitude: Vector2 | None = Field(
-        None, description='With area: lowest and highest z of targets; none: 2D [m]'
+        None, description='With area: lowest and highest z of targets; default: 2D [m]'
     )
     keep_outs: list[Zone] = Field(
-        default_factory=list, description='No target is expected there, and no robot goes there'
+        default_factory=list,
+        description='Zones that hold no targets and that robots must not enter',
     )
     obstacles: list[Zone] = Field(
         default_factory=list,
-        description='Solid things in the way; also names of maps of Nav2 (YAML), in a list',
+        description='Solid obstacles; the list may contain names of Nav2 maps (YAML)',
     )
     prior: PriorSettings = Field(
         default_factory=PriorSettings, description='Where targets are likely'
     )
     expected_targets: float = Field(
-        12.0, gt=0.0, description='N0, targets expected in all before the search [1]'
+        12.0, gt=0.0, description='N0, expected number of targets before the search [1]'
     )
     origin: OriginSettings | None = Field(
-        None, description='Of the map on the earth; with GeoJSON, none: amid its area'
+        None,
+        description="Geographic position of the map's origin; default with GeoJSON: the centre of "
+        'the area',
     )
 
     background: BackgroundSettings = Field(
-        default_factory=BackgroundSettings, description='Picture under the map'
+        default_factory=BackgroundSettings, description='Picture below the map'
     )
 
     @model_validator(mode='before')

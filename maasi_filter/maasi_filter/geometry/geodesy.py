@@ -10,9 +10,13 @@ from maasi_filter.settings import Finite, Settings
 class OriginSettings(Settings):
     """Where x = y = z = 0 of the map lies, on WGS 84; x points east, y north, z up."""
 
-    latitude: float = Field(ge=-90.0, le=90.0, description='North of the equator [degrees]')
-    longitude: float = Field(ge=-180.0, le=180.0, description='East of Greenwich [degrees]')
-    altitude: Finite = Field(0.0, description='Over the ellipsoid [m]')
+    latitude: float = Field(
+        ge=-90.0, le=90.0, description='Latitude, positive to the north [degrees]'
+    )
+    longitude: float = Field(
+        ge=-180.0, le=180.0, description='Longitude, positive to the east [degrees]'
+    )
+    altitude: Finite = Field(0.0, description='Height above the ellipsoid [m]')
 
 
 def geodetic(positions: FloatArray, origin: OriginSettings) -> FloatArray:

@@ -20,19 +20,19 @@ class NodeSettings(Settings):
 
     # First: what names a class of a plugin is checked after it.
     plugin_path: Annotated[list[str], AfterValidator(add_folders)] = Field(
-        [], description='Folders in which the modules of plugins (module:Class) are'
+        [], description='Folders with the modules of plugins (module:Class)'
     )
     step: float = Field(0.05, gt=0.0, le=10.0, description='Duration of a step [s]')
-    seed: int = Field(1, ge=0, description='Of all random numbers')
+    seed: int = Field(1, ge=0, description='Seed of all random numbers')
     lockstep: bool = Field(
-        False, description='Whether each step of lockstep/step waits for its nodes'
+        False, description='Whether each step of lockstep/step waits for this node'
     )
-    frame: str = Field('map', min_length=1, description='Name of the common frame')
+    frame: str = Field('map', min_length=1, description='Name of the common map frame')
     largest_message: int = Field(
         200_000,
         gt=0,
         description='Largest message with a list (detections, clusters, found targets) that is '
-        'read; larger ones are dropped [bytes]',
+        'accepted; larger ones are dropped [bytes]',
     )
     autostart: bool = Field(True, description='Whether the node configures and activates itself')
 
@@ -45,7 +45,7 @@ class SensorOfRobot(Settings):
     """Settings of a robot for the filter."""
 
     sensor: SensorSettings = Field(
-        default_factory=SensorSettings, description='Its sensor, as the filter believes'
+        default_factory=SensorSettings, description='Sensor model of the robot'
     )
 
 
@@ -54,34 +54,37 @@ class FilterNodeSettings(NodeSettings):
 
     live: ClassVar[frozenset[str]] = frozenset({'batch_timeout', 'particles_rate', 'markers_rate'})
 
-    environment: EnvironmentSettings = Field(description='Where the targets are')
-    filter: FilterSettings = Field(default_factory=FilterSettings, description='The filter')
-    robots: dict[str, SensorOfRobot] = Field(min_length=1, description='Robots, by name')
+    environment: EnvironmentSettings = Field(
+        description='Search area, keep-outs, obstacles and prior'
+    )
+    filter: FilterSettings = Field(default_factory=FilterSettings, description='Search filter')
+    robots: dict[str, SensorOfRobot] = Field(min_length=1, description='Robots by name')
     share_with: list[str] = Field(
         [],
-        description='Robots with filters of their own in their namespaces: what they find is taken '
-        'over, and they take over what this one finds',
+        description='Robots that run their own filter in their namespace; both filters exchange '
+        'found targets',
     )
     batch_timeout: Positive = Field(
         1.0,
-        description='Time after which a batch goes on without who is missing; not in lockstep [s]',
+        description='Time after which a batch is processed without missing detections; not in '
+        'lockstep [s]',
     )
     particles_rate: NotNegative = Field(
-        2.0, description='Most publications of particles; 0: none [1/s]'
+        2.0, description='Highest rate of particle messages; 0 disables them [1/s]'
     )
     markers_rate: NotNegative = Field(
-        5.0, description='Most publications of markers; 0: none [1/s]'
+        5.0, description='Highest rate of marker messages; 0 disables them [1/s]'
     )
     save_file: str = Field(
-        '', description='File that the state is saved to, and loaded from at the start'
+        '', description='File in which the state is saved, and from which it is loaded at the start'
     )
     save_period: NotNegative = Field(
-        0.0, description='Wall time between saves; 0: only at the end [s]'
+        0.0, description='Wall time between saves; 0: save only at the end [s]'
     )
     save_batches: bool = Field(
         False,
-        description='Whether the state is saved after each batch, with the place in the run, where '
-        'a restarted node goes on; the file belongs to one run then',
+        description='Whether the state is saved after each batch, so that a restarted node '
+        'resumes the same run; the file then belongs to one run',
     )
 
     def resolved(self) -> Self:

@@ -24,9 +24,9 @@ class BoxSettings(Settings):
     centre: list[Finite] = Field(
         min_length=2,
         max_length=3,
-        description='Centre x y z; of two numbers: it stands on the floor [m, map]',
+        description='Centre x y z; with two numbers, the box stands on the floor [m, map]',
     )
-    size: list[Positive] = Field(min_length=3, max_length=3, description='Along x, y, z [m]')
+    size: list[Positive] = Field(min_length=3, max_length=3, description='Size along x, y, z [m]')
 
     def array(self, floor: float) -> FloatArray:
         """Return its lower and upper corner, (3, 2) [m], on a floor at that height [m]."""
@@ -45,7 +45,7 @@ class ObjectSettings(BoxSettings):
     faces: list[Face] = Field(
         default_factory=lambda: list(FACES[:4]),
         min_length=1,
-        description='Faces to search; west is that of the smallest x, north of the largest y',
+        description='Faces to search; west is at the smallest x, north at the largest y',
     )
 
 
@@ -53,10 +53,14 @@ class SearchCameraSettings(Settings):
     """The camera of a searching robot, and how well it detects people (004, III-C)."""
 
     angle: float = Field(
-        1.0471975511965976, gt=0.0, lt=3.0, description='Opening of the view [rad]'
+        1.0471975511965976, gt=0.0, lt=3.0, description='Opening angle of the field of view [rad]'
     )
-    least_distance: Positive = Field(17.0, description='d_min of (4) [m]')
-    largest_distance: Positive = Field(90.0, description='d_max of (4) [m]')
+    least_distance: Positive = Field(
+        17.0, description='d_min, distance up to which detection is certain (eq. 4) [m]'
+    )
+    largest_distance: Positive = Field(
+        90.0, description='d_max, distance from which detection is impossible (eq. 4) [m]'
+    )
 
     @model_validator(mode='after')
     def _order(self) -> SearchCameraSettings:
@@ -71,11 +75,11 @@ class SearchCameraSettings(Settings):
 class DynamicsSettings(Settings):
     """Mass point with air resistance under bounded forces, 004, (1)."""
 
-    mass: Positive = Field(3.35, description='m [kg]')
-    resistance: float = Field(0.2, ge=0.0, lt=1.0, description='eta, each step [1]')
+    mass: Positive = Field(3.35, description='m, mass [kg]')
+    resistance: float = Field(0.2, ge=0.0, lt=1.0, description='eta, air resistance per step [1]')
     force: Positive = Field(35.0, description='Largest force on each axis [N]')
     speed: Positive = Field(15.0, description='Largest speed on each axis [m/s]')
-    gravity: NotNegative = Field(9.81, description='g [m/s^2]')
+    gravity: NotNegative = Field(9.81, description='g, gravity [m/s^2]')
 
     @model_validator(mode='after')
     def _lifts(self) -> DynamicsSettings:
@@ -92,15 +96,15 @@ class DynamicsSettings(Settings):
 class HazardSettings(Settings):
     """Failure probability of a battery at each step, 004, (3)."""
 
-    alpha: Positive = Field(100.0, description='alpha_1 [steps]')
-    beta: Positive = Field(0.3, description='beta_1 [1/step]')
+    alpha: Positive = Field(100.0, description='alpha_1 of the failure probability (eq. 3) [steps]')
+    beta: Positive = Field(0.3, description='beta_1 of the failure probability (eq. 3) [1/step]')
     recharge_steps: list[Annotated[int, Field(ge=1)]] = Field(
         [5, 10],
         min_length=2,
         max_length=2,
-        description='T_R, least and most steps of a recharge [steps]',
+        description='T_R, shortest and longest duration of a recharge [steps]',
     )
-    failures: bool = Field(True, description='Whether batteries fail at all')
+    failures: bool = Field(True, description='Whether batteries can fail')
 
     @model_validator(mode='after')
     def _order(self) -> HazardSettings:
@@ -121,11 +125,15 @@ class HazardSettings(Settings):
 class SearcherSettings(Settings):
     """A robot that searches buildings."""
 
-    start: Vector3 = Field(description='Where it starts, and recharges, x y z [m, map]')
+    start: Vector3 = Field(
+        description='Start position x y z, where the robot also recharges [m, map]'
+    )
     yaw: Finite = Field(0.0, description='Heading at the start [rad]')
-    dynamics: DynamicsSettings = Field(default_factory=DynamicsSettings, description='Its body')
+    dynamics: DynamicsSettings = Field(
+        default_factory=DynamicsSettings, description='Dynamics of the robot'
+    )
     hazard: HazardSettings = Field(
-        default_factory=HazardSettings, description='How its battery fails'
+        default_factory=HazardSettings, description='Failures of its battery'
     )
 
 
@@ -133,69 +141,70 @@ class CuboidMethodSettings(Settings):
     """The distributed model predictive control of 004, without its mission."""
 
     detection_probability: float = Field(
-        0.88, gt=0.0, le=1.0, description='p_d that each snapshot must have, (4) [1]'
+        0.88, gt=0.0, le=1.0, description='p_d that each snapshot must reach (eq. 4) [1]'
     )
     coverage: Literal['paper', 'strict'] = Field(
         'paper',
-        description='Cells of a face: rounded as in the paper, which may leave strips of a few '
-        'percent unseen, or so many that every point is seen',
+        description='Number of cells on a face: rounded as in the paper, which can leave strips '
+        'of a few percent unseen, or large enough that every point is seen',
     )
-    cuboid_size: Positive = Field(10.0, description='Side of a cuboid [m]')
+    cuboid_size: Positive = Field(10.0, description='Side length of a cuboid [m]')
     camera: SearchCameraSettings = Field(default_factory=SearchCameraSettings, description='Camera')
-    horizon: int = Field(10, ge=2, le=25, description='T [steps]')
+    horizon: int = Field(10, ge=2, le=25, description='T, planning horizon [steps]')
     guidance_step: int = Field(
-        3, ge=1, description='tau*, at most T - 1: the step that is drawn to a cuboid [1]'
+        3, ge=1, description='tau*, the step that is guided to a cuboid; at most T - 1 [1]'
     )
-    guidance_weight: Positive = Field(1e-4, description='w1 [1/m^2]')
-    smoothness_weight: Positive = Field(1e-4, description='w2 [1/N^2]')
-    visit_weight: NotNegative = Field(0.3, description='w3 [1]')
+    guidance_weight: Positive = Field(1e-4, description='w1, weight of the guidance [1/m^2]')
+    smoothness_weight: Positive = Field(1e-4, description='w2, weight of the smoothness [1/N^2]')
+    visit_weight: NotNegative = Field(0.3, description='w3, weight of visits [1]')
     discount: float = Field(
         0.95,
         gt=0.0,
         le=1.0,
-        description='Of the reward, for each step that a visit comes later, the more the more '
-        'often it was put off; 1 is the paper, in which robots may hover for ever [1]',
+        description='Factor on the reward of a visit for each step of delay, stronger the more '
+        'often the visit was postponed; 1: as in the paper, in which robots may hover forever [1]',
     )
     assignment: Literal['predicted', 'printed'] = Field(
         'predicted',
-        description='Distances of the assignment (10): from where the plans have the robots at '
-        'tau* + 1, as (10) has it for a robot alone, or from where they are, as printed',
+        description='Distances of the assignment (eq. 10) are measured from the planned positions '
+        'at tau* + 1, as for a single robot, or from the present positions, as printed',
     )
     around_corners: bool = Field(
         True,
-        description='Whether a robot aims at the first corner of its way around obstacles '
-        'instead of at the cuboid behind them',
+        description='Whether a robot heads for the first corner of its path around obstacles '
+        'instead of the cuboid behind them',
     )
     between_samples: bool = Field(
-        True, description='Whether obstacles are kept away from between samples, too'
+        True, description='Whether plans avoid obstacles between samples, too'
     )
     brake_at_end: bool = Field(
         True,
-        description='Whether each plan leaves room to brake after its last step; without it, as '
-        'printed, the next problem may have no solution',
+        description='Whether each plan leaves space to brake after its last step; without it, as '
+        'printed, the next problem may be infeasible',
     )
-    clearance: NotNegative = Field(0.01, description='Kept from obstacles [m]')
+    clearance: NotNegative = Field(0.01, description='Distance kept from obstacles [m]')
     visit_depth: float = Field(
         1e-3,
         ge=0.0,
         lt=0.5,
-        description='How far inside its cuboid a visit is planned; 0 is the paper: an optimum '
-        'touches a face, and rounding decides whether it was a visit [m]',
+        description='Planned depth of a visit inside its cuboid; 0: as in the paper, where an '
+        'optimum touches a face and rounding decides whether the visit counts [m]',
     )
-    alpha: Positive = Field(2.0, description='alpha_2 of (13) [1]')
-    beta: Positive = Field(0.5, description='beta_2 of (13) [1]')
+    alpha: Positive = Field(2.0, description='alpha_2 of eq. 13 [1]')
+    beta: Positive = Field(0.5, description='beta_2 of eq. 13 [1]')
     condition: Literal['low_hazard', 'printed'] = Field(
         'low_hazard',
-        description='When (13) holds: where p_b(t + T) is at most 0.5, or above 0.5 as printed',
+        description='When eq. 13 holds: where p_b(t + T) is at most 0.5, or above 0.5 as printed',
     )
-    communication_range: Positive = Field(100.0, description='C_R [m]')
+    communication_range: Positive = Field(100.0, description='C_R, range of communication [m]')
     time_limit: Positive = Field(
-        0.5, description='Wall time of a solve; then the best plan so far [s]'
+        0.5, description='Wall time of a solve, after which the best plan so far is used [s]'
     )
     node_limit: int = Field(
         20000,
         ge=1,
-        description='Nodes of a solve; then the best plan so far, the same on every machine [1]',
+        description='Number of nodes of a solve, after which the best plan so far is used; gives '
+        'the same plan on every machine [1]',
     )
 
     @property
@@ -212,8 +221,8 @@ class CuboidMethodSettings(Settings):
 class CuboidSettings(CuboidMethodSettings):
     """The distributed model predictive control of 004 and its mission."""
 
-    objects: list[ObjectSettings] = Field(default_factory=list, description='To be searched')
-    obstacles: list[BoxSettings] = Field(default_factory=list, description='To be kept away from')
+    objects: list[ObjectSettings] = Field(default_factory=list, description='Objects to search')
+    obstacles: list[BoxSettings] = Field(default_factory=list, description='Obstacles to avoid')
 
 
 Box = Annotated[list[Finite], Field(min_length=6, max_length=6)]
@@ -226,30 +235,30 @@ class CuboidPlannerSettings(NodeSettings, SearcherSettings):
 
     search_on_start: bool = Field(
         False,
-        description='Whether the search starts as soon as the planner is active; otherwise with '
-        'the service search/start',
+        description='Whether the search starts as soon as the planner is active; otherwise it '
+        'starts with the service search/start',
     )
     step: float = Field(1.0, gt=0.0, le=10.0, description='dT, duration of a step [s]')
-    team: list[str] = Field([], description='Names of all robots, for their colours')
-    environment: EnvironmentSettings = Field(description='Where robots may be')
+    team: list[str] = Field([], description='Names of all robots, which select their colours')
+    environment: EnvironmentSettings = Field(description='Area in which robots may move')
     planner: CuboidMethodSettings = Field(
-        default_factory=CuboidMethodSettings, description='The method'
+        default_factory=CuboidMethodSettings, description='Distributed model predictive control'
     )
     objects: list[Box] = Field(
-        min_length=1, description='To be searched: centre x y z and size x y z of each [m]'
+        min_length=1, description='Objects to search: centre x y z and size x y z of each [m]'
     )
     faces: list[str] = Field(
-        [], description='Faces of each object, with spaces between; none: the lateral ones'
+        [], description='Faces of each object, separated by spaces; default: the lateral faces'
     )
     obstacles: list[Box] = Field(
-        [], description='To be kept away from: centre x y z and size x y z of each [m]'
+        [], description='Obstacles to avoid: centre x y z and size x y z of each [m]'
     )
     link_patience: float = Field(
         0.3,
         gt=0.0,
         le=1.0,
-        description='Share of a step after which it decides without having heard of anyone; '
-        'not in lockstep [1]',
+        description='Share of a step after which the robot decides without the messages of '
+        'others; not in lockstep [1]',
     )
 
     def search(self) -> CuboidSettings:

@@ -12,40 +12,44 @@ class InformationSettings(JointSettings):
 
     objective: Literal['paper', 'information'] = Field(
         'information',
-        description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
-        'expected new targets of all measurements of the team together',
+        description='Terms T and E: those of paper 000 (eq. 17 to 22, 26 to 32), or information '
+        'gain and expected new targets of all measurements of the team together',
     )
     alpha: NotNegative = Field(0.5, description='Weight of target refinement T [1]')
     beta: NotNegative = Field(1.0, description='Weight of exploration E [1]')
     control_weight: NotNegative = Field(1e-6, description='Weight of the control cost C [1]')
     normalisation: Literal['steps', 'distance'] = Field(
-        'steps', description='What J is divided by: steps K, or metres of the trajectory'
+        'steps',
+        description='J is divided by the number of steps K, or by the length of the trajectory in '
+        'metres',
     )
     measure_at_arrival: bool = Field(
         True, description='Whether T and E count the measurement at the waypoint itself'
     )
     count_present: bool = Field(
         False,
-        description='Whether T and E count the measurement at the present place, the same for all '
-        'candidates',
+        description='Whether T and E count the measurement at the present position, which all '
+        'candidates share',
     )
     own_measurement: bool = Field(
         True,
-        description='Whether e in E at a measurement includes that measurement itself, as (21), '
-        '(22) do. With pi = 1 around the robot that makes E vanish',
+        description='Whether e in E includes the measurement at which it is evaluated, as in eq. '
+        '21 and 22 of paper 000; with pi = 1 around the robot, E is then 0',
     )
     extension: Literal['measuring', 'silent'] = Field(
         'measuring',
-        description='Whether robots that wait at the end of a predicted trajectory go on measuring',
+        description='Whether robots that wait at the end of a predicted trajectory continue to '
+        'measure',
     )
     cluster_candidates: bool = Field(True, description='Whether cluster centres are candidates too')
     exploration_nodes: int = Field(
-        1000, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
+        1000, ge=8, le=1_000_000, description='Largest number of nodes for expected new targets [1]'
     )
     pair_budget: int = Field(
         1000,
         ge=0,
-        description='Most evaluations of moves of two robots when up to 5 choose in turn [1]',
+        description='Largest number of evaluated moves of two robots when up to 5 choose in turn '
+        '[1]',
     )
 
     @classmethod

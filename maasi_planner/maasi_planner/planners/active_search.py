@@ -37,14 +37,14 @@ class ActiveSearchSettings(JointSettings):
     """Settings of `maas`."""
 
     alpha: NotNegative = Field(0.5, description='Weight of exploration [1]')
-    horizon: int = Field(1, ge=1, le=3, description='Waypoints planned ahead [1]')
+    horizon: int = Field(1, ge=1, le=3, description='Number of waypoints planned ahead [1]')
     agent_exploration: Literal['own', 'shared'] = Field(
         'own',
-        description='Whether e of a robot has its own measurements only (002, eq. 12, 16) or those '
-        'of the whole team',
+        description='Whether e of a robot counts only its own measurements (paper 002, eq. 12, '
+        '16) or those of the whole team',
     )
     refinement: Literal['centres', 'mutual_information'] = Field(
-        'centres', description='T by centre probabilities or by mutual information'
+        'centres', description='T from probabilities at cluster centres, or from mutual information'
     )
 
 

@@ -34,18 +34,18 @@ class LawnmowerSettings(PlannerSettings):
     """Settings of `lawnmower`; its robots share the lanes."""
 
     coordination: Literal['centralized'] = Field(
-        'centralized', description='All robots with one filter and joint choices'
+        'centralized', description='All robots share one filter and choose jointly'
     )
     lane_spacing: float | None = Field(
-        None, gt=0.0, description='Distance of lanes; none: size of the view [m]'
+        None, gt=0.0, description='Distance between lanes; default: width of the field of view [m]'
     )
     layer_spacing: float | None = Field(
-        None, gt=0.0, description='Distance of layers in 3D; none: as lanes [m]'
+        None, gt=0.0, description='Distance between layers in 3D; default: that of lanes [m]'
     )
     margin: float | None = Field(
         None,
         ge=0.0,
-        description='Distance of the outer lanes from the bounds; none: half a lane [m]',
+        description='Distance of the outer lanes from the bounds; default: half a lane [m]',
     )
 
 
