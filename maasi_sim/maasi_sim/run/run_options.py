@@ -46,6 +46,7 @@ class Options:
     replay: Path | None = None
     remap: tuple[tuple[str, str], ...] = ()
     check: bool = False
+    listing: bool = False
     view: ViewOptions | None = None
 
     def overrides(self) -> dict[str, tuple[Key, Any]]:
@@ -81,7 +82,7 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = Parser(
         prog='run_scenario',
-        description='Run a scenario as separate ROS 2 processes, or replay a recording of one.',
+        description='Run a search scenario as ROS 2 nodes, or replay a recording.',
         epilog=f'Exit codes: {", ".join(f"{code} {what}" for code, what in EXIT_CODES.items())}.',
     )
     add = parser.add_argument
@@ -90,39 +91,55 @@ def build_parser() -> argparse.ArgumentParser:
         nargs='?',
         default='',
         metavar='FILE',
-        help='scenario file, or name of one in config',
+        help='scenario file, or the name of a scenario that --list prints',
     )
-    add('--out', type=Path, metavar='DIR', help='folder of the run (default: runs/<time>)')
-    add('--seed', type=whole, metavar='N', help="instead of the scenario's")
     add(
-        '--lockstep',
+        '--list',
+        dest='listing',
         action='store_true',
-        help='step by step, as fast as it goes: the same seed gives the same run',
-    )
-    add('--rate', type=positive, metavar='X', help='simulated over wall time (default: 1)')
-    add('--no-record', dest='record', action='store_false', help='write no recording')
-    add('--planner', metavar='NAME', help="instead of the scenario's")
-    add('--time-limit', type=positive, metavar='S', help='simulated time [s], instead of its own')
-    add('--domain-id', type=whole, metavar='N', help='ROS domain (default: one of its own)')
-    add(
-        '--namespace',
-        type=_namespace,
-        metavar='NS',
-        help='of all nodes and topics of the run; /clock and /diagnostics are shared',
+        help='list the scenarios in config/scenarios with their descriptions and exit',
     )
     add(
         '--check',
         action='store_true',
-        help='start nothing: check the scenario, and print what its search takes: area, passes, '
-        'batteries, time, and what no robot reaches',
+        help='check the scenario without starting it; print its area, the estimated search time '
+        'and battery charges, and cells that no robot can reach',
     )
-    add('--log-level', choices=LOG_LEVELS, help='of the nodes (default: info)')
+    add('--out', type=Path, metavar='DIR', help='folder for the results (default: runs/<time>)')
+    add('--seed', type=whole, metavar='N', help="random seed (default: the scenario's)")
+    add('--planner', metavar='NAME', help="planner (default: the scenario's)")
+    add(
+        '--time-limit',
+        type=positive,
+        metavar='S',
+        help="stop after this simulated time [s] (default: the scenario's limits.time)",
+    )
+    add(
+        '--lockstep',
+        action='store_true',
+        help='run step by step at full speed; the same seed then gives the same run',
+    )
+    add(
+        '--rate',
+        type=positive,
+        metavar='X',
+        help='run at X times real time, without --lockstep (default: 1)',
+    )
+    add('--no-record', dest='record', action='store_false', help='do not record a bag')
+    add('--domain-id', type=whole, metavar='N', help='use this ROS domain (default: a free one)')
+    add(
+        '--namespace',
+        type=_namespace,
+        metavar='NS',
+        help='put all nodes and topics, except /clock and /diagnostics, below this namespace',
+    )
+    add('--log-level', choices=LOG_LEVELS, help='log level of the nodes (default: info)')
     add(
         '--replay',
         type=Path,
         metavar='BAG',
-        help='feed the filter the recorded measurements, and compare what it finds; with a '
-        'scenario: search a recording of cameras and poses, which needs nothing else of this suite',
+        help='run the filter on recorded measurements and compare the targets that it finds; with '
+        'FILE: search in a recording of camera images and poses from any robot',
     )
     add(
         '--remap',
@@ -130,10 +147,10 @@ def build_parser() -> argparse.ArgumentParser:
         action='append',
         default=[],
         metavar='FROM:=TO',
-        help='with FILE and --replay: the recorded topic FROM is taken as TO',
+        help='read the recorded topic FROM as TO (with FILE and --replay)',
     )
-    add_view_options(parser)
     add('--view', action='store_true', help='show the run in a browser')
+    add_view_options(parser)
     return parser
 
 
@@ -144,21 +161,21 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
         '--port',
         type=lambda text: whole(text, most=65535),
         metavar='N',
-        help='of the page; the next free one (default: 8420)',
+        help='serve the page on this port, or on the next free one (default: 8420)',
     )
     add(
         '--host',
         default='127.0.0.1',
         metavar='ADDRESS',
-        help='that the page is served on (default: 127.0.0.1, this machine only); others need the '
-        'whole link, which has a token',
+        help='serve the page on this address (default: 127.0.0.1, this machine only); other '
+        'machines need the full link including its token',
     )
     add(
         '--control',
         action='store_true',
-        help='let the page pause, resume, send home and stop; its address has a token',
+        help='show buttons to pause, resume, send home and stop; the link contains a token',
     )
-    add('--no-browser', dest='browser', action='store_false', help='do not open the page')
+    add('--no-browser', dest='browser', action='store_false', help='do not open a browser')
 
 
 def _namespace(text: str) -> str:
@@ -188,12 +205,14 @@ def parse(arguments: list[str] | None) -> Options:
     given['remap'] = tuple(given['remap'])
     given |= {'namespace': given['namespace'] or '', 'view': view if given['view'] else None}
     options = Options(**given)
+    if options.listing:
+        return options
     if options.check and (options.replay is not None or options.view is not None):
         parser.error('--check: allowed without --replay and --view')
     if options.remap and not (options.replay and options.scenario):
         parser.error('--remap: allowed with a scenario and --replay BAG')
     if options.replay is None and not options.scenario:
-        parser.error('give either a scenario or --replay BAG')
+        parser.error('give a scenario, --list or --replay BAG')
     return options
 
 

@@ -17,6 +17,8 @@ def main(arguments: list[str] | None = None) -> int:
     # ROS has its logs there.
     os.environ.setdefault('HOME', os.path.abspath(os.path.expanduser('~')))
     options = parse(arguments)
+    if options.listing:
+        return list_scenarios()
     if options.check:
         return check(options)
     if middleware.is_missing():
@@ -49,6 +51,18 @@ def main(arguments: list[str] | None = None) -> int:
     except (ScenarioError, DomainError, ProcessError, BagError, ResultsError) as error:
         _print_errors(error)
         return NOT_WRITTEN if isinstance(error, (ResultsError, BagWriteError)) else WRONG_INPUT
+
+
+def list_scenarios() -> int:
+    """Print name and description of each scenario in config, and return the exit code."""
+    from maasi_sim.scenario.layering import read_layer
+    from maasi_sim.scenario.loading import config_folder
+
+    files = sorted(config_folder().glob('scenarios/*.yaml'))
+    width = max(len(file.stem) for file in files)
+    for file in files:
+        print(f'{file.stem:{width}}  {read_layer(file).data["description"]}')
+    return DONE
 
 
 def check(options: Options) -> int:
