@@ -152,3 +152,39 @@ def test_of_many_nodes_the_best_for_their_distance_are_planned():
     # Of the others those that are near.
     gaps = np.linalg.norm(nodes[:, None] - starts, axis=2).min(axis=1)
     assert gaps[visited][prizes[visited] < 1.0].max() < 60.0
+
+
+def test_a_new_plan_never_collects_less_than_the_rest_of_the_old_one():
+    """After 20, 40 and 60 % of the paths the rest of them is a known solution that fits."""
+    gains = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        rows, columns, robots = *rng.integers(4, 8, 2), rng.integers(1, 4)
+        points, hot = lattice(rows, columns), rng.uniform(0.0, rows, (2, 2))
+        gaps = np.linalg.norm(points[:, None] - hot, axis=2)
+        prizes = np.exp(-(gaps**2) / 4.0).sum(axis=1) + 0.02 * rng.random(len(points))
+        starts = rng.uniform(0.0, rows, (robots, 2))
+        budgets = rng.uniform(0.2, 0.8, robots) * len(points) / robots
+        ends = starts if seed % 2 else None
+        homes = starts if seed % 2 else [None] * robots
+        paths = plan_ways(points, prizes, starts, budgets, ends)
+        for share in (0.2, 0.4, 0.6):
+            here, left, rest = starts.copy(), budgets.copy(), []
+            for k, path in enumerate(paths):
+                done = int(share * len(path))
+                if done:
+                    here[k] = points[path[done - 1]]
+                    left[k] -= arrivals(points, starts[k], path[:done])[1]
+                rest.append(path[done:])
+            now = prizes.copy()
+            now[[node for path, old in zip(paths, rest) for node in path if node not in old]] = 0.0
+            again = plan_ways(points, now, here, left, ends, known=rest)
+            visited = np.concatenate(again)
+            assert len(visited) == len(set(visited.tolist()))
+            for k, path in enumerate(again):
+                most = max(left[k], 0.0 if homes[k] is None else np.hypot(*(homes[k] - here[k])))
+                assert arrivals(points, here[k], path, homes[k])[1] <= most + 1e-9
+            before = now[np.concatenate(rest)].sum()
+            gains.append(now[visited].sum() - before)
+            assert gains[-1] >= -1e-9 * prizes.sum()
+    assert np.mean(gains) > 0.0

@@ -87,7 +87,8 @@ def plan_ways(
     speeds : (r,) array, optional
         Of the robots, on any common scale; none: all alike.
     known : list of (m,) arrays, optional
-        Ways to improve, beside new ones; nodes that are not on them are added.
+        Paths to improve, in addition to new ones; nodes that are not on them are added. Where they
+        keep to the budgets, the result never collects less than they do.
     """
     used, robots = np.flatnonzero(np.asarray(prizes) > 0.0), len(budgets)
     endless = bool(np.isinf(budgets).any())
@@ -100,7 +101,8 @@ def plan_ways(
         if number < len(used):
             far = 0.0 if starts is None else cKDTree(starts).query(nodes[used])[0]
             best = np.argsort(-prizes[used] / (np.mean(reach) + far), kind='stable')[:number]
-            used = np.sort(used[best])
+            best = used[best] if known is None else np.concatenate([used[best], *known])
+            used = used[np.isin(used, best)]
     n, d = len(used), np.shape(nodes)[1]
     if n == 0:
         return [used] * robots
@@ -119,10 +121,10 @@ def plan_ways(
     direct = [_gap(points, free, n + k, n + robots + 1 + k) for k in range(robots)]
     limits = np.maximum(budgets, direct)
     early = _terms(limits, rate=rates)
-    begun = []
+    begun, old = [], [used[:0]] * robots
     if known is not None and any(map(len, known)):
-        rows = [np.searchsorted(used, way[np.isin(way, used)]) for way in known]
-        begun.append(_completed(places, rows))
+        old = [np.searchsorted(used, way[np.isin(way, used)]) for way in known]
+        begun.append(_completed(places, old))
     for axes in (np.arange(d), np.array([1, 0, *range(2, d)])):
         begun.append(_shared(places, _lanes(points[:n][:, axes]), robots))
     routes, least = _routes(places, begun[0]), math.inf
@@ -134,7 +136,7 @@ def plan_ways(
         if cost < (1.0 - 1e-6) * least:
             routes, least = found, cost
     if (routes.lengths() > limits).any():
-        routes = _within(places, routes, limits, rates)
+        routes = _within(places, routes, _routes(places, old), limits, rates)
     return [used[row] for row in routes.visited()]
 
 
@@ -209,10 +211,13 @@ def _routes(places: _Places, rows: list[IntArray]) -> _Routes:
     return routes
 
 
-def _within(places: _Places, routes: _Routes, limits: FloatArray, rates: FloatArray) -> _Routes:
+def _within(
+    places: _Places, routes: _Routes, known: _Routes, limits: FloatArray, rates: FloatArray
+) -> _Routes:
     """Return routes within limits [m]: a price of each robot's metres is adapted to them.
 
-    After each round what does not fit is dropped, and what fits is added.
+    After each round what does not fit is dropped, and what fits is added. Known routes that fit are
+    the first candidate, as they are and improved.
     """
     usual = places.prizes.sum() / max(routes.lengths().sum(), 1e-9)
     size = 0.01 / max(routes.lengths().max(), 1e-9)
@@ -222,12 +227,15 @@ def _within(places: _Places, routes: _Routes, limits: FloatArray, rates: FloatAr
     # First the part of ways that collect all early which fits.
     rows = [row[: _reach(places, routes, k, limits[k])] for k, row in enumerate(routes.visited())]
     best, most = _routes(places, rows), -1.0
-    for _ in range(ROUNDS):
-        fitted = _routes(places, rows)
-        _improve(places, fitted, fit)
+    for k in range(-2, ROUNDS):
+        fitted = _routes(places, known.visited() if k < 0 else rows)
+        if k > -2:
+            _improve(places, fitted, fit)
         collected = sum(places.prizes[row].sum() for row in fitted.visited())
         if collected > most and (fitted.lengths() <= limits).all():
             best, most = fitted, collected
+        if k < 0:
+            continue
         _improve(places, routes, _terms(limits, price, worth=1.0))
         rows, over = routes.visited(), routes.lengths() > limits
         low, high = np.where(over, price, low), np.where(over, high, price)
