@@ -4,6 +4,15 @@
 #   MAASI_REQUIREMENTS   folder of requirements*.txt (default: the repository)
 #   MAASI_WORKSPACE   where environment and build go (default: .workspace in the repository)
 
+# The help of a command answers before anything is set up.
+case "${1:-}" in
+  -h|--help)
+    maasi_help="${BASH_SOURCE[1]:-}"
+    maasi_help="${maasi_help%/*}/help/${maasi_help##*/}.txt"
+    [ ! -f "$maasi_help" ] || { cat "$maasi_help" && exit; }
+    ;;
+esac
+
 maasi_root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 maasi_workspace="${MAASI_WORKSPACE:-$maasi_root/.workspace}"
 case "$maasi_workspace" in /*) ;; *) maasi_workspace="$PWD/$maasi_workspace" ;; esac

@@ -29,23 +29,23 @@ DONE, FAILED, ABSENT, INTERRUPTED = 0, 1, 2, 130
 # Commands that only drivers have.
 _OF_DRIVERS = ('release', 'arm')
 _HELP = {
-    'start': 'begin the search, or begin it again',
-    'pause': 'stop where they are, and keep their state',
-    'resume': 'continue after a pause',
-    'home': 'go to where they started, and pause there',
-    'stop': 'end the search, and stop the robots; drivers accept no goals until release',
-    'release': 'let drivers accept goals again',
-    'arm': 'let vehicles take off, once for each call',
-    'state': 'print pose, battery, goal and reason of a robot',
-    'go': 'send a robot to a waypoint, and wait until it is there; Ctrl-C cancels the goal',
+    'start': 'start or restart the search',
+    'pause': 'stop the robots at their positions; the search keeps its state',
+    'resume': 'continue after pause or home',
+    'home': 'return to the start positions and pause there',
+    'stop': 'end the search and stop the robots; drivers refuse goals until release',
+    'release': 'accept goals again after stop',
+    'arm': 'allow vehicles to take off once',
+    'state': 'print pose, battery, goal and status of a robot',
+    'go': 'send a robot to a waypoint and wait until it arrives; Ctrl-C cancels the goal',
 }
 _STATUS = {
     AgentState.IDLE: 'no goal',
-    AgentState.MOVING: 'on the way',
+    AgentState.MOVING: 'moving to the goal',
     AgentState.REACHED: 'goal reached',
     AgentState.CANCELED: 'goal cancelled',
-    AgentState.ABORTED: 'goal given up',
-    AgentState.UNAVAILABLE: 'cannot go on',
+    AgentState.ABORTED: 'goal aborted',
+    AgentState.UNAVAILABLE: 'unavailable',
 }
 _SETTLED = 1.0  # discovery ends this long after the last new service [s]
 _CANCEL_TIME = 5.0  # longest wait for the answer to a cancelled goal [s]
@@ -55,26 +55,33 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='team_command',
-        description='Commands a team or some of its robots. stop, release and arm reach the '
-        'drivers themselves, so that they work without a planner; state and go are for tests.',
-        epilog='Each command takes --namespace NS (of the team) and --timeout S. Exit codes: 0 all '
-        'followed, 1 one refused, did not answer, gave up or was cancelled, 2 wrong arguments or '
-        'no such service or driver, 130 interrupted.',
+        description='Command a team or some of its robots. stop, release and arm call the '
+        'drivers directly and work without a planner; state and go are for tests.',
+        epilog='Options of each command: --namespace NS of the team, --timeout S for answers. Exit '
+        'codes: 0 done, 1 refused, no answer, goal aborted or cancelled, 2 wrong arguments or no '
+        'such service or driver, 130 interrupted.',
     )
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument('--namespace', default='', metavar='NS', help='of the team')
-    text = 'longest wait for an answer [s]'
+    common.add_argument('--namespace', default='', metavar='NS', help='namespace of the team')
+    text = 'wait up to S seconds for an answer (default: %(default)g)'
     common.add_argument('--timeout', type=float, default=10.0, metavar='S', help=text)
     words = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for word in (*COMMANDS, *_OF_DRIVERS):
         calls = words.add_parser(word, parents=[common], help=_HELP[word])
-        calls.add_argument('robots', nargs='*', metavar='ROBOT', help='default: the team')
+        calls.add_argument(
+            'robots', nargs='*', metavar='ROBOT', help='robots (default: the whole team)'
+        )
     for word in ('state', 'go'):
         one = words.add_parser(word, parents=[common], help=_HELP[word])
         one.add_argument('robot', metavar='ROBOT')
     for axis in 'XY':
-        one.add_argument(axis, type=_metres, help='[m, map]')
-    one.add_argument('Z', type=_metres, nargs='?', help='[m, map]; default: the present height')
+        one.add_argument(axis, type=_metres, help='coordinate in the map frame [m]')
+    one.add_argument(
+        'Z',
+        type=_metres,
+        nargs='?',
+        help='height in the map frame [m] (default: the current height)',
+    )
     return parser
 
 

@@ -242,7 +242,7 @@ def main():
     kept = 'folder of the runs; those there are kept'
     parser.add_argument('--out', type=Path, default=folder, metavar='DIR', help=kept)
     parser.add_argument('--document', type=Path, metavar='FILE', help='write the tables into it')
-    brief = 'one table: seconds until half, 90 % and all are found'
+    brief = 'one table: seconds until half, 90 %% and all are found'
     parser.add_argument('--short', action='store_true', help=brief)
     options, regimes, seeds = wanted(parser, REGIMES, runs=16, jobs=os.cpu_count() or 1)
     plans = {

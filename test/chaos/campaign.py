@@ -24,22 +24,30 @@ GOLDEN = 0.6180339887498949
 def build_parser():
     parser = Parser(
         prog='chaos',
-        description='Run scenarios in which nodes are killed or hang, and check the results: '
+        description='Run scenarios in which nodes are killed or hang and check the results: '
         'exit code, robots at rest, found targets, recording, report, processes.',
-        epilog='Exit codes: 0 all cases passed, 1 some did not, 2 wrong input, 130 interrupted.',
+        epilog='Exit codes: 0 all cases passed, 1 some failed, 2 wrong input, 130 interrupted.',
     )
     add = parser.add_argument
-    add('--list', action='store_true', help='list all cases and exit')
-    add('--case', nargs='+', action='extend', metavar='NAME', help='only these; * is a wildcard')
-    add('--seed', type=whole, default=1, metavar='N', help='of all runs')
-    add('--json', type=Path, metavar='FILE', help='write the results')
-    add('--out', type=Path, metavar='DIR', help='keep the runs (default: a temporary folder)')
-    add('--jobs', type=count, default=1, metavar='N', help='cases in parallel (default: 1)')
+    add('--list', action='store_true', help='list the cases and exit')
+    add(
+        '--case',
+        nargs='+',
+        action='extend',
+        metavar='NAME',
+        help='run only these cases; * is a wildcard',
+    )
+    add('--seed', type=whole, default=1, metavar='N', help='random seed of all runs (default: 1)')
+    add('--json', type=Path, metavar='FILE', help='write the results to FILE')
+    add(
+        '--out', type=Path, metavar='DIR', help='keep the runs in DIR (default: a temporary folder)'
+    )
+    add('--jobs', type=count, default=1, metavar='N', help='run N cases in parallel (default: 1)')
     add(
         '--budget',
         type=float,
         metavar='S',
-        help='wall time after which no case is started; the order then mixes all kinds [s]',
+        help='start no case after S seconds; the order then alternates between kinds',
     )
     return parser
 

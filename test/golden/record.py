@@ -133,19 +133,23 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(
         prog='golden',
-        description='Run the golden runs and print what moved: run, step, quantity, by how much.',
-        epilog='Exit codes: 0 nothing moved, or stored anew; 1 something moved; 2 wrong input.',
+        description='Run the golden runs and print each difference: run, step, quantity, amount.',
+        epilog='Exit codes: 0 no difference, or --write; 1 differences; 2 wrong input.',
     )
-    parser.add_argument('names', nargs='*', metavar='NAME', help='scenarios or experiments')
-    parser.add_argument('--write', action='store_true', help='store what came out')
     parser.add_argument(
-        '--save', type=Path, metavar='FILE', help='keep the runs to the bit, for --against'
+        'names', nargs='*', metavar='NAME', help='scenarios or experiments (default: all)'
+    )
+    parser.add_argument(
+        '--write', action='store_true', help='store the results as the new golden runs'
+    )
+    parser.add_argument(
+        '--save', type=Path, metavar='FILE', help='write the runs with all bits, for --against'
     )
     parser.add_argument(
         '--against',
         type=Path,
         metavar='FILE',
-        help='compare with a file of --save, to the bit: on one machine, from commit to commit',
+        help='compare bit by bit with a file of --save from the same machine',
     )
     options = parser.parse_args(arguments)
     known = runs()
@@ -164,12 +168,12 @@ def main(arguments: list[str] | None = None) -> int:
         tolerance = TOLERANCE_ELSEWHERE if elsewhere else TOLERANCE
         found += moved(name, recordings, stored, 0.0 if options.against else tolerance)
     if elsewhere:
-        print(f'stored on another machine: {elsewhere}')
+        print(f'the golden runs are from another machine: {elsewhere}')
     print(*found, sep='\n', end='\n' if found else '')
     number = sum(len(item) for item in made.values())
     how = ', to the bit' if options.against else ''
     spent = time.monotonic() - begin
-    print(f'{number} runs in {spent:.0f} s{how}: {len(found)} quantities moved')
+    print(f'{number} runs in {spent:.0f} s{how}: {len(found)} differences')
     if options.save:
         write(options.save, made)
     if options.write:

@@ -1,5 +1,6 @@
 """The commands in scripts/, as a user calls them."""
 
+import ast
 import os
 import re
 import runpy
@@ -62,7 +63,7 @@ def test_an_environment_that_cannot_be_set_up_ends_a_script_but_no_interactive_s
     result = call('bash', '--norc', '-ic', commands, PYTHON='no_such_python')
     assert 'status 2' in result.stdout
     assert 'no Python 3.10 to 3.13 was found at PYTHON=no_such_python' in result.stderr
-    result = call(SCRIPTS / 'run_scenario', '--help', PYTHON='no_such_python')
+    result = call(SCRIPTS / 'run_scenario', '--list', PYTHON='no_such_python')
     assert (result.returncode, result.stdout) == (2, '')
     assert 'PYTHON=no_such_python' in result.stderr
     result = call(SCRIPTS / 'demo', MAASI_WORKSPACE='/proc/workspace')
@@ -73,11 +74,23 @@ def test_an_environment_that_cannot_be_set_up_ends_a_script_but_no_interactive_s
     ]
 
 
-@pytest.mark.parametrize('name', ['colcon_test', 'demo', 'docs', 'shell', 'test'])
-def test_help_says_what_a_command_is_before_anything_is_set_up(name):
+COMMANDS = sorted(path.name for path in SCRIPTS.iterdir() if path.is_file() and not path.suffix)
+
+
+@pytest.mark.parametrize('name', COMMANDS)
+def test_help_is_printed_before_anything_is_set_up(name):
     result = call(SCRIPTS / name, '--help', PYTHON='no_such_python')
-    assert result.returncode == 0
-    assert result.stdout.startswith(f'usage: {name}')
+    assert (result.returncode, result.stderr) == (0, '')
+    assert result.stdout.startswith(f'usage: {name} ')
+
+
+def test_stored_help_is_that_of_the_parsers():
+    code = f"import runpy; print(runpy.run_path('{SCRIPTS}/write_help.py')['helps']())"
+    helps = ast.literal_eval(call(sys.executable, '-c', code).stdout)
+    assert {'run_scenario', 'team_command', 'bench'} <= helps.keys()
+    for name, text in helps.items():
+        stored = (SCRIPTS / 'help' / f'{name}.txt').read_text()
+        assert stored.split() == text.split(), 'run ./scripts/python scripts/write_help.py'
 
 
 def test_the_build_of_the_site_says_how_far_it_is_and_fails_as_sphinx_does():

@@ -25,8 +25,8 @@ Item = TypeVar('Item')
 
 DONE, SOME_FAILED, WRONG_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
 EXIT_CODES = (
-    'Exit codes: 0 all runs are there, 1 some failed, 2 wrong input, 3 stopped: no room on the '
-    'disk, or the workers are gone, 130 interrupted.'
+    'Exit codes: 0 all runs are done, 1 some failed, 2 wrong input, 3 stopped: disk full or '
+    'workers lost, 130 interrupted.'
 )
 PATIENCE = 20.0  # longest wait for the scheduler of a cluster and for its first worker [s]
 # One thread for each worker; the number of workers sets the load.
@@ -246,12 +246,13 @@ def one_machine(workers: Workers, campaigns: Sequence[Campaign]) -> dict[str, st
 def add_worker_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `carry_out_all`."""
     add = parser.add_argument
-    add('--jobs', type=count, metavar='N', help='processes (default: one for each core)')
-    add('--cluster', metavar='ADDRESS', help='scheduler of a Dask cluster')
+    add('--jobs', type=count, metavar='N', help='run N processes (default: one per core)')
+    add('--cluster', metavar='ADDRESS', help='run on the Dask cluster with this scheduler')
     add(
         '--mixed-workers',
         action='store_true',
-        help='mix runs of different processors or versions, which may differ in the last bits',
+        help='allow workers with different processors or versions; results may differ in the last '
+        'bits',
     )
 
 

@@ -33,46 +33,62 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = Parser(
         prog='compare',
-        description='Compare planners and filters in whole searches on the same seeds, each '
-        'search in one process; the same command resumes an interrupted comparison.',
+        description='Compare planners and filters in complete searches on the same seeds. Run '
+        'the same command again to resume an interrupted comparison.',
         epilog=EXIT_CODES,
     )
     add = parser.add_argument
-    add('scenarios', nargs='+', metavar='SCENARIO', help='file, or name of one in config/scenarios')
+    add(
+        'scenarios',
+        nargs='+',
+        metavar='SCENARIO',
+        help='scenario file, or its name in config/scenarios',
+    )
     add(
         '--planner',
         type=_names,
         default=(),
         metavar='NAME,...',
-        help="planners; differences are to the first one (default: the scenario's)",
+        help="planners; the first is the baseline of differences (default: the scenario's)",
     )
     add(
         '--filter',
         type=_names,
         default=(),
         metavar='NAME,...',
-        help="filters, each with each planner (default: the scenario's)",
+        help="filters, each combined with each planner (default: the scenario's)",
     )
-    add('--runs', type=count, default=30, metavar='N', help='of each (default: %(default)s)')
+    add(
+        '--runs',
+        type=count,
+        default=30,
+        metavar='N',
+        help='searches of each combination (default: %(default)s)',
+    )
     add(
         '--seed',
         type=partial(whole, most=2**32),
         default=1,
         metavar='N',
-        help='of the first run; others follow (default: %(default)s)',
+        help='seed of the first search; the next ones count up (default: %(default)s)',
     )
-    add('--time-limit', type=positive, metavar='S', help="of a search [s], not the scenario's")
+    add(
+        '--time-limit',
+        type=positive,
+        metavar='S',
+        help="end each search after this simulated time [s] (default: the scenario's limits.time)",
+    )
     add_worker_options(parser)
     add(
         '--again',
         action='store_true',
-        help='repeat searches in DIR that are of other settings, or of another version of the code',
+        help='repeat searches in DIR that were run with other settings or another code version',
     )
     add(
         '--out',
         type=Path,
         metavar='DIR',
-        help='folder of the results (default: runs/compare_<time>, or one that was interrupted)',
+        help='folder for the results (default: the interrupted comparison, or runs/compare_<time>)',
     )
     return parser
 

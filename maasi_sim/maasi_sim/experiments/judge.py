@@ -251,19 +251,35 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = Parser(
         prog='judge',
-        description="Judge the tour planner's ways by SAREnv: its own evaluator, terrains, victims "
-        'and planners. Exit codes: 0 all terrains are judged, 1 some are not, 2 wrong input.',
+        description="Evaluate the tour planner's paths with SAREnv: its evaluator, terrains, "
+        'victims and baseline planners.',
+        epilog='Exit codes: 0 all terrains evaluated, 1 some refused, 2 wrong input.',
     )
     add = parser.add_argument
-    add('judge', choices=['sarenv'], help='the outside judge')
-    add('--data', type=Path, required=True, metavar='FOLDER', help="its folder 'sarenv_dataset'")
-    add('--terrains', nargs='+', metavar='NAME', help='folders in it (default: all)')
-    add('--budget', nargs='+', type=positive, default=[*GOALS], metavar='KM', help='of all drones')
-    add('--victims', type=count, default=1000, metavar='N', help='on each (default: %(default)s)')
-    add('--seed', type=whole, default=1, metavar='N', help='of the victims (default: %(default)s)')
-    add('--jobs', type=count, default=1, metavar='N', help='processes (default: %(default)s)')
-    add('--out', type=Path, metavar='DIR', help='folder of judge.json')
-    add('--document', type=Path, metavar='FILE', help='writes the tables between its marks')
+    add('judge', choices=['sarenv'], help='external benchmark')
+    add(
+        '--data',
+        type=Path,
+        required=True,
+        metavar='FOLDER',
+        help="SAREnv's folder 'sarenv_dataset'",
+    )
+    add('--terrains', nargs='+', metavar='NAME', help='folders in FOLDER (default: all)')
+    add(
+        '--budget',
+        nargs='+',
+        type=positive,
+        default=[*GOALS],
+        metavar='KM',
+        help='total path length of all drones [km] (default: 100 and 300)',
+    )
+    text = 'victims on each terrain (default: %(default)s)'
+    add('--victims', type=count, default=1000, metavar='N', help=text)
+    text = 'random seed of the victims (default: %(default)s)'
+    add('--seed', type=whole, default=1, metavar='N', help=text)
+    add('--jobs', type=count, default=1, metavar='N', help='run N processes (default: %(default)s)')
+    add('--out', type=Path, metavar='DIR', help='write judge.json into this folder')
+    add('--document', type=Path, metavar='FILE', help='update the tables in this document')
     return parser
 
 

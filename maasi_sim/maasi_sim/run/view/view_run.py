@@ -20,8 +20,8 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = Parser(
         prog='view',
-        description=f'Makes {REPLAY}, a page with the whole run inside, and opens it.',
-        epilog='Exit codes: 0 done, 2 no recording of a search, 4 it could not be written.',
+        description=f'Make {REPLAY}, a page that contains the complete run, and open it.',
+        epilog='Exit codes: 0 done, 2 no recording of a search, 4 the page could not be written.',
     )
     add = parser.add_argument
     add(
@@ -29,12 +29,28 @@ def build_parser() -> argparse.ArgumentParser:
         type=Path,
         nargs='?',
         metavar='BAG_OR_RUN',
-        help='recording, or folder of a run (default: the newest in runs)',
+        help='recording or folder of a run (default: the newest in runs)',
     )
-    add('--out', type=Path, metavar='FILE', help=f'page (default: {REPLAY} beside the recording)')
-    add('--video', type=Path, metavar='FILE', help='a video instead: FILE.mp4 or FILE.gif')
-    add('--speed', type=float, default=5.0, metavar='X', help='of the video (default: 5)')
-    add('--no-browser', dest='browser', action='store_false', help='do not open the page')
+    add(
+        '--out',
+        type=Path,
+        metavar='FILE',
+        help=f'page (default: {REPLAY} in the folder of the run)',
+    )
+    add(
+        '--video',
+        type=Path,
+        metavar='FILE',
+        help='make a video instead of a page: FILE.mp4 or FILE.gif',
+    )
+    add(
+        '--speed',
+        type=float,
+        default=5.0,
+        metavar='X',
+        help='play the video at X times real time (default: 5)',
+    )
+    add('--no-browser', dest='browser', action='store_false', help='do not open a browser')
     return parser
 
 
