@@ -15,7 +15,6 @@ from pathlib import Path
 from page_tables import code, table
 
 from maasi_filter.ros.parameters import parameters_of
-from maasi_sim.run.ending import EXIT_CODES
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / 'docs'
@@ -30,8 +29,8 @@ PARTS = {
         *('plugins', 'compare', 'view', 'robots', 'robots_mambo', 'robots_mavlink'),
     ],
     'Reference': [
-        'scenario_keys',
-        *(f'reference/{name}' for name in ('parameters', 'messages', 'commands')),
+        *('scenario_keys', 'commands', 'nodes'),
+        *(f'reference/{name}' for name in ('parameters', 'messages')),
         *('report', 'parameters', 'messages', 'measurement_feed', 'filter_presets', 'api/api'),
     ],
     'Explanation': [
@@ -51,18 +50,6 @@ NODES = [
     ('maasi_sim', 'simulation.sim_node', 'SimNode'),
     ('maasi_sim', 'run.buildings.cuboid_sim_node', 'CuboidSimNode'),
 ]
-PARSERS = [
-    'maasi_sim.run.run_options',
-    'maasi_sim.run.view.view_run',
-    'maasi_sim.experiments.reproduce',
-    'maasi_sim.experiments.compare',
-    'maasi_sim.experiments.judge',
-    'maasi_drivers.team_command',
-    'maasi_drivers.calibrate_sensor',
-    'maasi_drivers.measure_mambo',
-    'maasi_sim.simulation.emulators.mambo.fake_mambo',
-    'maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle',
-]
 HOME = """# MAASI
 
 A team of robots finds an unknown number of targets: a suite for ROS 2 Jazzy in Python, and a
@@ -70,7 +57,7 @@ library without ROS.
 
 ![The page of a run: where robots go, and why](view.png)
 
-Two commands, in a clone and without any ROS ([what they need](README.md#two-commands)). Two
+Two commands, in a clone and without any ROS ([what they need](README.md#try-it)). Two
 simulated robots find twelve markers, on the page above:
 
 ```sh
@@ -181,24 +168,9 @@ def messages_page() -> str:
     return '\n'.join(text)
 
 
-def commands_page() -> str:
-    os.environ['COLUMNS'] = '100'
-    codes = [(str(code), meaning) for code, meaning in EXIT_CODES.items()]
-    text = [
-        '# Commands and exit codes\n',
-        'Of `run_scenario`:\n',
-        table(('exit code', 'meaning'), codes),
-    ]
-    for module in PARSERS:
-        parser = importlib.import_module(module).build_parser()
-        text.append(f'## {parser.prog}\n\n```text\n{parser.format_help().strip()}\n```\n')
-    return '\n'.join(text)
-
-
 REFERENCE = {
     'parameters': parameters_page,
     'messages': messages_page,
-    'commands': commands_page,
 }
 
 

@@ -48,7 +48,6 @@ def test_every_page_is_in_the_contents_and_needs_no_network(site: Path) -> None:
     [
         ('parameters', ['planner_node', 'robot.NAME.candidates.grid', 'at least 1']),
         ('messages', ['PlanDecision', 'share of the environment that is explored']),
-        ('commands', ['--lockstep', 'a node died or hung', 'reproduce']),
     ],
 )
 def test_reference_is_made_from_the_code(site: Path, page: str, words: list[str]) -> None:
@@ -92,6 +91,13 @@ def test_page_of_keys_is_that_of_the_settings(monkeypatch: pytest.MonkeyPatch) -
         zones = 'environment.obstacles[]', 'environment.keep_outs[]'
         asked = {key.replace(*zones) for key in keys(scenario.content(), '')}
         assert len(asked) > 50 and asked <= written, asked - written
+
+
+def test_page_of_commands_has_every_command() -> None:
+    page = (ROOT / 'docs' / 'commands.md').read_text()
+    for command in (ROOT / 'scripts').iterdir():
+        if command.is_file() and not command.suffix:
+            assert f'`./scripts/{command.name}`' in page, command
 
 
 @needs_chromium
