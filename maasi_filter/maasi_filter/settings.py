@@ -1,4 +1,4 @@
-"""Settings of sensors, filter and environment: checked models for files, parameters and code."""
+"""Settings of sensors, filters and environments: checked models for files, parameters and code."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Intervals = Annotated[list[Vector2], AfterValidator(_ascending)]  # lower and up
 
 
 class Settings(BaseModel):
-    """Base of all settings: unknown keys are refused, and so is what is not finite."""
+    """Base of all settings: unknown keys and non-finite numbers are refused."""
 
     model_config = ConfigDict(
         extra='forbid', populate_by_name=True, validate_assignment=True, allow_inf_nan=False
@@ -106,7 +106,7 @@ class DetectionSettings(Settings):
         return self
 
     def build(self, dimension: int = 3) -> DetectionModel:
-        """Return the model; ValueError if one of a user's own is wrong."""
+        """Return the detection model; ValueError if a plugin's model is invalid."""
         if self.kind not in DETECTIONS.built_in:
             found = DETECTIONS.load(self.kind)(self.settings, self.probability, dimension)
             assert isinstance(found, DetectionModel)
@@ -118,7 +118,7 @@ class DetectionSettings(Settings):
 
 
 class NoiseSettings(Settings):
-    """Noise of a measurement; the meaning of each number is explicit."""
+    """Noise of a measurement."""
 
     range: Positive = Field(1.5, description='Noise of the range [m, or m^2 as variance]')
     bearing: Positive = Field(
@@ -136,7 +136,7 @@ class NoiseSettings(Settings):
     angles: Literal['radians', 'degrees'] = Field('radians', description='Unit of the angles')
 
     def deviations(self, dimension: int) -> FloatArray:
-        """Return the standard deviations, (d,), in metres and radians."""
+        """Return the standard deviations (d,) in metres and radians."""
         values = np.array([self.range, self.bearing, self.elevation][:dimension])
         if not (values > 0.0).all():
             raise ValueError('elevation: got 0, allowed in 3D are numbers above 0')
@@ -147,12 +147,12 @@ class NoiseSettings(Settings):
         return values
 
     def covariance(self, dimension: int) -> FloatArray:
-        """Return R, (d, d), in metres and radians, squared."""
+        """Return R (d, d) in squared metres and radians."""
         return np.diag(self.deviations(dimension) ** 2)
 
 
 class SensorSettings(Settings):
-    """A sensor of range and angles."""
+    """A sensor that measures range and angles."""
 
     detection: DetectionSettings = Field(
         default_factory=DetectionSettings, description='Probability of detection'
@@ -161,7 +161,13 @@ class SensorSettings(Settings):
         default_factory=NoiseSettings, description='Noise of a measurement'
     )
     clutter: NotNegative = Field(
-        0.0, description='Intensity of false detections [1/(m rad) in 2D, 1/(m rad^2) in 3D]'
+        0.0,
+        description='Intensity of false detections in a scan [1/(m rad), in 3D 1/(m rad^2); with '
+        '`clutter_in: area` 1/m^2, in 3D 1/m^3]',
+    )
+    clutter_in: Literal['measurements', 'area'] = Field(
+        'measurements',
+        description='Where false detections are uniform: in range and angles, or in the area',
     )
     period: NotNegative = Field(
         0.0, description='Time from one possible measurement to the next; 0: every step [s]'
@@ -178,12 +184,18 @@ class SensorSettings(Settings):
             raise ValueError(f'dimension: got {dimension}, allowed are 2 and 3')
         detection, covariance = self.detection.build(dimension), self.noise.covariance(dimension)
         return Sensor(
-            name, detection, covariance, self.clutter, self.period, resolution=self.resolution
+            name,
+            detection,
+            covariance,
+            self.clutter,
+            self.period,
+            resolution=self.resolution,
+            clutter_in=self.clutter_in,
         )
 
 
 class OffsetSettings(Settings):
-    """Errors of the robots' positions that last; both 0: their errors are independent."""
+    """Lasting errors of robot positions; with both 0, errors of measurements are independent."""
 
     deviation: NotNegative = Field(
         0.0, description='Standard deviation of the constant position offset on each axis [m]'
@@ -213,6 +225,9 @@ class PmbSettings(Settings):
         le=0.5,
         description='Existence probability below which a found target is withdrawn [1]',
     )
+    clutter_floor: Positive = Field(
+        0.05, description='Least mean number of false detections in a scan that is assumed [1]'
+    )
     walk: NotNegative = Field(
         0.0,
         description='Standard deviation of the random walk of targets on each axis after 1 s; 0: '
@@ -238,14 +253,14 @@ _FILTER = OwnSettings(FILTERS, 'method')
 
 @dataclass(frozen=True)
 class _Only:
-    """Marks a setting that one method of the suite uses, and the other one does not."""
+    """Marks a setting that only one method of the suite uses."""
 
     method: str
-    plugins: bool = False  # Whether filters of plugins can use it
+    plugins: bool = False  # whether filters of plugins can use it
 
 
 _IC_PHD, _PMB_ONLY = _Only('ic_phd'), _Only('pmb')
-_CHECKED = _Only('pmb', plugins=True)  # Used by `check_measurements`
+_CHECKED = _Only('pmb', plugins=True)  # used by `check_measurements`
 
 Preset = Literal['paper_000', 'paper_001', 'paper_002', 'paper_003']
 
@@ -285,10 +300,10 @@ _PMB: dict[str, Any] = {'use_detection_covariances': True}
 
 
 class FilterSettings(Settings):
-    """Numbers of the search filter.
+    """Settings of the search filter.
 
-    With `method: ic_phd`, None means the value of the preset; with `method: pmb` it is derived at
-    each step from the sensor and the environment, or not used.
+    With `method: ic_phd`, None stands for the value of the preset; with `method: pmb` it is derived
+    at each step from sensor and environment, or unused.
     """
 
     method: Annotated[str, FILTERS, AfterValidator(FILTERS.check)] = Field(
@@ -369,7 +384,7 @@ class FilterSettings(Settings):
         description='ic_phd: whether the closest or every measurement near a found target is '
         'removed',
     )
-    # Without mark: T_z is also the length by which found targets are scored.
+    # Not marked, as T_z is also the length by which found targets are scored.
     removal_distance: float | None = Field(
         None,
         gt=0.0,
@@ -396,11 +411,11 @@ class FilterSettings(Settings):
     @classmethod
     def _gone(cls, value: Any) -> Any:
         if value == 'recommended':
-            raise ValueError("'recommended' is gone, write method: pmb in its place")
+            raise ValueError("'recommended' was removed, use method: pmb")
         return value
 
     def resolved(self) -> FilterSettings:
-        """Return a copy with None replaced by the value of the method or preset."""
+        """Return a copy in which the values of the method or preset replace None."""
         filled = {'ic_phd': PRESETS[self.preset], 'pmb': _PMB}.get(self.method, {})
         values = {name: value for name, value in filled.items() if getattr(self, name) is None}
         return self.model_copy(update=values)
@@ -411,20 +426,20 @@ LARGEST_REMOVAL = 0.5
 
 
 def unsuitable_lengths(settings: FilterSettings, bounds: FloatArray) -> str:
-    """Return a warning if the lengths of a preset are not those of the bounds (d, 2), else ''."""
+    """Return a warning if the lengths of a preset do not suit the bounds (d, 2), else ''."""
     distance = settings.resolved().removal_distance
     side = float((bounds[:, 1] - bounds[:, 0]).min())
     if settings.method != 'ic_phd' or distance is None or distance <= LARGEST_REMOVAL * side:
         return ''
     return (
         f'filter.removal_distance: T_z is {distance:g} m, in an environment of {side:g} m: targets '
-        f'will be missed, as the lengths of {settings.preset} are those of a larger one; give '
+        f'will be missed, as the lengths of {settings.preset} suit larger environments; set '
         'found_radius, removal_distance and jitter_deviation, or method: pmb'
     )
 
 
 def unused_settings(settings: FilterSettings) -> str:
-    """Return a warning if settings are given that only another method has, else ''."""
+    """Return a warning if settings of another method are given, else ''."""
     method, unused = settings.method, dict[str, list[str]]()
     for name, info in FilterSettings.model_fields.items():
         for mark in info.metadata:
@@ -434,6 +449,6 @@ def unused_settings(settings: FilterSettings) -> str:
             if given and not (mark.plugins and method not in FILTERS.built_in):
                 unused.setdefault(mark.method, []).append(name)
     return '\n'.join(
-        f'filter: {", ".join(names)}: of method {other}; {method} does not use them'
+        f'filter: {", ".join(names)}: only for method {other}; {method} does not use them'
         for other, names in unused.items()
     )

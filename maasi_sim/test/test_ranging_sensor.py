@@ -71,7 +71,8 @@ def test_the_order_tells_nothing_and_values_stay_in_their_ranges():
 
 def test_clutter_comes_at_its_intensity_and_each_return_says_what_caused_it():
     targets = POSE.position + np.array([[10.0, 0.0, 0.0], [0.0, 20.0, 5.0], [-15.0, 8.0, -3.0]])
-    played = RangingSensor(sensor(clutter=0.002), targets, 3, 'drone', reach=100.0)
+    bounds = np.array([[0.0, 100.0], [0.0, 0.0], [0.0, 0.0]])
+    played = RangingSensor(sensor(clutter=0.002), targets, 3, 'drone', bounds)
     model, seen, clutter = played.sensor.measurement, 0, []
     for step in range(400):
         values, causes = played.measure(POSE, step)

@@ -38,11 +38,18 @@ def test_what_is_true_is_what_is_believed_unless_it_is_given():
     assert_allclose(np.diagonal(given.covariance), [0.09, 0.01, 0.04])
     assert true_sensor(probability_factor=50.0).detection.gain == 1.0
     # Clutter is played as often as told.
-    reach = float(np.linalg.norm(CUBE[:, 1] - CUBE[:, 0]))
     cluttered = true_sensor(clutter_per_scan=2.5)
-    played = RangingSensor(cluttered, np.zeros((0, 3)), 3, 'drone', reach)
+    played = RangingSensor(cluttered, np.zeros((0, 3)), 3, 'drone', CUBE)
     counts = [len(played.measure(POSE, step)[0]) for step in range(2000)]
     assert_allclose(np.mean(counts), 2.5, atol=0.12)
+    played.sensor = true_sensor(clutter_per_scan=2.5, clutter_in='area')
+    scans = [played.measure(POSE, step)[0] for step in range(2000)]
+    positions = played.sensor.measurement.inverse(np.concatenate(scans), POSE)
+    assert_allclose(len(positions) / 2000, 2.5, atol=0.12)
+    # Uniform: a mean of 5,000 within four standard errors of the centre.
+    side = CUBE[:, 1] - CUBE[:, 0]
+    error = 4.0 * side / np.sqrt(12.0 * len(positions))
+    assert (np.abs(positions.mean(axis=0) - CUBE.mean(axis=1)) < error).all()
 
 
 def test_odometry_reports_other_errors_than_it_has():

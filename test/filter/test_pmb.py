@@ -5,7 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exact_pmbm import ExactPmbm
-from searches import PLANE, SIDE, cells, checked, densities, measured, plane_filter, plane_sensor
+from searches import (
+    CUBE,
+    PLANE,
+    SIDE,
+    cells,
+    checked,
+    cube_sensor,
+    densities,
+    measured,
+    plane_filter,
+    plane_sensor,
+)
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, UnexploredMap, wrap_angle
 from maasi_filter.models.sensor import LEAST_PER_SCAN
@@ -100,12 +111,11 @@ def test_unseen_targets_are_thinned_as_the_exploration_function_says():
 
 def test_clutter_is_learnt_as_a_gamma_prior_says():
     learnt = Learnt()
-    assert learnt.clutter_per_scan(0.0) == LEAST_PER_SCAN
     assert learnt.clutter_per_scan(2.0) == 2.0
     for _ in range(40):
         learnt.count_clutter(3.0)
-    assert learnt.clutter_per_scan(0.0) == pytest.approx(
-        (PRIOR_SCANS * LEAST_PER_SCAN + 120.0) / (PRIOR_SCANS + 40)
+    assert learnt.clutter_per_scan(0.05) == pytest.approx(
+        (PRIOR_SCANS * 0.05 + 120.0) / (PRIOR_SCANS + 40)
     )
 
 
@@ -135,7 +145,7 @@ def test_close_to_the_exact_mixture(targets, tolerance):
                 values = np.concatenate([values, [false]])
             space = sensor.measurement_space(PLANE)
             learnt = search._learnt.get('robot', Learnt())
-            kappa = learnt.clutter_per_scan(sensor.clutter * space) / space
+            kappa = learnt.clutter_per_scan(max(sensor.clutter * space, 0.05)) / space
             search.step([measured(sensor, place, values, step)], 1, step)
             exact.update(*densities(sensor, place, values), kappa)
         density = exact.density()
@@ -279,3 +289,18 @@ def test_noise_of_a_camera_is_cartesian_next_to_the_robot():
     scan = make_scan(member, 1.0, search.exploration, MANY_DRAWS, np.random.default_rng(0))
     np.testing.assert_allclose(scan.means, place, atol=2e-4)
     np.testing.assert_allclose(scan.covariances[0], 0.005**2 * np.eye(2), atol=2e-6)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_clutter_that_is_uniform_in_the_area_is_so_in_measurements(seed):
+    generator = np.random.default_rng(seed)
+    bounds = (PLANE, CUBE)[seed % 2]
+    sensor = plane_sensor() if seed % 2 == 0 else cube_sensor()
+    sensor.clutter_in = 'area'
+    pose = Pose.from_yaw(generator.uniform(0.0, 100.0, 3), generator.uniform(-3.0, 3.0))
+    positions = generator.uniform(*bounds.T, (50, len(bounds)))
+    values = sensor.measurement.measure(positions, pose)
+    jacobians = sensor.measurement.jacobian(positions, pose)
+    volume = (bounds[:, 1] - bounds[:, 0]).prod()
+    expected = 3.0 / volume / np.abs(np.linalg.det(jacobians))
+    np.testing.assert_allclose(sensor.clutter_at(values, 3.0, bounds), expected, rtol=1e-6)

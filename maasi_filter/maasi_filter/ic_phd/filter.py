@@ -1,4 +1,4 @@
-"""Particle PHD filter with an iterated corrector, as in the papers (000, sections 3.2, 3.3)."""
+"""Particle PHD filter with an iterated corrector (000, sections 3.2, 3.3)."""
 
 import math
 import os
@@ -41,7 +41,7 @@ LEAST_BIRTHS = 20  # fewest particles of a birth, when many detections share the
 
 
 class IcPhdFilter(SearchFilter):
-    """Particle PHD filter with an iterated corrector, K-means, and removal of found targets."""
+    """Particle PHD filter with an iterated corrector, K-means and removal of found targets."""
 
     particles: FloatArray = np.empty((0, 0))
     weights: FloatArray = np.empty(0)
@@ -56,7 +56,6 @@ class IcPhdFilter(SearchFilter):
         self, settings: FilterSettings, area: Area | ArrayLike, generator: np.random.Generator
     ) -> None:
         super().__init__(settings, area, generator)
-        # Nothing is None in it.
         self._numbers: Any = settings.resolved()
         self.particles = np.empty((0, self.dimension))
         self.weights = np.empty(0)
@@ -65,13 +64,13 @@ class IcPhdFilter(SearchFilter):
 
     @property
     def expected_number(self) -> float:
-        """Expected number of targets in the intensity, the mass of the particles."""
+        """Mass of the particles."""
         return float(self.weights.sum())
 
     def step(
         self, measurements: Sequence[AgentMeasurement], steps: int, time: float
     ) -> FilterResult:
-        """Predict over `steps` control steps, correct with every robot of M_k, extract and mark."""
+        """Predict, correct with one robot after another, extract clusters, mark found targets."""
         dropped: dict[str, int] = {}
         members = check_measurements(measurements, steps, time, self._numbers, self.dimension)
         members = [self._without_found(member, dropped) for member in members]
@@ -79,8 +78,8 @@ class IcPhdFilter(SearchFilter):
         self.weights = self.weights * self._numbers.survival_probability**steps
         if self._numbers.births != 'measurement':
             self._append(*self._born_anywhere(members))
-        for place, member in enumerate(members):
-            self._correct(member, members[:place], dropped)
+        for index, member in enumerate(members):
+            self._correct(member, members[:index], dropped)
         if any(len(member.values) for member in members):
             self._resample()
         newly_found = self._extract(members, time)
@@ -94,10 +93,11 @@ class IcPhdFilter(SearchFilter):
         before: Sequence[CheckedMeasurement],
         dropped: dict[str, int],
     ) -> None:
-        """Correct with the detections of one robot, 000 (13) and (16); births are in D^{o-1}."""
+        """Correct with the detections of one robot (000, (13), (16)); births are in D^{o-1}."""
         births, intensity = self._births(member, before)
-        space = member.sensor.measurement_space(self.bounds)
-        clutter = max(member.sensor.clutter, LEAST_PER_SCAN / space)
+        sensor = member.sensor
+        per_scan = max(sensor.clutter * sensor.clutter_space(self.bounds), LEAST_PER_SCAN)
+        clutter = sensor.clutter_at(member.values, per_scan, self.bounds)
         scan = phd_scan(member.values, member.sensor, member.pose)
         factor, normaliser = phd_correct(
             self.particles, self.weights, scan, clutter + intensity.sum(axis=1), self._threads()
@@ -113,19 +113,19 @@ class IcPhdFilter(SearchFilter):
     def _births(
         self, member: CheckedMeasurement, before: Sequence[CheckedMeasurement]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return births at the detections of a robot, if that is the kind, and their b (m, J)."""
+        """Return births at the detections of a robot, if they are of that kind, and b (m, J)."""
         numbers = self._numbers
         count = len(member.values)
         if numbers.births != 'measurement' or not count:
             return np.empty((0, self.dimension)), np.zeros((count, 0))
-        room = numbers.particles // (2 * count)
-        number = max(LEAST_BIRTHS, min(numbers.birth_particles, room))
+        share = numbers.particles // (2 * count)
+        number = max(LEAST_BIRTHS, min(numbers.birth_particles, share))
         return measurement_births(member, before, self.area, number, self.generator)
 
     def _born_anywhere(
         self, members: Sequence[CheckedMeasurement]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return births independent of single measurements: uniform (001), or Gaussian (003)."""
+        """Return births independent of single measurements: uniform (001) or Gaussian (003)."""
         numbers = self._numbers
         expected, number = numbers.birth_targets, numbers.birth_particles
         if numbers.births == 'uniform' and members:
@@ -143,7 +143,7 @@ class IcPhdFilter(SearchFilter):
         self.weights = np.concatenate([self.weights, weights])
 
     def _resample(self) -> None:
-        """Resample to l particles for each expected target, within bounds."""
+        """Resample to l particles per expected target, within bounds."""
         numbers = self._numbers
         expected = self.expected_number
         if not expected > 1e-12:
@@ -158,7 +158,7 @@ class IcPhdFilter(SearchFilter):
         self.weights = np.full(number, expected / number)
 
     def _extract(self, members: Sequence[CheckedMeasurement], time: float) -> list[FoundTarget]:
-        """Find clusters by K-means; narrow and heavy ones are found and removed (000, 3.3)."""
+        """Find clusters by K-means; narrow and heavy ones are found targets (000, section 3.3)."""
         numbers = self._numbers
         if not members or not self.expected_number > 0.0:
             self.clusters = self.clusters if len(self.weights) else []
@@ -200,7 +200,7 @@ class IcPhdFilter(SearchFilter):
     def _without_found(
         self, member: CheckedMeasurement, dropped: dict[str, int]
     ) -> CheckedMeasurement:
-        """Return a measurement without detections of found targets and beyond maximum range."""
+        """Return a measurement without detections of found targets or beyond the maximum range."""
         member = within_range(member, dropped)
         if not self.found_targets:
             return member
@@ -223,7 +223,7 @@ class IcPhdFilter(SearchFilter):
         return self._pool
 
     def adopt(self, change: Change) -> None:
-        """Delete the particles that new found targets explain: those within T_z."""
+        """Remove the particles within T_z of new found targets."""
         super().adopt(change)
         for target in change.changed:
             offset = self.particles - target.position
@@ -234,7 +234,7 @@ class IcPhdFilter(SearchFilter):
 def nearest_detection(
     position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
 ) -> tuple[CheckedMeasurement, Label]:
-    """Return the robot with the nearest detection, else the last, and the label within T_z."""
+    """Return the robot with the nearest detection, otherwise the last, and the label within T_z."""
     apart, labelled = [(math.inf, members[-1])], [(limit, UNLABELLED)]
     for member in members:
         centres = member.sensor.measurement.inverse(member.values, member.pose)
@@ -247,7 +247,7 @@ def nearest_detection(
 def kept_measurements(
     centres: FloatArray, targets: Sequence[FoundTarget], limit: float, every: bool
 ) -> BoolArray:
-    """Return which of m detections stay: without all, or the closest, within T_z of found ones."""
+    """Return which of m detections remain without all, or the closest, within T_z of targets."""
     keep = np.ones(len(centres), np.bool_)
     for target in targets:
         apart = np.sqrt(((centres - target.position) ** 2).sum(axis=1))

@@ -1,4 +1,4 @@
-"""A robot's sensor: probability of detection, and measurement noise."""
+"""A robot's sensor: probability of detection and measurement noise."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,10 +12,11 @@ from maasi_filter.models.measurement import RangeAndAngles
 # Lower bound of the expected false detections in a scan: without it, a few stray particles
 # suffice to explain a false detection as a target.
 LEAST_PER_SCAN = 0.05
+LEAST_INTENSITY = 1e-12  # of false detections next to the sensor
 
 
 def is_covariance(covariance: FloatArray) -> bool:
-    """Return whether a finite square matrix is symmetric positive definite despite rounding."""
+    """Return whether a finite square matrix is symmetric and positive definite up to rounding."""
     variances = np.diagonal(covariance)
     if not (np.isfinite(covariance).all() and (variances > 0.0).all()):
         return False
@@ -28,24 +29,24 @@ def is_covariance(covariance: FloatArray) -> bool:
 
 @dataclass
 class Sensor:
-    """Sensor of a robot: it measures range and angles.
+    """Sensor of a robot, which measures range and angles.
 
     Parameters
     ----------
     name : str
-        For messages.
+        Name for messages.
     detection : DetectionModel
-        pi(x, q).
+        Probability of detection pi(x, q).
     covariance : (d, d) array
-        R, of a measurement; m and rad, squared. d is 2 or 3.
+        R, covariance of a measurement; m and rad, squared. d is 2 or 3.
     clutter : float
         Intensity of false detections, per unit of measurement space (m rad in 2D, m rad^2 in 3D).
     period : float
-        Seconds between possible measurements; 0 means no limit.
+        Seconds from one possible measurement to the next; 0: every step.
     maximum_range : float
-        Detections from farther away are dropped and counted, metres.
+        Range beyond which detections are dropped and counted, metres.
     resolution : float
-        Detections of one scan that are closer are of one target, in deviations of the noise.
+        Detections of one scan closer than this count as one, in deviations of the noise.
 
     Attributes
     ----------
@@ -65,6 +66,7 @@ class Sensor:
     period: float = 0.0
     maximum_range: float = field(default=math.inf)
     resolution: float = 1.0
+    clutter_in: str = 'measurements'
     measurement: RangeAndAngles = field(init=False)
 
     def __post_init__(self) -> None:
@@ -96,14 +98,32 @@ class Sensor:
         """2 or 3."""
         return self.measurement.dimension
 
+    def clutter_space(self, bounds: FloatArray) -> float:
+        """Return the volume in which false detections are uniform, in the unit of `clutter`."""
+        if self.clutter_in == 'area':
+            return float(np.prod(bounds[:, 1] - bounds[:, 0]))
+        return self.measurement_space(bounds)
+
+    def clutter_at(self, values: FloatArray, per_scan: float, bounds: FloatArray) -> FloatArray:
+        """Return the intensity of false detections at measured values (m, d), (m,).
+
+        It is per unit of measurement space: of positions uniform in the area, |dx/dz| as many.
+        """
+        intensity = np.full(len(values), per_scan / self.clutter_space(bounds))
+        if self.clutter_in == 'area':
+            intensity *= np.abs(values[:, 0]) ** (self.dimension - 1)
+            if self.dimension == 3:
+                intensity *= np.cos(values[:, 2])
+        return np.maximum(intensity, LEAST_INTENSITY)
+
     def measurement_space(self, bounds: FloatArray) -> float:
-        """Return the volume of measurements up to the farthest range [m rad, in 3D m rad^2]."""
+        """Return the volume of measurement space up to the largest range [m rad, in 3D m rad^2]."""
         size = bounds[:, 1] - bounds[:, 0]
         reach = min(self.maximum_range, math.sqrt(float((size * size).sum())))
         if isinstance(self.detection, BoxDetection):
             corner = np.maximum(np.abs(self.detection.lower), np.abs(self.detection.upper))
             corner = corner[: len(bounds)] + self.detection.edge
-            # A box in two axes does not limit the height.
+            # A box with two axes does not limit the height.
             if len(corner) == len(bounds):
                 reach = min(reach, math.sqrt(float((corner * corner).sum())))
         return reach * 2.0 * math.pi * (math.pi if len(bounds) == 3 else 1.0)

@@ -268,6 +268,7 @@ def merge(components: list[Component]) -> list[Component]:
     """Merge components of one target: the density of the heavier one, the sum of existences.
 
     At most one of the two is a target: the events exclude each other, so their probabilities add.
+    Densities too broad to be found overlap by chance: they count as independent.
     They are two targets if they were born in one scan, as a target causes at most one detection per
     scan, if their identities differ, or if their probabilities sum to more than one target.
     """
@@ -293,7 +294,8 @@ def merge(components: list[Component]) -> list[Component]:
             two = item.scan == other.scan or item.differs(other)
             two |= other.existence + item.existence > 1.0
             if not two and gap(other, item) < SAME_PLACE:
-                other.existence += item.existence
+                broad = max(one.density.radius - one.found_radius for one in (item, other)) > 0.0
+                other.existence += item.existence * (1.0 - other.existence if broad else 1.0)
                 other.labels.merge(item.labels)
                 still[place] = False
                 break

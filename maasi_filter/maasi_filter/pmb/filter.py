@@ -134,9 +134,11 @@ class PmbFilter(SearchFilter):
         """Correct with one robot's scan (docs/filter.md, Williams 2015, TOMB/P)."""
         member = without_repeats(within_range(member, result.dropped), result.dropped)
         components, learnt = self.components, self._learnt.setdefault(member.robot, Learnt())
-        # kappa: clutter per unit of measurement space; N0 / V.
-        space = member.sensor.measurement_space(self.bounds)
-        kappa = learnt.clutter_per_scan(member.sensor.clutter * space) / space
+        # kappa: clutter per unit of measurement space at each detection; N0 / V.
+        sensor = member.sensor
+        expected = sensor.clutter * sensor.clutter_space(self.bounds)
+        told = max(expected, self._numbers.pmb.clutter_floor)
+        kappa = sensor.clutter_at(member.values, learnt.clutter_per_scan(told), self.bounds)
         unseen = self.area.expected_targets / self.area.volume
         # Errors of the robot's position, those that last and those that the scan tells.
         member = self._offsets.localise(member, components, kappa, unseen)

@@ -10,7 +10,6 @@ from numba import njit
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.vector_math import normalised
 from maasi_filter.measurement_check import CheckedMeasurement
-from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.pmb.association import MANY_PAIRS, propagate
 from maasi_filter.pmb.component import Component, moments
 from maasi_filter.pmb.factors import MOST_PROBABLE
@@ -100,8 +99,7 @@ class Learnt:
 
     def clutter_per_scan(self, told: float) -> float:
         """Return the mean false detections in a scan, with a prior of `told` worth PRIOR_SCANS."""
-        prior = max(told, LEAST_PER_SCAN)
-        return (PRIOR_SCANS * prior + self.clutter) / (PRIOR_SCANS + self.scans)
+        return (PRIOR_SCANS * told + self.clutter) / (PRIOR_SCANS + self.scans)
 
     def count_clutter(self, false_detections: float) -> None:
         """Add a scan with an expected number of false detections."""
@@ -145,13 +143,13 @@ class Learnt:
         self,
         member: CheckedMeasurement,
         components: Sequence[Component],
-        clutter: float,
+        clutter: FloatArray,
         unseen: float,
     ) -> float:
         """Return the most probable deviation [m] of the position after a scan, on each axis.
 
-        `clutter` is kappa, per unit of measurement space; `unseen` N0 / V, per m^d: the largest
-        intensity of undetected targets.
+        `clutter` (m,) is kappa, per unit of measurement space; `unseen` is N0 / V, per m^d, the
+        largest intensity of undetected targets.
         """
         unit = math.sqrt(member.sensor.covariance[0, 0])
         items = likely(components)
@@ -192,7 +190,7 @@ class Learnt:
 def _log_likelihoods(
     member: CheckedMeasurement,
     items: Sequence[Component],
-    clutter: float,
+    clutter: FloatArray,
     unseen: float,
     unit: float,
 ) -> FloatArray:

@@ -48,7 +48,7 @@ class Offsets:
         self,
         member: CheckedMeasurement,
         components: Sequence[Component],
-        clutter: float,
+        clutter: FloatArray,
         unseen: float,
     ) -> CheckedMeasurement:
         """Return a robot's scan at its estimated pose, with components moved, if errors last."""

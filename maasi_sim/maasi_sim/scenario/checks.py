@@ -142,7 +142,8 @@ def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
     """Yield settings that a camera or an external robot does not have."""
     nothing = SimulatedSettings()
     if robot.camera is not None:
-        for field in ('noise', 'noise_factor', 'probability_factor', 'clutter_per_scan'):
+        factors = 'noise_factor', 'probability_factor'
+        for field in ('noise', *factors, 'clutter_per_scan', 'clutter_in'):
             value = getattr(robot.simulated, field)
             if value != getattr(nothing, field):
                 yield (

@@ -55,6 +55,11 @@ class SimulatedSettings(Settings):
         le=1e4,
         description='True mean number of false detections in a scan; none: as in the sensor [1]',
     )
+    clutter_in: Literal['measurements', 'area'] | None = Field(
+        None,
+        description='Where they are uniform, with `clutter_per_scan`: in range and angles, or in '
+        'the area; none: as in the sensor',
+    )
     odometry: OdometrySettings | None = Field(
         None,
         description='True noise, drift and offset of its odometry, while the covariance it reports '
@@ -74,6 +79,9 @@ class SimulatedSettings(Settings):
             size = bounds[:, 1] - bounds[:, 0]
             reach = min(math.sqrt(float((size * size).sum())), sensor.maximum_range)
             space = reach * 2.0 * math.pi * (math.pi if dimension == 3 else 1.0)
+            sensor.clutter_in = self.clutter_in or sensor.clutter_in
+            if sensor.clutter_in == 'area':
+                space = float(size.prod())
             sensor.clutter = self.clutter_per_scan / space
         return sensor
 

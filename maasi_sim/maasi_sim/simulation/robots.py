@@ -97,9 +97,8 @@ class SimulatedRobot:
             self.camera = CameraRenderer(camera, floor, shapes, seed, name)
         else:
             sensor = settings.simulated.sensor(settings.sensor, name, world.bounds)
-            size = world.bounds[:, 1] - world.bounds[:, 0]
-            reach = float(np.sqrt((size * size).sum()))
-            self.ranging = RangingSensor(sensor, world.targets_3d_at(0), seed, name, reach)
+            targets = world.targets_3d_at(0)
+            self.ranging = RangingSensor(sensor, targets, seed, name, world.bounds)
         self.laser: LaserScanner | None = None
         if settings.laser is not None:
             self.laser = LaserScanner(settings.laser, world.area, seed, name)

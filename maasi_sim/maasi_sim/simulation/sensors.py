@@ -21,16 +21,21 @@ from maasi_sim.simulation.world import noise_stream
 class RangingSensor:
     """A robot's ranging sensor (000, eq. (3) to (9)); seed, robot and step key its random numbers.
 
-    Shapes and units: targets (n, 2 or 3), true positions [m, map]; reach [m], of clutter.
+    Shapes and units: targets (n, 2 or 3), true positions, and bounds (d, 2) of clutter [m, map].
     """
 
     def __init__(
-        self, sensor: Sensor, targets: FloatArray, seed: int, robot: str, reach: float = 0.0
+        self,
+        sensor: Sensor,
+        targets: FloatArray,
+        seed: int,
+        robot: str,
+        bounds: FloatArray | None = None,
     ) -> None:
         self.sensor = sensor
         self.targets = np.asarray(targets, dtype=float)
         self.seed, self.robot = seed, robot
-        self.reach = min(reach, sensor.maximum_range)
+        self.bounds = bounds
         self._spread = np.linalg.cholesky(sensor.covariance)
 
     def measure(
@@ -56,12 +61,8 @@ class RangingSensor:
         for column in range(dimension):
             errors += noise[:, column, None] * self._spread[:, column]
         returns, causes = (values + errors)[seen], np.flatnonzero(seen)
-        if self.sensor.clutter > 0.0 and self.reach > 0.0:
-            # Uniform in range and angles.
-            low = np.array([0.0, -math.pi, -0.5 * math.pi][:dimension])
-            high = np.array([self.reach, math.pi, 0.5 * math.pi][:dimension])
-            number = generator.poisson(self.sensor.clutter * float(np.prod(high - low)))
-            clutter = generator.uniform(low, high, size=(number, dimension))
+        if self.sensor.clutter > 0.0 and self.bounds is not None:
+            clutter = self._clutter(generator, self.bounds, pose)
             returns = np.concatenate([returns, clutter])
             causes = np.concatenate([causes, np.full(len(clutter), -1)])
         order = generator.permutation(len(returns))
@@ -71,6 +72,24 @@ class RangingSensor:
         if dimension == 3:
             returns[:, 2] = np.clip(returns[:, 2], -0.5 * math.pi, 0.5 * math.pi)
         return returns, causes
+
+    def _clutter(
+        self, generator: np.random.Generator, bounds: FloatArray, pose: Pose
+    ) -> FloatArray:
+        """Return false detections, uniform in range and angles or in the bounds."""
+        if self.sensor.clutter_in == 'area':
+            low, high = bounds.T
+        else:
+            size = bounds[:, 1] - bounds[:, 0]
+            reach = min(math.sqrt(float((size * size).sum())), self.sensor.maximum_range)
+            low = np.array([0.0, -math.pi, -0.5 * math.pi][: len(bounds)])
+            high = np.array([reach, math.pi, 0.5 * math.pi][: len(bounds)])
+        number = generator.poisson(self.sensor.clutter * float(np.prod(high - low)))
+        clutter = generator.uniform(low, high, size=(number, len(bounds)))
+        if self.sensor.clutter_in == 'measurements':
+            return clutter
+        values = self.sensor.measurement.measure(clutter, pose)
+        return values[values[:, 0] <= self.sensor.maximum_range]
 
 
 class LaserSettings(Settings):
