@@ -1,8 +1,9 @@
-"""Errors of checked models in words: what was read, and what is allowed."""
+"""Numbers for people, and error texts of checked models: what was read, what is allowed."""
 
 import json
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pydantic import ValidationError
@@ -17,8 +18,27 @@ _PLAIN = {
 }
 
 
+def number(value: float) -> str:
+    """Return a number for people: three significant digits, '-' if it is not finite."""
+    if not math.isfinite(value):
+        return '-'
+    if abs(value) >= 100.0:
+        return f'{value:.0f}'
+    return f'{value:.3g}' if value else '0'
+
+
+def point(values: Iterable[float]) -> str:
+    """Return coordinates for people."""
+    return f'({", ".join(map(number, values))})'
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, which has an s unless it is 1."""
+    return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
+
+
 def shown(value: Any) -> str:
-    """Return a value as its file has it, shortened."""
+    """Return a value as written in its file, shortened."""
     if isinstance(value, Mapping):
         return 'a mapping of keys'
     text = repr(value) if isinstance(value, str) else json.dumps(value, default=str)
@@ -26,7 +46,7 @@ def shown(value: Any) -> str:
 
 
 def reason(item: Any) -> str:
-    """Return an error, of `ValidationError.errors()`, in words; those of our validators as is."""
+    """Return an item of `ValidationError.errors()` as text; our own texts are unchanged."""
     if item['type'] == 'value_error':
         return str(item['ctx']['error'])
     text = item['msg'].replace('Input should be', 'allowed is').replace(' after validation', '')
@@ -37,7 +57,7 @@ def reason(item: Any) -> str:
 
 
 def problems(error: ValidationError) -> str:
-    """Return all that is wrong in one line: keys and reasons."""
+    """Return all errors in one line: keys and reasons."""
     return '; '.join(
         ': '.join(filter(None, ('.'.join(map(str, item['loc'])), reason(item))))
         for item in error.errors()
