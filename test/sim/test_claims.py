@@ -97,6 +97,10 @@ def test_runs_that_did_not_finish_count_with_the_limit_and_are_counted():
     assert 'finished 0 of 3, 0 of 3' in nobody.here
     capped = tables.capped(np.array([3.0, math.nan, 90.0]), 40.0)
     np.testing.assert_array_equal(capped, [3.0, 40.0, 40.0])
+    # On the page only what is not complete is counted, without medians and ratios.
+    assert found.brief().split('<br>')[0] == '122 and 172' and '(medians' not in found.brief()
+    assert 'finished 3 of 4, 2 of 4' in found.brief() and ', x' not in found.brief()
+    assert 'finished' not in finding(a=LOW, b=HIGH).brief()
     # What each run has is not counted.
     assert 'finished' not in finding(quantity='error', a=LOW, b=HIGH).here
 
@@ -129,15 +133,15 @@ def test_page_and_summary_have_each_claim_of_each_experiment():
     known = {'000-toy': results(claim).experiment}
     page = claims.claims_page('{intervals} {level} {page}', known, {}, 'there.md')
     row = '| a claim (as printed), [000-toy](there.md#000-toy) |'
-    assert f'{row}  |  | not run |  |' in page and page.startswith('0 95.00 there.md')
+    assert f'{row}  |  | not run |' in page and page.startswith('0 95.00 there.md')
     against = {'000-toy': [found_with(1.0, gap=10.0)]}
     page = claims.claims_page('{intervals} {level}', known, against, 'there.md')
-    assert f'{row} less | here | **not here** | the wind |' in page and page.startswith('1 95.00')
+    assert f'{row} less | here | **not here**: the wind |' in page and page.startswith('1 95.00')
     holds = {'000-toy': [found_with(1.0)]}
     assert 'the wind' not in claims.claims_page('', known, holds, 'there.md')
     assert '| 000 | 1 | 1 (1) | 0 | 0 (0) | 0 |' in claims.summary(known, holds)
     one_run = {'000-toy': [found_with(None)]}
-    assert '| no interval |  |' in claims.claims_page('', known, one_run, 'there.md')
+    assert '| no interval |' in claims.claims_page('', known, one_run, 'there.md')
     text = f'before\n{claims.BEGIN}old\n{claims.END}after\n'
     new = claims.with_summary(text, 'table\n')
     assert new == f'before\n{claims.BEGIN}\ntable\n\n{claims.END}after\n'

@@ -1,6 +1,7 @@
 """The papers' claims: what our runs say about each, and a verdict by one rule."""
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,13 +19,23 @@ from maasi_sim.experiments.statistics import (
     paired_difference,
     student,
 )
-from maasi_sim.experiments.tables import interval, markdown_table, median, number, paired, shown
+from maasi_sim.experiments.tables import (
+    close,
+    interval,
+    markdown_table,
+    median,
+    number,
+    paired,
+    shown,
+)
 
 HOLDS, NOT_SHOWN, NOT_HERE, DIFFERS = 'holds', 'not shown', 'not here', 'differs'
 ONE_RUN, NOT_RUN = 'no interval', 'not run'
 ALIKE = 0.2  # what is within this share of the other is alike
 # The summary in README.md stands between these lines.
 BEGIN, END = '<!-- claims: begin -->\n', '<!-- claims: end -->\n'
+_MEDIANS = re.compile(r' \(medians? [^)]*\)')
+_WIDTH = re.compile(r' ± \S+')
 _WORDS = {'less': 'less', 'greater': 'more', 'alike': 'alike', 'number': ''}
 
 
@@ -55,6 +66,19 @@ class Finding:
         if self.expects == 'less':
             low, high = -high, -low
         return HOLDS if low > 0.0 else NOT_HERE if high < 0.0 else NOT_SHOWN
+
+    def brief(self) -> str:
+        """Return the cell without medians, ratio, and the widths that the difference has."""
+        means, *parts = _MEDIANS.sub('', self.here).split('<br>')
+        if ' against ' in means:
+            means = _WIDTH.sub('', means).replace(' against ', ' and ')
+        kept = [means]
+        for part in parts:
+            counts = [count.split(' of ') for count in part.removeprefix('finished ').split(', ')]
+            if part.startswith('finished') and all(done == every for done, every in counts):
+                continue
+            kept.append(part.split(', x ')[0].replace('none in any', 'no difference in any'))
+        return '<br>'.join(kept)
 
     def marked(self, level: float) -> str:
         """Return the verdict, in bold if it is the same by an interval of this level."""
@@ -206,14 +230,16 @@ def claims_page(
             row = [f'{says}, [{name}]({page}#{name})']
             one = known.get(claim.says)
             if one is None:
-                row += ['', '', NOT_RUN, '']
+                row += ['', '', NOT_RUN]
             else:
-                cause = '' if one.verdict() in (HOLDS, ONE_RUN) else claim.cause or 'unknown'
+                cause = '' if one.verdict() in (HOLDS, ONE_RUN) else claim.cause
                 earlier = ' (earlier)' if one.earlier else ''
-                row += [one.paper, one.here + earlier, one.marked(level), cause]
+                verdict = ': '.join(filter(None, (one.marked(level), cause)))
+                paper = one.paper.removesuffix(' against -').replace(' against ', ' and ')
+                row += [close(paper), close(one.brief()) + earlier, verdict]
             papers.setdefault(name[:3], []).append(row)
     for paper, rows in papers.items():
-        heads = ['claim', 'paper', 'here', 'verdict', 'cause']
+        heads = ['claim', 'paper', 'here', 'verdict']
         parts.append(f'## Paper {paper}\n\n{markdown_table([heads, *rows])}')
     return '\n'.join(parts)
 

@@ -157,6 +157,7 @@ class Experiment:
     seconds: float = 2.0  # of a run on one core, about
     maps: str | None = None  # those with the same name have the same maps; None: its own
     note: str = ''
+    shown: Sequence[str] = ()  # quantities on the page that neither claim nor difference uses
     compared: bool = False  # searches are compared: the seed is the number of the map
 
     def seed(self, number: int, seed: int = 1) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import textwrap
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -11,16 +12,16 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from maasi_sim.experiments.brief import brief_tables
 from maasi_sim.experiments.campaign import Campaign, maps_in, plan
 from maasi_sim.experiments.claims import Finding, claims_page, findings, summary, with_summary
 from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
 from maasi_sim.experiments.figures import as_png
-from maasi_sim.experiments.papers import FOLDER, experiments, title_of
+from maasi_sim.experiments.papers import FOLDER, experiments, named, title_of
 from maasi_sim.experiments.runs import runs_text, steps_text, write_file
 from maasi_sim.experiments.tables import (
     beside_paper,
     case_cells,
-    markdown_table,
     pair_cells,
     table_text,
 )
@@ -63,7 +64,10 @@ def configuration_text(results: Results, seed: int) -> str:
 def write_outputs(work: Campaign, seed: int) -> None:
     """Write raw runs, tables, figure and configuration."""
     experiment, results = work.experiment, work.results()
-    described = _described(experiment, case_cells(results), pair_cells(results))
+    described = [
+        *beside_paper(case_cells(results), pair_cells(results)),
+        *_words_of(experiment),
+    ]
     parts = [f'# {experiment.name}: {experiment.title}\n', *described, listed(experiment.choices)]
     for name, content in (
         ('steps.csv', steps_text(results.every())),
@@ -76,18 +80,18 @@ def write_outputs(work: Campaign, seed: int) -> None:
         write_file(work.folder / name, content)
 
 
-def _described(
-    experiment: Experiment, cases: dict[str, dict[str, str]], pairs: list[list[str]]
-) -> list[str]:
-    parts = [*beside_paper(cases, pairs), experiment.note and f'{experiment.note}\n']
+def _words_of(experiment: Experiment) -> list[str]:
+    parts = [experiment.note and f'{experiment.note}\n']
     if experiment.tested:
-        parts.append(f'Causes of differences, tested: {experiment.tested}\n')
+        parts.append(f'Tested causes of differences: {experiment.tested}\n')
     return parts
 
 
 def listed(choices: Sequence[OpenPoint]) -> str:
     """Return open points of the paper as a list in Markdown."""
-    return ''.join(f'- {item.what}: **{item.taken}**. {item.reason}\n' for item in choices)
+    return ''.join(
+        f'- {item.what}: **{item.taken}**. {item.reason}'.strip() + '\n' for item in choices
+    )
 
 
 @dataclass
@@ -147,32 +151,57 @@ def stored_section(store: Path) -> Section | None:
 
 def page(sections: dict[str, Section]) -> str:
     """Return the page of all experiments, from what is shown of each by its name."""
-    known = experiments()
-    rows = [['experiment', 'shows', 'rests on']]
-    for name, experiment in known.items():
-        rests = sections[name].rests if name in sections else '**not run**'
-        rows.append([f'[{name}](#{name})' if name in sections else name, experiment.title, rests])
     introduction = (FOLDER / 'introduction.txt').read_text(encoding='utf-8')
-    parts = [introduction, '## What was run\n', markdown_table(rows)]
-    papers: dict[str, list[Experiment]] = {}
-    for name in known:
-        if name in sections:
-            papers.setdefault(name[:3], []).append(known[name])
-    for paper, items in papers.items():
+    known: dict[str, list[Experiment]] = {}
+    for name, experiment in experiments().items():
+        known.setdefault(name[:3], []).append(experiment)
+    parts = [introduction]
+    for paper, items in known.items():
+        links = [_link(item.name, item.name in sections) for item in items]
+        parts.append(f'- {named(paper)}: {", ".join(links)}')
+    parts.append('')
+    for paper, items in known.items():
+        items = [item for item in items if item.name in sections]
+        if not items:
+            continue
         parts.append(f'## Paper {paper}\n\n{title_of(paper)}\n')
-        # Each open point once, with a letter that the experiments name.
+        # Each open point once, with a number that the experiments name.
         choices = list(dict.fromkeys(choice for item in items for choice in item.choices))
         parts.append('What the paper leaves open, and what is taken here:\n')
         parts.append(''.join(f'{n}. {listed([c])[2:]}' for n, c in enumerate(choices, start=1)))
         for item in items:
             section = sections[item.name]
-            numbers = ', '.join(str(choices.index(choice) + 1) for choice in item.choices)
-            words = f'{item.title}. Rests on {section.rests}.{section.duration}'
+            numbers = _spans([choices.index(choice) + 1 for choice in item.choices])
+            words = f'{item.title}. {section.rests}.'
             words += f' Open points: {numbers}.' if numbers else ''
+            words += _verdicts(section.claims)
             parts.append(f'### {item.name}\n\n{words}\n')
-            parts.append(f'![{item.title}](reproduction/{item.name}.png)\n')
-            parts += _described(item, section.cases, section.pairs)
+            parts.append(f'![Figure {item.name}](reproduction/{item.name}.png)\n')
+            parts += brief_tables(item, section.cases, section.pairs)
+            parts += _words_of(item)
     return '\n'.join(filter(None, parts))
+
+
+def _link(name: str, has_runs: bool) -> str:
+    return f'[{name}](#{name})' if has_runs else f'{name} (**not run**)'
+
+
+def _spans(numbers: Sequence[int]) -> str:
+    """Return numbers with runs of three and more as spans, such as '1 to 4, 7'."""
+    spans: list[list[int]] = []
+    for number in sorted(numbers):
+        if spans and number == spans[-1][-1] + 1:
+            spans[-1].append(number)
+        else:
+            spans.append([number])
+    texts = (f'{s[0]} to {s[-1]}' if len(s) > 2 else ', '.join(map(str, s)) for s in spans)
+    return ', '.join(texts)
+
+
+def _verdicts(found: Sequence[Finding]) -> str:
+    count = Counter(one.verdict() for one in found)
+    said = ', '.join(f'{number} {verdict}' for verdict, number in count.items())
+    return f' [Claims](claims.md): {said}.' if said else ''
 
 
 def wrapped(text: str) -> str:
@@ -183,24 +212,31 @@ def wrapped(text: str) -> str:
             lines.append(line)
             continue
         mark = line.split(' ', 1)[0]
-        indent = ' ' * (len(mark) + 1) if mark == '-' or mark.rstrip('.').isdecimal() else ''
+        indent = ' ' * (len(mark) + 1) if mark == '-' or mark[:-1].isdecimal() else ''
         lines += textwrap.wrap(
             line, _COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
         )
     return '\n'.join(lines)
 
 
-def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) -> list[str]:
+def write_document(
+    file: Path, out: Path, seed: int = 1, small: bool = False, rewrite: bool = False
+) -> list[str]:
     """Write the pages of the experiments and of the claims; return what has runs in `out`.
 
     Figures and tables go to `reproduction/` beside the page; those without runs stay. The claims'
-    summary goes to the README.md of the folder above, if that has its marks.
+    summary goes to the README.md of the folder above, if that has its marks. With `rewrite`, the
+    pages are written from the stored tables only, which are not marked as earlier ones.
     """
-    sections, shown = {}, []
+    sections: dict[str, Section] = {}
+    shown = []
     for name, experiment in experiments().items():
         image = file.parent / 'reproduction' / f'{name}.png'
         store = image.with_suffix('.json')
         earlier = stored_section(store)
+        if rewrite:
+            sections |= {name: earlier} if earlier else {}
+            continue
         results = plan(experiment, out, maps_in(out / name), seed, small).results()
         every = len(results.names()) == len(results.cases)
         if results.names():

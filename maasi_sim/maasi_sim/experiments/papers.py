@@ -79,6 +79,11 @@ def title_of(paper: str) -> str:
     return str(_paper(paper)['title']) if paper in PAPERS else ''
 
 
+def named(paper: str) -> str:
+    """Return the code of a paper with its short name, such as '000 (MAASI 2024)'."""
+    return f'{paper} ({_paper(paper)["name"]})' if paper in PAPERS else paper
+
+
 def paper_experiments(number: str) -> list[Experiment]:
     """Return the experiments of a paper, such as '000'."""
     paper = _paper(number)

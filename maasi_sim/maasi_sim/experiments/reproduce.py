@@ -25,18 +25,23 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = Parser(
         prog='reproduce',
-        description="Run the papers' experiments; the same command resumes an interrupted run.",
+        description="Run the papers' experiments. Run the same command again to resume.",
         epilog=EXIT_CODES,
     )
     add = parser.add_argument
-    add('names', nargs='*', metavar='NAME', help='experiments, or "all"')
-    add('--list', action='store_true', help='list all experiments')
-    add('--runs', type=count, metavar='N', help="maps of each (default: the paper's number)")
+    add('names', nargs='*', metavar='NAME', help='experiments that --list prints, or "all"')
+    add('--list', action='store_true', help='list the experiments and exit')
+    add(
+        '--runs',
+        type=count,
+        metavar='N',
+        help="use N maps for each experiment (default: the paper's number)",
+    )
     add(
         '--case',
         action='append',
         metavar='NAME',
-        help='only this case of each experiment; may be given several times',
+        help='run only this case of each experiment; can be repeated',
     )
     add_worker_options(parser)
     add(
@@ -44,19 +49,26 @@ def build_parser() -> argparse.ArgumentParser:
         type=Path,
         default=Path('runs/reproduction'),
         metavar='DIR',
-        help='folder of the results (default: %(default)s)',
+        help='folder for the results (default: %(default)s)',
     )
-    add('--seed', type=whole, default=1, metavar='N', help='of the maps (default: %(default)s)')
+    add(
+        '--seed', type=whole, default=1, metavar='N', help='seed of the maps (default: %(default)s)'
+    )
     add(
         '--small',
         action='store_true',
-        help='short runs for a first look; their numbers mean nothing',
+        help='make short test runs whose numbers have no meaning',
     )
     add(
         '--document',
         type=Path,
         metavar='FILE',
-        help='write the page of all experiments in DIR, with their figures beside it',
+        help='write a page of all experiments in DIR to FILE, with its figures next to it',
+    )
+    add(
+        '--rewrite',
+        action='store_true',
+        help='with --document: write it from the stored tables only, without runs',
     )
     return parser
 
@@ -85,7 +97,8 @@ def _reproduce(options: argparse.Namespace) -> int:
             raise WrongInput(f"unknown case '{name}'; allowed are {allowed}")
     problems = _run(wanted, options) if wanted else []
     if options.document is not None:
-        shown = write_document(options.document, options.out, options.seed, options.small)
+        settings = options.seed, options.small, options.rewrite
+        shown = write_document(options.document, options.out, *settings)
         print(f'wrote {options.document} with {len(shown)} experiments')
     return SOME_FAILED if problems else DONE
 

@@ -138,6 +138,11 @@ def number(value: float) -> str:
     return f'{value:.3g}' if value else '0'
 
 
+def close(text: str) -> str:
+    """Return a cell for a page, with the half widths next to their means."""
+    return text.replace(' ± ', '±')
+
+
 def shown(value: Interval, sign: bool = False) -> str:
     """Return a mean with its half width."""
     if not math.isfinite(value.mean):
