@@ -41,6 +41,7 @@ PARTS = {
 LAST = 'Explanation'
 # Outside of docs/.
 SHOWN = (Path('README.md'), Path('CONTRIBUTING.md'))
+PICTURES = ('.png', '.gif')
 NODES = [
     ('maasi_filter', 'filter_node', 'FilterNode'),
     ('maasi_planner', 'planner_node', 'PlannerNode'),
@@ -85,7 +86,7 @@ def site_text(text: str, page: Path) -> str:
             return match.group()
         path = Path(os.path.normpath(page.parent / name)).relative_to(ROOT)
         source = page.relative_to(ROOT)
-        is_page = path in SHOWN or (path.parts[0] == 'docs' and path.suffix in ('.md', '.png'))
+        is_page = path in SHOWN or (path.parts[0] == 'docs' and path.suffix in ('.md', *PICTURES))
         if not is_page:
             # Not a page of the site.
             shown = words.strip('`')
@@ -95,6 +96,8 @@ def site_text(text: str, page: Path) -> str:
         )
         return f'{mark}[{words}]({os.path.relpath(there, here.parent)}{hash_}{anchor})'
 
+    # Badges would need the network.
+    text = re.sub(r'^\[!\[.*\n', '', text, flags=re.MULTILINE)
     text = re.sub(r'(!?)\[([^\]]*)\]\(([^)\s]+)\)', change, text)
     # A library that draws diagrams would need the network: they are shown as they are written.
     return text.replace('```mermaid', '```text')
@@ -111,7 +114,7 @@ def copy_pages(target: Path) -> None:
         place = target / (page.relative_to(DOCS) if DOCS in page.parents else page.name)
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_text(site_text(page.read_text(), page))
-    for picture in DOCS.rglob('*.png'):
+    for picture in (path for path in DOCS.rglob('*') if path.suffix in PICTURES):
         place = target / picture.relative_to(DOCS)
         place.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(picture, place)
