@@ -210,18 +210,36 @@ def full(works):
     return text
 
 
+def compact(works):
+    """Return a table in Markdown with a row for each regime and planner, as documents have it."""
+    heads = 'planner', 'seeds', 'complete', 'time to find all [s]', 'minus `before` [s]'
+    table = [['regime (limit)', *heads, 'mean time to find [s]']]
+    for name, work in works.items():
+        found = SearchTable(work.results())
+        regime = f'{name} ({REGIMES[name].limit:g} s)'
+        for case, means in found.means.items():
+            gap = found.differences[case]['time'] if case in found.differences else None
+            spans = [f'{means[key].mean:.1f}±{means[key].half_width:.1f}' for key in MEANS]
+            change = f'{gap.mean:+.1f} [{gap.low:+.1f}, {gap.high:+.1f}]' if gap else '-'
+            complete = found.complete[case].number
+            seeds = means['complete'].number
+            table.append([regime, case, f'{seeds}', f'{complete}', spans[0], change, spans[1]])
+            regime = ''
+    return '\n' + markdown_table(table)
+
+
 def short(works):
     """Return a table in Markdown with a row for each regime: the times to find of each planner."""
     table = []
     for name, work in works.items():
         results = work.results()
         runs = {case: len(results.runs[case]) for case in results.names()}
-        cells = [name, ' / '.join(map(str, dict.fromkeys(runs.values())))]
+        cells = [name, '/'.join(map(str, dict.fromkeys(runs.values())))]
         for case, number in runs.items():
             times = (results.values(case, quantity).mean() for quantity in FOUND)
             left = number - round(results.values(case, 'complete').sum())
-            some = f' ({left} incomplete)' if left else ''
-            cells.append(' / '.join(f'{time:.0f}' for time in times) + some)
+            some = f' ({left})' if left else ''
+            cells.append('/'.join(f'{time:.0f}' for time in times) + some)
         if 'tour' in runs and 'maasi' in runs:
             ours, theirs = results.pairs('tour', 'maasi', 'most_time')
             gap, one = bootstrap_difference(ours, theirs), theirs.mean() / 100.0
@@ -233,6 +251,7 @@ def short(works):
 
 
 FOUND = ('half_time', 'most_time', 'time')  # in each cell
+MEANS = ('time', 'mean_time')
 
 
 def main():
@@ -250,12 +269,12 @@ def main():
         for regime in regimes
     }
     problems = carry_out_all(list(plans.values()), max(options.jobs, 1))
-    text = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer where runs are slow).\n'
-    text += short(plans) if options.short else full(plans)
-    print(text)
+    head = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer where runs are slow).\n'
+    print(head + (short(plans) if options.short else full(plans)))
     if options.document is not None:
         begin = BEGIN_SHORT if options.short else BEGIN
         before, rest = options.document.read_text(encoding='utf-8').split(begin)
+        text = head + (short(plans) if options.short else compact(plans))
         page = f'{before}{begin}\n{text}{END}{rest.partition(END)[2]}'
         options.document.write_text(page, encoding='utf-8')
     return 1 if problems else 0
