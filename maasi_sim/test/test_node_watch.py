@@ -76,7 +76,7 @@ def test_a_silent_node_is_named_within_five_seconds_and_no_pause_of_three(run):
         assert run.until(second + 1) is None
     run.beat(PLANNER, at=34.0)
     when, words = run.until(36.0)
-    assert words.startswith(f'{FILTER} hangs: no heartbeat for')
+    assert words.startswith(FILTER) and 'limits.heartbeat' in words
     assert when < 35.0
 
 
@@ -84,7 +84,7 @@ def test_a_node_that_starts_has_as_long_as_the_limit_says(run):
     assert run.until(179.0) is None
     run.beat(PLANNER, at=179.5)
     when, words = run.until(181.0)
-    assert words == f'{FILTER} not ready 180 s after the start' and when < 180.5
+    assert words.startswith(FILTER) and 'limits.start' in words and when < 180.5
     # The last heartbeat of the process before does not count.
     node = run.nodes[PLANNER]
     node.started, node.beaten, node.restarts = 190.0, None, 1
@@ -119,12 +119,12 @@ def test_a_run_whose_time_stands_still_names_who_is_late(run):
     run.supervisor._options = Options(lockstep=True)
     run.nodes[PLANNER].restarts = 0
     when, words = run.until(180.0, stands_still=True)
-    assert words == f'step 7: nothing from {PLANNER} for 30 s' and 129.9 < when < 130.5
+    assert words.startswith('step 7: ') and PLANNER in words and 129.9 < when < 130.5
     # The planner lives, and waits for the other one.
     for filter_beaten, who in ((when, PLANNER), (when - 10.0, FILTER)):
         run.beats = {FILTER: filter_beaten, PLANNER: when}
         _, words = run.until(180.0, stands_still=True)
-        assert words == f'step 7: nothing from {who} for 30 s'
+        assert [node for node in run.nodes if node in words] == [who]
 
 
 @pytest.mark.parametrize('last', [1.0, 1.18, 61.2])
@@ -159,7 +159,7 @@ def test_a_node_is_killed_if_it_hangs_and_restarted_as_often_as_the_limit_says(
     assert 'start number 2' in node.last_words()
     node._popen = SimpleNamespace(pid=3, poll=lambda: 7)
     ending = run.beat(FILTER, at=6.6)
-    assert ending.text == f'{PLANNER} exited with 7, after 1 restarts'
+    assert ending.text == f'{PLANNER} exited with 7, after 1 restart (limits.restarts)'
     events = [event['event'] for event in run.supervisor.events]
     assert events[0] == 'hung' and events[-2:] == ['restarted', 'died']
     assert ending.nodes == [PLANNER]

@@ -47,12 +47,12 @@ def test_a_terminal_gets_a_line_that_changes_and_lines_that_stay(monkeypatch):
 
 
 def test_how_far_something_is_comes_now_and_then_and_on_a_terminal_only_if_quiet():
-    for period, said in ((0.0, ['replay: 0 %', 'replay: 50 %']), (1e6, ['replay: 0 %'])):
+    for period, said in ((0.0, ['replay: 1 %', 'replay: 50 %']), (1e6, ['replay: 1 %'])):
         stream = io.StringIO()
         display = ProgressDisplay(stream, period=period)
-        for share in (0, 50):
+        for share in (0.0, 0.01, 0.5):
             display.update('starting', quiet=True)
-            display.update(f'replay: {share} %')
+            display.share('replay', share)
         assert stream.getvalue().splitlines() == said
     stream = Terminal()
     ProgressDisplay(stream).update('starting', quiet=True)

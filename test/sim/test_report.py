@@ -175,7 +175,7 @@ def test_report_of_a_complete_run(run, tmp_path):
     for colour in ((0x73, 0x9E, 0x00), (0x7E, 0x00, 0xE6)):
         assert (np.abs(picture - colour).max(axis=2) < 12).sum() > 20
     text = target_summary(report)
-    for words in ('3 of 3 targets found, 1 false', 'all targets found', '3.0 times real time'):
+    for words in ('3 of 3 targets found, 1 false', 'all targets found', '3 x real time'):
         assert words in text
     table = list(csv.DictReader((tmp_path / 'found_targets.csv').open()))
     rows = [('0.51', '0'), ('1.5', '1'), ('1.0', ''), ('1.0', '2')]

@@ -1,4 +1,4 @@
-"""How a run ends: the reason with its exit code, and signals as a condition that a run polls."""
+"""Reasons and exit codes of runs, and signals as a condition that a run polls."""
 
 import contextlib
 import signal
@@ -8,20 +8,20 @@ from types import FrameType
 
 DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, NOT_WRITTEN, INTERRUPTED = 0, 1, 2, 3, 4, 130
 EXIT_CODES = {
-    DONE: 'all targets found (or, with stop: planner_done, ended as meant)',
-    NOT_ALL_FOUND: 'not all targets were found, or the planners ended with less than half explored',
+    DONE: 'all targets found (or the planner finished, with stop: planner_done)',
+    NOT_ALL_FOUND: 'not all targets found, or planner finished with less than half explored',
     WRONG_INPUT: 'wrong input',
     NODE_FAILED: 'a node died or hung',
-    NOT_WRITTEN: 'bag or report not written (disk full) or with gaps',
+    NOT_WRITTEN: 'bag or report not written or incomplete',
     INTERRUPTED: 'interrupted',
 }
-LEAST_EXPLORED = 0.5  # share with which a search that its planners end is complete [1]
+LEAST_EXPLORED = 0.5  # explored share that a complete search needs [1]
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True)
 class Ending:
-    """Why a run ended, its exit code, what to say about it, and the nodes that caused it."""
+    """Why a run ended, its exit code, a text for the user, and the nodes that caused it."""
 
     reason: str
     code: int
@@ -30,20 +30,15 @@ class Ending:
 
 
 def end_of_planners(reason: str, explored: float, meant: bool) -> Ending:
-    """Return how a run ends whose planners all report that they are finished.
-
-    reason: theirs; explored: share of what is expected, 0 to 1; meant: whether the scenario stops
-    there. A search that gave up with less than half explored is no success.
-    """
+    """Return the ending of a run whose planners have all finished."""
     if explored < LEAST_EXPLORED:
-        percent = f'{100.0 * explored:.1f} % explored'
-        text = f'{reason}; {percent}, less than half: the search is not complete'
+        text = f'{reason}; the search is incomplete: only {100.0 * explored:.1f} % explored'
         return Ending('planner_done', NOT_ALL_FOUND, text)
     return Ending('planner_done', DONE if meant else NOT_ALL_FOUND, reason)
 
 
 class Interruption:
-    """Handles SIGINT, SIGTERM and SIGHUP; true once one of them has arrived."""
+    """Handles SIGINT, SIGTERM and SIGHUP; true after the first one."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -58,7 +53,7 @@ class Interruption:
 
     @contextlib.contextmanager
     def at_once(self, *signals: signal.Signals) -> Iterator[None]:
-        """End the context at one of `signals` (none: any): for what needs no clean-up."""
+        """Let `signals` (none: all) end the context immediately, for code without clean-up."""
         self._at_once = signals or _SIGNALS
         with contextlib.suppress(KeyboardInterrupt):
             try:

@@ -1,4 +1,4 @@
-"""What a run needs of its mission: nodes, record, report."""
+"""What a run needs of a mission: nodes, record, report."""
 
 from __future__ import annotations
 
@@ -18,27 +18,24 @@ from maasi_sim.run.topics import STEP
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    # These need ROS; a search in one process has records, too.
+    # These need ROS; a search in one process does not.
     from maasi_sim.run.node_plan import NodePlan
     from maasi_sim.run.run_options import Options
     from maasi_sim.scenario.preflight import Preflight
 
 
 class Observer:
-    """Writes the record of a run from serialised messages, and detects the end of the run.
+    """Builds the record of a run from serialised messages and detects its end."""
 
-    Topics are those of `kinds`, by their type; further ones are not needed.
-    """
-
-    #: Of the needed `topics`, filter updates: added after the messages they refer to.
+    # : Topics of filter updates, which are added after the messages they refer to.
     update_topics: Sequence[str] = ()
-    #: Targets there are; true and false ones found so far; measurements of all robots.
+    # : Number of targets; true and false finds; measurements of all robots.
     total = found = false_found = measurements = 0
     explored = 0.0  #: share of the environment explored
-    news = False  #: whether something was found since the caller last reset it
-    completed: Any = None  #: time and step at which all was found, where the scenario stops then
-    settled: str | None = None  #: the reason, once all planners report that nothing is left to gain
-    end_step: int | None = None  #: step at which the search ended by itself
+    news = False  # whether targets were found since the caller reset it
+    completed: Any = None  # time and step of the last find, if the scenario stops then
+    settled: str | None = None  # the reason, after all planners have finished
+    end_step: int | None = None  # step at which the search ended by itself
 
     def __init__(self, log: RunRecord, types: Typestore, kinds: Mapping[str, str]) -> None:
         self.log, self._types = log, types
@@ -49,7 +46,7 @@ class Observer:
             for topic, kind in {STEP: 'LockstepStep', **kinds, **states}.items()
         }
         self.topics = list(self._kinds)
-        self.complaints: list[str] = []  #: messages that were dropped, in words
+        self.complaints: list[str] = []  # reasons of dropped messages
         self._facts = MessageFacts(True, scenario.names(), len(scenario.environment.array()))
 
     def kind(self, topic: str) -> str:
@@ -57,13 +54,13 @@ class Observer:
         return self._kinds[topic]
 
     def add(self, topic: str, data: bytes) -> None:
-        """Add a serialised message; one of another topic is ignored."""
+        """Add a serialised message, if its topic is one of `topics`."""
         if topic in self._kinds:
             kind = self._kinds[topic]
             try:
                 message = self._types.deserialize_cdr(data, kind)
             except SerdeError:
-                facts = self._facts.drop(topic, f'it is no {kind}')
+                facts = self._facts.drop(topic, f'it is not a {kind}')
             else:
                 facts = self._facts.of(topic, kind, message)
             for fact in facts:
@@ -72,18 +69,18 @@ class Observer:
                 self.handle(fact)
 
     def handle(self, fact: Fact) -> None:
-        """Take a fact of a message."""
+        """Add a fact of a message."""
         self.log.add(fact)
 
     def settle(self) -> None:
         """Evaluate the messages added since the last call."""
 
     def rests_on(self, topic: str, data: bytes, last_step: int) -> bool:
-        """Return whether an update up to a step used this measurement, which may be later."""
+        """Return whether an update up to a step used this measurement, even if it arrives later."""
         return False
 
     def lacking(self, last_step: int) -> list[str]:
-        """Return in words the measurements of updates up to a step that have not arrived."""
+        """Return the missing measurements of updates up to a step, as text."""
         return []
 
     def record(self, end: RunEnd) -> RunRecord:
@@ -98,10 +95,10 @@ Record = TypeVar('Record', bound=RunRecord, contravariant=True)
 class Mission(Protocol[Record]):
     """A kind of search: scenario, nodes, observer and report."""
 
-    #: Name of the scenario, and the scenario with all layers.
+    # : Name of the scenario, and the scenario with all layers.
     name: str
     scenario: Any
-    found_word: str  #: word for a success in the progress line
+    found_word: str  # past participle for the progress line
 
     def prepare(self) -> None:
         """Assign addresses on this host to simulated robots."""
@@ -111,10 +108,10 @@ class Mission(Protocol[Record]):
         """Return the nodes to start; `file` is the scenario with all layers."""
 
     def preflight(self) -> Preflight:
-        """Return what the search will take."""
+        """Return the estimate of the search."""
 
     def warning(self) -> str:
-        """Return a warning about the scenario, or an empty text; takes a while."""
+        """Return a warning about the scenario, or an empty text; slow."""
         return ''
 
     def observer(self, types: Typestore) -> Observer:
@@ -124,7 +121,7 @@ class Mission(Protocol[Record]):
         """Return the report as plain values."""
 
     def tables(self, record: Record) -> dict[str, str]:
-        """Return further files of the report: their text by name."""
+        """Return the texts of further report files, by name."""
         return {}
 
     def summary(self, report: dict[str, Any]) -> str:
@@ -136,11 +133,11 @@ class Mission(Protocol[Record]):
 
 @dataclass(frozen=True)
 class MissionKind:
-    """A kind of mission other than a search for targets: what it is, in words."""
+    """A kind of mission other than a target search."""
 
     what: str
-    make: Callable[..., Mission[Any]]  #: of a name, a layer of a scenario, and overrides
+    make: Callable[..., Mission[Any]]  # from a name, a scenario layer and overrides
 
 
-#: By the name of their planner; each registers itself in its module `<folder>/<name>_mission.py`.
+# : By planner name; each registers itself in its module `<folder>/<name>_mission.py`.
 MISSIONS: dict[str, MissionKind] = {}

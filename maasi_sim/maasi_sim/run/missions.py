@@ -1,4 +1,4 @@
-"""The one place where a scenario file becomes a mission."""
+"""Missions from scenario files."""
 
 import importlib
 import warnings
@@ -21,7 +21,7 @@ for module in sorted(Path(__file__).parent.glob('*/*_mission.py')):
 def load_mission(
     path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
 ) -> Mission[Any]:
-    """Read a scenario file; parameters and errors as of `load_scenario`."""
+    """Read a scenario file; parameters and errors as in `load_scenario`."""
     path = find_scenario(path)
     layer = read_scenario(path)
     planner = layer.data.get('planner')
@@ -29,33 +29,29 @@ def load_mission(
     mission = MISSIONS.get(name)
     for origin, (key, value) in (overrides or {}).items():
         if key == ('planner', 'name') and MISSIONS.get(str(value)) is not mission:
-            what, allowed = 'a search for targets', 'one that searches for them'
+            what, allowed = 'a target search', 'a planner of target searches'
             if mission is not None:
                 what, allowed = mission.what, f"'{name}'"
-            raise ScenarioError(
-                f"{origin}: read '{value}'; {path} is {what}, for which the allowed planner is "
-                f'{allowed}'
-            )
+            raise ScenarioError(f"{origin}: read '{value}'; {path} is {what}, allowed is {allowed}")
     if mission is None:
         return TargetMission(path.stem, check_scenario(layer, overrides))
     return mission.make(path.stem, layer, overrides)
 
 
 def checked_mission(options: Options, display: ProgressDisplay) -> Mission[Any]:
-    """Return the mission of a run; say what it will take, and what is hardly meant in its file."""
+    """Return the mission of a run; print its estimate and the warnings about its file."""
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter('always', InputWarning)
         mission = load_mission(options.scenario, options.overrides())
     forecast = mission.preflight()
     for line in forecast.lines:
         display.say(line)
-    # A file with overrides is read twice.
+    # A file with overrides is validated twice.
     display.warn(*dict.fromkeys(str(doubt.message) for doubt in doubts), *forecast.warnings)
     # A node in the namespace of a robot belongs to that robot.
     if options.namespace.rpartition('/')[2] in mission.scenario.names():
         raise ScenarioError(
-            f"--namespace: read '{options.namespace}', allowed is a name that is none of "
-            'a robot of the scenario'
+            f"--namespace: read '{options.namespace}', allowed is a name that no robot has"
         )
     return mission
 

@@ -1,4 +1,4 @@
-"""Nodes as processes, forked from a server that has loaded what they share."""
+"""Nodes as processes, forked from a server that has loaded the shared modules."""
 
 import contextlib
 import ctypes
@@ -21,22 +21,22 @@ from setproctitle import getproctitle, setproctitle
 
 _PR_SET_PDEATHSIG = 1
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-# Of the suite: a node of another one is executed, and inherits nothing.
+# Nodes of other packages are executed and inherit nothing.
 _PACKAGES = ('maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
-# In the environment of the server only: the process that started it.
+# Set for the server only: the process that started it.
 _STARTED_BY = 'MAASI_NODE_SERVER_OF'
-# One thread for each linear algebra library: there is a process for each node, and a process with
-# several threads must not be forked.
+# One thread per linear algebra library: there is one process per node, and a process with several
+# threads must not be forked.
 _ENVIRONMENT = {
     'PYTHONUNBUFFERED': '1',
     'OMP_NUM_THREADS': '1',
     'OPENBLAS_NUM_THREADS': '1',
     'MKL_NUM_THREADS': '1',
 }
-# Addresses of Unix sockets have at most 107 bytes; multiprocessing adds 32 to the folder.
+# Unix socket addresses have at most 107 bytes; multiprocessing adds 32 to the folder.
 _LONGEST_FOLDER = 75
 _LEAST_START = 0.5  # a heartbeat this soon after a restart is from the previous process [s]
-# Signals of a shutdown, and the timeout of each [s].
+# Shutdown signals and their timeouts [s].
 ENDING = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5.0))
 
 
@@ -45,17 +45,17 @@ class ProcessError(RuntimeError):
 
 
 def start_server() -> None:
-    """Start the server, which loads what nodes share in the background."""
+    """Start the server, which loads the shared modules in the background."""
     forkserver.set_forkserver_preload([__name__])
     resource_tracker.ensure_running()
     for key, value in _ENVIRONMENT.items():
         os.environ.setdefault(key, value)
     os.environ[_STARTED_BY] = str(os.getpid())
-    # Ctrl-C in the terminal must not reach the server before it has a session of its own.
+    # Ctrl-C in the terminal must not reach the server before it has its own session.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     folder = tempfile.gettempdir()
     try:
-        # The server's socket needs a folder whose path is not too long for an address.
+        # The path of the folder of the server's socket must not be too long.
         if len(os.fsencode(folder)) > _LONGEST_FOLDER:
             tempfile.tempdir = '/tmp'
         util.get_temp_dir()
@@ -67,54 +67,54 @@ def start_server() -> None:
 
 
 def wait_for_server() -> None:
-    """Return once the server has loaded what nodes share."""
+    """Return once the server has loaded the shared modules."""
     process = ForkServerProcess(target=int)
     try:
         process.start()
     except (OSError, EOFError) as error:
-        raise ProcessError('the server of the nodes has ended: its error is above') from error
+        raise ProcessError('the node server has ended; its error is above') from error
     process.join()
 
 
 def _load(started_by: int) -> None:
-    """Load what nodes need; the server ends with the process that started it."""
-    # It finds the place of the title beside an environment that has not changed yet.
+    """Load the shared modules; the server ends with the process that started it."""
+    # setproctitle must run before the environment changes.
     getproctitle()
     os.setsid()
     _die_with(started_by)
-    # Nodes inherit them.
+    # Nodes inherit these modules.
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     gc.disable()
     # Not rclpy, which starts threads.
     importlib.import_module('maasi_sim.run.warm_up').prepare_nodes()
-    # What exists now is never garbage: nodes share its memory.
+    # Nodes share this memory, so it is never collected.
     gc.freeze()
     gc.enable()
 
 
 def _die_with(parent: int) -> None:
-    """Let Linux kill this process when its parent ends for any reason."""
+    """Let Linux kill this process when its parent ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:
         os._exit(1)
 
 
 def find_executable(package: str, executable: str) -> Path:
-    """Return the file that `ros2 run package executable` would run."""
+    """Return the file that `ros2 run package executable` runs."""
     try:
         folder = Path(get_package_prefix(package)) / 'lib' / package
     except PackageNotFoundError:
         raise ProcessError(f'package {package} is not installed: source the workspace') from None
     path = folder / executable
     if not os.access(path, os.X_OK):
-        raise ProcessError(f'package {package}: has no executable {executable} in {folder}')
+        raise ProcessError(f'package {package} has no executable {executable} in {folder}')
     return path
 
 
 def beside(function: Callable[..., None], *arguments: Any) -> Iterator[Any]:
-    """Run a function in a fork of the server, and return what it sends by its last argument."""
+    """Run a function in a fork of the server and yield what it sends through its last argument."""
     receives, sends = Pipe(duplex=False)
     words = (function, *arguments, sends.send)
     with sends, contextlib.suppress(OSError, EOFError):
@@ -134,11 +134,9 @@ def _received(connection: Connection) -> Iterator[Any]:
 
 
 class NodeProcess(ForkServerProcess):
-    """A node that runs as a process and cannot outlive this one.
+    """A node as a process that ends with this one; times are wall times [s].
 
-    A node of this suite inherits what the server has loaded. Until the first heartbeat of its
-    executor, one a second, it is starting, which may include compilation. Times are of the wall
-    [s].
+    Before its executor's first heartbeat (1 Hz) the node is starting and may be compiling.
     """
 
     def __init__(self, name: str, command: list[str], log: Path) -> None:
@@ -146,7 +144,7 @@ class NodeProcess(ForkServerProcess):
         self.command, self.log = command, log
         self.restarts = 0
         self.started = 0.0
-        #: Time of its last heartbeat, and how long it had waited for a processor by then.
+        # : Time of the last heartbeat, and the processor waiting time until then.
         self.beaten: float | None = None
         self._waited = 0.0
 
@@ -165,7 +163,7 @@ class NodeProcess(ForkServerProcess):
         self.restarts += 1
         with contextlib.suppress(OSError), self.log.open('ab') as output:
             output.write(f'--- start number {self.restarts + 1} ---\n'.encode())
-        # One process object starts once.
+        # A process object can be started only once.
         self.join()
         super().__init__(name=self.name)
         self.start()
@@ -177,7 +175,7 @@ class NodeProcess(ForkServerProcess):
         try:
             output = os.open(self.log, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
         except OSError:
-            # The disk is full: the node runs without a log.
+            # The disk is full; run without a log.
             output = os.open(os.devnull, os.O_WRONLY)
         nothing = os.open(os.devnull, os.O_RDONLY)
         for source, target in ((nothing, 0), (output, 1), (output, 2)):
@@ -195,7 +193,7 @@ class NodeProcess(ForkServerProcess):
         sys.exit(getattr(commands, executable.name)())
 
     def signal(self, number: int) -> None:
-        """Send a signal, if it still runs."""
+        """Send a signal if it is running."""
         if self.is_alive() and self.pid is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, number)
@@ -207,14 +205,14 @@ class NodeProcess(ForkServerProcess):
             self.beaten, self._waited = now, waited_for_processor(self.pid)
 
     def hangs(self, now: float, limit: float) -> bool:
-        """Return whether there was no heartbeat for a time; waits for a processor do not count."""
+        """Return whether heartbeats have been missing for a time, without waits for a processor."""
         if self.beaten is None or now - self.beaten <= limit:
             return False
         waited = waited_for_processor(self.pid) - self._waited
         return now - self.beaten - waited > limit
 
     def how_it_ended(self) -> str:
-        """Return in words how it ended."""
+        """Return how it ended, as text."""
         code = self.exitcode
         if code is None:
             return 'is running'
@@ -235,7 +233,7 @@ class NodeProcess(ForkServerProcess):
 
 
 def waited_for_processor(pid: int | None) -> float:
-    """Return how long the main thread of a process was runnable without running [s]."""
+    """Return how long the main thread of a process was runnable but not running [s]."""
     try:
         return 1e-9 * int(Path(f'/proc/{pid}/schedstat').read_text().split()[1])
     except (OSError, IndexError, ValueError):
@@ -243,7 +241,7 @@ def waited_for_processor(pid: int | None) -> float:
 
 
 def stop(processes: Sequence[NodeProcess]) -> list[str]:
-    """Stop processes by stronger and stronger signals; return the names of those it killed."""
+    """Stop processes with increasingly strong signals; return the names of those killed."""
     for number, patience in ENDING:
         rest = [process for process in processes if process.is_alive()]
         for process in rest:
@@ -256,5 +254,5 @@ def stop(processes: Sequence[NodeProcess]) -> list[str]:
 
 if _STARTED_BY in os.environ:
     _load(int(os.environ.pop(_STARTED_BY)))
-#: Of a node, its parent: a node is forked from where this module was loaded before.
+# : Parent process of a node: it was forked from the process that loaded this module first.
 _server = os.getpid()

@@ -7,28 +7,29 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from maasi_filter.wording import number
 from maasi_sim.machine import this_machine
 from maasi_sim.run.log import RunRecord
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.run_folder import ResultsError, remove, write_text, write_whole
 
-REPORT_VERSION = 1  # of the format of `report.json`, see `report.schema.json`
+REPORT_VERSION = 1  # format version of `report.json`, see `report.schema.json`
 
 END_REASONS = {
     'all_found': 'all targets found',
-    'planner_done': 'nothing is left to gain, says the planner',
-    'time_limit': 'time limit',
+    'planner_done': 'the planner expects no further finds',
+    'time_limit': 'time limit reached',
     'interrupted': 'interrupted',
     'node_died': 'a node died',
     'node_hung': 'a node hung',
-    'not_ready': 'the nodes did not get ready',
-    'no_robot': 'no robot can go on',
+    'not_ready': 'the nodes did not become ready',
+    'no_robot': 'no robot can continue',
 }
-MISSION_REASONS: dict[tuple[str, str], str] = {}  # of a mission, in place of those
+MISSION_REASONS: dict[tuple[str, str], str] = {}  # replaces those of a mission
 
 
 def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> dict[str, Any]:
-    """Return a report: what was run, what came of it, how it ended; no number is infinite."""
+    """Return a report with the mission's content; infinite numbers are None."""
     wall = record.wall_time
     return {
         'version': REPORT_VERSION,
@@ -48,27 +49,26 @@ def whole_report(record: RunRecord, mission: str, content: dict[str, Any]) -> di
 
 
 def finite(value: float) -> float | None:
-    """Return a number, None if it is infinite or not a number."""
+    """Return a number, or None if it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 
 def reason_of_end(report: dict[str, Any]) -> str:
-    """Return in words why a run ended."""
+    """Return the reason why a run ended, as text."""
     reason = report['end_reason']
     return MISSION_REASONS.get((report['mission'], reason)) or END_REASONS.get(reason, reason)
 
 
 def summary(report: dict[str, Any], found: str, counts: str) -> str:
-    """Return a report in a few lines: what was found, what was counted, and the pace."""
+    """Return a report in a few lines: finds, counts and speed."""
     lines = [f'{found} (ended: {reason_of_end(report)})', counts]
-    if report['real_time_factor'] is not None:
-        wall, factor = report['wall_time'], report['real_time_factor']
-        lines.append(f'{wall:.1f} s of wall time, {factor:.1f} times real time')
+    if factor := report['real_time_factor']:
+        lines.append(f'{report["wall_time"]:.1f} s of wall time, {number(factor)} x real time')
     return '\n'.join(lines)
 
 
 def write_report(mission: Mission[Any], record: RunRecord, folder: Path) -> dict[str, Any]:
-    """Write report, picture and further files into a folder and return the report."""
+    """Write report, picture and further files into a folder; return the report."""
     report = mission.report(record)
     text = json.dumps(report, indent=2, allow_nan=False)
     write_text(folder / 'report.json', text + '\n')
@@ -82,10 +82,10 @@ def write_report(mission: Mission[Any], record: RunRecord, folder: Path) -> dict
 def store_report(
     mission: Mission[Any], record: RunRecord, folder: Path
 ) -> tuple[dict[str, Any], Path | None, str]:
-    """Write a report into the folder of the run, or, if that fails, into a new one elsewhere.
+    """Write a report into the run's folder, or elsewhere if that fails.
 
-    Elsewhere is the first with space: temporary files, home, `/dev/shm`. Return the report, its
-    folder (None: nowhere), and why it is not in that of the run.
+    Elsewhere: temporary files, home, `/dev/shm`. Returns the report, its folder (None: not
+    written), and why it is not in the run's folder.
     """
     problem = ''
     for base in (None, Path(tempfile.gettempdir()), Path.home(), Path('/dev/shm')):
@@ -98,7 +98,7 @@ def store_report(
         except (OSError, ResultsError) as error:
             cause = error.__cause__ or error
             reason = getattr(cause, 'strerror', None) or str(error)
-            problem = problem or f'{folder}: the report cannot be written: {reason}'
+            problem = problem or f'{folder}: cannot write the report: {reason}'
             remove(place / 'report.json')
             if base is not None:
                 with contextlib.suppress(OSError):

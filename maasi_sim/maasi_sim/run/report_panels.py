@@ -1,4 +1,4 @@
-"""The frame of the figures of reports: the map from above and the sides, ways, plots and text."""
+"""The layout of report figures: the map from above and the sides, paths, plots and text."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -23,21 +23,21 @@ from maasi_filter.geometry.area import Area
 from maasi_sim.run.log import RunRecord
 
 PALE, GRID, UNSEEN = '#9A9A9A', '#E6E6E6', '#CFCFCF'
-MARGIN = 1.015  # of axes to the right of the last value, or a step at the end cannot be seen
-# Size [inch], and the parts of it that a legend takes beside a text, and for a letter.
+MARGIN = 1.015  # space to the right of the last value
+# Size [inch], the share of the legend next to a text, and per letter.
 _SIZE, _HANDLE, _LETTER = (13.0, 8.0), 0.75, 0.068
-_THINNEST = 0.22  # a side view is at least this share of the size of the view from above
+_THINNEST = 0.22  # smallest relative size of a side view
 
 
 @dataclass(frozen=True)
 class MapView:
-    """Axes that show two of the map's axes: those to the right and upwards, 0, 1, 2 for x, y, z."""
+    """Axes that show two axes of the map, to the right and upwards (0, 1, 2: x, y, z)."""
 
     axes: Axes
     plane: tuple[int, int]
 
     def points(self, places: ArrayLike, width: int = 3) -> FloatArray:
-        """Return places (n, d) [m, map] in this view, (2, n)."""
+        """Return positions (n, d) [m, map] in this view, (2, n)."""
         array = np.asarray(places, dtype=float).reshape(-1, width)
         return array[:, list(self.plane)].T
 
@@ -45,7 +45,7 @@ class MapView:
 def ellipse(
     place: tuple[float, float], covariance: FloatArray, sigmas: float, least: float, **style: Any
 ) -> Ellipse:
-    """Return the ellipse of so many deviations of a place [m]; half axes are at least so long."""
+    """Return the ellipse of some deviations at a position [m], at least of a given size."""
     values, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
     widths = 2.0 * np.maximum(sigmas * np.sqrt(np.maximum(values, 0.0)), least)
     angle = math.degrees(math.atan2(directions[1, 0], directions[0, 0]))
@@ -75,7 +75,7 @@ def draw_ground(view: MapView, area: Area, bounds: FloatArray) -> None:
         view.axes.add_patch(Rectangle(corner, *size, **style))
 
 
-# A plot of counts beside the map: label of its axis to the right, relative height, what draws it.
+# A plot next to the map: label of its right axis, relative height, drawing function.
 Plot = tuple[str, float, Callable[[Axes], None]]
 
 
@@ -88,11 +88,7 @@ def draw_report(
     heading: str,
     rows: Sequence[tuple[str, str]],
 ) -> Figure:
-    """Return the figure of a report.
-
-    The map (d, 2) [m] from above, in 3D also from the south and the east, with the robots' ways;
-    beside it the first plot, over time, the shades of the ways, the other plots, and rows of text.
-    """
+    """Return the figure of a report: map with paths, plots over time, and rows of text."""
     figure = Figure(figsize=_SIZE, layout='constrained')
     FigureCanvasAgg(figure)
     halves = GridSpec(1, 2, figure, width_ratios=[1.5, 1.0])
@@ -192,7 +188,7 @@ def _draw_times(axes: Axes, colours: Mapping[str, str], end: float) -> None:
     axes.set_ylim(len(colours) - 0.5, -0.5)
     axes.set_yticks(range(len(colours)), list(colours), fontsize=8)
     axes.tick_params(axis='y', length=0)
-    axes.set_xlabel('time [s], and the shades of the ways')
+    axes.set_xlabel('time [s] and the shades of the paths')
     axes.spines[['top', 'right', 'left']].set_visible(False)
 
 

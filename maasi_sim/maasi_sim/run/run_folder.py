@@ -23,7 +23,9 @@ def make_folder(out: Path | None, suffix: str = '') -> Path:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
             if (out / 'bag').exists() or (out / 'report.json').exists():
-                raise ScenarioError(f'--out: {out} holds a run already, allowed is another folder')
+                raise ScenarioError(
+                    f'--out: {out} already contains a run, allowed is another folder'
+                )
             return out.resolve()
         stamp = datetime.now().strftime('%Y%m%d_%H%M%S') + suffix
         for number in itertools.count(1):

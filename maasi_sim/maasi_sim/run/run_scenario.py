@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         start_server()
     except OSError as error:
-        print(f'error: the server of the nodes cannot be started: {error}', file=sys.stderr)
+        print(f'error: cannot start the node server: {error}', file=sys.stderr)
         return WRONG_INPUT
     gc.disable()
     from maasi_sim.run.bag import BagError, BagWriteError

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from maasi_filter.wording import counted, number
 from maasi_sim.run.bag import ENDING_TOPIC, BagError, BagWriter, load_types
 from maasi_sim.run.domain import Domain
 from maasi_sim.run.ending import (
@@ -41,18 +42,18 @@ from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.view_run import send_replay
 from maasi_sim.scenario.layering import to_yaml
 
-# Between two checks of processes and topics; while the nodes start, and while they run [s].
+# Wall time between checks of processes and topics, during the start and afterwards [s].
 _START_POLL, _POLL = 0.02, 0.05
-# Longest wait for a publisher of others, which may not fit the recorder [s].
+# Longest wait for a publisher of another program, whose QoS may not match [s].
 _CONNECTION_PATIENCE = 5.0
-_START_PATIENCE = 10.0  # wall time between two messages about missing nodes [s]
+_START_PATIENCE = 10.0  # wall time between messages about missing nodes [s]
 
 
 def execute(options: Options, interruption: Interruption) -> int:
-    """Run a scenario and return the exit code; in a terminal its page stays until it is read."""
+    """Run a scenario and return the exit code; the page is served until its reader closes it."""
     display = ProgressDisplay()
     mission = checked_mission(options, display)
-    # Teams of robots that another program moves have its clock in common.
+    # Teams whose robots are moved by another program share its clock.
     shared = mission.scenario.external_clock and options.domain_id is not None
     with contextlib.ExitStack() as served:
         with Domain(options.domain_id, team=options.namespace, shared=shared) as domain:
@@ -70,7 +71,7 @@ def execute(options: Options, interruption: Interruption) -> int:
 
 
 def prepare(mission: Mission[Any], options: Options) -> Path:
-    """Return the folder of the run, with the scenario as it is run."""
+    """Create the folder of the run and write its scenario and RViz view."""
     folder = make_folder(options.out)
     mission.prepare()
     write_text(folder / 'scenario.yaml', mission.scenario.text())
@@ -99,16 +100,16 @@ class RunningRun:
             f'{mission.name}: seed {self.scenario.seed}, {len(processes)} nodes in ROS '
             f'domain {domain.number}, results in {short(folder)}'
         )
-        # Wall time when all nodes were ready, and of the first step.
+        # Wall times at which all nodes were ready, and of the first step.
         self._complete: float | None = None
         self._begun: float | None = None
         with contextlib.ExitStack() as ends:
             ends.callback(self.display.close)
             ends.callback(stop, processes)
-            # Ctrl-C ends the wait at once; the run reports it.
+            # Ctrl-C ends the wait; the run reports it.
             with self.interruption.at_once():
                 wait_for_server()
-            # Nodes start while this process makes what is its own.
+            # Nodes start while this process loads its modules.
             for process in () if self.interruption else processes:
                 process.start()
             types = load_types()
@@ -159,7 +160,7 @@ class RunningRun:
                 scene['replay'] = short(self.folder / REPLAY)
             page = RunPage(scene, options, domain, self.options.namespace)
         except OSError as error:
-            self.display.warn(f'no view: {options.host}: {error.strerror or error}')
+            self.display.warn(f'cannot serve the page: {options.host}: {error.strerror or error}')
             return None
         page.announce(self.display.say, options.browser)
         return page
@@ -180,13 +181,13 @@ class RunningRun:
             self.supervisor.note('recorder', 'gap', reason=gap)
         self.supervisor.stop()
         if self._bag is not None:
-            # An error is reported where the recording is closed.
+            # Closing the recording reports its errors.
             with contextlib.suppress(BagError):
                 self._bag.write_text(ENDING_TOPIC, recorder.time, f'{ending.reason}\n{ending.text}')
         if self.page is not None:
             self.page.put(EventMaker.end, ending.reason, ending.text)
         unwritten += self._close_bag()
-        # Beside the report; never before the server of the nodes is there.
+        # The replay is written in parallel to the report, if the server of the nodes is running.
         ran = options.record and self._processes[0].pid is not None
         replay = beside(send_replay, self.folder) if ran else iter(())
         end = RunEnd(ending.reason, recorder.elapsed, wall_time, self.supervisor.events)
@@ -208,33 +209,38 @@ class RunningRun:
             what = ', '.join(f'{name} {lack}' for name, lack in lacks.items())
             waited = time.monotonic() - begin
             if waited > self.scenario.limits.start:
-                text = f'{what} after {self.scenario.limits.start:g} s'
+                text = f'{what} after {self.scenario.limits.start:g} s (limits.start)'
                 return Ending('not_ready', NODE_FAILED, text, lacks)
             if waited > patience:
                 self.display.say(f'waiting: {what}')
                 patience += _START_PATIENCE
-        # Their executors run, even if no heartbeat has arrived so far.
+        # Their executors run, even if no heartbeat has arrived yet.
         for node in self._processes:
             node.beat(time.monotonic())
         if ending is None:
             loose = self.recorder.unmatched()
-            self.display.warn(*(f'{topic} has a publisher that is not recorded' for topic in loose))
+            self.display.warn(
+                *(
+                    f'{topic}: a publisher cannot be recorded because its QoS does not match'
+                    for topic in loose
+                )
+            )
             self.recorder.publish_ready()
-            # It takes a while.
+            # This takes a while.
             news = beside(send_warning, self.mission)
             threading.Thread(target=lambda: self.display.warn(*news), daemon=True).start()
         return ending
 
     def _lacks(self) -> dict[str, str]:
-        """Return the nodes, else the topics, else the nodes again that lack something, and what."""
+        """Return what is still missing, by node or topic."""
         recorder = self.recorder
-        # Nodes report last, so that all topics of one that has reported are discovered.
+        # Nodes report last: all topics of a node that has reported are discovered.
         ready = set(recorder.take_ready())
         recorder.discover()
         nodes = list(self.supervisor.processes)
         late = [name for name in nodes if name not in ready]
         done, total = len(nodes) - len(late), len(nodes)
-        self.display.update(f'starting: {done} of {total} nodes are ready', quiet=True)
+        self.display.update(f'starting: {done} of {total} nodes ready', quiet=True)
         if self.page is not None:
             self.page.starting(done, total)
         if late:
@@ -242,8 +248,8 @@ class RunningRun:
         self._complete = self._complete or time.monotonic()
         unmatched = recorder.unmatched()
         if unmatched and time.monotonic() - self._complete <= _CONNECTION_PATIENCE:
-            return dict.fromkeys(unmatched, 'has a publisher that is not connected')
-        return dict.fromkeys(recorder.unanswered(nodes), 'does not know the recorder')
+            return dict.fromkeys(unmatched, 'has an unconnected publisher')
+        return dict.fromkeys(recorder.unanswered(nodes), 'has not discovered the recorder')
 
     def _name_external_robots(self) -> None:
         team = self.options.namespace
@@ -252,8 +258,8 @@ class RunningRun:
         for name, robot in self.scenario.robots.items():
             if robot.external and robot.link != 'topics':
                 self.display.say(
-                    f'{name} is external: it takes off when you call its service arm '
-                    f'(team_command arm {name}{where}, with ROS_DOMAIN_ID={domain})'
+                    f'{name} is external; to let it take off: '
+                    f'ROS_DOMAIN_ID={domain} ./scripts/team_command arm {name}{where}'
                 )
 
     def _follow(self) -> Ending:
@@ -288,12 +294,13 @@ class RunningRun:
             meant = self.scenario.stop == 'planner_done'
             return end_of_planners(observer.settled, self.explored, meant)
         if recorder.elapsed >= limit:
-            return Ending('time_limit', NOT_ALL_FOUND)
+            text = f'time limit of {number(limit)} s reached: raise limits.time or --time-limit'
+            return Ending('time_limit', NOT_ALL_FOUND, text)
         return None
 
     @property
     def explored(self) -> float:
-        """Share that is explored, by the planner that reports most of it."""
+        """Explored share, from the planner that reports the largest."""
         return max(self.observer.explored, self.recorder.explored)
 
     def _show(self) -> None:
@@ -303,24 +310,25 @@ class RunningRun:
         wall = time.monotonic() - (self._begun or time.monotonic())
         targets = f' of {observer.total}' if observer.total else ''
         targets += f' ({observer.false_found} false)' if observer.false_found else ''
-        self.display.show(
-            f'{seconds:7.1f} s   {observer.measurements:4d} measurements   '
+        text = (
+            f'{seconds:7.1f} s   {counted(observer.measurements, "measurement"):>16}   '
             f'{observer.found} {self.mission.found_word}{targets}   '
-            f'{100.0 * self.explored:3.0f} % explored   '
-            f'{seconds / wall if wall > 0.0 else 0.0:.1f} x real time',
-            observer.found,
+            f'{100.0 * self.explored:3.0f} % explored'
         )
+        if seconds > 0.0 and wall > 0.0:
+            text += f'   {number(seconds / wall)} x real time'
+        self.display.show(text, observer.found)
 
 
 @dataclass(frozen=True)
 class EndedRun:
-    """A run whose nodes have ended: it is to be reported."""
+    """A run whose nodes have ended, ready to be reported."""
 
     run: RunningRun
     ending: Ending
     end: RunEnd
     unwritten: list[str]  #: errors of writing
-    replay: Iterator[Any]  #: what the process that writes the replay sends
+    replay: Iterator[Any]  # progress of the process that writes the replay, then its error
 
     def report(self) -> int:
         """Write report and replay, print the summary, and return the exit code."""
@@ -329,7 +337,7 @@ class EndedRun:
         report: dict[str, Any] = {}
         place, problem = None, ''
         with run.interruption.at_once(signal.SIGINT):
-            say('writing report and replay (Ctrl-C skips each)')
+            say('writing report and replay (Ctrl-C skips each one)')
             record = run.observer.record(self.end)
             report, place, problem = store_report(run.mission, record, run.folder)
         say(run.mission.summary(report) if report else 'report: skipped')
@@ -342,7 +350,7 @@ class EndedRun:
         for text in unwritten:
             say(f'error: {text}')
         if report:
-            say(f'report: {"nowhere" if place is None else short(place / "report.json")}')
+            say(f'report: {"not written" if place is None else short(place / "report.json")}')
         if run.options.record:
             with run.interruption.at_once(signal.SIGINT):
                 self._leave_replay()
@@ -357,7 +365,7 @@ class EndedRun:
         display, problem = self.run.display, 'it was not written'
         for news in self.replay:
             if isinstance(news, float):
-                display.share(REPLAY, news)
+                display.share(f'writing {REPLAY}', news)
             else:
                 problem = news
         if problem:
