@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import explained_time
 from quality_conditions import RADIANS, changed, copies, robots, wanted
 
 from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
@@ -263,7 +264,15 @@ def main():
     parser.add_argument('--document', type=Path, metavar='FILE', help='write the tables into it')
     brief = 'one table: seconds until half, 90 %% and all are found'
     parser.add_argument('--short', action='store_true', help=brief)
+    why = 'one table: where the time until 90 % are found goes, instead'
+    parser.add_argument('--explain', action='store_true', help=why)
     options, regimes, seeds = wanted(parser, REGIMES, runs=16, jobs=os.cpu_count() or 1)
+    if options.explain:
+        pairs = itertools.product(regimes, options.planner)
+        works = [((regime, kind), prepared(regime, kind)) for regime, kind in pairs]
+        table = [explained_time.HEAD, *explained_time.rows(works, seeds, options.jobs)]
+        print(markdown_table(table))
+        return 0
     plans = {
         regime: plan(comparison(regime, options.planner), options.out, len(seeds), first=seeds[0])
         for regime in regimes
