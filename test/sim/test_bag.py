@@ -97,21 +97,21 @@ def test_images_that_cannot_be_compressed_are_stored_as_they_are(types, tmp_path
 
 
 def test_what_cannot_be_written_is_named(types, tmp_path):
-    with pytest.raises(BagError, match='exists already'):
+    with pytest.raises(BagError, match=str(tmp_path)):
         BagWriter(tmp_path, types)
     writer = BagWriter(tmp_path / 'bag', types)
-    with pytest.raises(BagError, match='unknown message type other_msgs/msg/Thing'):
+    with pytest.raises(BagError, match='other_msgs/msg/Thing'):
         writer.add_topic('/thing', 'other_msgs/msg/Thing')
-    with pytest.raises(BagError, match='/elsewhere: not announced'):
+    with pytest.raises(BagError, match='/elsewhere'):
         writer.write('/elsewhere', 0, b'')
     # An error of the thread is raised, not swallowed.
     writer.add_topic('/image', 'sensor_msgs/msg/Image')
     writer.write('/image', 0, b'no message')
     wait_until(lambda: writer.failed)
     for end in (lambda: writer.write('/image', 1, b''), writer.close):
-        with pytest.raises(BagError, match='writing failed'):
+        with pytest.raises(BagError, match='failed'):
             end()
-    with Bag(tmp_path / 'bag') as bag, pytest.raises(BagError, match='holds no scenario'):
+    with Bag(tmp_path / 'bag') as bag, pytest.raises(BagError, match='scenario'):
         bag.scenario()
 
 

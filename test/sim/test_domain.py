@@ -195,9 +195,9 @@ def test_teams_share_a_domain_where_another_program_publishes_their_clock(tmp_pa
         with Domain(57, str(tmp_path), team='team/b', shared=True) as second:
             assert second.number == 57
             for team, shared, words in (
-                ('team/b', True, 'namespace /team/b in 57 is used by another'),
-                ('team_a', True, 'namespace /team_a in 57 is used by another'),
-                ('team_c', False, 'domain id: 57 is used by another run'),
+                ('team/b', True, 'namespace /team/b in 57'),
+                ('team_a', True, 'namespace /team_a in 57'),
+                ('team_c', False, 'domain id: .*57'),
             ):
                 with pytest.raises(DomainError, match=words):
                     Domain(57, str(tmp_path), team=team, shared=shared)
@@ -230,4 +230,4 @@ def test_a_run_says_that_the_loopback_interface_is_down():
         pytest.skip('a network namespace needs root, or user namespaces in the kernel')
     done = subprocess.run([*alone, sys.executable, '-c', code], capture_output=True, text=True)
     assert done.returncode == 2
-    assert 'error: the loopback interface cannot be used' in done.stderr
+    assert 'loopback interface' in done.stderr

@@ -174,7 +174,7 @@ def test_topics_are_renamed_or_the_wrong_one_is_named(searched, capsys, words, s
 def test_a_robot_without_camera_is_refused(searched, capsys):
     folder, _ = searched
     assert main(['ranging_drone_3d', '--replay', str(folder / 'odom')]) == 2
-    assert 'camera: got nothing, allowed with --replay' in capsys.readouterr().err
+    assert 'robots.drone.camera: read nothing' in capsys.readouterr().err
 
 
 def test_area_keep_outs_and_expected_targets_hold(searched, tmp_path, capsys, monkeypatch):

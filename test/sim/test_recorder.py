@@ -246,7 +246,7 @@ def test_a_measurement_that_never_arrives_is_a_gap(session, monkeypatch):
     session.until(lambda: session.recorder.step == 1)
     session.until(lambda: '/filter_update' in session.recorder.last_seen)
     session.recorder.finish()
-    lacks = 'the recording lacks measurement 7 of rover, which an update used'
+    lacks = 'the recording lacks measurement 7 of rover, used by an update'
     assert lacks in session.recorder.gaps(False, 5.0)
 
 

@@ -141,7 +141,7 @@ def of_topic(run, topic):
 
 def check_replay(run, folder):
     done = started([*command('', '')[:3], '--replay', str(run.bag)], folder, cwd=folder).finish()
-    assert done.code == 0 and 'equal to the bit' in done.output, done.output
+    assert done.code == 0 and 'bit-identical' in done.output, done.output
 
 
 class Operator:

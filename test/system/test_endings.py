@@ -206,7 +206,7 @@ def test_wrong_options_are_named(options, words, capsys):
     ('options', 'words'),
     [
         ({'planner': 'masi'}, "--planner: planner.name: unknown planner 'masi'"),
-        ({'namespace': 'team/mambo'}, "read 'team/mambo', allowed is a name that is none of"),
+        ({'namespace': 'team/mambo'}, "--namespace: read 'team/mambo'"),
     ],
 )
 def test_what_does_not_fit_the_scenario_is_named_with_the_option(options, words):

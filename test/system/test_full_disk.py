@@ -64,8 +64,8 @@ def test_a_run_that_fills_its_disk_reports_where_it_can(scenario, tmp_path, room
     if room:
         assert '"end_reason": "not_recorded"' in report.read_text()
     else:
-        assert 'the report cannot be written: File too large' in run.output
-        assert 'report: nowhere' in run.output and not report.exists()
+        assert 'cannot write the report: File too large' in run.output
+        assert 'report: not written' in run.output and not report.exists()
     assert list(elsewhere.iterdir()) == []
 
 
@@ -77,7 +77,7 @@ def test_a_report_for_which_its_folder_has_no_room_is_elsewhere(tmp_path, monkey
     monkeypatch.setattr(tempfile, 'tempdir', str(elsewhere))
     mission = SimpleNamespace(report=dict, tables=lambda _: {}, figure=lambda _: Figure())
     report, place, problem = store_report(mission, {'found': 3}, folder)
-    assert problem == f'{folder}: the report cannot be written: No space left on device'
+    assert problem == f'{folder}: cannot write the report: No space left on device'
     assert place.parent == elsewhere and not (folder / 'report.json').exists()
     assert json.loads((place / 'report.json').read_text()) == report == {'found': 3}
 

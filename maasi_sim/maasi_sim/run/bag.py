@@ -1,4 +1,4 @@
-"""Write recordings (rosbag2, MCAP) of serialised messages without ROS, by time; read runs'."""
+"""Write recordings (rosbag2, MCAP) of serialised messages without ROS, and read those of runs."""
 
 import contextlib
 import queue
@@ -29,24 +29,24 @@ from maasi_drivers.calibration.bag_reader import BagError, BagReader
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 SCENARIO_TOPIC = '/scenario'
-ENDING_TOPIC = '/ending'  # reason in one word, then a line in words
+ENDING_TOPIC = '/ending'  # reason as one word, then a line of text
 
 ImageFormat = Literal['jpeg', 'png', 'raw']
 
-# Encodings that are compressed, with their number of channels.
+# Compressed encodings, with their number of channels.
 _CHANNELS = {'bgr8': 3, 'rgb8': 3, 'mono8': 1, '8UC1': 1, '8UC3': 3}
 ROS_DISTRO = 'jazzy'
-# Latest time after which written messages are in the file [s of wall time].
+# Written messages are in the file after this time [s of wall time].
 FLUSH_PERIOD = 0.5
 _FOREVER = QosTime(9223372036, 854775807)
 
 
 class BagWriteError(BagError):
-    """A recording cannot be written: the disk is full, or fails."""
+    """A recording cannot be written, e.g. because the disk is full."""
 
 
 def topic_qos(reliable: bool = True, latched: bool = False, depth: int = 10) -> Qos:
-    """Return the quality of service of a topic, for players of the recording."""
+    """Return the quality of service of a topic, for players."""
     return Qos(
         QosHistory.KEEP_LAST,
         depth,
@@ -79,7 +79,7 @@ def load_types() -> Typestore:
 
 
 class _Storage(McapWriter):
-    """An MCAP file whose metadata name the distribution of ROS in place of the library."""
+    """An MCAP file whose metadata names the ROS distribution instead of the library."""
 
     def close(self, version: int, metadata: str) -> None:
         super().close(version, _with_distribution(metadata))
@@ -102,12 +102,12 @@ def _with_distribution(metadata: str) -> str:
 
 
 class BagWriter(contextlib.AbstractContextManager['BagWriter']):
-    """Writes a recording in its own thread; after any error it can be closed, and is readable then.
+    """Writes a recording in its own thread; readable after `close`, also after errors.
 
-    Messages are in the file after `FLUSH_PERIOD`; times that do not increase go up by 1 ns. Images
-    are stored compressed on `<topic>/compressed` as by image_transport (JPEG of quality 95 without
-    chroma subsampling, or PNG, ten times slower). `write` blocks while more than `backlog` bytes
-    wait; it and `close` raise the errors of the thread.
+    Messages are in the file after `FLUSH_PERIOD`; times that do not increase are raised by 1
+    ns. Images are stored on `<topic>/compressed` as by image_transport (JPEG of quality 95, or
+    PNG, ten times slower). `write` blocks while more than `backlog` bytes wait; it and `close`
+    raise the errors of the thread.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
         try:
             self._writer.open()
         except OSError as error:
-            raise BagWriteError(f'{path}: cannot be written: {error.strerror}') from error
+            raise BagWriteError(f'{path}: cannot write: {error.strerror}') from error
         self._topics: dict[str, tuple[str, Qos]] = {}
         self._connections: dict[str, Connection] = {}
         self._time = -1
@@ -137,16 +137,16 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
         self._thread.start()
 
     def add_topic(self, topic: str, type_name: str, qos: Qos | None = None) -> None:
-        """Announce a topic, which is in the recording even without messages."""
+        """Add a topic, which the recording has even without messages."""
         if type_name not in self._types.fielddefs:
             raise BagError(f'topic {topic}: unknown message type {type_name}')
         self._topics[topic] = (type_name, qos or topic_qos())
 
     def write(self, topic: str, time: int, data: bytes) -> None:
-        """Take a serialised message (CDR) received at `time` [ns]."""
+        """Write a serialised message (CDR) received at `time` [ns]."""
         self._check()
         if topic not in self._topics:
-            raise BagError(f'topic {topic}: not announced')
+            raise BagError(f'topic {topic}: add_topic was not called')
         with self._changed:
             self._pending += len(data)
             self._queue.put((topic, time, data))
@@ -158,24 +158,24 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
         self.write(topic, time, bytes(self._types.serialize_cdr(message, type_name)))
 
     def write_scenario(self, text: str, facts: Mapping[str, str]) -> None:
-        """Store the scenario: latched on topic `/scenario`, and as custom data of the recording."""
+        """Store the scenario on the latched topic `/scenario` and as metadata."""
         for key, value in facts.items():
             self._writer.set_custom_data(key, value)
         self.write_text(SCENARIO_TOPIC, 0, text)
 
     def write_text(self, topic: str, time: int, text: str) -> None:
-        """Store a text on a latched topic of its own, at `time` [ns]."""
+        """Store a text on its own latched topic, at `time` [ns]."""
         string = self._types.types['std_msgs/msg/String']
         self.add_topic(topic, 'std_msgs/msg/String', topic_qos(latched=True, depth=1))
         self.write_message(topic, time, string(data=text))
 
     @property
     def failed(self) -> bool:
-        """Whether writing has failed; nothing more is written then."""
+        """Whether writing has failed."""
         return self._error is not None
 
     def close(self) -> None:
-        """Write all waiting messages and the index; closing again does nothing."""
+        """Write all waiting messages and the index."""
         if self._closed:
             return
         self._closed = True
@@ -189,7 +189,7 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
             except Exception as error:
                 self._error = error
         if self._error is not None:
-            # Whole chunks stay readable, without an index.
+            # Complete chunks stay readable without an index.
             self._writer.metapath.with_suffix('.yaml.tmp').unlink(missing_ok=True)
             with contextlib.suppress(Exception):
                 self._writer.abort()
@@ -223,7 +223,7 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
                 self._changed.notify_all()
 
     def _flush(self) -> None:
-        """Write the chunk to the file if it is due: a killed writer loses no more than the rest."""
+        """Write the chunk to the file if it is due."""
         storage = cast('McapWriter', self._writer.storage)
         if storage.chunk.msgs and monotonic() >= self._flushed + FLUSH_PERIOD:
             storage.close_chunk()
@@ -249,7 +249,7 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
         return self._connections[name]
 
     def _compress(self, data: bytes) -> bytes | None:
-        """Return an image compressed, or None if OpenCV cannot hold its encoding."""
+        """Return a compressed image, or None if OpenCV does not support its encoding."""
         import cv2
 
         image: Any = self._types.deserialize_cdr(data, IMAGE_TYPE)
@@ -281,12 +281,12 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
 
 
 class Bag(BagReader):
-    """Reads the recording of a run, also one whose end is missing."""
+    """Reads the recording of a run, even if its end is missing."""
 
     def scenario(self) -> dict[str, Any]:
-        """Return scenario, seed and the parameters of each node of the run."""
+        """Return the scenario, seed and node parameters of the run."""
         for item in self.messages([SCENARIO_TOPIC]):
             content = yaml.safe_load(item.message.data)
             if isinstance(content, dict):
                 return content
-        raise BagError(f'{self.path}: holds no scenario: run_scenario did not record it')
+        raise BagError(f'{self.path}: contains no scenario; only recordings of run_scenario do')

@@ -1,4 +1,4 @@
-"""ROS domains of runs, and the shared memory that processes with Fast DDS leave in them."""
+"""ROS domains of runs, and the shared memory of Fast DDS in them."""
 
 import contextlib
 import fcntl
@@ -15,31 +15,30 @@ from pathlib import Path
 
 from maasi_filter.ros.loopback import loopback_fault
 
-DOMAINS = range(0, 102)  # domains whose ports lie below the ephemeral ports of Linux (from 32768)
-_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'  # environment variable of the profiles of Fast DDS
-# A port or a segment, its locks, and the semaphore under which a port is opened (Fast DDS 2.14).
+DOMAINS = range(0, 102)  # domains with ports below the ephemeral ports of Linux (from 32768)
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'  # environment variable with the profiles of Fast DDS
+# Files of Fast DDS 2.14: ports, segments, their locks and semaphores.
 _NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
-# Ports of the RTPS specification: this many for each domain, from this one.
+# Ports of the RTPS specification: number per domain, and first one.
 FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
-# Fast DDS asks the ports of the first 32 participants of a host. Those beyond are named as peers,
-# with some that are started next to a run (a display, commands of ROS).
+# Fast DDS contacts 32 participants per host. Further ones are named as peers, with some more for
+# programs that are started during a run.
 _FOUND, _OTHERS, _LAST = 28, 8, 119
 _PEERS = '<initialPeersList>{}</initialPeersList>'
 _PEER = '<locator><udpv4><address>127.0.0.1</address><port>{}</port></udpv4></locator>'
-# First word of a memory that its creator has made ready (Boost.Interprocess).
+# First word of a shared memory that is ready (Boost.Interprocess).
 _READY = (2).to_bytes(4, sys.byteorder)
 
 
 class DomainError(RuntimeError):
-    """No domain is free, or it cannot be used."""
+    """No domain is free, or the requested one cannot be used."""
 
 
 class Domain(contextlib.AbstractContextManager['Domain']):
-    """A ROS domain that no other run on this host uses, until `release`; the first free one from 1.
+    """A ROS domain reserved for this run on this host until `release`; the first free one from 1.
 
-    It, and a namespace in it, is locked by the name of an abstract Unix socket: valid for all
-    users, without a file, until the process ends. Locks of different purposes are independent; of a
-    `shared` one, only the namespace `team` is locked.
+    An abstract Unix socket locks the domain, or only the namespace `team` of a `shared` one:
+    for all users, without files, until the process ends.
     """
 
     def __init__(
@@ -50,7 +49,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         team: str = '',
         shared: bool = False,
     ) -> None:
-        # Nodes discover each other through it.
+        # Nodes discover each other by multicast in it.
         if fault := loopback_fault():
             raise DomainError(fault)
         self._purpose = purpose
@@ -58,7 +57,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         self._files = contextlib.ExitStack()
         if number is not None and number not in DOMAINS:
             raise DomainError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
-        # A requested domain may be in use by other nodes.
+        # Other nodes may use a requested domain.
         used = _domains_in_use() if number is None else set()
         for candidate in DOMAINS[1:] if number is None else [number]:
             if candidate in used:
@@ -71,14 +70,14 @@ class Domain(contextlib.AbstractContextManager['Domain']):
                 remove_dead(self._own)
                 return
             if number is not None:
-                raise DomainError(f'domain id: {problem} is used by another run')
+                raise DomainError(f'domain id: another run uses {problem}')
         raise DomainError(f'no ROS domain from 1 to {DOMAINS[-1]} is free')
 
     def _take(self, number: int, team: str, shared: bool) -> str:
         wanted = {} if shared else {f'{number}': f'{number}'}
         wanted[f'{number} {team}'] = f'namespace /{team} in {number}'
         for name, words in wanted.items():
-            # A digest, as the names of sockets are short.
+            # Socket names are short: use a digest.
             digest = hashlib.sha256(f'{self._purpose} {name}'.encode()).hexdigest()
             self._locks.append(socket.socket(socket.AF_UNIX))
             try:
@@ -89,9 +88,9 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         return ''
 
     def environment(self, participants: int = 0) -> dict[str, str]:
-        """Return variables for nodes of this domain, on this host, with fast discovery.
+        """Return environment variables for nodes of this domain on this host.
 
-        participants: as many processes of the run find each other, while the domain is held.
+        participants: number of processes that must discover each other.
         """
         variables = {
             'ROS_DOMAIN_ID': str(self.number),
@@ -114,7 +113,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         return file.name
 
     def release(self) -> None:
-        """Release the domain; what killed nodes left in shared memory goes before."""
+        """Release the domain after removing the shared memory of killed nodes."""
         remove_dead(self._own)
         self._unlock()
 
@@ -128,7 +127,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
 
 
 def _domains_in_use() -> set[int]:
-    """Return the domains of which a port is open; nodes on this host only open no common one."""
+    """Return the domains with an open port."""
     used = set()
     for table in ('/proc/net/udp', '/proc/net/udp6'):
         with contextlib.suppress(OSError):
@@ -139,12 +138,11 @@ def _domains_in_use() -> set[int]:
 
 
 def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> list[str]:
-    """Remove segments and ports of this user that no process has open; return the removed files.
+    """Remove shared memory of this user that no process has open; return the removed files.
 
-    They fill the memory, and who opens a port whose creator died before it was ready waits for
-    ever. Of `domain`, which no process uses, all ports are removed; of others, whose names new
-    processes use again, only those that were never ready: an opener would share a removed one with
-    nobody.
+    Dead files fill the memory, and a process that opens a half-created port waits forever. All
+    ports of `domain` are removed, of other domains only half-created ones, as new processes
+    reuse their names.
     """
     parts: dict[str, list[Path]] = defaultdict(list)
     for path in folder.iterdir() if folder.is_dir() else ():
@@ -152,7 +150,7 @@ def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> l
             parts[match[1]].append(path)
     removed = []
     for name, paths in parts.items():
-        # Not the lock alone: without it Fast DDS takes the port of a dead reader for a live one.
+        # Without the port Fast DDS would treat a dead reader's lock as alive.
         if all(map(_is_unused, paths)) and _may_go(folder / name, domain):
             for path in paths:
                 with contextlib.suppress(OSError):
@@ -173,7 +171,7 @@ def _may_go(path: Path, domain: int | None) -> bool:
 
 
 def _is_unused(path: Path) -> bool:
-    """Return whether no process has a file open or mapped: Linux then grants a write lease."""
+    """Return whether no process has a file open or mapped: Linux grants a write lease."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
@@ -181,7 +179,7 @@ def _is_unused(path: Path) -> bool:
     try:
         if os.fstat(file).st_uid != os.getuid():
             return False
-        # Who opens it meanwhile causes this signal, which is ignored by default, not SIGIO.
+        # If a process opens it now, Linux sends this signal (ignored by default) instead of SIGIO.
         fcntl.fcntl(file, fcntl.F_SETSIG, signal.SIGURG)
         fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_WRLCK)
     except OSError:

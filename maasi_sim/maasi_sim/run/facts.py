@@ -1,7 +1,7 @@
-"""What happens in a run, as facts.
+"""Facts: the events of a run.
 
-Two adapters write them: `maasi_sim.search`, and `MessageFacts` from the messages of nodes. Of them
-live the log of a search (`RunLog`), its report, and its page (`EventMaker`).
+`maasi_sim.search` and `MessageFacts` (from node messages) create facts. The log of a search
+(`RunLog`), its report and its page (`EventMaker`) use them.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from maasi_planner.team import Decision
 
 @dataclass(frozen=True)
 class Fact:
-    """Something that happened, at a time since the first step [s]."""
+    """An event, with the time since the first step [s]."""
 
     time: float
 
 
 @dataclass(frozen=True)
 class Present(Fact):
-    """The robots that take part from a step on."""
+    """The robots of the team from a step on."""
 
     robots: Sequence[str]
     step: int
@@ -49,9 +49,9 @@ class Left(Fact):
 
 @dataclass(frozen=True)
 class RobotAt(Fact):
-    """Where a robot is, by its odometry: x, y, z [m] and yaw [rad].
+    """Odometry pose of a robot: x, y, z [m], yaw [rad].
 
-    battery: 0 to 1, negative where unknown; status: a constant of `AgentState`; step: -1, unknown.
+    battery: 0 to 1, negative if unknown; status: constant of `AgentState`; step: -1 if unknown.
     """
 
     robot: str
@@ -76,7 +76,7 @@ class Decided(Fact):
 
 @dataclass(frozen=True)
 class PathPlanned(Fact):
-    """The path that a robot is going to take, (n, 3) [m]."""
+    """The planned path of a robot, (n, 3) [m]."""
 
     robot: str
     positions: Sequence[Sequence[float]] | FloatArray
@@ -84,9 +84,10 @@ class PathPlanned(Fact):
 
 @dataclass(frozen=True)
 class Measured(Fact):
-    """A measurement, from a position [m] at a pose; None: of which the attitude is unusable.
+    """A measurement from a position [m]; pose: None if its attitude is unusable.
 
-    values: range [m], bearing and elevation [rad] of each detection; covariances: of each, or None.
+    values: range [m], bearing and elevation [rad] of each detection; covariances: of each, or
+    None.
     """
 
     robot: str
@@ -95,7 +96,7 @@ class Measured(Fact):
     values: Sequence[Any] | FloatArray
     covariances: Sequence[FloatArray | None] | FloatArray | None
     index: int
-    batch: int = 1  # 0: that nobody asked for
+    batch: int = 1  # 0: not requested
 
     @classmethod
     def of(cls, time: float, item: AgentMeasurement) -> Measured:
@@ -106,7 +107,7 @@ class Measured(Fact):
 
 @dataclass(frozen=True)
 class Photographed(Fact):
-    """The image, a message, of which the detections of a measurement are."""
+    """The image message with the detections of a measurement."""
 
     measured: Measured
     image: Any
@@ -114,7 +115,7 @@ class Photographed(Fact):
 
 @dataclass(frozen=True)
 class Found(Fact):
-    """All targets that a filter has found itself, up to the update with a batch."""
+    """All targets that a filter itself has found, up to its update with a batch."""
 
     team: str
     targets: Sequence[FoundTarget]
@@ -123,27 +124,27 @@ class Found(Fact):
 
 @dataclass(frozen=True)
 class Updated(Fact):
-    """An update of a filter by measurements: robots and their index."""
+    """An update of a filter: robots and indices of their measurements."""
 
     step: int
     team: str
     members: Sequence[tuple[str, int]]
-    found: Sequence[FoundTarget] | None  # by this filter, all of them; None: as before
+    found: Sequence[FoundTarget] | None  # of this filter, all of them; None: unchanged
     expected: float = 0.0
     clusters: Sequence[Cluster] = ()
     duration: float = 0.0  # computation [s]
-    #: Where all robots are, (3,) [m]: the truth, in a search in one process.
+    # : True positions of all robots, (3,) [m], in a search in one process.
     positions: Mapping[str, FloatArray] = field(default_factory=dict)
-    new: Sequence[FoundTarget] = ()  # newly found, where `found` comes as a message of its own
+    new: Sequence[FoundTarget] = ()  # newly found, if `found` has its own message
     batch: int = 0
 
 
 @dataclass(frozen=True)
 class Explored(Fact):
-    """The exploration function of a planner on a grid: values, or letters of `shades`.
+    """Exploration function of a planner on a grid: values, or letters of `shades`.
 
-    Values below 0: there may be no target. share: explored, None: not said; rounded: by a message
-    with one step for both axes.
+    Values below 0 are cells where no target can be. share: explored share, None if unknown;
+    rounded: from a message with one cell size for both axes.
     """
 
     team: str
@@ -156,7 +157,7 @@ class Explored(Fact):
 
 @dataclass(frozen=True)
 class KeepOutsChanged(Fact):
-    """The keep-out zones that hold from now on [m, map]."""
+    """The keep-out zones from now on [m, map]."""
 
     shapes: Sequence[BaseGeometry]
 
@@ -170,14 +171,14 @@ class Truth(Fact):
 
 @dataclass(frozen=True)
 class SceneFound(Fact):
-    """Parts of a scene that became known by a message."""
+    """Parts of a scene that a message contains."""
 
     parts: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Said(Fact):
-    """A line of a log: a level ('team', 'warning', 'fault', ...), whose it is, and its text."""
+    """A log line: level ('team', 'warning', 'fault', ...), source, text."""
 
     source: str
     level: str
@@ -194,7 +195,7 @@ class Modes(Fact):
 
 @dataclass(frozen=True)
 class Shown(Fact):
-    """An event of the page that only one kind of mission has: its kind, owner and content."""
+    """A page event of one mission: kind, owner and content."""
 
     kind: str
     owner: str
@@ -203,7 +204,7 @@ class Shown(Fact):
 
 @dataclass(frozen=True)
 class Ended(Fact):
-    """The end of a run: a key of `END_REASONS`, and what is known of it."""
+    """The end of a run: a key of `END_REASONS`, and its text."""
 
     reason: str
     text: str = ''

@@ -1,6 +1,6 @@
-"""The record of a run: the facts of it, what they count to, and their scores.
+"""The record of a run: its facts, counts and scores.
 
-It is written by `maasi_sim.search`, and from the messages of nodes by an `Observer`.
+`maasi_sim.search` writes it, and an `Observer` from the messages of nodes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class RunEnd:
 class Count:
     """Measurements and found targets of all robots after a filter update.
 
-    rmse: of the true targets among those found [m], nan without any; members: that measured.
+    rmse: of the true finds [m], nan without any; members: robots that measured.
     """
 
     time: float
@@ -59,26 +59,11 @@ class Count:
 
 
 class RunRecord:
-    """What is known of the robots in a run of any mission, and how it ended.
+    """Record of a run of any mission.
 
-    Attributes
-    ----------
-    name : str
-        Of the run.
-    scenario : BaseScenario
-        Of the run.
-    seed : int
-        Of its random numbers.
-    events : list of dict
-        Robots that were lost or joined, and what the run noted: 'time' [s], 'agent', 'event', ...
-    last_steps : dict
-        Step of the last state of each robot that has sent one.
-    distance : dict
-        Distance travelled of each robot [m]; of messages at the end only.
-    end_reason : str
-        A key of `END_REASONS`.
-    end_time, wall_time : float
-        Simulated, and of the clock on the wall [s].
+    events: lost and joined robots and notes of the run ('time' [s], 'agent', 'event').
+    distance: path length of each robot [m], in runs of nodes set at the end. end_reason: a key
+    of `END_REASONS`. end_time, wall_time: simulated and wall time [s].
     """
 
     def __init__(self, scenario: BaseScenario, seed: int, name: str = '') -> None:
@@ -87,9 +72,9 @@ class RunRecord:
         self.last_steps: dict[str, int] = {}
         self.distance = dict.fromkeys(scenario.names(), 0.0)
         self.end_reason, self.end_time, self.wall_time = '', 0.0, 0.0
-        # Of each robot: time and position of its states. An hour of them has 2 MB.
+        # Time and position of the states of each robot; an hour needs 2 MB.
         self._path = {name: array('d') for name in scenario.names()}
-        self.team = set(scenario.names())  #: robots that take part
+        self.team = set(scenario.names())  # : robots of the team
         self._lost: set[str] = set()
 
     def add(self, fact: facts.Fact) -> None:
@@ -111,11 +96,11 @@ class RunRecord:
                 self._note_lost(time, robot, True)
 
     def _note_lost(self, time: float, robot: str, lost: bool, reason: str = '') -> None:
-        # A robot that left is not back by what its driver still publishes.
+        # A robot that left stays lost, even if its driver still publishes.
         lost = lost or robot not in self.team
         if lost != (robot in self._lost):
             self._lost ^= {robot}
-            # Before the first step robots get ready.
+            # Before the first step robots become ready.
             if time >= 0.0:
                 because = {'reason': reason} if lost and reason else {}
                 self._note(time, robot, 'lost' if lost else 'joined', **because)
@@ -124,16 +109,16 @@ class RunRecord:
         self.events.append({'time': time, 'agent': robot, 'event': event, **more})
 
     def takes_part(self, robot: str) -> bool:
-        """Return whether a robot is of the team, and can go on."""
+        """Return whether a robot is in the team and can continue."""
         return robot not in self._lost
 
     @property
     def trajectories(self) -> dict[str, FloatArray]:
-        """Where each robot was by its odometry: time [s], x, y, z [m], (n, 4)."""
+        """Odometry positions of each robot: time [s], x, y, z [m], (n, 4)."""
         return {name: np.array(path).reshape(-1, 4) for name, path in self._path.items()}
 
     def close(self, end: RunEnd, until: float) -> None:
-        """Note the end of a run of nodes, and drop what came after a time [s]."""
+        """Note the end of a run of nodes and drop later data; `until` in s."""
         self.end_reason, self.end_time, self.wall_time = end.reason, until, end.wall_time
         for name, path in self.trajectories.items():
             path = path[path[:, 0] <= until]
@@ -144,7 +129,7 @@ class RunRecord:
 
 
 class RunLog(RunRecord):
-    """What happened in a search for targets, its counts and scores.
+    """Log of a search for targets, with its counts and scores.
 
     Parameters
     ----------
@@ -209,7 +194,7 @@ class RunLog(RunRecord):
         self._begin_counts()
 
     def _begin_counts(self) -> None:
-        # Also of a world without targets.
+        # Also for a world without targets.
         none = np.zeros((0, self.scenario.dimension))
         self.truth = np.asarray(none if self._world is None else self._world.targets, dtype=float)
         radius = scoring_radius(self.scenario, self.truth)
@@ -241,7 +226,7 @@ class RunLog(RunRecord):
                 self._count(fact)
 
     def add_states(self, time: float, states: Mapping[str, RobotState]) -> None:
-        """Add where robots are, no more often than is shown."""
+        """Add robot states, at the rate of the page."""
         if time - self._last_states >= STATE_PERIOD - 1e-9:
             self._last_states = time
             for name, state in states.items():
@@ -249,10 +234,10 @@ class RunLog(RunRecord):
                 self.add(facts.RobotAt(time, name, pose))
 
     def add_map(self, time: float, team: str, exploration: UnexploredMap, now: bool) -> None:
-        """Add an exploration function as a planner node does: once a second, and if `now`."""
+        """Add an exploration function as a planner node does: once per second, and if `now`."""
         if now or time - self._last_maps.get(team, -np.inf) >= _MAP_PERIOD - 1e-9:
             self._last_maps[team] = time
-            # As coarse as it is shown: a byte for each cell.
+            # At the resolution of the page: one byte per cell.
             lower, step, shown = exploration.shown()
             letters = np.frombuffer(shades(shown).encode(), 'S1').reshape(shown.shape)
             share = exploration.explored_fraction()
@@ -261,7 +246,7 @@ class RunLog(RunRecord):
     def _count(self, update: facts.Updated) -> None:
         team = update.team
         for robot, index in update.members:
-            # A restarted filter republishes its last update.
+            # A restarted filter repeats its last update.
             if robot in self._path and (team, robot, index) not in self._counted:
                 self._counted.add((team, robot, index))
                 self.measurements[robot] += 1
@@ -290,7 +275,7 @@ class RunLog(RunRecord):
             self.completed = now
 
     def recount(self, updates: Sequence[facts.Updated]) -> None:
-        """Count again, in the order of steps and teams instead of arrival, to the completion."""
+        """Count again, by step and team instead of arrival."""
         self._begin_counts()
         for update in sorted(updates, key=lambda item: (item.step, item.team, item.batch)):
             if self.completed is not None and update.step > self.completed.step:
@@ -303,24 +288,24 @@ class RunLog(RunRecord):
 
     @property
     def found_targets(self) -> list[FoundTarget]:
-        """Targets found so far, of all filters."""
+        """Targets found so far by all filters."""
         return numbered(list(self._board.found.values()))
 
     def scores_against(self, truth: FloatArray) -> Scores:
-        """Return the scores of what is found against true targets (n, d) [m]."""
+        """Return the scores of the found targets against true targets (n, d) [m]."""
         scores = self._board.scores_against(truth)
         assert scores is not None
         return scores
 
     def end(self, step: int, reason: str) -> None:
-        """Note the last step of a search in one process, and why it ended."""
+        """Note the last step of a search in one process, and its reason."""
         self.steps, self.end_reason = step + 1, reason
         if self._world is not None:
             self.truth = np.asarray(self._world.targets_at(step), dtype=float)
         self.scores = self.scores_against(self.truth)
 
     def close(self, end: RunEnd, until: float) -> None:
-        """See `RunRecord.close`; it ends with the update that completed it."""
+        """See `RunRecord.close`; a completed search ends with the completing update."""
         last: float = np.inf
         if self.completed is not None:
             until, last = self.completed.time, self.completed.step
@@ -330,11 +315,9 @@ class RunLog(RunRecord):
             self.measured_from[robot] = [item for item in poses if item[0] <= until]
         super().close(end, until)
 
-    # ---- what is asked of it -----------------------------------------------------------------
-
     @property
     def explored(self) -> float:
-        """Share that is explored, by the planner that reports most of it."""
+        """Explored share, from the planner that reports the largest."""
         return max(self._shares.values(), default=0.0)
 
     @property
@@ -349,12 +332,12 @@ class RunLog(RunRecord):
 
     @property
     def rmse(self) -> float:
-        """Of the true ones among those found [m]; nan without any."""
+        """Error of the true finds [m]; nan without any."""
         return self.scores.match.rmse
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Index of a found target, and of the true one that it is."""
+        """Pairs of indices: found target, true target."""
         return self.scores.match.pairs
 
     @property
@@ -383,7 +366,7 @@ class RunLog(RunRecord):
         return [item.duration for item in self.facts if isinstance(item, facts.Updated)]
 
     def columns(self) -> dict[str, Any]:
-        """Return the progress by columns, with places of robots and whether they measured."""
+        """Return the progress by column, with positions of robots and whether they measured."""
         progress = self.progress
         kinds = ('step', 'time', 'measurements', 'found', 'true_found', 'rmse')
         columns: dict[str, Any] = {

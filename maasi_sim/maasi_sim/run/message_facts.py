@@ -1,4 +1,4 @@
-"""Facts of the messages of a run, as they come in a bag or a ROS graph."""
+"""Facts from the messages of a run, of a bag or a ROS graph."""
 
 import contextlib
 import importlib
@@ -28,30 +28,23 @@ _COLUMNS = {**dict(zip(_SAME, _SAME)), 'lengths': 'length'}
 # Levels of rcl_interfaces/msg/Log and of diagnostic_msgs/msg/DiagnosticStatus.
 _WARNING, _ERROR = 30, 40
 _FINE, _STALE = 0, 3
-_DIAGNOSTIC_WORDS = {0: 'well again', 1: 'warning', 2: 'error', 3: 'stale'}
-# Parts of a scene, by the last part of a topic of markers and of their namespace.
+_DIAGNOSTIC_WORDS = {0: 'recovered', 1: 'warning', 2: 'error', 3: 'stale'}
+# Parts of a scene, by the last part of a marker topic and by the markers' namespace.
 _PARTS = {
     ('markers', 'obstacles'): 'obstacles',
     ('search_area', 'obstacles'): 'blocks',
     ('search_area', 'objects'): 'objects',
 }
-# A stamp that is earlier than the topic's last one by more than this begins another run [s].
+# An earlier stamp on a topic by more than this begins another run [s].
 _REWIND = 10.0
 
 
 class MessageFacts:
     """Turns messages, of `rosbags` or of ROS, into facts.
 
-    Parameters
-    ----------
-    waits : bool
-        Whether the run begins at its first step; else with the first state of a robot.
-    teams : collection of str
-        Robots with a filter of their own, of which messages say what others found, too.
-    dimension : int
-        Of the search, 2 or 3; of found targets.
-    on_restart : callable, optional
-        Called where the time jumps back, as in a bag that is played again.
+    waits: the run begins at its first step, else with the first robot state. teams: robots with
+    their own filter, whose messages contain targets of others. dimension: 2 or 3. on_restart:
+    called if the time jumps back, as in a bag that is played again.
     """
 
     def __init__(
@@ -70,16 +63,16 @@ class MessageFacts:
         # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
-        # facts.Explored share by team, as its planner last reported it.
+        # Explored share by team, as last reported by its planner.
         self._shares: dict[str, float] = {}
-        self.dropped = Counter[str]()  #: messages with values that cannot be used, by topic
-        self.pictures = Pictures()  #: images that wait for their detections
-        self.notes: dict[Any, Any] = {}  #: what readers of other missions remember
+        self.dropped = Counter[str]()  # : number of unusable messages by topic
+        self.pictures = Pictures()  # : images without detections yet
+        self.notes: dict[Any, Any] = {}  # : memory of readers of other missions
 
     def of(self, topic: str, kind: str, message: Any) -> Iterator[facts.Fact]:
         """Return the facts of a message of a topic, for which `is_read` is true.
 
-        A message with values that cannot be used is dropped; a fact says so, the first time.
+        Unusable messages are dropped; the first one is reported as a fact.
         """
         if self._waits and kind != STEP:
             self._early.append((topic, kind, message))
@@ -96,15 +89,15 @@ class MessageFacts:
             yield from self.of(*item)
 
     def drop(self, topic: str, why: str) -> Iterator[facts.Fact]:
-        """Count a message that cannot be used, and say so, the first time."""
+        """Count an unusable message; report the first one."""
         self.dropped[topic] += 1
         if self.dropped[topic] == 1:
             yield facts.Said(
-                self._latest, topic, 'warning', f'messages are dropped, the first: {why}'
+                self._latest, topic, 'warning', f'dropping unusable messages; first problem: {why}'
             )
 
     def _now(self, topic: str, message: Any) -> float:
-        """Return the run's time of a message; begin again if time jumps back on its topic."""
+        """Return the run's time of a message; restart if time jumps back on its topic."""
         now = seconds(message.stamp if hasattr(message, 'stamp') else message.header.stamp)
         if self.begin is None:
             self.begin = now
@@ -118,7 +111,7 @@ class MessageFacts:
         return now - self.begin
 
     def time(self, message: Any) -> float:
-        """Return the run's time of a message with a header [s]; 0 before the run has begun."""
+        """Return the run's time of a message with a header [s]; 0 before the run begins."""
         return 0.0 if self.begin is None else seconds(message.header.stamp) - self.begin
 
     def _step(self, topic: str, message: Any) -> Iterator[facts.Fact]:
@@ -136,7 +129,7 @@ class MessageFacts:
         yaw = math.atan2(
             2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
         )
-        # Also a robot without a usable pose has a status.
+        # A robot without a usable pose has a status, too.
         pose = (math.nan,) * 4
         with contextlib.suppress(ValueError):
             pose = (*place('pose', message.pose.pose.position), yaw)
@@ -201,7 +194,7 @@ class MessageFacts:
         yield facts.Found(self.time(message), team, targets, int(message.batch_id))
 
     def _targets(self, team: str, messages: Iterable[Any]) -> list[FoundTarget]:
-        """Return the targets that a filter found itself, not those that others told it."""
+        """Return the targets that a filter found itself, without those of others."""
         return [
             self._target(item) for item in messages if team not in self._teams or item.robot == team
         ]
@@ -232,9 +225,9 @@ class MessageFacts:
                 for name, field in _COLUMNS.items()
             }
             places = [place('candidates.position', row.position) for row in item.candidates]
-            # Planned paths are messages of their own.
+            # Planned paths have their own messages.
             path, waypoint = np.zeros((0, 3)), np.array(place('waypoint', item.waypoint))
-            # Recordings of earlier versions have no tours.
+            # Recordings of earlier versions contain no tours.
             tour = [place('tour', corner) for corner in getattr(item, 'tour', ())]
             robots[item.robot] = RobotDecision(
                 int(item.chosen),
@@ -323,7 +316,7 @@ class MessageFacts:
 
 
 Reader = Callable[[MessageFacts, str, Any], Iterator[facts.Fact]]
-# By type: what reads it, and the last parts that the name of its topic may have; none: any.
+# Reader and allowed last parts of the topic's name (none: any), by type.
 READERS: dict[str, tuple[Reader, tuple[str, ...]]] = {
     STEP: (MessageFacts._step, ()),
     'maasi_msgs/msg/AgentState': (MessageFacts._state, ()),
@@ -342,7 +335,7 @@ READERS: dict[str, tuple[Reader, tuple[str, ...]]] = {
     'diagnostic_msgs/msg/DiagnosticArray': (MessageFacts._diagnostics, ('diagnostics',)),
     **{kind: (MessageFacts._image, (name,)) for kind, name in IMAGES.items()},
 }
-# Those of a mission's own messages stand in its folder.
+# Those of other missions are in their folders.
 for path in sorted(Path(__file__).parent.glob('*/facts.py')):
     module = importlib.import_module(f'{__package__}.{path.parent.name}.facts')
     READERS |= module.READERS
@@ -350,7 +343,7 @@ for path in sorted(Path(__file__).parent.glob('*/facts.py')):
 
 
 def is_read(topic: str, kind: str) -> bool:
-    """Return whether there are facts in the messages of a topic of a type."""
+    """Return whether messages of this topic and type contain facts."""
     if kind not in READERS or '/_' in topic:
         return False
     _, names = READERS[kind]
@@ -358,7 +351,7 @@ def is_read(topic: str, kind: str) -> bool:
 
 
 def _reasons(message: Any) -> dict[str, str]:
-    """Return the reasons of a decision by robot, as `decision_to_ros` joins them."""
+    """Return the reasons of a decision by robot (inverse of `decision_to_ros`)."""
     names = '|'.join(re.escape(item.robot) for item in message.robots)
     parts = re.split(rf'(?:^|; )({names}): ', message.reason)[1:] if names else []
     return dict(zip(parts[::2], parts[1::2]))

@@ -1,4 +1,4 @@
-"""Search a recording of robots' cameras and poses; each measures once a sensor period."""
+"""Search in a recording of robots' cameras and poses, with one measurement per sensor period."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +13,7 @@ from maasi_drivers.vision.marker_detector import read_markers
 from maasi_filter.geometry.area import Area
 from maasi_filter.make_filter import make_filter
 from maasi_filter.records import AgentMeasurement
+from maasi_filter.wording import counted, point
 from maasi_planner.coordinator import Coordinator
 from maasi_sim.run.ending import DONE
 from maasi_sim.run.facts import Measured, RobotAt, Updated
@@ -26,11 +27,11 @@ from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, planner_settings
 
-Placed = tuple[StampedPose, AgentMeasurement]  # where a robot was, and what it saw there
+Placed = tuple[StampedPose, AgentMeasurement]  # pose of a robot and its measurement there
 
 
 def search_recording(options: Options) -> int:
-    """Search a recording, print and write what is found, and return the exit code."""
+    """Search a recording, print and write the found targets, and return the exit code."""
     assert options.replay is not None
     seed, bag, topics = options.seed, options.replay, dict(options.remap)
     overrides: dict[str, tuple[Key, object]] = {} if seed is None else {'--seed': (('seed',), seed)}
@@ -46,10 +47,13 @@ def search_recording(options: Options) -> int:
     write_text(folder / 'found_targets.csv', csv_text(rows, loaded.dimension, origin))
     write_replay(event_log(log, bag.name), folder / REPLAY)
     for target in found:
-        place = ' '.join(f'{value:.3f}' for value in target.position)
-        print(f'target {target.id} of {target.robot} at {place} m, after {target.time:.1f} s')
+        print(
+            f'target {target.id} of {target.robot} at {point(target.position)} m, '
+            f'after {target.time:.1f} s'
+        )
     print(
-        f'{len(recorded)} measurements: {len(found)} targets found, {explored:.0%} explored; '
+        f'{counted(len(recorded), "measurement")}: {counted(len(found), "target")} found, '
+        f'{100.0 * explored:.0f} % explored; '
         f'results in {folder}'
     )
     return DONE
@@ -58,11 +62,11 @@ def search_recording(options: Options) -> int:
 def recorded_measurements(
     scenario: Scenario, name: str, bag: Path, remap: Mapping[str, str]
 ) -> list[Placed]:
-    """Return the measurements of a robot by its recorded images, by the steps of its driver."""
+    """Return the measurements of a robot from its recorded images, as its driver makes them."""
     robot = scenario.robots[name]
     if robot.camera is None:
         raise ScenarioError(
-            f'robots.{name}.camera: got nothing, allowed with --replay is a robot with a camera'
+            f'robots.{name}.camera: read nothing, allowed with --replay are robots with a camera'
         )
     settings = DriverSettings(
         environment=scenario.environment,
@@ -78,7 +82,7 @@ def recorded_measurements(
     try:
         recorded = RecordedRobot(bag, settings, space, 'images', remap=remap)
         if not recorded.records('/camera/camera_info'):
-            print(f'{name}: no camera_info is recorded, its camera is that of the scenario')
+            print(f'{name}: no camera_info recorded: using the camera of the scenario')
         detector, sensor = recorded.detector(), robot.sensor.build(name, scenario.dimension)
         found: list[Placed] = []
         for place, image in recorded.images(robot.sensor.period):
@@ -92,17 +96,20 @@ def recorded_measurements(
         print(f'warning: {recorded.recovered}')
     if not found:
         raise BagError(
-            f'{bag}: {name}: none of {recorded.left_out} images can be used: {recorded.why}'
+            f'{bag}: {name}: cannot use any of {recorded.left_out} images: {recorded.why}'
         )
     poses = recorded.pose_source()
-    print(f'{name}: {len(found)} images at poses of {poses}, {recorded.left_out} left out')
+    print(
+        f'{name}: {counted(len(found), "image")} used with poses of {poses}, '
+        f'{recorded.left_out} skipped'
+    )
     if recorded.left_out:
-        print(f'{name}: left out: {recorded.why}')
+        print(f'{name}: skipped images: {recorded.why}')
     return found
 
 
 def search_measurements(scenario: Scenario, recorded: list[Placed]) -> tuple[RunLog, float]:
-    """Feed a filter with measurements by stamp; return the log, and the explored share."""
+    """Feed a filter with measurements by stamp; return the log and the explored share."""
     common = {'step': scenario.step, 'seed': scenario.seed, 'lockstep': True}
     coordinator = Coordinator(planner_settings(scenario, scenario.names(), common))
     generator = np.random.default_rng(scenario.seed)

@@ -1,4 +1,4 @@
-"""The recorder: subscribes to all topics of a run, records them, and takes part in lockstep."""
+"""The recorder subscribes to all topics of a run, records them and takes part in lockstep."""
 
 import contextlib
 import math
@@ -37,26 +37,25 @@ NAME = 'recorder'
 READY, DONE = '/lockstep/ready', '/lockstep/done'
 DIAGNOSTICS, ROSOUT = '/diagnostics', '/rosout'
 _SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)  # topics shared by all teams of a domain
-_SKIPPED = ('/parameter_events', READY)  # not recorded: of no use to readers of the recording
-_KEPT = '/found_targets/kept'  # a copy of the found targets for a restarted filter
-# Topics still recorded during shutdown.
+_SKIPPED = ('/parameter_events', READY)  # not recorded: of no use to readers
+_KEPT = '/found_targets/kept'  # copy of the found targets for a restarted filter
+# Topics still recorded during the shutdown.
 _MEASURED = '/detections'
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
-# The clock may come after messages of its time: by so much [s], in lockstep by so many steps. A
-# larger lead is of another clock.
+# The clock may arrive later than messages of its time: by this long [s], in lockstep by this many
+# steps. A larger lead belongs to another clock.
 _LARGEST_LEAD, _MOST_STEPS = 1.0, 50
-_ARMING_PERIOD = 2.0  # between two calls to take off [s]
+_ARMING_PERIOD = 2.0  # time between calls to take off [s]
 _LAST_PATIENCE = 5.0  # longest wait for measurements that the last updates used [s]
 _STOP_PATIENCE = 1.0  # longest wait for the acknowledgement of stop commands [s]
-_ACKNOWLEDGED = Duration(seconds=0.1)  # until they are sent again
+_ACKNOWLEDGED = Duration(seconds=0.1)  # wait before they are sent again
 
 
 class Recorder:
-    """
-    A node that takes serialised messages from all topics that it discovers.
+    """Records serialised messages of all topics that it discovers.
 
-    It has no executor: `drain` takes messages without callbacks, at a fifth of the cost.
-    Without a bag it takes only what the observer needs. Topics of the observer are relative to the
+    It has no executor: `drain` takes messages without callbacks, which costs a fifth. Without a
+    bag it takes only what the observer needs. Topics of the observer are relative to the
     namespace `team`, which has no slashes at its ends.
 
     Subscribes
@@ -110,9 +109,11 @@ class Recorder:
         #: Robots at the first step, and time of the first message of each recorded topic [ns].
         self.robots: list[str] = []
         self.first: dict[str, int] = {}
-        self.explored = 0.0  #: share of the environment explored, published by planners each second
-        self._faulty: set[str] = set()  # planners whose present error is among the complaints
-        #: Time of the last diagnostics of each node [s of wall time].
+        self.explored = 0.0  # : explored share, published by planners each second
+        self._faulty: set[str] = (
+            set()
+        )  # planners whose current error is already among the complaints
+        # : Wall time of the last diagnostics of each node [s].
         self.heartbeats: dict[str, float] = {}
         self._arming: dict[str, Client] = {}
         self._armed_at = 0.0
@@ -130,7 +131,7 @@ class Recorder:
         self.listener: Callable[[str, str, bytes], None] | None = None
         self._shown: dict[str, str] = {}
         self._wanted = {*observer.topics, CLOCK, DONE, DIAGNOSTICS}
-        # Taken by themselves, in this order.
+        # Read separately, in this order.
         self._in_order = {*observer.update_topics, STEP, CLOCK}
         self._subscriptions: dict[str, Subscription] = {}
         self._refused: set[str] = set()
@@ -151,7 +152,7 @@ class Recorder:
         return topic if topic in _SHARED else within(self._team, topic)
 
     def relative(self, topic: str) -> str | None:
-        """Return the name of a topic or node within the team; None for one of others."""
+        """Return the name of a topic or node within the team, or None outside of it."""
         if not self._team or topic in _SHARED:
             return topic
         inner = topic.removeprefix(f'/{self._team}')
@@ -164,7 +165,7 @@ class Recorder:
             if topic is None or topic in self._subscriptions or topic in self._refused:
                 continue
             shown = self.listener is not None and is_read(topic, types[0])
-            # A name with an underscore in front is hidden: the inner topics of actions.
+            # An underscore in front hides a name: internal topics of actions.
             useless = topic in _SKIPPED or '/_' in topic or topic.endswith(_KEPT)
             wanted = not useless and (self.bag is not None or topic in self._wanted)
             if not (wanted or shown):
@@ -181,14 +182,14 @@ class Recorder:
                     self.bag.add_topic(full, types[0], topic_qos(reliable, latched))
             except (ImportError, AttributeError, BagError) as error:
                 self._refused.add(topic)
-                self._complaints.append(f'topic {full} is not recorded: {error}')
+                self._complaints.append(f'topic {full} cannot be recorded: {error}')
                 continue
             self._subscriptions[topic] = self._subscribe(topic, kind, qos)
             if shown:
                 self._shown[topic] = types[0]
 
     def unmatched(self) -> list[str]:
-        """Return the topics with a publisher that is known, but not connected yet."""
+        """Return the topics with a publisher that is known but not connected yet."""
         return [
             full
             for topic, subscription in self._subscriptions.items()
@@ -207,9 +208,9 @@ class Recorder:
     def unanswered(self, nodes: Collection[str]) -> list[str]:
         """Return the nodes that may not send to all subscriptions of the recorder yet.
 
-        A publisher that the recorder is connected to may not know the recorder, and drops what it
-        publishes. Nodes learn of subscriptions in the order in which these were made: one that
-        answers a new subscription, with its latched report of being ready, knows all before it.
+        A connected publisher may not know the recorder yet and drop its messages. Nodes
+        discover subscriptions in the order of their creation: a node that answers a new
+        subscription with its latched ready report knows all earlier ones.
         """
         if self._asked_with != len(self._subscriptions):
             self._asked_with = len(self._subscriptions)
@@ -220,12 +221,12 @@ class Recorder:
         return [name for name in nodes if name not in self._answered]
 
     def take_heartbeats(self) -> dict[str, float]:
-        """Return when nodes have sent diagnostics since the last call [s of wall time]."""
+        """Return the wall times of diagnostics of nodes since the last call [s]."""
         beats, self.heartbeats = self.heartbeats, {}
         return beats
 
     def take_complaints(self) -> list[str]:
-        """Return what became wrong since the last call: of recording, messages and planners."""
+        """Return problems of recording, messages and planners since the last call."""
         complaints = self._complaints + self.observer.complaints
         self._complaints, self.observer.complaints = [], []
         return complaints
@@ -235,19 +236,19 @@ class Recorder:
         self._ready_publisher.publish(LockstepDone(node=self.name, step=0))
 
     def publish_done(self, step: int) -> None:
-        """Report that the recorder is done with a step."""
+        """Report that the recorder has finished a step."""
         self._done_publisher.publish(LockstepDone(node=self.name, step=step))
 
     def drain(self, limit: int | None = None) -> None:
         """Pass all received messages to the observer and the recording.
 
-        A run ends at a step, the last one at `limit`, simulated time after the first [ns]: later
-        messages are dropped, so that equal runs give equal recordings.
+        Messages later than `limit`, the simulated time after the first step [ns], are
+        dropped, so that equal runs give equal recordings.
         """
         self.take_ready()
-        # In lockstep a message may come later than others that were published after it.
+        # In lockstep a message may arrive after others that were published later.
         before = 0 if self._lockstep else self.time
-        # Messages that an update refers to precede it: take updates first, add them last.
+        # Updates come after the messages they refer to: take updates first, add them last.
         updates = self._take(self.observer.update_topics)
         steps = self._take([STEP])
         for _, data in steps:
@@ -264,14 +265,14 @@ class Recorder:
         topics.sort(key=lambda topic: topic.endswith(_MEASURED))
         others = [item for item in self._take(topics) if self._is_own(*item)]
         if limit is not None and self.step is not None and not self._finished:
-            # Messages of the step at the limit may come before that step.
+            # Messages of the step at the limit may arrive before that step.
             end, length = limit + (self._begun or 0), self._step_length
             if stamp_of_step(self.step + 1, length) >= end:
                 self._last_step = self.step
                 while self._last_step and stamp_of_step(self._last_step, length) >= end:
                     self._last_step -= 1
                 self._end = stamp_of_step(self._last_step + 1, length)
-        # In the order of their times, as several steps may be taken at once.
+        # Several steps may be taken at once: sort by time.
         taken = [
             (self._logged(before, topic, data), topic, data)
             for topic, data in clocks + others + updates + steps
@@ -289,7 +290,7 @@ class Recorder:
                     self._note_planner(status)
             # Also those of the last step that arrive after the end.
             self.observer.add(topic, data)
-            # Measurements of later steps are for the observer only.
+            # Only the observer needs measurements of later steps.
             later = topic.endswith(_MEASURED) and not self._belongs(topic, data)
             if self.listener is not None and topic in self._shown and not later:
                 self.listener(topic, self._shown[topic], data)
@@ -302,7 +303,7 @@ class Recorder:
         self._record(taken)
 
     def _logged(self, before: int, topic: str, data: bytes) -> int:
-        """Return a message's recorded time [ns]: now, if its stamp is far ahead or too old."""
+        """Return a message's recorded time [ns]: now, if its stamp is implausible."""
         stamp = stamp_of(topic, self._subscriptions[topic].msg_type, data)
         known = 0 <= stamp <= self.time + self._lead
         return max(stamp, before) if known else self.time
@@ -335,7 +336,7 @@ class Recorder:
         return True
 
     def _record(self, taken: list[tuple[int, str, bytes]]) -> None:
-        # A failed bag ends the run: see `bag.failed`.
+        # A failed bag ends the run (`bag.failed`).
         if self.bag is None or self.bag.failed:
             return
         try:
@@ -347,26 +348,26 @@ class Recorder:
                 raise
 
     def gaps(self, joined: bool, patience: float) -> list[str]:
-        """Return topics of every step that are missing, or late by more than `patience` [s]."""
+        """Return the topics of every step that are missing, or late by more than `patience` [s]."""
         topics = [STEP, *(f'/{name}/state' for name in self.robots)]
         times = [self.first.get(topic, self.time) for topic in topics]
-        # Robots that another program moves may be there long before the first step.
+        # Robots that another program moves may exist long before the first step.
         begin = times[0] if joined else 0
         gaps = []
         for topic, time_ in zip(topics, times):
             missed = (time_ - begin) * 1e-9
-            # Without a step the robots and the beginning are unknown.
+            # Without a step the robots and the begin are unknown.
             if topic not in self.first and (topic == STEP or missed > patience):
                 gaps.append(f'the recording lacks {topic}')
             elif missed > patience:
                 gaps.append(f'the recording lacks the first {missed:.1f} s of {topic}')
         lacking = self.observer.lacking(self._last_step)
-        return gaps + [f'the recording lacks {what}, which an update used' for what in lacking]
+        return gaps + [f'the recording lacks {what}, used by an update' for what in lacking]
 
     def finish(self) -> None:
-        """Keep only messages of the steps so far, what they rest on, and the shutdown from now on.
+        """Keep only messages of the steps so far, what updates used, and the shutdown.
 
-        An update may arrive before a measurement that it used: wait for that.
+        Waits for measurements that updates used but that have not arrived.
         """
         if self._last_step < 0 and self.step is not None:
             self._last_step = self.step
@@ -398,7 +399,7 @@ class Recorder:
         ]
 
     def done_steps(self) -> dict[str, int]:
-        """Return the last step that each node recently reported done."""
+        """Return the last step that each node has recently reported done."""
         steps: dict[str, int] = {}
         for data in self._last_done:
             message = deserialize_message(data, LockstepDone)
@@ -406,7 +407,7 @@ class Recorder:
         return steps
 
     def arm(self, robots: Iterable[str]) -> None:
-        """Call the service `arm` of drivers that are not ready, now and then, as a person would."""
+        """Repeatedly call the service `arm` of drivers that are not ready."""
         if time.monotonic() - self._armed_at < _ARMING_PERIOD:
             return
         self._armed_at = time.monotonic()
@@ -420,7 +421,7 @@ class Recorder:
                 self._arming[name].call_async(Trigger.Request())
 
     def stop_robots(self, names: Collection[str]) -> None:
-        """Publish zeros on `cmd_vel` of robots that subscribe to it, and wait until they arrive."""
+        """Publish zero on `cmd_vel` of robots that subscribe to it; wait for acknowledgements."""
         types = dict(self.node.get_topic_names_and_types())
         publishers: list[Any] = []
         for topic in (self._full(f'/{name}/cmd_vel') for name in names):
@@ -440,13 +441,13 @@ class Recorder:
                 message.header.stamp = stamp_to_ros(self.time)
             publisher.publish(message)
         for publisher, message in messages:
-            # Who missed it hears of it again only seconds later, but of a further one at once.
+            # A lost message is repeated only after seconds; a new one triggers the repetition.
             while not publisher.wait_for_all_acked(_ACKNOWLEDGED) and time.monotonic() < deadline:
                 publisher.publish(message)
             self.node.destroy_publisher(publisher)
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Destroy the node."""
         if self.context.ok():
             self.node.destroy_node()
             rclpy.shutdown(context=self.context)
@@ -454,7 +455,7 @@ class Recorder:
 
 @cache
 def _has_step(kind: Any) -> bool:
-    # In other packages it is something else: the length of an image's row.
+    # In other messages this field is different: the row length of an image.
     return kind.__module__.startswith('maasi_msgs.') and 'step' in kind.get_fields_and_field_types()
 
 

@@ -1,4 +1,4 @@
-"""Replay the measurements of a recording to the filter node, and compare the found targets."""
+"""Replay recorded measurements to the filter node and compare the found targets."""
 
 import contextlib
 import os
@@ -19,6 +19,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, UPDATES
+from maasi_filter.wording import counted
 from maasi_msgs.msg import (
     DetectionArray,
     FilterUpdate,
@@ -36,7 +37,7 @@ from maasi_sim.run.topics import BATCH, FOUND, UPDATE, within
 
 FILTER = 'filter_node'
 EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
-# Timeouts of an update, and of the start of the node, which may have to compile [s].
+# Timeouts of an update, and of the node's start, which may compile [s].
 _PATIENCE = 60.0
 _START_PATIENCE = 180.0
 # Without clock, lockstep, batch timeout, loading or saving.
@@ -53,7 +54,7 @@ REPLAYED = {
 
 @dataclass
 class Batch:
-    """One recorded update of a filter, and its serialised measurements; late: after their batch."""
+    """A recorded filter update and its measurements; late: processed after their batch."""
 
     update: FilterUpdate
     detections: list[bytes]
@@ -66,9 +67,9 @@ class Recording:
     """Contents of a recording for a replay."""
 
     facts: dict[str, Any]  #: scenario, seed and parameters of each node
-    #: Of several filters in the order of steps and names.
+    # : Batches of all filters, by step and name.
     batches: list[Batch] = field(default_factory=list)
-    #: By namespace of the filter: found targets at the end.
+    # : Found targets at the end, by namespace of the filter.
     found: dict[str, FoundTargetArray] = field(default_factory=dict)
 
 
@@ -82,13 +83,13 @@ def read_recording(path: Path) -> Recording:
             if node == FILTER:
                 recording.found[namespace] = FoundTargetArray()
         if not recording.found:
-            raise BagError(f'{path}: holds no parameters of {FILTER}')
+            raise BagError(f'{path}: contains no parameters of {FILTER}')
         robots = recording.facts['scenario']['robots']
         topics = {within(team, f'/{name}/detections'): name for name in robots}
         detections: dict[tuple[str, int], bytes] = {}
         for topic, _, _, data in bag.raw(topics):
             index = deserialize_message(data, DetectionArray).measurement
-            # Duplicate index: a restarted driver; the filter used the first.
+            # A restarted driver repeats an index; the filter used the first one.
             detections.setdefault((topics[topic], index), data)
         for namespace in list(recording.found):
             last = 0
@@ -113,7 +114,7 @@ def read_recording(path: Path) -> Recording:
 
 
 class ReplayNode:
-    """The peer of one or several filter nodes, in namespaces of which an empty one is the root.
+    """The peer of one or several filter nodes; an empty namespace is the root.
 
     Publishes
     ---------
@@ -166,7 +167,7 @@ class ReplayNode:
         self._executor.spin_once(timeout_sec=timeout)
 
     def publish(self, batch: Batch) -> None:
-        """Publish a batch with the measurements that the filter had processed."""
+        """Publish a batch with the measurements that the filter processed."""
         update = batch.update
         if not batch.late:
             self._batches[batch.namespace].publish(
@@ -184,21 +185,23 @@ class ReplayNode:
         self._awaited.discard(message.node)
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Destroy the node."""
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
 
 
 class _Stopped(Exception):
-    """The replay cannot go on: exit code, and what to say."""
+    """The replay cannot continue: exit code and message."""
 
 
 def differences(recorded: list[Any], found: list[Any]) -> list[str]:
-    """Return in words how two lists of found targets differ; empty if they are equal to the bit."""
+    """Return the differences of two lists of found targets, as text; empty if bit-identical."""
     lines = []
     if len(recorded) != len(found):
-        lines.append(f'{len(recorded)} found targets were recorded, {len(found)} found now')
+        lines.append(
+            f'the recording has {counted(len(recorded), "found target")}, the replay {len(found)}'
+        )
     for before, now in zip(recorded, found):
         for key in before.get_fields_and_field_types():
             old, new = getattr(before, key), getattr(now, key)
@@ -259,9 +262,9 @@ def _feed(
         node.publish(batch)
         wait_for(
             lambda number=number: len(node.updates) >= number,  # type: ignore[misc]
-            f'the filter did not answer batch {batch.update.batch_id}',
+            f'the filter sent no update for batch {batch.update.batch_id}',
         )
-        # Robots are missing where none is requested.
+        # Robots without a request have no measurement.
         batch.update.missing = node.updates[-1].missing
         if first_difference is None and node.updates[-1] != batch.update:
             first_difference = batch.update.batch_id
@@ -277,10 +280,13 @@ def _feed(
     for line in lines:
         print(line)
     if first_difference is not None:
-        print(f'the first update that differs is that of batch {first_difference}')
+        print(f'the first difference is in the update for batch {first_difference}')
     number = sum(len(item.targets) for item in found.values())
     if lines:
-        print(f'{len(recording.batches)} batches replayed: the found targets are NOT equal')
+        print(f'{len(recording.batches)} batches replayed: the found targets differ')
         return DIFFERENT
-    print(f'{len(recording.batches)} batches replayed: {number} found targets, equal to the bit')
+    print(
+        f'{len(recording.batches)} batches replayed: {counted(number, "found target")}, '
+        'bit-identical'
+    )
     return EQUAL

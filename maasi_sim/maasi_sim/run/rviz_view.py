@@ -1,4 +1,4 @@
-"""RViz's view of a run: the files of maasi_config, with the cameras of the scenario's robots."""
+"""RViz configurations of a run: those of maasi_config with the cameras of its robots."""
 
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,13 @@ def view_text(mission: Mission[Any], namespace: str = '') -> str:
             continue
         topic = f'{team}/{robot}/camera/image_raw'
         displays.append(_camera(f'Camera of {robot}', topic, shown=True))
-        # What a bag holds.
+        # Topic in a bag.
         displays.append(_camera(f'Camera of {robot}, bag', f'{topic}/compressed', shown=False))
     return yaml.safe_dump(content, sort_keys=False)
 
 
 def shown_topics(path: Path) -> list[str]:
-    """Return the topics that a configuration of RViz shows, and those of the frames."""
+    """Return the topics that an RViz configuration shows, and those of frames."""
     content = yaml.safe_load(path.read_text(encoding='utf-8'))
     displays = content['Visualization Manager']['Displays']
     topics = [display['Topic']['Value'] for display in displays if 'Topic' in display]

@@ -16,28 +16,30 @@ from maasi_sim.scenario.schema import Scenario
 def scoring_radius(scenario: Scenario, truth: FloatArray) -> float:
     """Return the distance within which a found target is true [m]; true positions (n, d) [m].
 
-    The scenario's, or three times T_z, at most half the smallest distance between two targets, so
-    that none can be matched with its neighbour.
+    The scenario's, or 3 T_z, at most half the smallest distance of two targets, so that a find
+    matches only one target.
     """
     if scenario.scoring.radius is not None:
         return scenario.scoring.radius
     radius = 3.0 * scenario.removal_distance()
     if len(truth) > 1:
-        # Deferred: it is the slowest import of a run.
+        # Deferred: the slowest import of a run.
         from scipy.spatial.distance import pdist
 
         nearest = float(pdist(truth).min())
         if nearest == 0.0:
-            raise ValueError('truth: got two targets at the same place, allowed are different ones')
+            raise ValueError(
+                'truth: read two targets at the same position, allowed are different ones'
+            )
         radius = min(radius, 0.5 * nearest)
     return radius
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Found targets against the truth: one-to-one pairs, and GOSPA.
+    """One-to-one pairs of found and true targets, and GOSPA.
 
-    `radius` is the distance within which a found target is true, and c of GOSPA [m]; `order` its p.
+    `radius`: distance within which a find is true, and c of GOSPA [m]; `order`: p.
     """
 
     radius: float
@@ -54,7 +56,7 @@ class Scores:
 def score(
     found: Sequence[FoundTarget] | FloatArray, truth: ArrayLike, radius: float, order: float = 2.0
 ) -> Scores:
-    """Return the scores of found targets, or of places (n, d), against true ones (m, d) [m]."""
+    """Return the scores of found targets or positions (n, d) against true ones (m, d) [m]."""
     if not isinstance(found, np.ndarray):
         found = np.array([getattr(item, 'position', item) for item in found])
     return Scores(
@@ -66,21 +68,10 @@ def score(
 
 
 class Scoreboard:
-    """Found targets of all filters against the true ones, now.
+    """Scores of the current finds of all filters.
 
-    Parameters
-    ----------
-    radius : float or None
-        Distance within which a found target is true [m]; None: nothing is scored.
-    order : float
-        p of GOSPA.
-    truth : (n, d) array or None
-        True targets [m], where they are known.
-
-    Attributes
-    ----------
-    found : dict
-        Targets that the filter of a team has found, by team.
+    radius: distance within which a find is true [m], None: no scores. order: p of GOSPA. truth:
+    true targets (n, d) [m], or None. found: targets found by the filter of each team.
     """
 
     def __init__(self, radius: float | None, order: float, truth: FloatArray | None) -> None:
@@ -88,11 +79,11 @@ class Scoreboard:
         self.found: dict[str, Sequence[FoundTarget]] = {}
 
     def scores(self) -> Scores | None:
-        """Return the scores; None if there is nothing to score against."""
+        """Return the scores, or None without a truth."""
         return None if self.truth is None else self.scores_against(self.truth)
 
     def scores_against(self, truth: FloatArray) -> Scores | None:
-        """Return the scores of what is found against true targets (n, d) [m]."""
+        """Return the scores against true targets (n, d) [m]."""
         if self._radius is None:
             return None
         found = numbered(list(self.found.values()))
@@ -100,7 +91,7 @@ class Scoreboard:
 
 
 def numbered(found: Sequence[Sequence[FoundTarget]]) -> list[FoundTarget]:
-    """Return the found targets of several filters as one list, numbered in the order of time."""
+    """Return the found targets of several filters as one list, numbered by time."""
     if len(found) == 1:
         return list(found[0])
     every = sorted(chain(*found), key=lambda item: (item.time, item.robot, item.id))

@@ -1,4 +1,4 @@
-"""Names of topics; times and classes of messages, also of serialised ones (CDR)."""
+"""Topic names, and stamps and classes of messages, also of serialised ones (CDR)."""
 
 import importlib
 import math
@@ -29,7 +29,7 @@ def point(item: Any) -> tuple[float, float, float]:
 
 
 def finite_numbers(field: str, *values: float) -> tuple[float, ...]:
-    """Return the numbers of a field; ValueError: one is not finite."""
+    """Return the numbers of a field; raises ValueError if one is not finite."""
     if not all(map(math.isfinite, values)):
         read = ', '.join(f'{value:g}' for value in values)
         raise ValueError(f'{field}: read {read}, allowed are finite numbers')
@@ -37,7 +37,7 @@ def finite_numbers(field: str, *values: float) -> tuple[float, ...]:
 
 
 def place(field: str, item: Any) -> tuple[float, float, float]:
-    """Return the coordinates of a `geometry_msgs/Point`; ValueError: one is not on this earth."""
+    """Return the coordinates of a `geometry_msgs/Point`; raises ValueError if implausible."""
     x, y, z = finite_numbers(field, *point(item))
     if max(abs(x), abs(y), abs(z)) > _FARTHEST:
         raise ValueError(f'{field}: read {x:g}, {y:g}, {z:g}, allowed are up to {_FARTHEST:g} m')
@@ -45,9 +45,9 @@ def place(field: str, item: Any) -> tuple[float, float, float]:
 
 
 def stamp_of(topic: str, kind: Any, data: bytes) -> int:
-    """Return the stamp of a serialised message, -1 if it has none near its beginning [ns]."""
+    """Return the stamp of a serialised message [ns], -1 if it has none near its begin."""
     offset = _stamp_offset(kind)
-    # Transforms are a sequence, which starts with its length.
+    # Transforms are a sequence, which begins with its length.
     if topic.rpartition('/')[2] == 'tf' and len(data) >= 16:
         offset = 8
     return -1 if offset is None else time_at(data, offset)
@@ -55,7 +55,7 @@ def stamp_of(topic: str, kind: Any, data: bytes) -> int:
 
 @cache
 def _stamp_offset(kind: Any) -> int | None:
-    """Return where the stamp of a serialised message is, if only long numbers are before it."""
+    """Return the offset of a message's stamp, if only 64-bit numbers precede it."""
     offset = 4
     for field in kind.get_fields_and_field_types().values():
         if field in ('builtin_interfaces/Time', 'std_msgs/Header'):
@@ -67,7 +67,7 @@ def _stamp_offset(kind: Any) -> int | None:
 
 
 def time_at(data: bytes, offset: int) -> int:
-    """Return the time at a place of a serialised message [ns]."""
+    """Return the time at an offset of a serialised message [ns]."""
     seconds, nanoseconds = struct.unpack_from('<iI', data, offset)
     return int(seconds) * 10**9 + int(nanoseconds)
 

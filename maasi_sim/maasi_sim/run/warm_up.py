@@ -1,4 +1,4 @@
-"""What nodes need at their start, done once in the process that they are forked from."""
+"""Work that all nodes need at their start, done once in the process that forks them."""
 
 import importlib
 import inspect
@@ -21,7 +21,7 @@ _SERVICES = ('lifecycle_msgs.srv', 'maasi_msgs.action', 'rcl_interfaces.srv', 's
 def warm_up() -> None:
     """Compile, or load from the cache, the kernels of simulations."""
     _simulate('mambo_turtlebot_obstacles', 'ranging_pair_3d')
-    # Of missions that have scenarios of their own: without messages, which may not be built yet.
+    # Missions with their own scenarios: without messages, which may not be built yet.
     for path in sorted(Path(__file__).parent.glob('*/scenario.py')):
         importlib.import_module(f'{__package__}.{path.parent.name}.scenario').warm_up()
 
@@ -35,13 +35,12 @@ def _simulate(*names: str) -> None:
 
 
 def prepare_nodes() -> None:
-    """Do once what nodes would do at their start, for nodes that are forked from here."""
+    """Do in advance what each forked node would do at its start."""
     with compiling_said():
         _simulate('mambo_turtlebot')
     for name in (*(f'{name}_msgs.msg' for name in _MESSAGES), *_SERVICES):
         importlib.import_module(name)
     importlib.import_module('rosidl_generator_py')  # messages import it at their first use
-    # Searches of all installed packages and of all modules, which a node needs for its parameters
-    # and for its first log message.
+    # Searches of packages and modules, needed for parameters and the first log message.
     PLANNERS.names()
     inspect.getmodule(inspect.currentframe())

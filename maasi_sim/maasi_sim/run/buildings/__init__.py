@@ -1,1 +1,1 @@
-"""Searches of buildings (004): scenario, simulation, observer and report."""
+"""Searches of buildings (paper 004): scenario, simulation, observer and report."""

@@ -1,4 +1,4 @@
-"""A search of buildings, as a run sees it: its nodes, observer and report."""
+"""Nodes, observer and report of a search of buildings."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.ros.parameters import flatten
+from maasi_filter.wording import number
 from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_sim.run.buildings.observer import (
     CuboidObserver,
@@ -45,14 +46,14 @@ class BuildingMission(Mission[CuboidRecord]):
         cuboids = len(scenario.mission().cells)
         return Preflight(
             [
-                f'space: {" x ".join(f"{side:g}" for side in sides)} m, {cuboids} cuboids to visit',
+                f'space: {" x ".join(map(number, sides))} m, {cuboids} cuboids to visit',
                 *starts,
-                f'limit {scenario.limits.time:g} s',
+                f'time limit {number(scenario.limits.time)} s',
             ]
         )
 
     def plan_nodes(self, options: Options, file: Path) -> list[NodePlan]:
-        """Return the simulation, and for each robot a planner and a guard: not in lockstep."""
+        """Return the simulation and a planner for each robot, outside of lockstep also a guard."""
         scenario = self.scenario
         common = common_parameters(scenario, options)
         plans = [sim_plan('cuboid_sim_node', scenario, options, file)]

@@ -1,4 +1,4 @@
-"""The simulation node of searches of buildings: robots, time, and the link between the robots."""
+"""The simulation node of searches of buildings: robots, time and radio link."""
 
 from functools import partial
 from typing import Any
@@ -15,15 +15,14 @@ from maasi_sim.run.buildings.scenario import load_cuboid_scenario
 from maasi_sim.run.buildings.simulation import CuboidSimulation
 from maasi_sim.simulation.sim_node import SimNode
 
-_PATIENCE = 0.1  # share of a step after which the link delivers, even if some robots sent nothing
+_PATIENCE = 0.1  # share of a step after which the link delivers, even if robots have not sent
 
 
 class CuboidSimNode(SimNode):
-    """Simulates the robots of a search of buildings, and a radio of limited range.
+    """Simulates the robots of a search of buildings and a radio of limited range.
 
-    What a robot sends at a step is delivered to those within the communication range, in one
-    message with all that they receive: when all present robots have sent, or, free running, soon
-    after the step began.
+    Each robot receives one message per step with all that robots in its range have sent: once
+    all present robots have sent, or, without lockstep, soon after the begin of the step.
 
     Publishes
     ---------
@@ -78,7 +77,7 @@ class CuboidSimNode(SimNode):
             self._deliver()
 
     def _deliver(self) -> None:
-        """Deliver to each robot that has sent the messages in its range."""
+        """Deliver to each robot the messages of the robots in its range."""
         self._link_timer.cancel()
         places = {
             name: self.simulation.robots[name].state.pose.position

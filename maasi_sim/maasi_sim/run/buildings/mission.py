@@ -1,4 +1,4 @@
-"""A search of buildings (004) in one process: robots, batteries, and a link of limited range."""
+"""A search of buildings (paper 004) in one process: robots, batteries and radio link."""
 
 import time
 from collections.abc import Mapping
@@ -25,27 +25,27 @@ Scheme = Literal['distributed', 'sequential', 'centralized']
 
 @dataclass
 class MissionRecord:
-    """What became of a mission."""
+    """Results of a mission."""
 
     mission: CoveragePlan
     steps: int
-    complete: bool  # whether all cuboids were visited after these steps
+    complete: bool  # whether all cuboids were visited
     paths: dict[str, FloatArray]  # positions at all steps, (steps + 1, 3) [m]
     visited: NDArray[np.int64]  # (steps + 1,): cuboids visited by the team
     active: NDArray[np.int64]  # (steps + 1,): robots that search
     snapshots: list[Snapshot]
-    collisions: int  # steps on which a way cut an object or obstacle
+    collisions: int  # steps on which a path cut an object or obstacle
     outside: int  # steps on which a robot was outside the area
-    how: dict[str, int]  # decisions by how they were made
-    solve_times: FloatArray  # of each decision, of all robots together if centralized [s]
+    how: dict[str, int]  # number of decisions by method
+    solve_times: FloatArray  # per decision; of all robots together if centralized [s]
     recharges: int  # batteries that failed
-    plans: dict[int, dict[str, FloatArray]]  # predicted positions at the steps asked for
+    plans: dict[int, dict[str, FloatArray]]  # predicted positions at the requested steps
 
 
 def within_range(
     positions: Mapping[str, FloatArray], communication_range: float
 ) -> dict[str, list[str]]:
-    """Return the robots in range of each robot, in name order: at most C_R [m] away (III-B)."""
+    """Return the robots within C_R [m] of each robot, in name order (III-B)."""
     names = sorted(positions)
     return {
         name: [
@@ -59,11 +59,11 @@ def within_range(
 
 
 class CuboidMission:
-    """Robots that search the faces of objects, step by step of dT [s].
+    """Robots that search the faces of objects in steps of dT [s].
 
-    Distributed is each for itself, as in P2; sequential one after the other, with the new plans of
-    those before; centralized all together, P1. ValueError: a robot cannot fly, an object is outside
-    the area, or no cuboid can be reached.
+    Schemes: distributed (P2, each robot alone), sequential (each knows the new plans of those
+    before), centralized (P1). Raises ValueError if a robot cannot fly, an object is outside the
+    area, or no cuboid can be reached.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class CuboidMission:
         self.choices: dict[str, Plan] = {}
 
     def run(self, limit: int = 2000, keep: tuple[int, ...] = ()) -> MissionRecord:
-        """Run until the team, which may not know it, has visited all cuboids, or to a limit."""
+        """Run until the team has visited all cuboids, or up to a limit of steps."""
         paths: dict[str, list[FloatArray]] = {name: [] for name in self.agents}
         visited, active, times = [], [], []
         how: dict[str, int] = {}
@@ -145,7 +145,7 @@ class CuboidMission:
         if self.scheme == 'centralized':
             return [self._decide_jointly()]
         places = {name: message.position for name, message in broadcasts.items()}
-        # None hears while it recharges.
+        # Recharging robots receive nothing.
         reach = within_range(places, self.settings.communication_range)
         times = []
         done: dict[str, Plan] = {}
@@ -166,7 +166,7 @@ class CuboidMission:
             agent.visited |= known
         begun = time.perf_counter()
         everything = np.ones(len(known), dtype=bool)
-        # Each is drawn to its nearest cuboid, as (6) has it.
+        # Equation (6): each robot is drawn to its nearest cuboid.
         problems = [agent.problem([], everything) for agent in agents]
         joint = solve_jointly(agents[0].solver, problems)
         spent = time.perf_counter() - begun
@@ -176,7 +176,7 @@ class CuboidMission:
 
 
 def _not_planned(heard: list[Broadcast], done: dict[str, Plan], agent: SearchAgent) -> BoolArray:
-    """Return the cuboids that no plan of another robot has, the new ones where there are."""
+    """Return the cuboids that no plan of another robot contains, preferring new plans."""
     wanted = np.ones(len(agent.visited), dtype=bool)
     for message in heard:
         if message.robot in done:

@@ -1,4 +1,4 @@
-"""Gathers the data of a search of buildings from its messages, and reports them."""
+"""Record and report of a search of buildings from its messages."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -9,6 +9,7 @@ import numpy as np
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.wording import counted
 from maasi_planner.buildings.agent import Activity
 from maasi_planner.buildings.preplanning import CoveragePlan
 from maasi_sim.run.buildings.facts import CuboidsDecided
@@ -23,31 +24,19 @@ MISSION_REASONS['buildings', 'all_found'] = 'all cuboids visited'
 
 
 class Moment(NamedTuple):
-    """When a cuboid was visited: since the first step [s], and the step."""
+    """Time since the first step [s] and step of a visit."""
 
     time: float
     step: int
 
 
 class CuboidRecord(RunRecord):
-    """The record of a search of buildings.
+    """Record of a search of buildings.
 
-    Attributes
-    ----------
-    mission : CoveragePlan
-        What is to be visited.
-    snapshots : list of dict
-        Of cuboids, in the order of time; several may be of one cuboid.
-    choices : dict
-        Number of decisions by how they were made.
-    active : (n, 2) array
-        Time [s], and number of robots that search.
-    solve_times : (n,) array
-        Of decisions [s].
-    most_heard : int
-        Largest number of robots received at once.
-    completed : Moment or None
-        When all was visited.
+    mission: what is to be visited; snapshots: by time, several may show one cuboid; choices:
+    number of decisions by method; active: time [s] and number of searching robots (n, 2);
+    solve_times: of decisions [s]; most_heard: largest number of robots received at once;
+    completed: when all was visited.
     """
 
     snapshots: list[dict[str, Any]]
@@ -73,7 +62,7 @@ class CuboidRecord(RunRecord):
         self._decisions.append((time, decision))
         moment = Moment(time, int(decision.step))
         for shot in decision.snapshots:
-            # Of another mission.
+            # From another mission.
             if int(shot.cuboid) >= len(self.mission.cells):
                 continue
             self.snapshots.append(self._snapshot(shot, decision.robot, time))
@@ -123,7 +112,7 @@ class CuboidRecord(RunRecord):
 
 
 class CuboidObserver(Observer):
-    """See `Observer`; it ends when all is visited, or all robots know that."""
+    """See `Observer`; ends when all cuboids are visited, or all robots know that."""
 
     log: CuboidRecord
 
@@ -207,8 +196,9 @@ def cuboid_summary(report: dict[str, Any]) -> str:
     """Return the report in a few lines."""
     cuboids = report['cuboids']
     counts = (
-        f'{len(report["snapshots"])} snapshots, {report["decisions"]} decisions, '
-        f'{report["collisions"]} collisions'
+        f'{counted(len(report["snapshots"]), "snapshot")}, '
+        f'{counted(report["decisions"], "decision")}, '
+        f'{counted(report["collisions"], "collision")}'
     )
     if report['time_to_find_all'] is not None:
         counts += f'; all visited after {report["time_to_find_all"]:.1f} s'

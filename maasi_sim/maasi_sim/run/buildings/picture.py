@@ -1,4 +1,4 @@
-"""Pictures of a search of buildings (004): objects, cuboids and trajectories in 3D."""
+"""3D pictures of a search of buildings (paper 004)."""
 
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -21,7 +21,7 @@ def draw_mission(
     visited: Collection[int],
     plans: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Draw a mission on 3D axes: ways (n, 3) [m], visited cuboids, predicted positions."""
+    """Draw a mission on 3D axes: paths (n, 3) [m], visited cuboids, predicted positions."""
     for box in mission.objects:
         draw_box(axes, box, OBJECT, 0.35, 'object')
     for box in mission.obstacles:
@@ -79,6 +79,6 @@ def draw_box(axes: Any, box: FloatArray, colour: str, alpha: float, label: str) 
     sides = [corners[list(side)] for side in _SIDES]
     solid = Poly3DCollection(sides, facecolor=colour, edgecolor=colour, alpha=alpha, linewidth=0.4)
     axes.add_collection3d(solid)
-    # A collection has no handle for a legend in 3D.
+    # Collections have no legend handle in 3D.
     axes.plot([], [], [], 's', color=colour, alpha=max(alpha, 0.35), label=label)
     return solid

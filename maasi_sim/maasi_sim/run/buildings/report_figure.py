@@ -1,4 +1,4 @@
-"""The figure of a search of buildings: from above and the sides, and its course."""
+"""The report figure of a search of buildings."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,6 +8,7 @@ from matplotlib.patches import Rectangle
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.colours import robot_colours
+from maasi_filter.wording import number
 from maasi_sim.run.buildings.observer import CuboidRecord, build_cuboid_report
 from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED
 from maasi_sim.run.report_files import reason_of_end
@@ -15,7 +16,7 @@ from maasi_sim.run.report_panels import MARGIN, MapView, draw_report
 
 
 def plot_cuboid_report(record: CuboidRecord) -> Figure:
-    """Return a figure: the mission from above and the sides, cuboids visited over time."""
+    """Return a figure of the mission from above and the sides, and of visited cuboids over time."""
     visited = {shot['cuboid'] for shot in record.snapshots}
     return draw_report(
         record,
@@ -84,7 +85,7 @@ def _draw_active(axes: Axes, record: CuboidRecord) -> None:
     axes.step(record.active[:, 0], record.active[:, 1], where='post', color='#009E73', lw=2.0)
     axes.set_xlim(0.0, MARGIN * max(record.end_time, 1e-9))
     axes.set_ylim(0.0, len(record.scenario.robots) + 0.5)
-    axes.set_ylabel('robots that search')
+    axes.set_ylabel('searching robots')
 
 
 def _rows(record: CuboidRecord) -> list[tuple[str, str]]:
@@ -93,7 +94,7 @@ def _rows(record: CuboidRecord) -> list[tuple[str, str]]:
     return [
         ('visited', f'{report["cuboids"]["visited"]} of {report["cuboids"]["total"]}'),
         ('all visited after', '-' if complete is None else f'{complete:.0f} s'),
-        ('least p_d', '-' if least is None else f'{least:.3g} of a snapshot'),
+        ('smallest p_d', '-' if least is None else f'{number(least)} of a snapshot'),
         ('collisions', str(report['collisions'])),
         *((key, f'{number} decisions') for key, number in report['choices'].items()),
         ('ended', f'{reason_of_end(report)}, at {record.end_time:.1f} s'),

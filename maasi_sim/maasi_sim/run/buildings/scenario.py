@@ -1,4 +1,4 @@
-"""Scenario files of searches of buildings (004): `planner: {name: cuboid_mpc}`."""
+"""Scenario files of searches of buildings (paper 004): `planner: {name: cuboid_mpc}`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,51 +23,51 @@ NAME = 'cuboid_mpc'
 
 
 class SearchRobotSettings(SearcherSettings):
-    """One robot: its type's settings with the scenario's own on top."""
+    """A robot: the settings of its type, overridden by the scenario's."""
 
     type: str = Field(description='Name of the type: a file in config/robots')
-    description: str = Field('', description='What it is, in words')
+    description: str = Field('', description='Description')
     link: Literal['topics'] = Field(
-        'topics', description='How its planner reaches it; the other end is simulated'
+        'topics', description='How its planner connects to it; the robot is simulated'
     )
-    dynamics: DynamicsSettings = Field(description='Its body')
+    dynamics: DynamicsSettings = Field(description='Radius of its body')
     odometry: OdometrySettings = Field(
         default_factory=OdometrySettings, description='Errors of its simulated odometry'
     )
     battery: BatterySettings = Field(
-        default_factory=BatterySettings, description='Its battery as it is shown, simulated'
+        default_factory=BatterySettings, description='Its simulated battery, for display'
     )
 
-    # The simulation moves it, and it flies from the start.
+    # Simulated, and in flight from the start.
     battery_unit: ClassVar[str] = 'fraction'
     external: ClassVar[bool] = False
     takes_off: ClassVar[bool] = False
 
 
 class CuboidPlanner(CuboidSettings):
-    """The planner of each robot, and what is searched."""
+    """The planner of each robot, and the buildings."""
 
     name: Literal['cuboid_mpc'] = Field(description='Planner')
 
 
 class CuboidScenario(BaseScenario):
-    """A scenario file of a search of buildings, all layers merged."""
+    """A scenario of a search of buildings, with all layers merged."""
 
     environment: EnvironmentSettings = Field(description='Where robots may be, in 3D')
     step: float = Field(1.0, gt=0.0, le=10.0, description='dT [s]')
     robots: dict[str, SearchRobotSettings] = Field(min_length=1, description='Robots by name')
-    planner: CuboidPlanner = Field(description='Planner of each robot, and what is searched')
+    planner: CuboidPlanner = Field(description='Planner of each robot, and the buildings')
 
     def namespaces(self) -> dict[str, list[str]]:
         """Return nothing: there is no filter, and no planner of the team."""
         return {}
 
     def mission(self) -> CoveragePlan:
-        """Return what is searched."""
+        """Return the mission."""
         return plan_mission(self.planner, self.environment.array())
 
     def world(self, seed: int) -> World:
-        """Return the true world of a run: there are no targets."""
+        """Return the true world of a run, without targets."""
         return World.from_settings(self.environment, TargetSettings(count=0), seed)
 
 
@@ -97,15 +97,12 @@ def load_cuboid_scenario(
 def _problems(scenario: CuboidScenario) -> Problems:
     if scenario.dimension != 3:
         yield (
-            f'environment.bounds: read {scenario.dimension} axes, allowed are three: buildings are '
-            'searched in 3D'
+            f'environment.bounds: read {scenario.dimension} axes, allowed are three: this search '
+            'is in 3D'
         )
         return
     if scenario.environment.obstacles:
-        yield (
-            'environment.obstacles: read some, allowed is none: those of this planner are boxes, '
-            'planner.obstacles'
-        )
+        yield ('environment.obstacles: read some, allowed are none; use planner.obstacles')
     yield from name_problems(scenario)
     yield from event_problems(scenario)
     try:
@@ -117,11 +114,11 @@ def _problems(scenario: CuboidScenario) -> Problems:
         try:
             SearchAgent(name, scenario.planner, mission, robot, scenario.step)
         except ValueError as error:
-            yield f'robots.{str(error).replace(": ", ".", 1)}'  # it begins with `name: key: `
+            yield f'robots.{str(error).replace(": ", ".", 1)}'  # text begins with `name: key: `
 
 
 def mission_of(scenario: CuboidScenario) -> CuboidMission:
-    """Return a search of buildings in this process, as its nodes carry it out."""
+    """Return a search of buildings in this process, as its nodes run it."""
     area = scenario.environment.array()
     return CuboidMission(scenario.planner, area, scenario.robots, scenario.step, scenario.seed)
 

@@ -1,4 +1,4 @@
-"""Robots that search buildings, on one clock, and their link of limited range (004)."""
+"""Simulated robots that search buildings (paper 004), and their clock."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +14,7 @@ from maasi_sim.simulation.robots import Battery, SimulatedTeam
 
 
 class SearchingRobot:
-    """A mass point under a force for each step, 004, (1); without one it brakes and hovers."""
+    """A mass point under a force per step, paper 004 eq. (1); without one it brakes and hovers."""
 
     camera = ranging = laser = None
 
@@ -39,7 +39,7 @@ class SearchingRobot:
         self._command = check_command(velocity)
 
     def step(self, step: int, dt: float) -> None:
-        """Advance by `dt` seconds, those of the dynamics, to the discrete step `step`, from 1."""
+        """Advance by `dt` seconds to the discrete step `step` (from 1)."""
         pose = self.state.pose
         control = self._dynamics.control_for(
             self.state.velocity, pose.rotation() @ self._command[:3]
@@ -52,7 +52,7 @@ class SearchingRobot:
         self.odometry = self._odometry.step(self.state, step)
 
     def stand(self, step: int) -> None:
-        """Stand still until the discrete step `step`; the last command is void."""
+        """Stand still until the discrete step `step`, ignoring the last command."""
         self._command = np.zeros(4)
         self.state = RobotState(self.state.pose, np.zeros(3))
         self.odometry = self._odometry.step(self.state, step)
@@ -73,8 +73,8 @@ class CuboidSimulation(SimulatedTeam):
         super().__init__(scenario, robots)
 
     def warm_up(self) -> None:
-        """Do nothing: there is nothing to compile."""
+        """Do nothing: nothing is compiled."""
 
     def images_due(self, name: str) -> bool:
-        """Return false: snapshots are taken by the planners."""
+        """Return false: planners take the snapshots."""
         return False

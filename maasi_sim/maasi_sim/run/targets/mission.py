@@ -1,4 +1,4 @@
-"""A search for targets, as a run sees it: its nodes, observer and report."""
+"""Nodes, observer and report of a search for targets."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from maasi_sim.simulation.emulators.linked_robots import with_addresses
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_BATCH_TIMEOUT = 3.0  # at most: planners hold robots after four seconds without an update [s]
-_LOCKSTEP_TF_RATE = 4.0  # of the robots' frames in lockstep, where each message counts [Hz]
+_BATCH_TIMEOUT = 3.0  # upper limit: planners hold robots after 4 s without an update [s]
+_LOCKSTEP_TF_RATE = 4.0  # of the robots' frames in lockstep, where each message takes time [Hz]
 
 
 class TargetMission:
@@ -98,11 +98,11 @@ class TargetMission:
 def _team_plans(
     namespace: str, names: list[str], scenario: Scenario, common: dict[str, Any], state: Path
 ) -> list[NodePlan]:
-    """Return filter and planner of robots that share them; a restarted filter has its state."""
+    """Return filter and planner of a team; a restarted filter loads its state."""
     others = [name for name in scenario.names() if name not in names]
     respawns = scenario.on_exit == 'respawn'
     file = state / f'{namespace}_filter_node.maasi'.strip('_')
-    # A robot that is asked just after a measurement answers a period later.
+    # A robot that has just measured answers one period later.
     longest = max(scenario.robots[name].sensor.period for name in names)
     filter_settings = FilterNodeSettings.model_validate(
         {
@@ -136,7 +136,7 @@ def _team_plans(
 
 
 def _plugin(name: str, driver: str, scenario: Scenario) -> tuple[str, ...]:
-    """Return the arguments of `plugin_driver` for a driver of a user's own."""
+    """Return the arguments of `plugin_driver` for a user's driver."""
     if driver in DRIVERS.built_in:
         return ()
     arguments = (driver, *scenario.plugin_path)
@@ -151,7 +151,7 @@ def _plugin(name: str, driver: str, scenario: Scenario) -> tuple[str, ...]:
 def _robot_plans(
     name: str, robot: RobotSettings, scenario: Scenario, common: dict[str, Any]
 ) -> list[NodePlan]:
-    """Return a robot's driver, and its guard if it has one: not in lockstep."""
+    """Return a robot's driver, and outside of lockstep its guard if it has one."""
     settings = DriverSettings.model_validate(
         {
             **common,
@@ -171,7 +171,7 @@ def _robot_plans(
             'driver',
             name,
             {**flatten(settings), **SIMULATED},
-            # A robot with its own planner gets its batches from that one.
+            # A robot with its own planner receives its batches from it.
             remaps={BATCH: within(name, BATCH)} if own else {},
             role='driver',
             arguments=_plugin(name, robot.driver, scenario),

@@ -1,4 +1,4 @@
-"""Writes the log of a run of nodes that search for targets, and detects the end of the run."""
+"""Writes the log of a target search from node messages and detects its end."""
 
 from dataclasses import replace
 from typing import Any
@@ -34,12 +34,11 @@ class TargetObserver(Observer):
         self._new_found: dict[str, list[Found]] = {space: [] for space in spaces}
         # Updates of several filters, with all that each has found.
         self._history: list[Updated] = []
-        # Planners that expect no further gain: since which step, and why.
+        # Step and reason of planners that have finished.
         self._settled: dict[str, tuple[int, str]] = {}
-        # Step at which all planners were settled.
+        # Step at which all planners had finished.
         self._ending: int | None = None
-        # Robot and index of each measurement that has arrived; of each that an update used, its
-        # step.
+        # Robot and index of arrived measurements; steps of measurements that updates used.
         self._arrived: set[tuple[str, int]] = set()
         self._used: dict[tuple[str, int], int] = {}
 
@@ -59,7 +58,7 @@ class TargetObserver(Observer):
                 self._arrived.add((fact.robot, fact.index))
             case Decided(decision=decision):
                 self.explored = self.log.explored
-                # Of a planner that is settled.
+                # From a planner that has finished.
                 if decision.reason and not decision.robots:
                     self._settled.setdefault(fact.team, (decision.step, decision.reason))
                     self._note_ending(decision.step)
@@ -116,7 +115,7 @@ class TargetObserver(Observer):
         searching = {
             space for space, names in self._spaces.items() if any(map(self.log.takes_part, names))
         }
-        # Without any robot left, the planners that were settled decide.
+        # Without any robot left, the finished planners decide.
         if self._settled.keys() >= (searching or self._spaces.keys()):
             last, self.settled = max(self._settled.values())
             self._ending = max(step, last)
@@ -124,7 +123,7 @@ class TargetObserver(Observer):
                 self.end_step = self._ending
 
     def record(self, end: RunEnd) -> RunLog:
-        """See `Observer.record`; several filters in the order of steps, not of arrival."""
+        """See `Observer.record`; several filters by step instead of arrival."""
         if self._history:
             self.log.recount(self._history)
         self.log.close(end, end.time)

@@ -1,4 +1,4 @@
-"""The report of a search for targets as plain values, and in words."""
+"""The report of a search for targets, as plain values and text."""
 
 from itertools import takewhile
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 from maasi_filter.unexplored_map import UnexploredMap
+from maasi_filter.wording import counted, number
 from maasi_planner.candidates import map_spacing
 from maasi_sim.run.log import RunLog
 from maasi_sim.run.report_files import finite, summary, whole_report
@@ -14,7 +15,7 @@ from maasi_sim.run.report_files import finite, summary, whole_report
 def build_report(log: RunLog) -> dict[str, Any]:
     """Return the report of a run as plain values."""
     scores, total = log.scores, len(log.truth)
-    # All targets were found, and stayed so, since the last of these.
+    # The first update since which all targets are found.
     stayed = list(takewhile(lambda item: item.true_found == total, log.progress[::-1]))
     complete = stayed[-1] if total and stayed else None
     true = dict(scores.match.pairs)
@@ -52,7 +53,7 @@ def build_report(log: RunLog) -> dict[str, Any]:
 
 
 def explored_after(log: RunLog) -> UnexploredMap:
-    """Return what is unexplored after all measurements of the robots."""
+    """Return the map of unexplored area after all measurements."""
     scenario, area = log.scenario, Area(log.scenario.environment)
     sensors = {
         name: robot.sensor.build(name, scenario.dimension)
@@ -72,18 +73,18 @@ def target_summary(report: dict[str, Any]) -> str:
     if report['false_found']:
         found += f', {report["false_found"]} false'
     if report['rmse'] is not None:
-        found += f', RMSE {report["rmse"]:.3g} m'
+        found += f', RMSE {number(report["rmse"])} m'
     measurements = sum(report['measurements'].values())
-    counts = f'{measurements} measurements, {report["decisions"]} decisions'
+    counts = f'{counted(measurements, "measurement")}, {counted(report["decisions"], "decision")}'
     if report['time_to_find_all'] is not None:
         counts += f'; all found after {to_find_all(report)}'
     return summary(report, found, counts)
 
 
 def to_find_all(report: dict[str, Any]) -> str:
-    """Return in words what it took to find all targets."""
+    """Return the measurements and time to find all targets, as text."""
     time, measurements = report['time_to_find_all'], report['measurements_to_find_all']
-    return '-' if time is None else f'{measurements} measurements and {time:.1f} s'
+    return '-' if time is None else f'{counted(measurements, "measurement")} and {time:.1f} s'
 
 
 def _numbers(values: FloatArray) -> list[float | None]:

@@ -1,4 +1,4 @@
-"""The figure of a search for targets: where, when, and what was found."""
+"""The report figure of a search for targets."""
 
 import math
 from typing import Any
@@ -15,6 +15,7 @@ from maasi_filter.geometry.area import Area
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
+from maasi_filter.wording import counted, number
 from maasi_sim.run.log import RunLog
 from maasi_sim.run.report_files import reason_of_end
 from maasi_sim.run.report_panels import (
@@ -30,13 +31,13 @@ from maasi_sim.run.targets.report import build_report, explored_after, to_find_a
 
 _TRUE, _MISSED, _FALSE = '#222222', '#D62728', '#E6007E'
 _SIGMAS = 3.0
-# Of the longest side: half axes of an ellipse are drawn at least so long.
+# Smallest half axis of a drawn ellipse, as a share of the longest side.
 _LEAST = {2: 0.012, 3: 0.022}
-_VIEW_GRID = 160  # points on each axis where a field of view is evaluated
+_VIEW_GRID = 160  # points per axis of a field of view
 
 
 def plot_report(record: RunLog) -> Figure:
-    """Return a figure: the search from above, in 3D also from the sides, and its progress."""
+    """Return a figure of the search from above (in 3D also from the sides) and its progress."""
     scenario = record.scenario
     area = Area(scenario.environment)
     bounds = area.bounds
@@ -75,7 +76,7 @@ def plot_report(record: RunLog) -> Figure:
 
 
 def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -> None:
-    """Shade what is not searched: e, in 3D its mean along the line of sight."""
+    """Shade the unexplored area: e, in 3D its mean along the line of sight."""
     hidden = tuple(axis for axis in range(explored.dimension) if axis not in view.plane)
     lower, step, shown = explored.shown()
     shown = np.maximum(shown, 0.0)
@@ -91,13 +92,13 @@ def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -
     if not explored.area.shapes['area'] or 2 in view.plane:
         frame = Rectangle((low[0], low[1]), *(high - low), fc='none', ec='#B0B0B0', lw=1.0)
         view.axes.add_patch(frame)
-    view.axes.plot([], [], 's', color=UNSEEN, ms=9, label='not searched')
+    view.axes.plot([], [], 's', color=UNSEEN, ms=9, label='not explored')
 
 
 def _draw_field(
     view: MapView, detection: DetectionModel, pose: Pose, colour: str, bounds: FloatArray
 ) -> None:
-    """Draw where a robot's probability of detection is half its largest."""
+    """Draw the contour at half of a robot's largest detection probability."""
     right, up = (np.linspace(bounds[axis, 0], bounds[axis, 1], _VIEW_GRID) for axis in view.plane)
     places = np.tile(pose.position[: len(bounds)], (_VIEW_GRID**2, 1))
     grid = np.meshgrid(right, up)
@@ -118,13 +119,13 @@ def _draw_targets(view: MapView, record: RunLog, bounds: FloatArray) -> None:
     missed = np.setdiff1d(np.arange(len(truth)), [true for _, true in pairs])
     least = _LEAST[width] * float(np.ptp(bounds, axis=1).max())
     enlarged = False
-    for number, target in enumerate(found):
+    for index, target in enumerate(found):
         covariance = target.covariance[np.ix_(view.plane, view.plane)]
         enlarged |= _SIGMAS * math.sqrt(max(np.linalg.eigvalsh(covariance)[0], 0.0)) < least
         place = (target.position[view.plane[0]], target.position[view.plane[1]])
-        style: dict[str, Any] = {'ec': _FALSE if number in wrong else FOUND, 'lw': 1.3}
+        style: dict[str, Any] = {'ec': _FALSE if index in wrong else FOUND, 'lw': 1.3}
         axes.add_patch(ellipse(place, covariance, _SIGMAS, least, zorder=5, **style))
-    sigmas = f'{_SIGMAS:g} sigma' + (f', drawn at least {least:.2g} m' if enlarged else '')
+    sigmas = f'{_SIGMAS:g} sigma' + (f', at least {least:.2g} m' if enlarged else '')
     marks: tuple[tuple[FloatArray, str, dict[str, Any], str], ...] = (
         (truth, 'D', {'mfc': 'none', 'mec': _TRUE, 'ms': 11, 'mew': 1.2}, 'true target'),
         (positions[right], 'D', {'color': FOUND, 'ms': 3.5}, 'found target'),
@@ -147,14 +148,14 @@ def _draw_progress(axes: Axes, record: RunLog, by_time: bool) -> None:
     if by_time:
         places, right, every = [*places, record.end_time], [*right, right[-1]], [*every, every[-1]]
     if any(found > true for found, true in zip(every, right)):
-        axes.step(places, every, where='post', color=_FALSE, lw=1.0, label='with false ones')
+        axes.step(places, every, where='post', color=_FALSE, lw=1.0, label='including false finds')
     axes.step(places, right, where='post', color=FOUND, lw=2.0, label='found')
     axes.axhline(number, color=_TRUE, lw=1.0, ls='--', label='true targets')
     axes.set_xlim(0.0, MARGIN * max(places[-1], 1.0))
     axes.set_ylim(0.0, max(number, max(every), 1) * 1.08)
     axes.set_ylabel('targets')
     if by_time:
-        # Beside the title: inside the axes it would cover curves.
+        # Outside of the axes, where it covers no curve.
         above: dict[str, Any] = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'ncol': 3}
         close = {'handlelength': 1.6, 'columnspacing': 1.2, 'borderaxespad': 0.1}
         axes.legend(**above, **close, fontsize=8.5, frameon=False)
@@ -162,16 +163,20 @@ def _draw_progress(axes: Axes, record: RunLog, by_time: bool) -> None:
 
 def _rows(record: RunLog) -> list[tuple[str, str]]:
     report = build_report(record)
-    rmse = '-' if report['rmse'] is None else f'{report["rmse"]:.3g} m'
+    rmse = '-' if report['rmse'] is None else f'{number(report["rmse"])} m'
     found = f'{report["true_found"]} of {len(report["targets"])}'
     return [
         ('found', f'{found}, {report["missed"]} missed, {report["false_found"]} false'),
         ('RMSE', rmse),
-        ('GOSPA', f'{report["gospa"]["total"]:.3g} m (c = {report["scoring"]["c"]:.3g} m)'),
+        ('GOSPA', f'{number(report["gospa"]["total"])} m (c = {number(report["scoring"]["c"])} m)'),
         ('all found after', to_find_all(report)),
         ('decisions', str(report['decisions'])),
         *(
-            (name, f'{report["measurements"][name]} measurements, {report["distance"][name]:.1f} m')
+            (
+                name,
+                f'{counted(report["measurements"][name], "measurement")}, '
+                f'{report["distance"][name]:.1f} m',
+            )
             for name in report['agents'][:4]
         ),
         ('ended', f'{reason_of_end(report)}, at {record.end_time:.1f} s'),

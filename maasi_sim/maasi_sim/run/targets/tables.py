@@ -27,7 +27,7 @@ def found_rows(
     pairs: Iterable[tuple[int, int]],
     origin: OriginSettings | None,
 ) -> list[Row]:
-    """Return a row of `columns` for each found target; `pairs`: of it and the true one it is."""
+    """Return a row of `columns` for each found target; `pairs`: found and true indices."""
     rows, true = [], dict(pairs)
     for index, item in enumerate(found):
         target = true.get(index)
@@ -68,7 +68,7 @@ def _on_earth(position: FloatArray, origin: OriginSettings) -> Row:
 
 
 def csv_text(rows: Sequence[Row], dimension: int, origin: OriginSettings | None) -> str:
-    """Return the table as CSV; empty cells for what there is not."""
+    """Return the table as CSV; missing values are empty cells."""
     out = io.StringIO()
     writer = csv.DictWriter(out, columns(dimension, origin), lineterminator='\n')
     writer.writeheader()
@@ -77,7 +77,7 @@ def csv_text(rows: Sequence[Row], dimension: int, origin: OriginSettings | None)
 
 
 def found_geojson(rows: Sequence[Row]) -> str:
-    """Return rows with geodetic coordinates: a point each, to a millimetre."""
+    """Return rows with geodetic coordinates as points, to a millimetre."""
     features = []
     for row in rows:
         properties, digits = dict(row), {'longitude': 8, 'latitude': 8, 'altitude': 3}
@@ -87,30 +87,30 @@ def found_geojson(rows: Sequence[Row]) -> str:
 
 
 def ways_geojson(record: RunLog, origin: OriginSettings) -> str:
-    """Return the ways of the robots, and what they have explored."""
+    """Return the paths of the robots and the explored area."""
     area = _area(record, origin)
     return _collection([*area, _explored(record, origin), *_ways(record, origin)])
 
 
 def _area(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
-    """Return the area of the search and what in it is not to be entered."""
+    """Yield the area of the search and its keep-out zones."""
     for kind, shapes in Area(record.scenario.environment).shapes.items():
         for polygon in shapely.get_parts(shapes):
             yield _polygon(polygon, origin, {'kind': kind})
 
 
 def _explored(record: RunLog, origin: OriginSettings) -> Row:
-    """Return where less than half is unseen, in 3D of the whole height."""
+    """Return the explored area (less than half unseen), in 3D over the whole height."""
     explored = explored_after(record)
     unseen = np.atleast_3d(explored.values).mean(axis=2)
-    # Cells that follow each other along y are one box: row, first cell, and that behind the last.
+    # Consecutive cells along y form a box: row, first cell, end.
     edges = np.diff(unseen < 0.5, axis=1, prepend=False, append=False)
     row, ends = (index.reshape(-1, 2) for index in np.nonzero(edges))
     half, (low, high) = 0.5 * explored.step[:2], explored.bounds[:2].T
     x, y = explored.axes()[:2]
     first = np.clip(np.stack([x[row[:, 0]], y[ends[:, 0]]], axis=1) - half, low, high)
     last = np.clip(np.stack([x[row[:, 0]], y[ends[:, 1] - 1]], axis=1) + half, low, high)
-    # Boxes that touch, to a micrometre, become one.
+    # Join boxes that touch, to a micrometre.
     cells = shapely.union_all(shapely.box(*first.T, *last.T), grid_size=1e-6)
     share = round(explored.explored_fraction(), 6)
     return _polygon(cells, origin, {'kind': 'explored', 'share': share})
