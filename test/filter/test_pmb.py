@@ -20,7 +20,7 @@ from searches import (
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, UnexploredMap, wrap_angle
 from maasi_filter.models.sensor import LEAST_PER_SCAN
-from maasi_filter.pmb.component import Component, is_known
+from maasi_filter.pmb.component import Component, is_known, reflects
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.pmb.learnt import PRIOR_SCANS, Learnt
@@ -255,6 +255,24 @@ def test_a_place_that_answers_too_rarely_is_not_found_unless_all_do(seed):
     assert found == [True, True, True, False]
     # It is hardly worth another look.
     assert sum(cluster.mass for cluster in search.clusters) < 0.5
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_what_exists_for_sure_is_looked_at_again_until_it_is_found_or_surely_a_reflection(seed):
+    generator = np.random.default_rng(seed)
+    search, doubtful = plane_filter(seed=seed, particles=300), 0
+    chance = generator.uniform(0.4, 0.9)
+    for step in range(40):
+        seen = TARGET[generator.random(1) < chance]
+        look(search, PRECISE, seen, [(58.0, 45.0)], step)
+        masses = [cluster.mass for cluster in search.clusters]
+        for item in search.potential:
+            reflecting = reflects(item.answers, search._rates)
+            if item.existence > 0.99 and item.hits >= 2.0 and reflecting < 0.95:
+                doubtful += reflecting >= 0.3
+                assert item.existence in masses
+    # Otherwise it asserts nothing.
+    assert doubtful or search.found_targets
 
 
 def test_found_target_that_answers_too_rarely_is_withdrawn():

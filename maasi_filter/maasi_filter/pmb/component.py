@@ -26,6 +26,8 @@ COMMON = RATES[:3]
 PRIOR = np.array([0.9, 0.05, 0.05])
 MOST_OF_REFLECTION = 0.5  # a reflection answers at most this often, compared with a target
 REFLECTIONS = 0.1  # probability beforehand that a place that answers is one
+# p_D that a look tells with at most: a few misses do not make a reflection of a target.
+MOST_TELLING = 0.9
 
 # By the rate of targets and that of a place: weights of what a place is.
 _TARGET = (1.0 - REFLECTIONS) * np.eye(len(COMMON), len(RATES))
@@ -39,6 +41,7 @@ def add_look(answers, detected, missed):  # type: ignore[no-untyped-def]  # prag
 
     `detected` is p_D as it is believed, `missed` the probability that the place did not answer.
     """
+    detected = min(detected, MOST_TELLING)
     for k in range(len(RATES)):
         answers[k] += missed * math.log1p(-RATES[k] * detected)
         answers[k] += (1.0 - missed) * math.log(RATES[k])

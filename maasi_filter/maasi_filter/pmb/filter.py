@@ -47,6 +47,9 @@ FOUND_RADIUS_DEVIATIONS = 2.0  # default of T_r, in standard deviations of the r
 # is withdrawn.
 MOST_REFLECTING = 0.3
 SURELY_REFLECTING = 0.5
+# What exists with more than this probability, and was detected so often, remains a potential target
+# with its whole mass, so that a robot looks again; unless it surely is a reflection.
+SURE, SURE_HITS, CERTAINLY_REFLECTING = 0.99, 2.0, 0.95
 CERTAIN = 0.999  # existence probability of targets that other filters found
 
 
@@ -274,7 +277,10 @@ class PmbFilter(SearchFilter):
         """Return what may be a target; a place that reflects weighs less."""
         clusters = []
         for item in components:
-            mass = item.existence * (1.0 - reflects(item.answers, self._rates))
+            reflecting = reflects(item.answers, self._rates)
+            sure = item.existence > SURE and item.hits >= SURE_HITS
+            doubtful = not (sure and reflecting < CERTAINLY_REFLECTING)
+            mass = item.existence * (1.0 - reflecting if doubtful else 1.0)
             if mass >= LEAST_CLUSTER_MASS:
                 density = item.density
                 mean, covariance = density.mean.copy(), density.covariance.copy()
