@@ -28,8 +28,8 @@ setup(
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',
     description=(
-        'What the team believes: sensors, exploration and the particle PHD filter, with '
-        'the filter node'
+        'Particle PHD and Poisson multi-Bernoulli filters for target search, sensor models '
+        'and the exploration map; the filter node'
     ),
     license='Apache-2.0',
     entry_points={'console_scripts': ['filter_node = maasi_filter_entry:filter_node']},

@@ -25,7 +25,7 @@ setup(
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',
     description=(
-        'Where each robot goes: motion models, objective and planners, with the planner node'
+        'Planners, motion models and objectives for multi-robot target search; the planner node'
     ),
     license='Apache-2.0',
     entry_points={

@@ -138,7 +138,7 @@ def test_detections_of_ones_own_are_found_without_a_warning(domain):
     # Fast DDS may complain there of the ports of processes that were killed.
     match = re.search(r'found a target at \((.*), (.*)\) m after', done.stdout)
     assert match and np.allclose([float(part) for part in match.groups()], [3.0, 2.0], atol=0.1)
-    assert 'came late' not in log and 'allowed is' not in log, log
+    assert 'late detections' not in log and 'allowed is' not in log, log
 
 
 def test_the_team_of_the_field_finds_its_targets_in_simulation():

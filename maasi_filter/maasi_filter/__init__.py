@@ -1,4 +1,4 @@
-"""State estimation of the team: sensors, exploration, filters and found targets."""
+"""Multi-target search filters: sensor models, exploration map and found targets."""
 
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings

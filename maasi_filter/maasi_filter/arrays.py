@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PlainValidator
 
-# In records that are read from a file pydantic takes them as they are.
+# pydantic accepts them unchecked in records that are read from a file.
 _AS_IT_IS = PlainValidator(lambda value: value)
 
 FloatArray = Annotated[NDArray[np.float64], _AS_IT_IS]

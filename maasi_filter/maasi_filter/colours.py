@@ -1,16 +1,16 @@
-"""One colour for one thing: on the page (`colours.js` has the same), in pictures and in RViz."""
+"""Colours of robots and map features, shared by pictures, RViz and the page (`colours.js`)."""
 
 from collections.abc import Iterable
 
 FOUND, POTENTIAL, SEEN, AWAY = '#009E73', '#E69F00', '#CC79A7', '#8B929B'
 KEEP_OUT = '#8F9900'  # of no robot
-# Of robots in the order of their names, and of those that are called by a colour.
+# By the order of the robots' names, and for robots named after a colour.
 ROBOTS = ('#0072B2', '#B54800', '#6A3D9A', '#7A4A00', '#00707F', '#A02C6D')
 NAMED = {'purple': '#7B3294', 'red': '#D62728', 'green': '#1F7A1F', 'blue': '#0072B2'}
 
 
 def robot_colours(names: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each robot of a team; one that is called by a colour has that."""
+    """Return a colour for each robot of a team; a robot named after a colour gets that colour."""
     return {
         name: NAMED.get(name, ROBOTS[index % len(ROBOTS)])
         for index, name in enumerate(sorted(names))

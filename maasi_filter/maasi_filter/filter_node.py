@@ -1,4 +1,4 @@
-"""The filter node: from detections to clusters and found targets."""
+"""The filter node: turns detections into clusters and found targets."""
 
 import math
 import time
@@ -51,25 +51,25 @@ _SHARING_PATIENCE = 0.5  # longest wait for other filters to acknowledge found t
 
 
 class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
-    """The filter of the team: particle PHD (000, sections 3.1 to 3.3) or Poisson multi-Bernoulli.
+    """Estimate the targets of a team by the particle PHD or the Poisson multi-Bernoulli filter.
 
-    In the namespace of its only robot it is the filter of that robot alone, and exchanges found
-    targets with the filters of the other robots (002, section 4, independent planner). Received
-    found targets take effect for batches with a later stamp.
+    In the namespace of its only robot, the node filters for that robot alone and exchanges found
+    targets with the filters of the other robots (002, section 4). Received found targets take
+    effect in batches with a later stamp.
 
     Subscribes
     ----------
-    `measurement_batch` (maasi_msgs/MeasurementBatch): which robots measure;
-    `<robot>/detections` (maasi_msgs/DetectionArray): their measurements;
-    `keep_outs` (maasi_msgs/KeepOuts, latched): that hold now, published again;
+    `measurement_batch` (maasi_msgs/MeasurementBatch): robots that measure at a step;
+    `<robot>/detections` (maasi_msgs/DetectionArray): their detections;
+    `keep_outs` (maasi_msgs/KeepOuts, latched): active keep-outs, which the node publishes again;
     `found_targets/kept` (maasi_msgs/FoundTargetArray, latched): targets found before a restart;
-    `<robot>/found_targets` (maasi_msgs/FoundTargetArray) of robots with filters of their own
+    `<robot>/found_targets` (maasi_msgs/FoundTargetArray) of robots with their own filters
 
     Publishes
     ---------
-    `filter_update` (maasi_msgs/FilterUpdate, latched): for every batch, in the order of their ids;
+    `filter_update` (maasi_msgs/FilterUpdate, latched): one per batch, in the order of their ids;
     `clusters` (maasi_msgs/ClusterArray), `found_targets` (maasi_msgs/FoundTargetArray, latched),
-    with an origin of the map `found_targets/fixes` (maasi_msgs/FoundFixArray, latched),
+    `found_targets/fixes` (maasi_msgs/FoundFixArray, latched) if the map has an origin,
     `particles` (sensor_msgs/PointCloud2), `markers` (visualization_msgs/MarkerArray)
     """
 
@@ -77,7 +77,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         super().__init__('filter_node', FilterNodeSettings, **options)
 
     def prepare(self) -> None:
-        """Create the filter, or load it from its file."""
+        """Create the filter, or load it from `save_file`."""
         settings = self.settings
         self._dimension = settings.environment.dimension
         self._sensors = {
@@ -89,8 +89,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self.area = Area(settings.environment)
         self._marker_size = 0.01 * float((bounds[:, 1] - bounds[:, 0]).max())
         self._begin_anew()
-        # Until when batches wait for the targets that the planner keeps for a restarted filter.
-        # Only the first message is used: later ones contain what this filter found itself.
+        # Batches wait this long for the found targets that the planner retained.
+        # Later messages contain what this filter found itself.
         self._kept_until, self._kept_taken = math.inf, False
         if settings.save_file and Path(settings.save_file).exists():
             self._restore(Path(settings.save_file))
@@ -116,7 +116,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._batches = BatchAssembly(self, self._sensors, progress)
 
     def _restore(self, file: Path) -> None:
-        """Resume the saved search, or after the last batch of a process that died."""
+        """Resume the saved search, or the run of a process that died."""
         settings = self.settings
         try:
             saved, progress = load_state(file)
@@ -130,11 +130,11 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 raise SettingsError(f'parameter save_file: {error}') from None
             # The rest of the team continues, so this node starts without the saved state.
             aside = file.replace(file.with_name(f'{file.name}.refused'))
-            self.get_logger().error(f'{error}; set aside as {aside}')
+            self.get_logger().error(f'{error}; renamed to {aside}')
             return
         if saved.settings != settings.filter:
             self.get_logger().warning(
-                f'{file} was saved with other settings of the filter; they go on'
+                f'{file} was saved with other filter settings, which stay in use'
             )
         self._adopt_area(saved.area)
         self.filter = saved
@@ -144,12 +144,10 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             return
         self._continue_from(progress)
         self._restored = True
-        self.get_logger().warning(
-            f'restarted after batch {progress.batch} with {found}, from {file}'
-        )
+        self.get_logger().warning(f'resumed after batch {progress.batch} with {found}, from {file}')
 
     def set_up(self) -> None:
-        """Compile and connect."""
+        """Compile the kernels, create publishers and subscriptions."""
         settings = self.settings
         warm_up(settings.filter.method)
         self._update_publisher = self.create_publisher(FilterUpdate, 'filter_update', UPDATES)
@@ -173,7 +171,6 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             )
         self._shared.set_up()
         KeepOutTopic(self, self._adopt_area, keep=True)
-        # Subscribers: the filters of the others, and the planner that keeps the found targets.
         self.expect_subscribers(self._found_publisher, len(self._shared) + 1 if self._shared else 0)
         if not settings.lockstep:
             self.create_wall_timer(_TIMEOUT_PERIOD, self._give_up_waiting)
@@ -181,7 +178,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             self.create_wall_timer(settings.save_period, self._save)
 
     def start(self) -> None:
-        """Republish the restored state: the latched messages of the dead process are lost."""
+        """Publish the restored state again, as latched messages end with their process."""
         self._kept_until = min(self._kept_until, time.monotonic() + _KEPT_PATIENCE)
         if not self._restored:
             return
@@ -208,12 +205,12 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         try:
             if settings.save_batches:
                 file.parent.mkdir(parents=True, exist_ok=True)
-            # After each batch it need not survive a power failure, only the death of the process.
+            # A copy after each batch only has to survive the process, not a power failure.
             durable = not settings.save_batches
             progress = self._progress if settings.save_batches else None
             write_state(file, {**self.filter.state(), 'progress': progress}, durable=durable)
         except OSError as error:
-            # A search must not fail because its copy cannot be written.
+            # The search continues without a saved copy.
             self.warn_throttled('state', f'{file}: state not saved: {error.strerror}')
 
     def reset(self) -> None:
@@ -230,17 +227,16 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             'particles': len(self.filter.weights),
             'expected number': f'{self.filter.expected_number:.3f}',
             'found': len(self.filter.found_targets),
-            # That is no fault, as what is dropped is.
             'detections of found targets': self._no_faults[FOUND],
             'repeated detections': self._no_faults[REPEATED],
             'last step [ms]': f'{1e3 * self._latency:.2f}',
         }
 
     def warnings(self) -> list[str]:
-        """Return which robots' detections do not fit their settings."""
+        """Return warnings about robots whose detections do not fit their settings."""
         return list(self._misfits.values())
 
-    # ---- what comes in -----------------------------------------------------------------------
+    # ---- input -------------------------------------------------------------------------------
 
     def _on_batch(self, batch: MeasurementBatch) -> None:
         if not self.active:
@@ -248,7 +244,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         if self.settings.lockstep and batch.step < (self._progress.step or 0):
             self.get_logger().warning(
                 f'measurement_batch.step went back from {self._progress.step} to {batch.step}: '
-                'starting anew'
+                'the search starts again'
             )
             self.reset()
         self._batches.add(batch)
@@ -270,7 +266,6 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     # ---- the step ----------------------------------------------------------------------------
 
     def _process_complete(self) -> None:
-        """Process the batches that are complete, in the order of their ids."""
         # New ids must differ from those of targets that were found before a restart.
         awaited = not self._kept_taken and time.monotonic() < self._kept_until
         if awaited and self._batches.pending and self.count_publishers(self._kept_topic):
@@ -343,7 +338,6 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._latency = time.perf_counter() - begin
 
     def _publish_views(self, header: Header, now: float) -> None:
-        """Publish the particles and markers that are due at the time `now` [s]."""
         settings, search = self.settings, self.filter
         if _is_due(settings.particles_rate, now, self._particles_at):
             self._particles_at = now
@@ -373,7 +367,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         )
 
     def _on_kept(self, message: FoundTargetArray) -> None:
-        """Restore targets found before a restart of this node without its state."""
+        """Restore found targets after a restart without a saved state."""
         if not self.active or self._kept_taken:
             return
         self._kept_taken = True
@@ -393,8 +387,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             for target in new:
                 self._progress.settled_by[target.id] = known.get(target.id, 0)
             self.get_logger().warning(
-                f'restarted without the state of the search: {len(new)} found targets taken from '
-                'found_targets/kept; what was believed of others is lost'
+                f'restarted without a saved state: {len(new)} found targets were restored from '
+                'found_targets/kept; estimates of all other targets are lost'
             )
             self._publish_found(message.header, int(message.batch_id))
         self._process_complete()

@@ -1,4 +1,4 @@
-"""Found targets of a filter: its own, and those of the filters of other robots (002, section 4)."""
+"""Found targets of a filter and of the filters of other robots (002, section 4)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ def distance(position: FloatArray, covariance: FloatArray, target: FoundTarget) 
 
 
 def nearest(target: FoundTarget, estimates: Sequence[tuple[FloatArray, FloatArray]]) -> int:
-    """Return the index of the nearest estimate, position and covariance, within the gate, or -1."""
+    """Return the index of the nearest (position, covariance) within the gate, or -1."""
     apart = [distance(*estimate, target) for estimate in estimates]
     best = int(np.argmin(apart)) if apart else -1
     return best if apart and apart[best] < SAME_TARGET else -1
@@ -26,7 +26,7 @@ def nearest(target: FoundTarget, estimates: Sequence[tuple[FloatArray, FloatArra
 
 @dataclass
 class FoundTargets:
-    """Found targets that a filter knows, in the order of being found, and the largest id so far."""
+    """Found targets known to a filter, in the order of being found, and the largest id so far."""
 
     targets: list[FoundTarget] = field(default_factory=list)
     last_id: int = 0
@@ -39,7 +39,7 @@ class FoundTargets:
 
 @dataclass
 class Change:
-    """Found targets after a change: all, those that are new or changed, and those removed."""
+    """Found targets after a change: all of them, new or changed ones, and removed ones."""
 
     found: FoundTargets
     changed: list[FoundTarget] = field(default_factory=list)
@@ -50,11 +50,10 @@ class Change:
 
 
 def merge(own: FoundTargets, others: Mapping[str, Sequence[FoundTarget]]) -> Change:
-    """Return the found targets of a filter with those of others, by robot.
+    """Merge the found targets of a filter with those of others, given by robot.
 
-    A target that two robots found belongs to the robot that found it first (ties: first by name),
-    and follows the estimate of that robot. What a robot does not have any more is removed: `others`
-    has all that the filter of each has found itself.
+    A target found by two robots belongs to the robot that found it first (ties: first by name),
+    and follows the estimate of that robot. `others` is complete: what is not in it is removed.
     """
     change = Change(FoundTargets([*own.targets], own.last_id))
     for robot, targets in others.items():
@@ -72,7 +71,6 @@ def merge(own: FoundTargets, others: Mapping[str, Sequence[FoundTarget]]) -> Cha
 
 
 def _adopt(change: Change, robot: str, targets: Sequence[FoundTarget]) -> None:
-    """Add targets of another robot, or replace known ones by them."""
     known, changed = change.found.targets, []
     for target in targets:
         same = [(item.robot, item.origin) == (robot, target.id) for item in known]
@@ -83,10 +81,10 @@ def _adopt(change: Change, robot: str, targets: Sequence[FoundTarget]) -> None:
             change.changed.append(known[-1])
             continue
         old = known[f]
-        # A target kept from before a restart has its robot, but not its id there.
+        # A target restored after a restart has its robot, but no id of that robot's filter.
         theirs = any(same) or (old.robot, old.origin) == (robot, 0)
         if not theirs and (old.time, old.robot) <= (target.time, robot):
-            continue  # another one found it first
+            continue  # another robot found it first
         new = replace(target, id=old.id, robot=robot, origin=target.id)
         if not (
             (new.origin, new.robot) == (old.origin, old.robot)
@@ -99,10 +97,7 @@ def _adopt(change: Change, robot: str, targets: Sequence[FoundTarget]) -> None:
 
 
 def restore(own: FoundTargets, kept: Sequence[FoundTarget]) -> Change:
-    """Return the found targets of a filter with those found before it was created.
-
-    They keep their ids, except that an id in use is replaced by the next free one.
-    """
+    """Add targets found before the filter was created; an id in use becomes the next free one."""
     change = Change(FoundTargets([*own.targets], own.last_id))
     known, ids = {target.id: target for target in own.targets}, {target.id for target in kept}
     since = [target for target in own.targets if target.id not in ids]

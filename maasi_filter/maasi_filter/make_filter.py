@@ -1,4 +1,4 @@
-"""The filter that the settings name: new, from a file, or resumed; its kernels compiled."""
+"""Creates, loads and compiles the filter that the settings name."""
 
 import os
 from dataclasses import dataclass, field
@@ -33,15 +33,17 @@ def make_filter(
 
     Parameters
     ----------
+    settings : FilterSettings
+        Method and its parameters.
     area : Area or (d, 2) array
-        Where targets may be, or the bounds of a box, metres; d = 2 or 3.
+        Search area, or its bounds in metres; d = 2 or 3.
     generator : numpy.random.Generator
-        Every random draw comes from it.
+        Source of every random draw.
 
     Raises
     ------
     ValueError
-        If the bounds or the spacing of the exploration grid are not usable.
+        If the bounds or the spacing of the exploration grid are invalid.
     """
     kind: type[SearchFilter] = FILTERS.load(settings.method)
     return kind(settings, area, generator)
@@ -49,32 +51,32 @@ def make_filter(
 
 @dataclass
 class Progress:
-    """Progress of a run after a batch."""
+    """Progress of a run after a batch, saved with the filter."""
 
-    batch: int = 0  # Id of the last batch
-    stamp: int = -1  # Of the last batch [ns]
-    step: int | None = None  # Of the last batch, or of a later measurement of its own
+    batch: int = 0  # id of the last batch
+    stamp: int = -1  # of the last batch [ns]
+    step: int | None = None  # of the last batch, or of a later separate measurement
     #: Id of the batch that completed each found target, by its id.
     settled_by: dict[int, int] = field(default_factory=dict)
-    #: Batch, measurement, stamp [ns] last heard, by robot.
+    #: Last received batch, measurement and stamp [ns], by robot.
     heard: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     #: The last update, serialised; it may not have been sent yet.
     update: ByteArray = field(default_factory=lambda: np.empty(0, np.uint8))
 
 
 def load_filter(path: str | os.PathLike[str]) -> SearchFilter:
-    """Return the saved filter; it continues bit for bit as the saved one would have.
+    """Return a saved filter, which continues bit for bit.
 
     Raises
     ------
     StateFileError
-        If the file is missing, of another format or version, or damaged; it says which.
+        If the file is missing, damaged, or of another format or version.
     """
     return load_state(path)[0]
 
 
 def load_state(path: str | os.PathLike[str]) -> tuple[SearchFilter, Progress | None]:
-    """Return the saved filter as `load_filter`, and the progress of its run, if it was saved."""
+    """Return the saved filter, and the progress of its run if it was saved."""
     saved = read_state(path)
     try:
         progress = TypeAdapter[Any](Progress | None).validate_python(saved.pop('progress', None))
@@ -86,7 +88,7 @@ def load_state(path: str | os.PathLike[str]) -> tuple[SearchFilter, Progress | N
 
 
 def warm_up(method: str | None = None) -> None:
-    """Compile, or load from the cache, every kernel that a step uses; of one method, or of both."""
+    """Compile every kernel of a step, or load it from the cache, for one method or for both."""
     for dimension in (2, 3):
         bounds = np.array([[0.0, 10.0]] * dimension)
         for detection in (
@@ -109,12 +111,12 @@ def warm_up(method: str | None = None) -> None:
                     search.step(
                         [AgentMeasurement('warm_up', pose, sensor, values, None, step)], 1, step
                     )
-            # All that a filter of a plugin shares with them.
+            # Filters of plugins need no more.
             exploration = UnexploredMap(bounds)
             exploration.update(sensor.detection, Pose.from_yaw([3.0, 3.0, 3.0], 0.1))
             exploration.at(np.full((1, 3), 3.0))
         if method in (None, 'pmb'):
-            # What only a large scan needs.
+            # Kernels of large scans.
             associate(np.ones((1, MANY_PAIRS + 1)), np.ones(MANY_PAIRS + 1))
-            place, spread = np.zeros((1, dimension)), np.eye(dimension)[None]
-            gaps_of(np.ones((1, 1), np.bool_), place, spread, place, spread)
+            position, spread = np.zeros((1, dimension)), np.eye(dimension)[None]
+            gaps_of(np.ones((1, 1), np.bool_), position, spread, position, spread)

@@ -1,4 +1,4 @@
-"""Checks of measurements before a step, and detections that are not used, by reason."""
+"""Checks measurements before a step, and counts detections that are not used by their reason."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from maasi_filter.models.sensor import Sensor, is_covariance
 from maasi_filter.records import AgentMeasurement, FoundTarget, Label
 from maasi_filter.settings import FilterSettings
 
-# Default position error of a robot with a box-shaped field of view, as a share of its half size:
-# the position error blurs the edge.
+# Default position error of a robot with a box-shaped field of view, which blurs its edge, as a
+# share of its half size.
 POSE_ERROR_OF_BOX = 0.05
-# Most detections of a scan, against unbounded computation times; messages have fewer.
+# Largest number of detections of a scan, which bounds the computation time.
 MOST_VALUES = 1000
-# Reasons that are no faults: a found target took it, or another one of the scan is the same.
+# Reasons that are not faults: the detection belongs to a found target, or repeats another one.
 FOUND = 'found'
 REPEATED = 'repeated'
 
 
 @dataclass
 class CheckedMeasurement:
-    """A checked measurement: every detection has a covariance, and their order is fixed."""
+    """A valid measurement whose detections all have covariances and are in a fixed order."""
 
     robot: str
     pose: Pose
     sensor: Sensor
     values: FloatArray
     covariances: FloatArray
-    has_covariances: bool  # Whether the detections have covariances
+    has_covariances: bool
     index: int
     #: Standard deviation of the robot's position error per axis, as far as the covariances do
     #: not include it [m].
     pose_error: float
-    labels: tuple[Label, ...] = ()  # Of each detection; empty: none has one
+    labels: tuple[Label, ...] = ()  # of each detection, or empty
 
     def only(self, keep: BoolArray) -> CheckedMeasurement:
-        """Return a copy with some of the detections, or the measurement if that is all of them."""
+        """Return a copy with the detections selected by `keep`."""
         if keep.all():
             return self
         labels = tuple(label for label, kept in zip(self.labels, keep.tolist()) if kept)
@@ -58,7 +58,7 @@ def check_measurements(
     settings: FilterSettings,
     dimension: int,
 ) -> list[CheckedMeasurement]:
-    """Return the measurements of a step in the order of the robots' names."""
+    """Return the valid measurements of a step in the order of the robots' names."""
     if isinstance(steps, bool) or int(steps) != steps or steps < 0:
         raise ValueError(f'steps: got {steps!r}, allowed are whole numbers from 0')
     if not math.isfinite(time):
@@ -107,7 +107,7 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
     labels = tuple(measurement.labels)
     if len(labels) not in (0, len(values)):
         raise ValueError(f'{name}: labels: got {len(labels)}, allowed are {len(values)}, or none')
-    # Sort, so that the result does not depend on the order in which a sensor lists detections.
+    # Results do not depend on the order in which a sensor lists detections.
     order = np.lexsort(values.T[::-1])
     return CheckedMeasurement(
         name,
@@ -151,7 +151,7 @@ def _reported_error(name: str, reported: FloatArray, d: int) -> float:
 
 
 def check_taken(robot: str, targets: Sequence[FoundTarget], dimension: int) -> None:
-    """Refuse targets with non-finite numbers, of another dimension, or of equal ids."""
+    """Raise ValueError for targets with non-finite numbers, another dimension, or equal ids."""
     ids = [target.id for target in targets]
     if min(ids, default=1) < 1 or len(set(ids)) < len(ids):
         raise ValueError(f'{robot}: target ids: got {ids}, allowed are different ones from 1')
@@ -171,7 +171,7 @@ def check_taken(robot: str, targets: Sequence[FoundTarget], dimension: int) -> N
 
 
 def count_dropped(dropped: dict[str, int], reason: str, number: int) -> None:
-    """Add a number of detections to those dropped for a reason."""
+    """Count detections that are dropped for a reason."""
     if number:
         dropped[reason] = dropped.get(reason, 0) + number
 
@@ -184,9 +184,9 @@ def within_range(member: CheckedMeasurement, dropped: dict[str, int]) -> Checked
 
 
 def without_repeats(member: CheckedMeasurement, dropped: dict[str, int]) -> CheckedMeasurement:
-    """Merge detections that are one by the sensor's resolution; different identities stay apart."""
+    """Merge detections closer than the sensor's resolution, unless their identities differ."""
     values, gate = member.values, member.sensor.resolution
-    # Detections are sorted by range, which is within the gate first of all.
+    # Detections are sorted by range.
     reach = values[:, 0] - gate * np.sqrt(member.covariances[:, 0, 0])
     first = np.searchsorted(values[:, 0], reach, side='right')
     keep = np.ones(len(values), np.bool_)
@@ -203,7 +203,7 @@ def without_repeats(member: CheckedMeasurement, dropped: dict[str, int]) -> Chec
 
 
 def count_unexplained(centres: FloatArray, bounds: FloatArray, dropped: dict[str, int]) -> None:
-    """Count detections that only clutter explains, by the places (m, d) they point at."""
+    """Count detections that only clutter explains, by the positions (m, d) that they point at."""
     inside = ((centres >= bounds[:, 0]) & (centres <= bounds[:, 1])).all(axis=1)
     count_dropped(dropped, 'outside', int((~inside).sum()))
     count_dropped(dropped, 'unseen', int(inside.sum()))

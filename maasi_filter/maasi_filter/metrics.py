@@ -1,4 +1,4 @@
-"""Metrics of the estimate of a set of targets."""
+"""Errors of the estimate of a set of targets."""
 
 import math
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ from maasi_filter.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Gospa:
-    """GOSPA with alpha = 2, and its parts (Rahmathullah, Garcia-Fernandez and Svensson, 2017).
+    """GOSPA with alpha = 2 and its parts (Rahmathullah, Garcia-Fernandez and Svensson, 2017).
 
-    `total` is (localisation + missed + false) to the power 1/p; the parts are powers already.
+    `total` is (localisation + missed + false) to the power 1/p.
     """
 
     total: float  #: The metric, metres.
     localisation: float  #: Sum of distances of matched pairs, to the power p.
-    missed: float  #: c^p / 2 for each target that is not matched.
-    false: float  #: The same for each estimate.
+    missed: float  #: c^p / 2 for each unmatched target.
+    false: float  #: c^p / 2 for each unmatched estimate.
     matched: int  #: Number of pairs.
 
 
@@ -48,7 +48,6 @@ def _distances(estimates: ArrayLike, truth: ArrayLike) -> FloatArray:
 
 
 def _assign(cost: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the assignment with the least total cost."""
     # Deferred: the slowest import, which no node needs.
     from scipy.optimize import linear_sum_assignment
 
@@ -66,12 +65,14 @@ def gospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 
 
     Parameters
     ----------
-    estimates, truth : (n, d), (m, d) arrays
-        Metres.
+    estimates : (n, d) array
+        Estimated positions, metres.
+    truth : (m, d) array
+        True positions, metres.
     cutoff : float
-        c, metres: pairs farther apart do not match.
+        c, largest distance of a matched pair, metres.
     power : float
-        p, from 1.
+        p, at least 1.
     """
     _positive('cutoff', cutoff)
     _positive('power', power, 1.0)
@@ -92,7 +93,7 @@ def gospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 
 class Match:
     """One-to-one matching of found targets to true ones."""
 
-    pairs: list[tuple[int, int]]  #: Index of the found, and of the true target.
+    pairs: list[tuple[int, int]]  #: Indices of found and true target.
     true_found: int  #: Number of pairs.
     missed: int  #: Number of unmatched true targets.
     false_found: int  #: Number of unmatched found targets.
@@ -100,10 +101,7 @@ class Match:
 
 
 def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Match:
-    """Match found targets to true ones within `radius` metres.
-
-    As many pairs as possible, and among these the smallest sum of squared distances.
-    """
+    """Match as many found targets as possible to true ones within `radius` [m], closest first."""
     _positive('radius', radius)
     apart = _distances(estimates, truth)
     # One more pair outweighs any sum of distances.

@@ -1,4 +1,4 @@
-"""Plugins: classes found by entry point, or by `module:Class`. See `docs/plugins.md`."""
+"""Plugins: classes found by entry point or by `module:Class` (docs/plugins.md)."""
 
 import contextlib
 import difflib
@@ -20,34 +20,33 @@ from pydantic.fields import FieldInfo
 
 _NAME = r'[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*'
 _REFERENCE = re.compile(f'{_NAME}:{_NAME}')
-# Folders that modules named in `module:Class` are looked for in, the last added first.
+# Folders of modules named in `module:Class`, the last added first.
 _folders: list[str] = []
 
 
 @cache
 def _entry_points(folder: str) -> list[EntryPoint]:
-    """Return the entry points of what is installed in a folder of the search path."""
     return [point for found in distributions(path=[folder]) for point in found.entry_points]
 
 
 class PluginError(ValueError):
-    """A plugin is not known, cannot be imported, or is not what it should be."""
+    """A plugin is unknown, cannot be imported, or does not fit its interface."""
 
 
 def is_reference(text: Any) -> bool:
-    """Return whether a value is of the form `module:Class`."""
+    """Return whether a value has the form `module:Class`."""
     return isinstance(text, str) and _REFERENCE.fullmatch(text) is not None
 
 
 def unknown(read: Any, known: Sequence[str], what: str) -> str:
-    """Return the complaint about an unknown name, with the closest known one first."""
+    """Return the error text for an unknown name, with the closest known one first."""
     close = difflib.get_close_matches(str(read), known, n=1, cutoff=0.6)
     hint = f" (did you mean '{close[0]}'?)" if close else ''
     return f'unknown {what} {read!r:.60}{hint}, known are {", ".join(known)}'
 
 
 def add_folders(folders: Iterable[str | Path]) -> list[str]:
-    """Look for modules in these folders too, after those that are installed; return the folders."""
+    """Add folders to the search path of modules, after installed packages; return them."""
     given = [str(Path(folder).absolute()) for folder in folders]
     for folder in reversed(given):
         if folder in _folders:
@@ -60,23 +59,19 @@ def add_folders(folders: Iterable[str | Path]) -> list[str]:
 
 @dataclass(frozen=True)
 class PluginGroup:
-    """Classes of one kind: those of the suite, of installed packages, and `module:Class`."""
+    """Classes of one kind: built in, from installed packages, or named by `module:Class`."""
 
-    group: str  # Name of the group of entry points
-    what: str  # What one of them is called in messages
-    base: str  # Class that all are subclasses of, as `module:Class`
-    built_in: Mapping[str, str] = field(hash=False)  # Those of the suite: name to `module:Class`
+    group: str  # name of the group of entry points
+    what: str  # kind of plugin, for messages
+    base: str  # base class, as `module:Class`
+    built_in: Mapping[str, str] = field(hash=False)  # by name: `module:Class`
 
     def names(self) -> list[str]:
-        """Return all names: the suite's, then those of installed packages."""
+        """Return all names: those of the suite, then those of installed packages."""
         return [*sorted(self.built_in), *sorted(set(self._installed()) - set(self.built_in))]
 
     def load(self, name: str) -> type:
-        """Return a class by one of `names`, or `module:Class`.
-
-        Modules beside the scenario file and in the current folder are found too. PluginError: it is
-        not known, cannot be imported, or is no subclass of `base`.
-        """
+        """Return the class of one of `names` or of `module:Class`; PluginError if unusable."""
         if name in self.built_in:
             return _attribute(self.built_in[name])
         if is_reference(name):
@@ -92,7 +87,7 @@ class PluginGroup:
                 raise PluginError(f'{self.what} {name!r}: {error}') from error
         base = _attribute(self.base)
         if not (isinstance(found, type) and issubclass(found, base)):
-            raise PluginError(f'{name} is no subclass of {self.base.replace(":", ".")}')
+            raise PluginError(f'{name} is not a subclass of {self.base.replace(":", ".")}')
         if inspect.isabstract(found):
             lacking = ', '.join(sorted(found.__abstractmethods__))  # type: ignore[attr-defined]
             raise PluginError(f'{name} lacks {lacking} of {self.base.replace(":", ".")}')
@@ -105,37 +100,37 @@ class PluginGroup:
         return name
 
     def check_known(self, name: str) -> str:
-        """Return a name that stands for something, without importing it; a validator."""
+        """Return a known name without importing its class; a validator for settings."""
         if name not in self.built_in and not is_reference(name) and name not in self._installed():
             raise PluginError(self._unknown(name, self.names()))
         return name
 
     def settings(self, name: str) -> type[BaseModel] | None:
-        """Return the model of a plugin's own settings: its attribute `Settings`, if it has one."""
+        """Return a plugin's attribute `Settings`, the model of its own settings, or None."""
         if name in self.built_in:
             return None
         model = getattr(self.load(name), 'Settings', None)
         if model is None:
             return None
         if not (isinstance(model, type) and issubclass(model, BaseModel)):
-            raise PluginError(f'{name}: its Settings are no pydantic model')
+            raise PluginError(f'{name}: its Settings are not a pydantic model')
         return model
 
     def _installed(self) -> dict[str, EntryPoint]:
-        # What comes first on the path counts.
+        # The first one on the path counts.
         points = [item for folder in reversed(sys.path) for item in _entry_points(folder)]
         return {item.name: item for item in points if item.group == self.group}
 
     def _unknown(self, name: str, known: list[str]) -> str:
-        return f'{unknown(name, known, self.what)}, and module:Class of your own'
+        return f'{unknown(name, known, self.what)}, and your own module:Class'
 
 
 @dataclass(frozen=True)
 class OwnSettings:
-    """Marks the field of settings that holds the own settings of a plugin."""
+    """Marks a settings field that holds the settings of a plugin."""
 
-    group: PluginGroup  # Kind of the plugin
-    selector: str  # Field that names the plugin; it stands before the marked one
+    group: PluginGroup  # kind of the plugin
+    selector: str  # earlier field, which names the plugin
 
     def check(self, value: Any, info: ValidationInfo) -> BaseModel | None:
         """Return the plugin's settings; a validator of the marked field."""
@@ -144,22 +139,22 @@ class OwnSettings:
         if model is not None:
             return model.model_validate({} if value is None else value, strict=True)
         if value and name is not None:
-            raise ValueError(f"{self.group.what} '{name}' has no settings of its own")
+            raise ValueError(f"{self.group.what} '{name}' has no settings")
         return None
 
 
 @dataclass(frozen=True)
 class ChosenSettings:
-    """Marks the field of settings whose model is chosen by its own values."""
+    """Marks a settings field whose model depends on its values."""
 
-    choose: Callable[[Mapping[str, Any]], type[BaseModel]]  # ValueError: they choose none
-    models: Callable[[], Mapping[str, type[BaseModel]]]  # Those of the suite, by what chooses them
+    choose: Callable[[Mapping[str, Any]], type[BaseModel]]  # or ValueError
+    models: Callable[[], Mapping[str, type[BaseModel]]]  # by the values that choose them
 
     def check(self, value: Any) -> Any:
-        """Return the settings of values; a validator of the marked field, before its own."""
+        """Return the settings for values; a validator of the marked field."""
         if not isinstance(value, Mapping):
             return value
-        # null: the default.
+        # YAML's null stands for the default.
         given = {key: item for key, item in value.items() if item is not None}
         return self.choose(given).model_validate(given, strict=True)
 
@@ -167,7 +162,7 @@ class ChosenSettings:
 def own_settings(
     info: FieldInfo, beside: Callable[[str], Any], values: Callable[[], Mapping[str, Any]]
 ) -> Any:
-    """Return the model of a marked field by its values and a value beside it; None: no mark."""
+    """Return the model of a marked field for its values, or None without a mark."""
     for mark in info.metadata:
         # An error is reported where the values are checked.
         with contextlib.suppress(ValueError):
@@ -179,7 +174,6 @@ def own_settings(
 
 
 def _attribute(reference: str, named: bool = False) -> Any:
-    """Return what `module:attribute` names; `named`: by a user, who may mean a file."""
     name, _, attribute = reference.partition(':')
     if named:
         importlib.invalidate_caches()
@@ -212,17 +206,17 @@ def _import_problem(name: str, error: BaseException) -> str:
             f'there is no module {missing}: it is not installed, and not in '
             f'{", ".join(_folders) or "any folder of plugins"}'
         )
-    place = ''
+    location = ''
     if isinstance(error, SyntaxError) and error.filename:
-        place = f' ({error.filename}:{error.lineno})'
+        location = f' ({error.filename}:{error.lineno})'
     elif frames := traceback.extract_tb(error.__traceback__):
-        place = f' ({frames[-1].filename}:{frames[-1].lineno})'
+        location = f' ({frames[-1].filename}:{frames[-1].lineno})'
     text = ' '.join(str(error).split())[:300]
-    return f'module {name} cannot be imported: {type(error).__name__}: {text}{place}'
+    return f'module {name} cannot be imported: {type(error).__name__}: {text}{location}'
 
 
 def _check_file(name: str, module: Any) -> None:
-    """Refuse a module that is another one than the file beside the scenario."""
+    """Raise PluginError if another module of that name hides the file next to the scenario."""
     top = name.partition('.')[0]
     for folder in _folders:
         spec = PathFinder.find_spec(top, [folder])

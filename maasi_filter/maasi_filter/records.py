@@ -1,4 +1,4 @@
-"""Input and output of a search filter: measurements, clusters, found targets, results."""
+"""Input and output of search filters: measurements, clusters, found targets, results."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from maasi_filter.models.sensor import Sensor
 
 
 def rounded_score(score: float) -> float:
-    """Return a score; sums of probabilities may miss 0 or 1 by their rounding."""
+    """Return a score moved into [0, 1], as sums of probabilities have rounding errors."""
     return float(min(max(score, 0.0), 1.0)) if -1e-6 <= score <= 1.0 + 1e-6 else score
 
 
@@ -20,16 +20,16 @@ class Label:
     Parameters
     ----------
     class_id : str
-        Name of the class; empty: not known.
+        Name of the class; empty if unknown.
     score : float
-        Confidence in the class, 0 to 1; 0: not known.
+        Confidence in the class, 0 to 1; 0 if unknown.
     identity : str
-        What tells this target from all others, such as the id of a marker; empty: not known.
+        Unique identity of the target, such as the id of a marker; empty if unknown.
 
     Raises
     ------
     ValueError
-        If the score is not from 0 to 1.
+        If the score is outside of [0, 1].
     """
 
     class_id: str = ''
@@ -42,32 +42,32 @@ class Label:
             raise ValueError(f'score: got {self.score}, allowed is 0 to 1')
 
 
-UNLABELLED = Label()  #: of a detection about which nothing is known but its position
+UNLABELLED = Label()  #: without class and identity
 
 
 @dataclass
 class AgentMeasurement:
-    """Measurement of one robot at one step; one without detections is information too.
+    """Measurement of one robot at one step, possibly without detections.
 
     Parameters
     ----------
     robot : str
-        Its name; robots are processed in the order of their names.
+        Name of the robot; robots are processed in the order of their names.
     pose : Pose
-        Of the sensor at the time of the measurement.
+        Pose of the sensor at the time of the measurement, frame `map`.
     sensor : Sensor
-        The sensor that measured.
+        Sensor that measured.
     values : (m, d) array
-        Detections: range, bearing and, in 3D, elevation; m, rad, rad.
+        Range [m], bearing [rad] and, in 3D, elevation [rad] of each detection.
     covariances : (m, d, d) array, optional
-        Covariance of each detection, instead of the sensor's; not used by the PHD filter.
+        Covariance of each detection, in place of the sensor's; not used by the PHD filter.
     index : int
-        That robot's measurement index.
+        Measurement index of the robot.
     position_covariance : (3, 3) array, optional
-        Covariance of the robot's position error as it reports it, square metres. Covariances of
-        detections are assumed to include it.
+        Covariance of the reported robot position, square metres. Covariances of detections are
+        assumed to include it.
     labels : sequence of Label
-        Class and identity of each detection; empty: none is known.
+        Class and identity of each detection; empty if all are unknown.
     """
 
     robot: str
@@ -93,7 +93,7 @@ class Cluster:
     radius : float
         Weighted root mean square distance from the mean, metres.
     mass : float
-        Expected number of targets in it.
+        Expected number of targets in the cluster.
     """
 
     position: FloatArray
@@ -104,26 +104,26 @@ class Cluster:
 
 @dataclass
 class FoundTarget:
-    """A target marked as found.
+    """A found target.
 
     Parameters
     ----------
     id : int
-        From 1, in the order of being found.
+        Number from 1, in the order of being found.
     position : (d,) array
-        Metres, frame `map`.
+        Estimated position, metres, frame `map`.
     covariance : (d, d) array
-        Of the error of `position`, square metres.
+        Covariance of the position error, square metres.
     robot : str
-        Robot whose measurement completed it.
+        Robot whose measurement completed the target.
     measurement : int
-        That robot's measurement index then.
+        Measurement index of that robot.
     time : float
-        Seconds.
+        Time of the find, seconds.
     origin : int
-        Its id in the filter of another robot that found it; 0 if this filter found it.
+        Id in the filter of the robot that found it; 0 if this filter found it.
     label : Label
-        Its class with the share of its detections that named it, and its identity.
+        Class, with the share of its detections that named it, and identity.
     """
 
     id: int
@@ -143,18 +143,17 @@ class FilterResult:
     Parameters
     ----------
     clusters : list of Cluster
-        Potential targets after the step, without found targets.
+        Potential targets after the step.
     newly_found : list of FoundTarget
         Targets found in this step.
     found_changed : bool
         Whether any found target is new or has moved.
     expected_number : float
-        Expected number of targets that are not found.
+        Expected number of targets that are not found yet.
     dropped : dict
-        Detections that were not used: reason to count.
+        Number of unused detections by reason.
     misfits : dict
-        Warnings that the detections of a robot do not fit its settings, by robot; or that some
-        potential targets were left out.
+        Warnings by robot: its detections do not fit its settings, or targets were left out.
     """
 
     clusters: list[Cluster] = field(default_factory=list)

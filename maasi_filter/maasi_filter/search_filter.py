@@ -1,4 +1,4 @@
-"""A search filter, for nodes, planners and searches in one process; what all filters share."""
+"""Interface of the search filters, and what all filters share."""
 
 import os
 from abc import ABC, abstractmethod
@@ -20,7 +20,7 @@ from maasi_filter.settings import FilterSettings
 from maasi_filter.state_file import SavedGenerator, write_state
 from maasi_filter.unexplored_map import UnexploredMap
 
-# What of every filter is saved, with its type, beside e.
+# Saved attributes of every filter with their types; e is saved, too.
 _SAVED: dict[str, Any] = {
     'settings': FilterSettings,
     'environment': EnvironmentSettings,
@@ -32,32 +32,32 @@ _SAVED: dict[str, Any] = {
 class SearchFilter(ABC):
     """A filter that finds targets from the detections of several robots.
 
-    A subclass has `step`; it keeps `clusters` and `exploration`, and adds to `register()` what it
-    finds. One that stores its found targets elsewhere overrides `found_targets`, `register` and
+    A subclass implements `step`, updates `clusters` and `exploration`, and adds found targets to
+    `register()`. If it stores found targets elsewhere, it overrides `found_targets`, `register` and
     `adopt`.
 
     Attributes
     ----------
     settings : FilterSettings
-        As given.
+        Settings of the filter.
     area : Area
-        Where targets may be.
+        Search area.
     bounds : (d, 2) array
-        Around the area, metres.
+        Bounding box of the area, metres.
     dimension : int
         2 or 3.
     exploration : UnexploredMap
         e, updated with every measurement.
     clusters : list of Cluster
-        Potential targets that are not found, heaviest first.
+        Potential targets, heaviest first.
     Settings : type or None
-        Model of the filter's own settings; with it, `settings.settings` is an instance.
+        Model of a plugin's own settings, of which `settings.settings` is an instance.
     own : BaseModel or None
         That instance.
     """
 
     Settings: ClassVar[type[BaseModel] | None] = None
-    #: Types of what is saved of one method only, by attribute.
+    #: Types of further saved attributes of a subclass.
     saved: ClassVar[dict[str, Any]] = {'_found': FoundTargets}
 
     def __init__(
@@ -74,11 +74,11 @@ class SearchFilter(ABC):
 
     @property
     def own(self) -> Any:
-        """The filter's own settings."""
+        """The plugin's own settings."""
         return self.settings.settings
 
     def adopt_area(self, area: Area) -> None:
-        """Take another area within the same bounds, as with other keep-outs."""
+        """Change keep-outs or obstacles: `area` has the same bounds."""
         self.area, self.environment = area, area.settings
         self.exploration.adopt_area(area)
 
@@ -89,38 +89,43 @@ class SearchFilter(ABC):
 
     @property
     def particles(self) -> FloatArray:
-        """Of targets that are not found yet, (n, d), metres; empty: the filter has none."""
+        """Particles of targets that are not found yet, (n, d), metres; empty if there are none."""
         return np.empty((0, self.dimension))
 
     @property
     def weights(self) -> FloatArray:
-        """Of the particles, (n,); they sum to `expected_number`."""
+        """Weights of the particles, (n,), which sum to `expected_number`."""
         return np.empty(0)
 
     @property
     def expected_number(self) -> float:
-        """Expected number of targets that are not found yet, of those that were detected."""
+        """Expected number of detected targets that are not found yet."""
         return float(sum(cluster.mass for cluster in self.clusters))
 
     @abstractmethod
     def step(
         self, measurements: Sequence[AgentMeasurement], steps: int, time: float
     ) -> FilterResult:
-        """Predict over `steps` control steps, correct with every robot of M_k, and mark.
+        """Process the measurements of a step: predict, correct and mark found targets.
 
         Parameters
         ----------
         measurements : sequence of AgentMeasurement
-            M_k, in any order; they are processed in the order of the robots' names. May be empty.
+            Measurements M_k of several robots in any order; may be empty.
         steps : int
-            Control steps since the last batch, from 0; irrelevant for pmb and static targets.
+            Control steps after the previous batch, at least 0; pmb ignores it for static targets.
         time : float
             Time of newly found targets, seconds.
+
+        Returns
+        -------
+        FilterResult
+            Clusters, new targets and warnings.
 
         Raises
         ------
         ValueError
-            If anything is not finite, a covariance is not positive definite, shapes or dimensions
+            If a number is not finite, a covariance is not positive definite, shapes or dimensions
             do not fit, or a robot appears twice. The filter is then unchanged.
         """
 
@@ -129,17 +134,20 @@ class SearchFilter(ABC):
         return self._found
 
     def adopt(self, change: Change) -> None:
-        """Take found targets into the state, of which some are new or changed, or withdrawn."""
+        """Update the state with new, changed or withdrawn found targets."""
         self._found = change.found
 
     def own_found_targets(self) -> list[FoundTarget]:
-        """Return the found targets that this filter found itself."""
+        """Return the targets that this filter found itself."""
         return [target for target in self.found_targets if not target.origin]
 
     def merge(self, others: Mapping[str, Sequence[FoundTarget]]) -> bool:
-        """Merge all that the filters of other robots have found themselves, before `step`.
+        """Merge all found targets of the filters of other robots; return whether anything changed.
 
-        Returns whether anything changed; see `found_targets.merge`.
+        Parameters
+        ----------
+        others : mapping
+            For each robot all targets that its filter found itself.
 
         Raises
         ------
@@ -155,8 +163,7 @@ class SearchFilter(ABC):
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets found before this filter was created; return those that are new.
 
-        They keep their ids, except that an id in use is replaced by the next free one. ValueError
-        as of `merge`.
+        An id in use is replaced by the next free one; ValueError as in `merge`.
         """
         check_taken('kept', targets, self.dimension)
         change = restore(self.register(), targets)
@@ -164,20 +171,17 @@ class SearchFilter(ABC):
         return change.changed
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the whole state, random generator included, to one file.
-
-        The file is replaced atomically: a crash leaves the old one or the new one.
-        """
+        """Write the whole state, with the random generator, atomically to one file."""
         write_state(path, self.state())
 
     def state(self) -> dict[str, dict[str, Any]]:
-        """Return the whole state, random generator included, by the name of the method."""
+        """Return the whole state, with the random generator, by the name of the method."""
         state = {name: getattr(self, name) for name in (*_SAVED, *self.saved)}
         return {self.settings.method: {**state, 'exploration': self.exploration.values}}
 
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> Self:
-        """Return a saved filter; it continues bit for bit as the saved one would have."""
+        """Return a saved filter, which continues bit for bit."""
         kinds = {**_SAVED, **cls.saved}
         state = {name: TypeAdapter(kinds[name]).validate_python(saved[name]) for name in kinds}
         search = cls(state['settings'], Area(state['environment']), state['generator'])

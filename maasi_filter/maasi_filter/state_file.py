@@ -1,8 +1,8 @@
 """The state of a search in one file: a tree of dataclasses, arrays and plain values.
 
-The file is one line of JSON (format, version, SHA-256 of the rest) and a NumPy archive of the tree
-as JSON with one array for all numbers of a type. What has the right version and checksum was
-written by this module, so that its content is not checked.
+The file is one line of JSON (format, version, SHA-256 of the rest) and a NumPy archive: the tree as
+JSON, and one array for all numbers of a type. Content with the right version and checksum was
+written by this module and is not checked further.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ VERSION = 6
 
 
 class StateFileError(ValueError):
-    """A state file cannot be used; the message says which file and why."""
+    """A state file cannot be used; the message names the file and the reason."""
 
 
 def _generator_of(state: dict[str, Any]) -> np.random.Generator:
@@ -31,12 +31,12 @@ def _generator_of(state: dict[str, Any]) -> np.random.Generator:
     return np.random.Generator(bit_generator)
 
 
-#: Type of a generator of random numbers in what is read.
+#: Type of a random generator that is read.
 SavedGenerator = Annotated[np.random.Generator, PlainValidator(_generator_of)]
 
 
 def pack(tree: Any) -> dict[str, NDArray[Any]]:
-    """Return a tree as a few arrays; one that occurs twice is stored once."""
+    """Return a tree as a few arrays; an object that occurs twice is stored once."""
     parts: dict[str, list[NDArray[Any]]] = {}
     known: dict[int, dict[str, Any]] = {}
 
@@ -68,7 +68,7 @@ def pack(tree: Any) -> dict[str, NDArray[Any]]:
 
 
 def write_state(path: str | os.PathLike[str], tree: Any, *, durable: bool = True) -> None:
-    """Write a tree to a file atomically; `durable` forces it to the disk first (fsync)."""
+    """Write a tree to a file atomically; `durable` flushes it to the disk first (fsync)."""
     target = Path(path)
     buffer = io.BytesIO()
     np.savez(buffer, **pack(tree))  # type: ignore[arg-type]
@@ -95,7 +95,7 @@ def read_state(path: str | os.PathLike[str]) -> Any:
     def whole(item: dict[str, Any]) -> Any:
         if item.keys() != {'array'}:
             return item
-        # One that was stored once is one again.
+        # An object that was stored once is shared again.
         key = str(item)
         if key not in arrays:
             kind, first, shape = item['array']
@@ -106,7 +106,6 @@ def read_state(path: str | os.PathLike[str]) -> Any:
 
 
 def _payload(path: str | os.PathLike[str]) -> bytes:
-    """Return what follows the header of a file, undamaged."""
     try:
         line, _, payload = Path(path).read_bytes().partition(b'\n')
     except OSError as error:

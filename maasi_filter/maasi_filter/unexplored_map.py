@@ -1,4 +1,4 @@
-"""The exploration function e(x) on a grid: what is still unseen (000, eq. (20), (30))."""
+"""The exploration function e(x) on a grid: 1 is unseen, 0 is explored (000, eq. (20), (30))."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from maasi_filter.models.detection import (
 )
 from maasi_filter.models.pose import Pose
 
-# Positions along each axis at which the density of a cell is sampled, and those on an axis of a
-# fine map, of which a cell has fewer.
+# Density samples per cell on each axis, and the number on a whole axis above which a cell
+# gets fewer.
 _PARTS, _SAMPLES = 5, 1000
 # Cells along the mean side of the environment, in 2D and 3D.
 CELLS = {2: 54, 3: 13}
 MAXIMUM_NODES = 20_000_000
-# A swath is at least so many cells wide, unless that takes more than so many cells: with 1,000,000
+# Cells across a swath, unless the map then has more cells than this: with 1,000,000
 # decisions take 0.1 s.
 SWATH_CELLS, MOST_CELLS = 3.0, 1_000_000
-MOST_SHOWN = 300  # cells along an axis of what is drawn, published or stored
+MOST_SHOWN = 300  # cells per axis of published, stored and drawn maps
 _ROUNDING = 1e-9  # of shares of cells that are open
 
 
@@ -37,10 +37,10 @@ _ROUNDING = 1e-9  # of shares of cells that are open
 def interpolate_at(
     values: FloatArray, lower: FloatArray, step: FloatArray, x: float, y: float, z: float
 ) -> float:
-    """Return the multilinear interpolation of a grid at one position, clamped to it.
+    """Return the multilinear interpolation of a grid (nx, ny, nz) at one position, clamped to it.
 
-    `values` (nx, ny, nz) are of nodes from `lower` (3,) on, `step` (3,) apart, metres; in 2D nz is
-    1, and z plays no part.
+    The first node is at `lower` (3,), and nodes are `step` (3,) apart, metres; in 2D nz is 1 and z
+    is ignored.
     """
     u = min(max((x - lower[0]) / step[0], 0.0), values.shape[0] - 1.0)
     i = min(np.int64(u), values.shape[0] - 2)
@@ -75,18 +75,16 @@ def _interpolate_many(
 
 
 def default_spacing(bounds: FloatArray) -> float:
-    """Return the spacing of the grid where none is given, metres."""
+    """Return the default spacing of the grid, metres."""
     size = bounds[:, 1] - bounds[:, 0]
     return float(np.prod(size)) ** (1.0 / len(bounds)) / CELLS[len(bounds)]
 
 
 def spacing_for(bounds: FloatArray, swath: float) -> tuple[float, bool]:
-    """Return the spacing of a grid on which a swath is explored, and whether it is too coarse.
+    """Return the spacing of a grid on which a swath [m] is resolved, and whether it is too coarse.
 
-    It is that of `default_spacing`, or a third of the swath where that is less, as far as the grid
-    has at most `MOST_CELLS` cells. It is too coarse if the swath is narrower than a cell.
-
-    swath: width of what the sensor that sees least detects on passing [m]; may be infinite.
+    It is `default_spacing`, or a third of the swath if that is less, within `MOST_CELLS` cells. It
+    is too coarse if the swath is narrower than a cell.
     """
     size = bounds[:, 1] - bounds[:, 0]
     least = (float(np.prod(size)) / MOST_CELLS) ** (1.0 / len(bounds))
@@ -95,7 +93,7 @@ def spacing_for(bounds: FloatArray, swath: float) -> tuple[float, bool]:
 
 
 def reach_of(detection: DetectionModel) -> tuple[float, float]:
-    """Return the level and the vertical distance beyond which pi is 0 [m]; inf if there is none."""
+    """Return the horizontal and the vertical distance beyond which pi is 0 [m], or inf."""
     kind, parameters = detection.kernel()
     if kind == CUSTOM:
         return float(parameters[REACH]), float(parameters[REACH])
@@ -117,21 +115,21 @@ def _update_near(
     solid: bool,
 ) -> None:
     """Multiply values (nx, ny, nz) by 1 - pi at the nodes within the reach of a pose."""
-    place, cosine, sine = pose
+    position, cosine, sine = pose
     kind, parameters = kernel
     low, high = np.zeros(3, np.int64), np.ones(3, np.int64)
     for axis in range(3 if solid else 2):
-        middle, last = (place[axis] - lower[axis]) / step[axis], float(values.shape[axis])
+        middle, last = (position[axis] - lower[axis]) / step[axis], float(values.shape[axis])
         width = (reach[1] if axis == 2 else reach[0]) / step[axis]
-        # Bounded as floats: what is far away or infinite is no integer.
+        # Bounded as floats, as infinite numbers are not integers.
         low[axis] = np.int64(min(max(np.floor(middle - width), 0.0), last))
         high[axis] = np.int64(min(max(np.ceil(middle + width) + 1.0, 0.0), last))
     for i in range(low[0], high[0]):
-        dx = lower[0] + step[0] * i - place[0]
+        dx = lower[0] + step[0] * i - position[0]
         for j in range(low[1], high[1]):
-            dy = lower[1] + step[1] * j - place[1]
+            dy = lower[1] + step[1] * j - position[1]
             for k in range(low[2], high[2]):
-                dz = lower[2] + step[2] * k - place[2] if solid else 0.0
+                dz = lower[2] + step[2] * k - position[2] if solid else 0.0
                 values[i, j, k] *= 1.0 - detection_probability_at(
                     kind, parameters, dx, dy, dz, cosine, sine
                 )
@@ -143,27 +141,27 @@ class UnexploredMap:
     Parameters
     ----------
     area : Area or (d, 2) array
-        Where targets may be, or lower and upper bound on each axis, metres; d = 2 or 3.
+        Search area, or its bounds on each axis, metres; d = 2 or 3.
     spacing : float, optional
-        Wanted spacing of the nodes, metres; none: `default_spacing`. On each axis the largest
-        spacing up to this one is used that puts nodes on both bounds.
+        Largest spacing of the nodes, metres; default: `default_spacing`. The spacing of each axis
+        is reduced so that nodes are on both bounds.
 
     Attributes
     ----------
     values : (nx, ny) or (nx, ny, nz) array
         e at the nodes, in [0, 1].
     step : (d,) array
-        Spacing used on each axis, metres.
+        Spacing on each axis, metres.
     volume : float
-        Of the area, m^d.
+        Volume of the area, m^d.
     ground : array
-        Of the shape of `values`: the volume that each node stands for times its density, of all
-        that is or was open since the map was made.
+        Volume of each node's cell times its density, of all cells that are or were open; the shape
+        is that of `values`.
 
     Raises
     ------
     ValueError
-        If the bounds or the spacing are not usable, or the grid would be too large.
+        If the bounds or the spacing are invalid, or the grid would be too large.
     """
 
     def __init__(self, area: Area | ArrayLike, spacing: float | None = None) -> None:
@@ -198,17 +196,16 @@ class UnexploredMap:
         self.ground, self._ever_open = self._volumes, self._open
 
     def adopt_area(self, area: Area) -> None:
-        """Take another area within the same bounds; e stays.
+        """Change keep-outs or obstacles: `area` has the same bounds, and e is retained.
 
-        Ground that is closed now still counts as ground, and what was never open before does from
-        now on.
+        Cells that were open once continue to count as ground.
         """
         self._adopt(area)
         opened = np.broadcast_to(self._open > self._ever_open + _ROUNDING, self._values.shape)
         opened = opened.reshape(self.values.shape)
         if not opened.any():
             return
-        # Both are relative to their own areas: what neither closed nor opened tells the scale.
+        # Both densities are relative to their areas; unchanged cells give the scale.
         same = (np.abs(self._open - self._ever_open) <= _ROUNDING) & (self._open > 0.0)
         same = np.broadcast_to(same, self._values.shape).reshape(self.values.shape)
         same = same & (self._volumes > 0.0)
@@ -233,16 +230,16 @@ class UnexploredMap:
             for n, axis, step, (low, high) in zip(number, self.axes(), self.step, self.bounds)
         )
         self.density, self._open = np.empty((2, *shape, 1))
-        # Row by row: all samples of a fine map take much memory.
+        # Row by row, which needs less memory.
         rows = max(1, _SAMPLES**2 // (number[0] * y.size))
         for first in range(0, shape[0], rows):
             part = x[first : first + rows]
-            places = np.stack(np.meshgrid(part.ravel(), y.ravel(), indexing='ij'), axis=-1)
-            density = area.density(places.reshape(-1, 2)).reshape(*part.shape, *y.shape)
+            positions = np.stack(np.meshgrid(part.ravel(), y.ravel(), indexing='ij'), axis=-1)
+            density = area.density(positions.reshape(-1, 2)).reshape(*part.shape, *y.shape)
             self.density[first : first + rows, :, 0] = density.mean(axis=(1, 3))
             self._open[first : first + rows, :, 0] = (density > 0.0).mean(axis=(1, 3))
         if not self.density.any():
-            # Narrower than the samples are apart.
+            # The area is narrower than the spacing of samples.
             low = self._lower[:2] - 0.5 * self._step[:2]
             self.density = self._open = area.outline(low, self._step[:2], shape)[:, :, None]
         volumes = self._cells.reshape(self._values.shape) * self.density
@@ -250,26 +247,25 @@ class UnexploredMap:
 
     @property
     def values(self) -> FloatArray:
-        """Value of e at the nodes; a view, write through `values[...] =`."""
+        """Values of e at the nodes; a view, which is written by `values[...] =`."""
         return self._values if self.dimension == 3 else self._values[:, :, 0]
 
     def axes(self) -> list[FloatArray]:
-        """Return the coordinates of the nodes along each axis, metres."""
+        """Return the coordinates of the nodes on each axis, metres."""
         parts = zip(self._lower, self._step, self.values.shape)
         return [lower + step * np.arange(number) for lower, step, number in parts]
 
     def nodes(self) -> FloatArray:
-        """Return the positions of all nodes, (n, d), in the order of `values.ravel()`."""
+        """Return the positions of all nodes, (n, d), metres, in the order of `values.ravel()`."""
         return self._nodes
 
     @cached_property
     def _nodes(self) -> FloatArray:
         grids = np.meshgrid(*self.axes(), indexing='ij')
-        # One row for each axis, as kernels read them.
         return np.array([grid.ravel() for grid in grids]).T
 
     def kernel(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return (values (nx, ny, nz), lower (3,), step (3,)) for `interpolate_at`."""
+        """Return values (nx, ny, nz), lower (3,) and step (3,) for `interpolate_at`."""
         return self._values, self._lower, self._step
 
     def update(self, detection: DetectionModel, pose: Pose) -> None:
@@ -284,7 +280,7 @@ class UnexploredMap:
         _update_near(*self.kernel(), detection.kernel(), turn, reach, solid)
 
     def diffuse(self, variance: float) -> None:
-        """Diffuse e as for targets in a random walk, `variance` [m^2], with reflecting bounds."""
+        """Diffuse e for targets in a random walk with `variance` [m^2] and reflecting bounds."""
         values = self.values
         for axis in range(self.dimension):
             rate = 0.5 * variance / float(self.step[axis]) ** 2
@@ -295,10 +291,9 @@ class UnexploredMap:
                 values += np.diff(flow, axis=axis, prepend=0.0, append=0.0)
 
     def at(self, positions: ArrayLike) -> FloatArray:
-        """Return e at positions (n, d) by multilinear interpolation, shape (n,).
+        """Return e at positions (n, d) [m], shape (n,), by multilinear interpolation.
 
-        Positions outside the bounds are moved to the nearest point on them. Coordinates beyond
-        the problem's dimension are ignored.
+        Positions outside of the bounds are moved to the nearest point on them.
         """
         array = np.ascontiguousarray(np.atleast_2d(np.asarray(positions, dtype=float)))
         if array.shape[1] < self.dimension:
@@ -311,23 +306,22 @@ class UnexploredMap:
         return _interpolate_many(self._values, self._lower, self._step, array)
 
     def cell_volumes(self) -> FloatArray:
-        """Return the volume (2D: area) each node stands for times its density, as `values`.
+        """Return the volume (2D: area) of each node's cell times its density, shaped as `values`.
 
-        The trapezoid rule: half a step at the ends of each axis. The density is prior times inside,
-        with mean 1 over the area; closed ground has 0.
+        Cells at the ends of an axis have half a step. The density is the prior in the open area,
+        with mean 1, and 0 elsewhere.
         """
         return self._volumes
 
     def unseen(self) -> FloatArray:
-        """Return e at the nodes, of the shape of `values`; -1 where no target may be."""
+        """Return e at the nodes, shaped as `values`; -1 where no target can be."""
         shown = np.where(self.density > 0.0, self._values, -1.0)
         return np.asarray(shown.reshape(self.values.shape))
 
     def shown(self, prior: bool = False) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return first node (d,), steps (d,) [m] and `unseen`, to be drawn, published or stored.
+        """Return the first node (d,), steps (d,) [m] and `unseen`, or the density, for display.
 
-        Of a fine map means of blocks of nodes, at most `MOST_SHOWN` along each axis. prior: the
-        density in place of e.
+        A fine map is averaged over blocks to at most `MOST_SHOWN` nodes on each axis.
         """
         values, number = self.unseen(), -(-max(self.values.shape) // MOST_SHOWN)
         if prior:
@@ -342,14 +336,11 @@ class UnexploredMap:
         return self.bounds[:, 0] + 0.5 * (number - 1) * self.step, number * self.step, values
 
     def explored_fraction(self) -> float:
-        """Return 1 - mean of e over the ground, in [0, 1]; also over what is closed now."""
+        """Return the explored share of the ground, in [0, 1]; closed ground counts."""
         return 1.0 - float((self.ground * self.values).sum() / self.ground.sum())
 
     def closed_share(self) -> float:
-        """Return the share of the expected targets that is unseen on ground that is closed now.
-
-        That is ground which was open once, as below a keep-out that came later.
-        """
+        """Return the share of the expected targets that is unseen on ground closed later."""
         closed = self._ever_open - self._open > _ROUNDING
         if not closed.any():
             return 0.0

@@ -1,4 +1,4 @@
-"""Planning of waypoints and measurements: motion models, objective and planners."""
+"""Planning of waypoints and measurements: planners, motion models and objectives."""
 
 from maasi_planner.candidates import CandidateSet, Unseen, Viewer, unseen_parts
 from maasi_planner.measurement_schedule import MeasurementSchedule

@@ -1,4 +1,4 @@
-"""Candidate waypoints, and what can never be seen from them."""
+"""Candidate waypoints, and the parts of an area that are invisible from them."""
 
 import math
 from collections.abc import Iterable
@@ -24,7 +24,7 @@ from maasi_planner.settings import CandidateSettings
 
 
 class CandidateSet:
-    """Candidate waypoints of one robot in its area: a grid, a ring, or a list."""
+    """Candidate waypoints of one robot: a grid, a ring, or a list."""
 
     def __init__(
         self, settings: CandidateSettings, area: Area | ArrayLike, height: float = 0.0
@@ -86,13 +86,13 @@ class CandidateSet:
         return complete
 
     def restrict(self, area: Area) -> None:
-        """Take another area within this one: of grids, rings and points those inside are left."""
+        """Keep only candidates inside a smaller area."""
         self.area = area
         if self._fixed is not None:
             self._fixed = self._fixed[area.inside(self._fixed)]
 
     def at(self, position: ArrayLike) -> FloatArray:
-        """Return the candidates at a position (3,), (W, 3); of grids and rings, those inside."""
+        """Return the candidates at a position (3,), (W, 3), without those outside."""
         if self._fixed is not None:
             return self._fixed.copy()
         points = np.asarray(position, dtype=float)[None, :] + self._ring
@@ -103,10 +103,9 @@ class CandidateSet:
 
 @dataclass
 class Unseen:
-    """Parts of the environment that no robot can ever see from its candidates.
+    """Parts of the area that no robot can see from its candidates.
 
-    fraction: of the environment; boxes (d, 2): around each connected part, the largest first,
-    metres.
+    fraction: share of the area; boxes (d, 2): bounds of each connected part [m], the largest first.
     """
 
     fraction: float
@@ -116,7 +115,7 @@ class Unseen:
         return bool(self.boxes)
 
     def describe(self) -> str:
-        """Return a warning that says which parts, or an empty text."""
+        """Return a warning about the parts, or an empty text."""
         if not self.boxes:
             return ''
         parts = []
@@ -143,9 +142,8 @@ def _percent(share: float) -> str:
 class Viewer:
     """One robot for `unseen_parts`.
 
-    candidates (W, 3): all waypoints it can be sent to, metres; start (3,): where it starts, metres;
-    sensor: what it sees with; spacing: distance between measurements on the way, metres; yaw: the
-    heading it keeps, radians; None if it faces its travel.
+    candidates (W, 3) and start (3,): metres; spacing: distance between measurements on the path,
+    metres; yaw: constant heading, radians; None: that of travel.
     """
 
     candidates: FloatArray
@@ -162,13 +160,12 @@ def unseen_parts(
     probability: float = 0.01,
     cells: int = 80,
 ) -> Unseen:
-    """Return what can never be seen on the straight ways between the candidates."""
+    """Return the parts that are invisible from all straight paths between candidates."""
     area = Area.of(area)
     box = np.stack([area.bounds[:, 0] + margin, area.bounds[:, 1] - margin], axis=1)
     size = float((box[:, 1] - box[:, 0]).max())
     grid = UnexploredMap(box, size / (cells if len(box) == 2 else min(cells, 40)))
     values, lower, step = grid.kernel()
-    # Where no target can be, nothing needs to be seen.
     seen = np.ascontiguousarray(area.density(grid.nodes()).reshape(values.shape) <= 0.0)
     for viewer in viewers:
         places, yaws = _poses(viewer, size)
@@ -189,7 +186,7 @@ def _mark_seen(
     reach: float,
     probability: float,
 ) -> None:
-    """Mark the nodes that some pose sees in seen (nx, ny, nz); `grid`: first node, distances."""
+    """Mark nodes that some pose sees in seen (nx, ny, nz); `grid`: first node and distances."""
     lower, step = grid
     kind, parameters = kernel
     low, high = np.zeros(3, np.int64), np.array(seen.shape)
@@ -226,12 +223,12 @@ def _mark_seen(
 
 
 def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
-    """Return places (n, 3) and headings (n,), thinned, on all ways between candidates."""
+    """Return thinned positions (n, 3) and headings (n,) on all paths between candidates."""
     points = np.vstack([viewer.start[None, :], viewer.candidates])
     ways = viewer.candidates[None, :, :] - points[:, None, :]
     lengths = np.sqrt((ways * ways).sum(axis=2))
     number = max(1, math.ceil(float(lengths.max(initial=0.0)) / viewer.spacing))
-    # From the way's end towards its start: what is seen on arrival counts in any case.
+    # Backwards, so that the view on arrival is included.
     along = np.arange(number + 1) * viewer.spacing
     share = np.maximum(0.0, 1.0 - along / np.maximum(lengths, 1e-12)[..., None])
     places = points[:, None, None, :] + share[..., None] * ways[:, :, None, :]
@@ -243,7 +240,7 @@ def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
     flat = places.reshape(-1, 3)
     sectors = np.zeros(len(flat), np.int64)
     kind, parameters = viewer.sensor.detection.kernel()
-    # Whether what it sees may depend on the heading.
+    # Whether the view depends on the heading.
     turns = kind == CUSTOM or (kind == BOX and bool(parameters[8] > 0.5))
     if viewer.yaw is None and turns:
         sectors = np.round(headings / (math.pi / 8.0)).astype(np.int64) % 16
@@ -256,7 +253,7 @@ def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
 
 
 def half_view(sensor: Sensor) -> float:
-    """Return how far a sensor sees level to each side [m]: half its box, or F."""
+    """Return the horizontal reach of a sensor to each side [m]: half its box, or F."""
     kind, parameters = sensor.detection.kernel()
     if kind == BOX:
         low, high = parameters[1:3], parameters[4:6]
@@ -266,9 +263,9 @@ def half_view(sensor: Sensor) -> float:
 
 
 def swath_of(sensor: Sensor) -> float:
-    """Return how wide a sensor sees with half of its best detection or more [m]; inf: everything.
+    """Return the width of the view with at least half of the best detection [m], or inf.
 
-    Of a box it is the smaller side.
+    For a box it is the smaller side.
     """
     kind, width = sensor.detection.kernel()[0], 2.0 * half_view(sensor)
     if kind == EXPONENTIAL:
@@ -277,27 +274,22 @@ def swath_of(sensor: Sensor) -> float:
 
 
 def map_spacing(bounds: FloatArray, sensors: Iterable[Sensor]) -> tuple[float, str]:
-    """Return the spacing of the exploration map for a team [m], and a warning, which may be empty.
-
-    The warning says that the map is coarser than what the sensor that sees least detects.
-    """
+    """Return the spacing of a team's exploration map [m], and a warning if it is too coarse."""
     swath = min(map(swath_of, sensors), default=math.inf)
     spacing, coarse = spacing_for(bounds, swath)
     if not coarse:
         return spacing, ''
     return spacing, (
         f'the exploration map has cells of {spacing:.3g} m, but a sensor sees a swath of only '
-        f'{swath:.3g} m: what is explored is counted too low; search a smaller area, or set '
+        f'{swath:.3g} m: the explored share is underestimated; search a smaller area, or set '
         'filter.exploration_spacing [m]'
     )
 
 
 def _parts(grid: UnexploredMap, seen: BoolArray) -> Unseen:
-    """Return the connected parts of nodes not seen."""
     hidden = ~seen.reshape(grid.values.shape)
     if not hidden.any():
         return Unseen(0.0, [])
-    # Deferred: SciPy takes long to import.
     from scipy import ndimage
 
     volumes = grid.cell_volumes()

@@ -1,4 +1,4 @@
-"""Between messages and the records of the planner, and checks of what its node receives."""
+"""Conversions between messages and records of the planner, and checks of received messages."""
 
 import array
 import math
@@ -36,7 +36,6 @@ NOT_ALLOWED = -1e30  # J of an inadmissible candidate; messages contain finite n
 
 
 def _robot_to_ros(name: str, index: int, decision: RobotDecision) -> RobotDecisionMessage:
-    """Return the decision of a robot with all its candidates."""
     objective = decision.objective.tolist()
     rows = zip(
         decision.candidates.tolist(),
@@ -77,7 +76,7 @@ def decision_to_ros(
     header: Header,
 ) -> PlanDecision:
     """Return a joint decision."""
-    # Choices by the objective explain themselves by its terms.
+    # Terms of the objective explain its choices.
     reasons = [
         f'{name}: {robot.reason}'
         for name, robot in sorted(decision.robots.items())
@@ -99,7 +98,7 @@ def decision_to_ros(
 
 
 def path_to_ros(positions: FloatArray, header: Header, most: int = 50) -> Path:
-    """Return a trajectory, thinned to a maximum number of poses."""
+    """Return a trajectory with at most `most` poses."""
     count = len(positions)
     chosen = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
     poses = []
@@ -112,10 +111,7 @@ def path_to_ros(positions: FloatArray, header: Header, most: int = 50) -> Path:
 
 
 def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyGrid:
-    """Return e in 2D as a grid: 100 is unseen, 0 searched, -1 where no target may be.
-
-    Nodes are centres of cells.
-    """
+    """Return e in 2D as a grid: 100 is unseen, 0 searched, -1 where no target can be."""
     lower, step, values = exploration.shown()
     grid = OccupancyGrid(header=header)
     grid.info.map_load_time = header.stamp
@@ -134,7 +130,7 @@ def planner_markers(
     header: Header,
     size: float,
 ) -> MarkerArray:
-    """Return markers of robots, waypoints, planned paths and tours, in the robots' colours."""
+    """Return markers of robots, waypoints, paths and tours, in the robots' colours."""
     markers = []
     for number, name in enumerate(sorted(robots)):
         position, waypoint, path, tour = robots[name]
@@ -165,7 +161,7 @@ def planner_markers(
 
 
 def area_markers(area: Area, header: Header, size: float) -> MarkerArray:
-    """Return markers of the rings of area, keep-outs and solid polygons, in the map."""
+    """Return markers of the outlines of area, keep-outs and solid polygons."""
     tints = {'area': '#1B1F24', 'keep_out': KEEP_OUT, 'obstacle': '#59636E'}
     markers: list[Marker] = []
     for kind, shapes in area.shapes.items():
@@ -185,7 +181,7 @@ def _check_frame(header: Header, frame: str) -> None:
 
 
 def checked_state(name: str, message: AgentState, settings: PlannerNodeSettings) -> RobotState:
-    """Return the state in a message that came on the topic of a robot."""
+    """Return the state in a message on the topic of a robot."""
     if message.robot != name:
         raise ValueError(f'robot: read {message.robot!r}, allowed is {name!r}')
     _check_frame(message.header, settings.frame)
@@ -202,9 +198,9 @@ def checked_state(name: str, message: AgentState, settings: PlannerNodeSettings)
 def checked_update(
     message: FilterUpdate, names: Collection[str], settings: PlannerNodeSettings, batch: int
 ) -> tuple[list[Cluster], dict[str, Pose]]:
-    """Return the clusters of an update and the poses of its members, by name.
+    """Return the clusters of an update, and the poses of its members by name.
 
-    Members may be robots of `names`; ids beyond what may follow `batch`, the last, are refused.
+    ValueError for members outside of `names`, and for ids that cannot follow `batch`.
     """
     _check_frame(message.header, settings.frame)
     dimension = settings.environment.dimension

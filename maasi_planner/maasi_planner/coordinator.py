@@ -1,6 +1,6 @@
-"""Planning of the team step by step: which robots plan and measure, what is explored.
+"""Step-by-step planning of a team: robots that plan and measure, explored area.
 
-Used by the planner node and the in-process search (000, algorithms 1 and 2).
+The planner node and the in-process search use it (000, algorithms 1 and 2).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -36,9 +36,7 @@ _ROUNDING = 1e-9  # of shares
 class Coordinator:
     """Plans for a team of robots step by step.
 
-    settings: robots, planner and environment; robots: in order of their names; exploration: e
-    after the last measurements; clusters: potential targets after the last measurements;
-    finished: why no gain is left; None before.
+    exploration and clusters: after the last measurements; finished: why the search ends, or None.
     """
 
     def __init__(self, settings: PlannerNodeSettings, area: Area | None = None) -> None:
@@ -57,11 +55,11 @@ class Coordinator:
         self.robots = {name: self._robot(name, sensor) for name, sensor in sensors.items()}
         self.homing = Homing(self.robots)
         self._ended = False
-        # Robots that have not been planned since ground was opened.
+        # Robots that were not planned after ground was opened.
         self._unasked: set[str] = set()
 
     def _planner(self) -> Planner | None:
-        """Return the planner; None: the robots that decide first choose it."""
+        """Return the planner, or None if the first planning robots determine it."""
         settings = self.settings.planner
         return None if settings.name == 'auto' else make_planner(settings.name, settings)
 
@@ -89,7 +87,7 @@ class Coordinator:
 
     @property
     def ended(self) -> str | None:
-        """Why no gain is left, once the robots with batteries are home; None before."""
+        """Why the search has ended, once robots with batteries are home, or None."""
         return self.finished if self._ended else None
 
     def planning(self, step: int, present: Mapping[str, PresentRobot]) -> list[str]:
@@ -104,12 +102,11 @@ class Coordinator:
         ]
 
     def _open_share(self) -> float:
-        """Return the share of the expected targets that is unseen on ground that is open."""
         exploration = self.exploration
         return 1.0 - exploration.explored_fraction() - exploration.closed_share()
 
     def _closed(self) -> float:
-        """Return how many targets are expected where zones are closed now; 0 if hardly any."""
+        """Return the expected number of targets in closed zones; 0 if negligible."""
         share = self.exploration.closed_share()
         least = 1.0 - self.settings.planner.explored_threshold
         return share * self.area.expected_targets if share > least else 0.0
@@ -117,16 +114,13 @@ class Coordinator:
     # ---- changes -----------------------------------------------------------------------------
 
     def adopt_area(self, area: Area) -> None:
-        """Take another area within the same bounds, as with other keep-outs.
-
-        A search that was finished continues where that opens something.
-        """
+        """Change keep-outs within the same bounds; opened ground resumes a finished search."""
         self.area = area
         before = self._open_share()
         self.exploration.adopt_area(area)
         if self._open_share() > before + _ROUNDING:
             self.finished, self._ended = None, False
-            # What the planner knew of each before says nothing about ground that is opened.
+            # Earlier decisions do not account for the opened ground.
             self._unasked = set(self.robots)
         for robot in self.robots.values():
             robot.adopt_area(area)
@@ -148,34 +142,33 @@ class Coordinator:
         present: Mapping[str, PresentRobot],
         taken: Sequence[tuple[FloatArray, float]] = (),
     ) -> Decision | None:
-        """Return the joint decision of the robots that plan at a step, None without any.
+        """Return the joint decision for a step; None without any.
 
-        A robot that nears its waypoint and has nowhere further to go is not in it: it goes on, and
-        plans again when it has arrived. Robots that leave a closed zone or go home are in it,
-        whatever the planner thinks. At the end of the search a decision without robots has its
-        reason.
+        A robot that nears its waypoint without a next one is not in it: it continues, and plans
+        again when it has arrived. Robots that leave a closed zone or go home are in it. At the end
+        of the search, a decision without robots has the reason.
 
-        present: the robots that take part, by name; taken: final positions (3,) of robots of other
-        planners [m], and their radii.
+        present: available robots; taken: final positions (3,) [m] and radii of robots of other
+        planners.
         """
-        # Charges, and whether batteries still allow anything.
+        # Update batteries.
         self.homing.update(step, present)
         self._check_batteries(step, present)
-        # Robots that have to move or to wait, and robots that the planner decides for.
+        # Robots with errands, waiting robots, and robots that the planner decides for.
         errands = self.homing.errands(step, present, self.finished is not None)
         waiting = self.homing.waiting(step, present, errands)
         asked = [name for name in self.planning(step, present) if name not in errands]
         if not (errands or waiting or asked):
             return self._end(step, present)
-        # The planner decides, or finds that nothing is left to gain.
+        # The planner decides, or ends the search.
         team = self._view(step, present, asked, taken)
         decision = self._decide(team, present, asked)
         decided = dict(decision.robots)
-        # Errands, which the end of the search may have added to.
+        # The end of the search may add errands.
         if asked and self.finished is not None:
             errands = self.homing.errands(step, present, True)
         self.homing.decide(team, waiting, errands, decision, self.finished is not None)
-        # Robots keep apart, and get their plans.
+        # Keep robots apart, and set their plans.
         keep_apart(team, decision, self._remaining(step, present, decision))
         self._adopt(step, present, decision, errands)
         changed = any(decided.get(name) is not item for name, item in decision.robots.items())
@@ -184,7 +177,6 @@ class Coordinator:
         return decision if decision.robots else self._end(step, present)
 
     def _check_batteries(self, step: int, present: Mapping[str, PresentRobot]) -> None:
-        """Finish the search where batteries leave no robot anything to do."""
         if self.finished is not None or self._closed():
             return
         self.homing.note_idle(step, present)
@@ -210,7 +202,6 @@ class Coordinator:
     def _decide(
         self, team: TeamView, present: Mapping[str, PresentRobot], asked: Sequence[str]
     ) -> Decision:
-        """Return what the planner decides, with the paths home of robots that afford nothing."""
         if not asked:
             return Decision(team.step)
         unasked = self._unasked.intersection(asked)
@@ -236,7 +227,7 @@ class Coordinator:
         asked: Sequence[str],
         conclusion: str,
     ) -> Decision:
-        """Finish the search, as nothing is left to gain; before closed zones robots wait."""
+        """Finish the search, or let robots wait for closed zones."""
         decision, closed = Decision(team.step), self._closed()
         for name in asked:
             self.robots[name].plan.turning_distance = 0.0
@@ -252,7 +243,7 @@ class Coordinator:
     def _remaining(
         self, step: int, present: Mapping[str, PresentRobot], decision: Decision
     ) -> dict[str, FloatArray]:
-        """Return the paths of robots that have not arrived, which they keep without another one."""
+        """Return the paths that robots continue without another one, as they have not arrived."""
         return {
             name: self.robots[name].plan.remaining(step)[0]
             for name in decision.robots
@@ -266,7 +257,7 @@ class Coordinator:
         decision: Decision,
         errands: Mapping[str, Errand],
     ) -> None:
-        """Hand the robots their plans; one that is on its way and would stay keeps its path."""
+        """Set the robots' plans; a moving robot that would stay continues its path."""
         for name, chosen in list(decision.robots.items()):
             robot = self.robots[name]
             if chosen.stays and not present[name].free:
@@ -302,7 +293,7 @@ class Coordinator:
         return members
 
     def absorb(self, poses: Mapping[str, Pose], clusters: list[Cluster]) -> None:
-        """Update with a batch that the filter has processed."""
+        """Update with a batch processed by the filter."""
         for name in sorted(poses):
             robot = self.robots[name]
             for exploration in (self.exploration, robot.exploration):
@@ -314,10 +305,10 @@ class Coordinator:
 def arrival_radius(motion: MotionModel, sensor: Sensor, settings: PlannerSettings) -> float:
     """Return the distance from its waypoint at which a robot takes its next decision [m].
 
-    The setting `arrival_radius` where it is given. Else 0, as in 000, for the objective of the
-    papers and for planners that measure at waypoints only; and for the others the distance at
-    which the robot begins to brake, at most what its sensor sees to each side: what it would have
-    seen from the waypoint is then still seen from its path.
+    It is the setting `arrival_radius`, or 0, as in 000, for the papers' objective and for planners
+    that measure only at waypoints. For others it is the braking distance, at most the reach of the
+    sensor to each side, so that the robot still sees from its path what it would have seen from the
+    waypoint.
     """
     given = motion.settings.arrival_radius
     if given is not None:

@@ -1,4 +1,4 @@
-"""Battery of a robot: its charge, what flying uses, and whether it still comes home."""
+"""Battery of a robot: charge, use in flight, and the way home."""
 
 import math
 from collections.abc import Callable
@@ -15,26 +15,26 @@ from maasi_planner.motion.base import STEPS_LIMIT
 
 # Parts of a path home that is longer than the longest prediction.
 _PARTS = 20
-# Bounds of the learned ratios of real to predicted use, and to predicted time.
+# Upper bound of learned ratios of real to predicted use and time.
 _LARGEST_RATIO = 3.0
-# Predicted use, and predicted time [s], over which ratios are averaged, and that count as ratio 1.
+# Windows of predicted use and predicted time [s] of ratios, and their priors of ratio 1.
 _USE_WINDOW, _USE_PRIOR = 0.25, 0.02
 _TIME_WINDOW, _TIME_PRIOR = 60.0, 5.0
-# At a charger: shares of a full battery that count as gained or lost, and the longest time without
-# a gain until the robot counts as not charged [s].
+# At a charger: shares of a full battery that count as gained or lost, and the time without a gain
+# after which the robot counts as not charged [s].
 _GAINED, _LOST, CHARGING_PATIENCE = 0.005, 0.02, 180.0
-# Charge that counts as a full battery, of a robot that affords nothing with less.
+# Target charge of a robot that can afford nothing with `full`.
 _TOP = 0.999
-#: Why a robot is done.
-NOT_CHARGED = 'it is not charged at its charger'
-NOTHING_AFFORDABLE = 'no position that is left is affordable with a full battery'
+#: Reasons of done robots.
+NOT_CHARGED = 'its charge does not rise at the charger'
+NOTHING_AFFORDABLE = 'a full battery does not suffice for any remaining position'
 SEARCH_ENDED = 'the search has ended'
-# Share of the use of the path home that a planned leg leaves on top of the reserve.
+# Margin of planned legs, as a share of the use of the path home.
 _MARGIN = 0.03
 
 
 class EnduranceSettings(Settings):
-    """What the battery is used for, as shares of a full one, and where it is charged."""
+    """Battery use as shares of a full battery, and chargers."""
 
     per_second: NotNegative = Field(
         0.0,
@@ -62,18 +62,18 @@ class EnduranceSettings(Settings):
 
 
 class Phase(Enum):
-    """What a robot does by its battery."""
+    """Phase of a robot with a battery."""
 
     AVAILABLE = 'available'  #: the planner decides where it goes
-    RETURNING = 'returning'  #: on its way to a charger
+    RETURNING = 'returning'  #: on its path to a charger
     CHARGING = 'charging'  #: at a charger
-    DONE = 'done'  #: goes home, and stays there
+    DONE = 'done'  #: goes home and stays there
 
 
 class HomePaths:
-    """Predicted time and length of the paths from rest at a position to the chargers.
+    """Predicted time and length of paths from rest at a position to the chargers.
 
-    A position near one that was predicted takes the path of that one and the distance between them.
+    A position near a predicted one gets its path plus the distance between them.
     """
 
     def __init__(self, motion: MotionModel, chargers: FloatArray, step: float) -> None:
@@ -83,16 +83,16 @@ class HomePaths:
         self._known: dict[tuple[int, ...], tuple[FloatArray, float, float]] = {}
 
     def clear(self) -> None:
-        """Forget all paths, as the area is another one."""
+        """Forget all paths after a change of the area."""
         self._known.clear()
 
     def least(self, row: int, position: FloatArray) -> float:
-        """Return a length that no path to a charger is shorter than [m]."""
+        """Return a lower bound of the length of the path to a charger [m]."""
         straight = math.sqrt(self._motion.squared_distance(position, self._chargers[row]))
         return max(straight - self._motion.settings.tolerance, 0.0)
 
     def path(self, row: int, position: FloatArray) -> tuple[float, float]:
-        """Return time [s] and length [m] of the path to a charger; infinite if there is none."""
+        """Return time [s] and length [m] of the path to a charger, or inf."""
         key = row, *np.floor(position / self._cell).astype(int).tolist()
         if key not in self._known:
             at_rest = RobotState.at_rest(position)
@@ -102,7 +102,7 @@ class HomePaths:
         return seconds + gap / self._motion.settings.speed, metres + gap
 
     def predict(self, row: int, state: RobotState) -> tuple[float, float]:
-        """Return the same from a state."""
+        """Return time [s] and length [m] of the path from a state to a charger, or inf."""
         goal, seconds, metres = self._chargers[row][None, :], 0.0, 0.0
         if math.isinf(self._motion.keep_out.path_length(state.pose.position, goal[0])):
             return math.inf, math.inf
@@ -120,14 +120,14 @@ class HomePaths:
 
 
 class Ratio:
-    """A ratio of what was measured to what was predicted, 1 at least, averaged over a window."""
+    """Ratio of measured to predicted values, at least 1, averaged over a window."""
 
     def __init__(self, window: float, prior: float) -> None:
         self._window, self._prior = window, prior
         self._measured = self._predicted = 0.0
 
     def add(self, measured: float, predicted: float) -> None:
-        """Take further values, of which older ones fade."""
+        """Add values; older ones fade."""
         fading = math.exp(-max(measured, predicted, 0.0) / self._window)
         self._measured = fading * self._measured + measured
         self._predicted = fading * self._predicted + predicted
@@ -142,11 +142,9 @@ class Ratio:
 class Endurance:
     """The battery of one robot, and its paths home.
 
-    Queries change nothing. Of each step the coordinator calls `update` once, and `begin` with the
-    phase that it has decided.
+    At each step the coordinator calls `update`, and `begin` with the phase that it has decided.
 
-    settings: use and chargers; motion: predicts the paths home; start (3,): charger where none is
-    named [m]; step: of the predictions [s].
+    start (3,): charger if none is named [m]; step: of the predictions [s].
     """
 
     def __init__(
@@ -158,66 +156,66 @@ class Endurance:
         area = motion.keep_out.area
         self._level = area is None or area.dimension == 2
         if self._level:
-            # A charger on the ground is below a drone that hovers over it.
+            # In 2D a drone hovers above a charger.
             self.chargers[:, 2] = np.asarray(start, dtype=float)[2]
         self._paths = HomePaths(motion, self.chargers, step)
-        self.charge = math.nan  #: 0 to 1; not a number: it was never known
-        self.estimated = False  #: whether the charge is an estimate, as no more is reported
+        self.charge = math.nan  #: 0 to 1; NaN: never known
+        self.estimated = False  #: whether the charge is an estimate
         self.phase = Phase.AVAILABLE
-        self.done_reason = ''  #: why it is done; empty if it is not
+        self.done_reason = ''  #: why the robot is done; empty if it is not
         self.cut_off = False  #: whether no path leads to any charger
-        self.must_return = False  #: whether it has to go home now
-        self.leg = 0.0  #: share of the battery that the rest of its present path takes
+        self.must_return = False  #: whether the robot has to go home now
+        self.leg = 0.0  #: share of the battery that its remaining path uses
         self._use, self._pace = Ratio(_USE_WINDOW, _USE_PRIOR), Ratio(_TIME_WINDOW, _TIME_PRIOR)
         self._before: tuple[int, FloatArray] | None = None
-        # Index on its predicted path that it has reached, and at which step.
+        # Reached index of the predicted path, and its step.
         self._progress, self._progress_at = 0, 0
-        # Charge that remained beyond the path home when it was predicted last, less twice what was
-        # used since: to fly back what it has flown takes as much again. None: to be predicted.
+        # Charge beyond the last prediction of the path home, less twice the use after it, as the
+        # flight back uses as much again. None: no prediction.
         self._slack: float | None = None
-        # Highest charge since it is at a charger, and since when it has not risen [s].
+        # Highest charge at the charger, and the time without a rise [s].
         self._peak = math.nan
         self._waited, self._target = 0.0, settings.full
-        #: Whether it has charged all that its charger gives.
+        #: Whether it has the highest charge that its charger gives.
         self.topped = False
 
     # ---- queries -----------------------------------------------------------------------------
 
     @property
     def charging(self) -> bool:
-        """Whether it is on its way to a charger, or charges."""
+        """Whether the robot charges, or is on its path to a charger."""
         return self.phase in (Phase.RETURNING, Phase.CHARGING)
 
     @property
     def full(self) -> bool:
-        """Whether it is charged enough to go out; also while its charge is unknown."""
+        """Whether the robot is charged enough to go out, or its charge is unknown."""
         return not self.charge < self.settings.full
 
     @property
     def short(self) -> bool:
-        """Whether its battery is expected to be empty before it is at any charger."""
+        """Whether the battery is expected to be empty before the robot is at any charger."""
         slack = math.inf if self._slack is None else self._slack
         return self.must_return and not self.cut_off and slack + self.settings.reserve < 0.0
 
     @property
     def use_ratio(self) -> float:
-        """Real use as a multiple of the use by the settings, as it was learned; 1 at least."""
+        """Learned ratio of real to predicted use, at least 1."""
         return self._use.value
 
     @property
     def time_ratio(self) -> float:
-        """Real time of paths as a multiple of the predicted one, as learned; 1 at least."""
+        """Learned ratio of real to predicted time of paths, at least 1."""
         return self._pace.value
 
     def describe(self) -> str:
         """Return the charge as text."""
         if math.isnan(self.charge):
-            return 'its battery is unknown'
+            return 'its charge is unknown'
         word = 'estimated at' if self.estimated else 'at'
         return f'its battery is {word} {100.0 * self.charge:.0f} %'
 
     def is_home(self, position: ArrayLike) -> bool:
-        """Return whether a robot is at a charger; in 2D at any height."""
+        """Return whether a position is at a charger; in 2D at any height."""
         here = np.asarray(position, dtype=float)
         if self._level:
             gaps = np.linalg.norm((self.chargers - here)[:, :2], axis=1)
@@ -226,7 +224,7 @@ class Endurance:
         return bool(least <= 4.0 * self.motion.settings.tolerance**2)
 
     def use(self, seconds: float, metres: float) -> float:
-        """Return the share of the battery that a predicted path takes."""
+        """Return the share of the battery that a predicted path uses."""
         if math.isinf(metres):
             return math.inf
         settings = self.settings
@@ -234,12 +232,12 @@ class Endurance:
         return used * self.use_ratio
 
     def use_home(self, position: ArrayLike) -> float:
-        """Return the share that the cheapest path home from rest takes; infinite without any."""
+        """Return the share that the cheapest path home from rest uses, or inf."""
         here = np.asarray(position, dtype=float)
         return self._cheapest(here, self._paths.path)
 
     def chargers_within(self, position: ArrayLike) -> FloatArray:
-        """Return the chargers (n, 3) that the battery reaches, nearest first; at least one."""
+        """Return the chargers (n, 3) within reach of the battery, nearest first; at least one."""
         here = np.asarray(position, dtype=float)
         uses = [self._to_charger(row, here) for row in range(len(self.chargers))]
         order = np.argsort(uses, kind='stable')
@@ -247,10 +245,9 @@ class Endurance:
         return self.chargers[usable or order[:1]]
 
     def range_from(self, position: FloatArray) -> tuple[float, FloatArray]:
-        """Return the longest path [m] that leaves the reserve, and its end, (3,).
+        """Return the longest path [m] beyond the present one that leaves the reserve, and its end.
 
-        The rest of the present path is paid before. Where the charge is unknown, or nothing is
-        used, the range is infinite and the end is the position itself.
+        With an unknown charge, or without use, the range is infinite and the end is the position.
         """
         settings, speed = self.settings, self.motion.settings.speed
         use = 1.1 * self.use(1.0 / speed, 1.0)
@@ -261,7 +258,7 @@ class Endurance:
         return left / use, self.chargers[int(np.argmin(uses))]
 
     def affords(self, ways: Trajectories, step: float) -> BoolArray:
-        """Return which predicted paths leave enough to come home with the reserve, (W,)."""
+        """Return which predicted paths leave enough charge to get home with the reserve, (W,)."""
         allowed = np.ones(len(ways.lengths), dtype=bool)
         if math.isnan(self.charge):
             return allowed
@@ -271,7 +268,7 @@ class Endurance:
         left = self.charge - settings.reserve - used
         for row in range(len(allowed)):
             end = ways.positions[row, -1]
-            # Most rows that are too far are known without a prediction.
+            # Bounds exclude most rows without a prediction.
             bounds = [self._least_use(charger, end) for charger in range(len(self.chargers))]
             allowed[row] = left[row] - self._margin(0.0) >= min(bounds)
             if allowed[row]:
@@ -280,7 +277,6 @@ class Endurance:
         return allowed
 
     def _least_use(self, row: int, position: FloatArray) -> float:
-        """Return a lower bound of the use of the path to a charger."""
         metres = self._paths.least(row, position)
         return self.settings.return_factor * self.use(metres / self.motion.settings.speed, metres)
 
@@ -290,7 +286,7 @@ class Endurance:
     def _cheapest(
         self, position: FloatArray, path: Callable[[int, FloatArray], tuple[float, float]]
     ) -> float:
-        """Return the use of the cheapest path home, without predicting those that cannot be it."""
+        """Return the use of the cheapest path home; paths that cannot be it are not predicted."""
         bounds = [self._least_use(row, position) for row in range(len(self.chargers))]
         best = math.inf
         for row in np.argsort(bounds, kind='stable').tolist():
@@ -300,9 +296,9 @@ class Endurance:
         return best
 
     def _margin(self, home: float) -> float:
-        """Return what a planned leg leaves on top of the reserve, by the use of the path home.
+        """Return the margin of a planned leg beyond the reserve, by the use of the path home.
 
-        It is for turning round at speed, and for what is learned on the way.
+        It covers turning at speed, and what is learned on the path.
         """
         seconds = 2.0 / self.motion.rate
         metres = seconds * self.motion.settings.speed
@@ -311,19 +307,19 @@ class Endurance:
     # ---- changes -----------------------------------------------------------------------------
 
     def update_charge(self, charge: float) -> None:
-        """Take a charge that was reported, 0 to 1; anything else is unknown."""
+        """Update with a reported charge, 0 to 1; anything else is unknown."""
         known = 0.0 <= charge <= 1.0
         self.estimated = not (known or math.isnan(self.charge))
         if known:
             self.charge = float(charge)
 
     def adopt_area(self) -> None:
-        """Note that the area has changed: paths home are predicted again."""
+        """Forget predicted paths home after a change of the area."""
         self._paths.clear()
         self._slack = None
 
     def begin(self, phase: Phase, reason: str = '') -> None:
-        """Enter a phase; reason: why it is done."""
+        """Enter a phase; reason: why the robot is done."""
         self.phase, self.done_reason = phase, reason if phase is Phase.DONE else ''
         self._peak, self._waited, self._target = math.nan, 0.0, self.settings.full
         self.topped = False
@@ -335,20 +331,20 @@ class Endurance:
         self._target = _TOP
 
     def begin_again(self) -> None:
-        """Begin a new search; what was learned is kept."""
+        """Begin a new search; learned ratios are retained."""
         self.begin(Phase.AVAILABLE)
         self.leg, self._slack, self.must_return = 0.0, None, False
 
     def note_pace(self, seconds: float, predicted: float) -> None:
-        """Note the time in which a part of a predicted path was flown, and the predicted time."""
+        """Note real and predicted time of a part of a path [s]."""
         self._pace.add(seconds, predicted)
 
     def begin_path(self, step: int) -> None:
-        """Note that another path begins."""
+        """Note the begin of a path."""
         self._progress, self._progress_at = 0, step
 
     def note_progress(self, step: int, position: FloatArray, path: FloatArray) -> None:
-        """Learn from how far it has come on its predicted path (n, 3) since the last step."""
+        """Learn from the progress on the predicted path (n, 3)."""
         last = len(path) - 1
         if self._progress >= last:
             return
@@ -356,20 +352,17 @@ class Endurance:
         ahead = path[self._progress : min(self._progress + 3 * gone + 1, last) + 1] - position
         reached = int(np.argmin((ahead * ahead).sum(axis=1)))
         self._progress, self._progress_at = self._progress + reached, step
-        # At its end it slows down, and may turn to the next waypoint.
+        # At the end the robot slows down, or turns to the next waypoint.
         if self._progress < last:
             self.note_pace(gone * self._step, reached * self._step)
 
     def plan_leg(self, path: FloatArray) -> None:
-        """Note the rest of its present path, (n, 3), which is empty where it stands."""
+        """Note the remaining present path, (n, 3), which may be empty."""
         metres = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
         self.leg = self.use(self._step * (len(path) - 1), metres) if len(path) else 0.0
 
     def update(self, step: int, state: RobotState, charge: float, stands: bool) -> None:
-        """Take the state and the charge of a step.
-
-        stands: whether the robot has no goal, or has ended its last one.
-        """
+        """Update with the state and charge of a step; stands: without a goal that has not ended."""
         here, before = np.array(state.pose.position), self.charge
         seconds, predicted = 0.0, 0.0
         if self._before is not None:
@@ -381,7 +374,7 @@ class Endurance:
         self.update_charge(charge)
         if self.estimated and not home:
             self.charge = max(before - predicted * self.use_ratio, 0.0)
-        # A jump upwards is another battery.
+        # A jump upwards is a replaced battery.
         elif not home and predicted > 0.0 and self.charge <= before + _GAINED:
             self._use.add(before - self.charge, predicted)
         if math.isnan(before) and not math.isnan(self.charge):
@@ -394,7 +387,7 @@ class Endurance:
         self._check_charging(home, seconds)
 
     def _check_return(self, state: RobotState, home: bool) -> None:
-        """Predict the path home, unless there is enough for it for sure."""
+        """Predict the path home unless the charge is surely sufficient."""
         settings, here = self.settings, np.asarray(state.pose.position, dtype=float)
         if home:
             self._slack, self.cut_off, self.must_return = None, False, False
@@ -405,12 +398,12 @@ class Endurance:
             self.cut_off = math.isinf(use)
             self._slack = self.charge - settings.reserve - use - 2.0 * next_step
             if math.isnan(self.charge):
-                self._slack = math.inf  # until it is known
+                self._slack = math.inf  # unknown charge
         self.must_return = self._slack < 0.0
 
     def _check_charging(self, home: bool, seconds: float) -> None:
-        """Begin to charge, be full, or be done as the charge does not rise."""
-        # Of a robot that was not charged a battery is exchanged, or the charger works again.
+        """Begin to charge, complete it, or give up as the charge does not rise."""
+        # The battery was replaced, or the charger works again.
         not_charged = self.done_reason == NOT_CHARGED
         if not_charged and self.charge > self._peak + _GAINED:
             self.begin(Phase.CHARGING)

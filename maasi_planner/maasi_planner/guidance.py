@@ -1,4 +1,4 @@
-"""Where a robot heads on its path around obstacles, and how they hold it back, at every step."""
+"""Heading of a robot on its path around obstacles, and limits of its speed, at every step."""
 
 import math
 from typing import NamedTuple
@@ -27,25 +27,25 @@ from maasi_planner.obstacles import (
     segment_distance,
 )
 
-# Among more vertices than these the one to head for is looked for again only where it is reached or
-# hidden; a prediction among fewer is the controller's own, to the bit.
+# With more vertices than this, predictions search the next one again only where it is reached or
+# hidden; with fewer they equal the controller bit for bit.
 MANY = 100
-_LAST = 1.6  # largest speed towards an obstacle close by, for each metre of distance [1/s]
-_ATTEMPTS = 40  # to satisfy the limits of several circles, one after the other
+_LAST = 1.6  # speed limit per distance close to an obstacle [1/s]
+_ATTEMPTS = 40  # to satisfy the limits of several circles in turn
 
 
 @njit(cache=True)
 def _nearest_visible(
     position: Vector, to_goal: FloatArray, around: Surroundings, least: float
 ) -> tuple[int, float, float]:
-    """Return the visible vertex on the shortest path, its distance, and the length.
+    """Return the visible vertex on the shortest path, its distance and the path's length.
 
-    It is at least `least` away; -1 where none is visible.
+    It is at least `least` away; -1 if none is visible.
     """
     px, py, _ = position
     before, rejected = -np.inf, -1
     while True:
-        # The next one by length of the path, as to see a vertex costs more than all these sums.
+        # By length of the path first, as visibility is costly.
         best, index, away = np.inf, -1, 0.0
         for i in range(around.vertices.shape[0]):
             dx, dy = around.vertices[i, 0] - px, around.vertices[i, 1] - py
@@ -66,7 +66,7 @@ def _nearest_visible(
 def _same_vertex(
     position: Vector, to_goal: FloatArray, around: Surroundings, before: int
 ) -> tuple[int, float]:
-    """Return the vertex of the step before and the length of its path; -1: look for it again."""
+    """Return the vertex of the step before and the length of its path, or -1."""
     vx, vy = around.vertices[before, 0], around.vertices[before, 1]
     away = math.hypot(vx - position[0], vy - position[1])
     if away < 0.5 * around.clearance:
@@ -84,8 +84,8 @@ def _best_vertex(
 ) -> tuple[int, float, bool]:
     """Return the visible vertex on the shortest path, its length, and whether to approach closely.
 
-    A vertex that is as good as reached gives way to the next one, if that is visible already;
-    otherwise it must be approached closely. -1 where no vertex is visible.
+    A vertex that is nearly reached is replaced by the next one if that is visible; otherwise it
+    must be approached closely. -1 if no vertex is visible.
     """
     index, away, best = _nearest_visible(position, to_goal, around, 0.0)
     if away >= 0.5 * around.clearance:
@@ -100,13 +100,13 @@ def _best_vertex(
 def _beside_sphere(
     position: Vector, target: Vector, sphere: int, around: Surroundings
 ) -> tuple[Vector, float]:
-    """Return a target beside a sphere, where the line passes its centre, and the way to it."""
+    """Return a target next to a sphere where the line passes its centre, and the distance to it."""
     way = minus(target, position)
     length = norm(way)
     way = (way[0] / length, way[1] / length, way[2] / length)
     offset = from_centre(position, around.circles, sphere)
     along = -dot(offset, way)
-    # From the centre to where the line passes it.
+    # From the centre to the nearest point of the line.
     side = plus(offset, along, way)
     size = norm(side)
     if size < 1e-6:
@@ -117,7 +117,7 @@ def _beside_sphere(
             side, size = (1.0, 0.0, 0.0), 1.0
     radius = around.circles[sphere, 3]
     reach = radius + around.clearance
-    # Head for the tangent cone: the point beside the centre, scaled out when close.
+    # Head for the tangent cone: the point next to the centre, farther out when close.
     away = max(norm(offset), reach * 1.0000001)
     widen = min(reach * away / math.sqrt(away * away - radius**2), 5.0 * reach)
     way = plus((-offset[0], -offset[1], -offset[2]), widen / size, side)
@@ -126,7 +126,7 @@ def _beside_sphere(
 
 @njit(cache=True)
 def _back_inside(position: Vector, goal: Vector, around: Surroundings) -> Vector:
-    """Return the point inside of the nearest wall, to which a robot beyond the walls leaves."""
+    """Return the point inside of the nearest wall for a robot beyond the walls."""
     circles, nearest, out = around.circles, np.inf, position
     for i in range(circles.shape[0]):
         if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
@@ -141,21 +141,21 @@ def _back_inside(position: Vector, goal: Vector, around: Surroundings) -> Vector
 
 @njit(cache=True)
 def length_to(position: Vector, goal: Vector, to_goal: FloatArray, around: Surroundings) -> float:
-    """Return the length of the shortest path to a goal, level if it bends; inf: there is none."""
+    """Return the length of the shortest path to a goal, horizontal if it bends, or inf."""
     if is_visible(position, goal, around, 0.0, True):
         return norm(minus(goal, position))
     return _nearest_visible(position, to_goal, around, 0.0)[2]
 
 
-# How a robot moves: in the room; out of a zone to an exit that it was given; back into the room.
+# A robot moves in free space, out of a zone to its exit, or back into free space.
 _WITHIN, _LEAVES, _RETURNS = range(3)
 
 
 class Heading(NamedTuple):
-    """Where a robot heads.
+    """Heading of a robot.
 
-    target: next point of its path, the goal itself where the straight line is clear; left: length
-    of the path [m]; manner: _WITHIN, _LEAVES or _RETURNS; vertex: that it heads for, or -1.
+    target: next point of its path, or the goal if the straight line is clear; left: length of the
+    path [m]; manner: _WITHIN, _LEAVES or _RETURNS; vertex: the next one, or -1.
     """
 
     target: Vector
@@ -166,9 +166,9 @@ class Heading(NamedTuple):
 
 @njit(cache=True)
 def _leaves(position: Vector, goal: Vector, around: Surroundings, inside: int) -> bool:
-    """Return whether a goal is the exit of a zone: just outside of it, past what is solid.
+    """Return whether a goal is the exit of a zone, just outside of it.
 
-    A robot that only touches the zone `inside` must not cross it: its exit is on its own side.
+    A robot that only touches the zone `inside` must not cross it: its exit is on the same side.
     """
     way = minus(position, goal)
     length = norm(way)
@@ -187,7 +187,7 @@ def _leaves(position: Vector, goal: Vector, around: Surroundings, inside: int) -
 def head_for(
     position: Vector, goal: Vector, to_goal: FloatArray, around: Surroundings, before: int
 ) -> Heading:
-    """Return where a robot heads; before: vertex of the step before, or -1."""
+    """Return the heading of a robot; before: vertex of the step before, or -1."""
     way = minus(goal, position)
     left, target, vertex = norm(way), goal, -1
     felt = felt_at(position, around)
@@ -208,7 +208,7 @@ def head_for(
         if beyond:
             target = _back_inside(position, goal, around)
             return Heading(target, left + around.clearance, _RETURNS, -1)
-        # A robot that was pushed into a circle leaves it.
+        # A robot that was pushed into a circle leaves it again.
         offset = from_centre(position, felt.circles, inside)
         if nearest < 1e-9:
             offset, nearest = (1.0, 0.0, 0.0), 1.0
@@ -217,7 +217,7 @@ def head_for(
         if felt.circles[inside, 4] <= 0.5:
             target = (target[0], target[1], goal[2])
         return Heading(target, left + around.clearance, _WITHIN, -1)
-    # On its way to a vertex it sees the goal where it gets there.
+    # At the vertex it sees the goal.
     index, best, closely = -1, np.inf, False
     if before >= 0:
         index, best = _same_vertex(position, to_goal, around, before)
@@ -249,7 +249,7 @@ def head_for(
 
 @njit(cache=True, forceinline=True)
 def minded(position: Vector, manner: int, around: Surroundings) -> tuple[Felt, bool]:
-    """Return the circles that hold a robot back, and whether it is beyond their walls."""
+    """Return the circles that limit a robot, and whether it is beyond their walls."""
     if manner == _WITHIN:
         return felt_at(position, around), False
     if manner == _RETURNS:
@@ -261,10 +261,10 @@ def minded(position: Vector, manner: int, around: Surroundings) -> tuple[Felt, b
 
 @njit(cache=True, forceinline=True)
 def approach_limit(room: float, limits: tuple[float, float]) -> float:
-    """Return the largest speed towards an obstacle that is `room` metres away [m/s].
+    """Return the highest speed towards an obstacle at a distance of `room` metres [m/s].
 
-    With a limit on the acceleration half of that stops it in time, but for the last half metre or
-    so, which delays need.
+    Half of a limited acceleration stops the robot in time, except for the last half metre or so,
+    which delays need.
     """
     rate, acceleration = limits
     if acceleration == np.inf or room <= 0.0:
@@ -276,22 +276,21 @@ def approach_limit(room: float, limits: tuple[float, float]) -> float:
 def hold_back(
     position: Vector, felt: Felt, beyond: bool, limits: tuple[float, float], velocity: Vector
 ) -> Vector:
-    """Return `velocity` with limits on its part that points into circles.
+    """Return `velocity` with its component into circles limited.
 
-    Towards a circle at distance d at most `approach_limit` is left, and inside of one at least as
-    much outwards; limits: rate [1/s] and acceleration [m/s^2] of that. It is turned along the
-    circles, or only slowed down where that leads further. Walls do not hold back a robot that is
-    beyond them.
+    Towards a circle `approach_limit` remains, and inside of one at least as much outwards; limits:
+    rate [1/s] and acceleration [m/s^2]. The velocity is turned along the circles, or reduced where
+    that leads further. Walls do not limit a robot that is beyond them.
     """
     circles, wanted, slack = felt.circles, velocity, 0.0
-    # Of the velocity as it is, and as it has become.
+    # Components of the original and the limited velocity.
     straight, shrink = 1.0, 1.0
-    # Farther ones do not limit it, even if it grows by what others add.
+    # Farther circles do not limit it, even if others increase it.
     enough = 1.5 * norm(velocity) / limits[0] + felt.off
     for attempt in range(_ATTEMPTS + 1):
         changed = False
         if attempt == 8:
-            # Between two that it touches only a limit satisfies both exactly.
+            # Between two touching circles only the limit satisfies both exactly.
             slack = 1e-4 * norm(velocity)
         for n in range(felt.first, felt.last):
             i = felt.rows[n]
@@ -313,7 +312,7 @@ def hold_back(
             if attempt < _ATTEMPTS:
                 velocity = plus(velocity, (least - outwards) / size, offset)
             elif least <= 0.0:
-                # The limits conflict: scale down, as standing still satisfies all.
+                # Conflicting limits: scale down, as standing still satisfies all.
                 shrink = min(shrink, least / outwards)
         if not changed:
             break

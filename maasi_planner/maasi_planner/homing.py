@@ -1,4 +1,4 @@
-"""Moves of robots that the planner does not decide: out of closed zones, home, and to charge."""
+"""Moves that the planner does not decide: out of closed zones, home, and to chargers."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -10,22 +10,21 @@ from maasi_planner.planners.way_home import go_home, make_room
 from maasi_planner.robot_plan import Errand, PlannedRobot, PresentRobot
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 
-# A robot at a charger makes room for one that waits for it with less than this share of its
-# reserve, and with so much less charge than its own.
+# A robot frees its charger for one that waits with less than this share of its reserve, and
+# with so much less charge.
 _URGENT, _MORE = 0.5, 0.2
-# Charge of a battery that cannot be charged any further.
+# Charge of a full battery.
 _FULL = 0.999
-TOP = 'charges beyond full'  # in place of the reason of a phase
-TOO_FAR = 'its battery does not last for the path to any charger'
+TOP = 'charges beyond full'  # reason of a phase
+TOO_FAR = 'its charge is too low to reach any charger'
 CUT_OFF = 'closed zones cut it off from every charger'
 
 
 class Homing:
-    """Decides which robots leave a closed zone, go home or charge, whatever the planner thinks.
+    """Decides which robots leave a closed zone, go home or charge.
 
-    robots: all, by name; alarms: what is wrong with robots now, by name; news: what has been
-    decided about batteries since the caller last cleared it; exhausted: whether batteries leave no
-    robot anything to do, and each was asked again.
+    alarms: present problems by robot; news: decisions about batteries that the caller has not
+    cleared; exhausted: batteries leave no robot anything to do, and each was asked again.
     """
 
     def __init__(self, robots: Mapping[str, PlannedRobot]) -> None:
@@ -33,11 +32,11 @@ class Homing:
         self.alarms: dict[str, str] = {}
         self.news: list[str] = []
         self.exhausted = False
-        # Robots that have come home at this step.
+        # Robots that come home at this step.
         self._landed: list[str] = []
-        # Phases that begin when their decisions are carried out, with the reason of a last one.
+        # Phases that begin with their decisions, and reasons of `DONE`.
         self._phases: dict[str, tuple[Phase, str]] = {}
-        # Since which step no robot has had anything to do.
+        # Step from which no robot has anything to do.
         self._idle_since: int | None = None
 
     def begin_again(self) -> None:
@@ -46,7 +45,7 @@ class Homing:
         self._idle_since = None
 
     def adopt_area(self) -> None:
-        """Take another area: what was out of reach may be in reach again."""
+        """Reconsider positions that were out of reach after a change of the area."""
         self._idle_since = None
         for robot in self._robots.values():
             if (endurance := robot.endurance) is not None:
@@ -55,7 +54,7 @@ class Homing:
                     endurance.begin(Phase.AVAILABLE)
 
     def update(self, step: int, present: Mapping[str, PresentRobot]) -> None:
-        """Take states and charges of a step."""
+        """Update with states and charges of a step."""
         self._landed, self.alarms = [], {}
         for name in sorted(present):
             robot, here = self._robots[name], present[name]
@@ -90,22 +89,21 @@ class Homing:
         self.exhausted = all((searching[name].plan.decided_at or 0) > since for name in idle)
 
     def estimates(self) -> list[str]:
-        """Return the robots whose charge is not reported any more, with what is assumed."""
+        """Return robots that no longer report a charge, with their estimates."""
         return [
-            f'{name}: no charge is reported, {robot.endurance.describe()}'
+            f'{name}: the robot reports no charge; {robot.endurance.describe()}'
             for name, robot in self._robots.items()
             if robot.endurance is not None and robot.endurance.estimated
         ]
 
     def _at_home(self, name: str) -> str:
-        """Return what a robot does that has come home."""
         endurance = self._endurance(name)
         if endurance.charging:
             return f'charges: {endurance.describe()}'
         return f'stays at home: {endurance.done_reason or endurance.describe()}'
 
     def is_available(self, name: str, here: PresentRobot) -> bool:
-        """Return whether the planner may send a robot."""
+        """Return whether the planner decides for a robot."""
         robot = self._robots[name]
         if not here.searches or robot.plan.errand in (Errand.LEAVE, Errand.ROOM):
             return False
@@ -113,39 +111,39 @@ class Homing:
         return endurance is None or (endurance.phase is Phase.AVAILABLE and not endurance.cut_off)
 
     def release(self, name: str) -> None:
-        """Let a robot go that was on its way to a charger, or charged."""
+        """Release a robot that charges, or is on its path to a charger."""
         endurance = self._robots[name].endurance
         if endurance is not None and endurance.phase is not Phase.AVAILABLE:
             endurance.begin(Phase.AVAILABLE)
 
     def occupies(self, name: str) -> bool:
-        """Return whether a robot leaves a zone, is on its way to a charger, charges, or is done."""
+        """Return whether a robot leaves a zone, goes to a charger, charges, or is done."""
         endurance, plan = self._robots[name].endurance, self._robots[name].plan
         home = endurance is not None and endurance.phase is not Phase.AVAILABLE
         return home or (plan.errand is not None and not plan.staying)
 
     def may_go(self, name: str, state: RobotState, goal: FloatArray, step_time: float) -> bool:
-        """Return whether the battery of a robot allows it to go to a goal (3,) and then home."""
+        """Return whether the battery suffices to go to a goal (3,) and then home."""
         endurance = self._robots[name].endurance
         if endurance is None or math.isnan(endurance.charge):
             return True
         if endurance.is_home(goal):
-            return True  # it goes to a charger
+            return True  # to a charger
         path = self._robots[name].facts.motion.predict(state, goal[None, :], step_time)
         return bool(endurance.affords(path, step_time)[0])
 
     def errands(
         self, step: int, present: Mapping[str, PresentRobot], finished: bool
     ) -> dict[str, Errand]:
-        """Return the robots that have to leave a zone, or to go home, now."""
+        """Return the robots that have to leave a zone or go home now."""
         found = {}
         for name in sorted(present):
             robot, here = self._robots[name], present[name]
             errand = _errand(robot, here, finished, step) if here.returns else None
-            # Where it could not go it tries again after a while.
+            # A robot that could not go tries again later.
             if errand is not None and not _waits(robot, here, step):
                 found[name] = errand
-        # Those with the least charge choose their chargers first.
+        # Robots with the least charge choose their chargers first.
         found = dict(sorted(found.items(), key=lambda item: (self._charge(item[0]), item[0])))
         for name in present:
             if self._is_wanted(name, present):
@@ -155,7 +153,7 @@ class Homing:
     def waiting(
         self, step: int, present: Mapping[str, PresentRobot], errands: Collection[str]
     ) -> list[str]:
-        """Return the robots that have come home now, or that zones cut off from every charger."""
+        """Return the robots that have just come home, or are cut off from every charger."""
         cut_off = [
             name
             for name, alarm in sorted(self.alarms.items())
@@ -169,7 +167,7 @@ class Homing:
         return 0.0 if endurance is None or math.isnan(endurance.charge) else endurance.charge
 
     def _is_wanted(self, name: str, present: Mapping[str, PresentRobot]) -> bool:
-        """Return whether a robot occupies a charger for which another one waits urgently."""
+        """Return whether another robot urgently waits for a robot's charger."""
         robot, here = self._robots[name], present[name]
         endurance = robot.endurance
         if endurance is None or not here.returns or not robot.is_home(here):
@@ -195,7 +193,7 @@ class Homing:
         decision: Decision,
         finished: bool,
     ) -> None:
-        """Add the decisions of robots that wait, and of those with errands."""
+        """Add the decisions for waiting robots and errands."""
         for name in waiting:
             view = team.robots[name]
             landed = name in self._landed
@@ -227,7 +225,7 @@ class Homing:
         return go_home(team, name, decision, reason)
 
     def check(self, team: TeamView, decision: Decision, arrived: Collection[str]) -> None:
-        """Send robots home in place of legs that they cannot afford."""
+        """Send robots home that cannot afford their legs."""
         for name in list(decision.robots):
             view, chosen = team.robots[name], decision.robots[name]
             endurance = self._robots[name].endurance
@@ -235,7 +233,7 @@ class Homing:
                 continue
             unaffordable = chosen.unaffordable
             if not chosen.stays:
-                # Not every planner asks for the battery.
+                # Not every planner checks the battery.
                 path = view.motion.predict(view.state, chosen.waypoint[None], team.step_time)
                 unaffordable = not endurance.affords(path, team.step_time)[0]
             if unaffordable:
@@ -245,7 +243,6 @@ class Homing:
     def _unaffordable(
         self, team: TeamView, name: str, decision: Decision, arrived: bool
     ) -> RobotDecision:
-        """Return what a robot does that cannot afford anything else."""
         endurance, view, chosen = self._endurance(name), team.robots[name], decision.robots[name]
         home = arrived and endurance.is_home(view.state.pose.position)
         if not endurance.full:
@@ -254,7 +251,7 @@ class Homing:
                 return stay(view, f'charges: {endurance.describe()}')
             return self._home(team, name, decision, False)
         if chosen.stays and not chosen.saves_battery:
-            return chosen  # others have all that is left
+            return chosen  # other robots visit what remains
         if not home:
             return self._home(team, name, decision, False)
         if endurance.charge < _FULL and not endurance.topped:
@@ -264,7 +261,7 @@ class Homing:
         return stay(view, f'stays: {NOTHING_AFFORDABLE}')
 
     def adopt(self, name: str, errand: Errand | None) -> None:
-        """Carry out a decision: enter the phase that belongs to it."""
+        """Enter the phase of an executed decision."""
         robot, endurance = self._robots[name], self._robots[name].endurance
         phase, reason = self._phases.pop(name, (None, ''))
         if errand is not None or phase is Phase.RETURNING:
@@ -278,7 +275,7 @@ class Homing:
                 endurance.begin(phase, reason)
 
     def drop(self, name: str) -> None:
-        """Forget what was decided for a robot that keeps its present path."""
+        """Forget the decision for a robot that continues its path."""
         self._phases.pop(name, None)
 
     def settled(self, present: Mapping[str, PresentRobot]) -> bool:
@@ -302,7 +299,7 @@ class Homing:
 def _errand(robot: PlannedRobot, here: PresentRobot, finished: bool, step: int) -> Errand | None:
     plan, endurance = robot.plan, robot.endurance
     leaving = plan.errand is Errand.LEAVE and not here.free
-    # It does not follow a line exactly, and zones change: its exit is chosen again as it goes.
+    # The exit is chosen again on the path, as zones change and lines are not followed exactly.
     recent = step - (plan.decided_at or 0) < robot.facts.period
     if not (leaving and recent) and _is_in_zone(robot, here):
         return Errand.LEAVE
@@ -323,7 +320,6 @@ def _errand(robot: PlannedRobot, here: PresentRobot, finished: bool, step: int) 
 
 
 def _is_in_zone(robot: PlannedRobot, here: PresentRobot) -> bool:
-    """Return whether a robot is in a closed zone."""
     keep_out = robot.facts.motion.keep_out
     if keep_out.area is None or not keep_out.area.settings.keep_outs:
         return False
@@ -331,7 +327,7 @@ def _is_in_zone(robot: PlannedRobot, here: PresentRobot) -> bool:
 
 
 def _waits(robot: PlannedRobot, here: PresentRobot, step: int) -> bool:
-    """Return whether a robot that could not go waits before it is asked again."""
+    """Return whether a robot that could not go still waits for its next attempt."""
     plan = robot.plan
     refused = plan.staying and plan.errand is not None and plan.decided_at is not None
     return refused and here.free and step - (plan.decided_at or 0) < robot.facts.period

@@ -1,4 +1,4 @@
-"""What one robot must keep out of, and its paths around that."""
+"""Keep-out regions of one robot, and paths around them."""
 
 from __future__ import annotations
 
@@ -30,38 +30,38 @@ from maasi_planner.obstacles import (
 from maasi_planner.visibility import VisibilityGraph
 
 CORNERS = 12  # of the vertices around a cylinder
-# Outlines with more detail than this share of the clearance lose it, to the safe side.
+# Detail of outlines below this share of the clearance is removed, to the safe side.
 _DETAIL = 0.2
-_TABLES = 2**22  # numbers in all tables that are kept
+_TABLES = 2**22  # numbers in all cached tables
 _ANYWHERE = Area([[-1e9, 1e9]] * 2)
 
 
 class KeepOut:
-    """What one robot must keep out of: inflated by its radius, with paths around.
+    """Keep-out regions inflated by the radius of one robot, and paths around them.
 
     Parameters
     ----------
     area : Area or None
-        Where robots may go; None: anywhere.
+        Area of the robot; None: unlimited.
     radius : float
-        Of the robot, metres.
+        Radius of the robot, metres.
     clearance : float
-        Kept beyond that by planned paths and by waypoints, metres.
+        Distance that paths and waypoints keep in addition, metres.
     reach : float
-        Distance at which an obstacle may change what the robot does, metres.
+        Distance at which an obstacle can influence the robot, metres.
 
     Attributes
     ----------
     circles : (n, 7) array
-        As of `Surroundings`, with the radius and a tenth of the clearance: robots stop short of
-        them, so that rounding does not put them into an obstacle.
+        As in `Surroundings`, inflated by the radius and a tenth of the clearance, so that rounding
+        does not put a robot into an obstacle.
     around : Surroundings
-        The same with what paths need.
+        The same with the data for paths.
 
     Raises
     ------
     ValueError
-        If the radius is not usable.
+        If the radius is invalid.
     """
 
     def __init__(
@@ -76,12 +76,12 @@ class KeepOut:
         room = self.area.room(apart)
         detail = _DETAIL * self.clearance
         inflation = radius + 0.1 * self.clearance
-        # At the sides of bounds robots may be on the bounds themselves, but not beyond.
+        # At the sides of bounds robots may be on the bounds.
         held = self.area.room(inflation)
         walls = None if held is None else _simplified(held, detail)
         self._round = len(self.area.circles)
         self.circles = self._inflated(self.area.circles, walls)
-        # Where waypoints may be; None: anywhere beside round ones.
+        # Region of waypoints; None: only round obstacles limit it.
         self._places = None if room is None else room.buffer(-apart, join_style='mitre')
         if self._places is not None:
             shapely.prepare(self._places)
@@ -97,7 +97,7 @@ class KeepOut:
         )
         corners = clear_vertices(self._corners(outline), self.around)
         self.around = self.around._replace(vertices=corners)
-        # Tables of the latest waypoints, candidates and chargers, which are asked for repeatedly.
+        # Tables of the latest waypoints, candidates and chargers.
         most = min(max(_TABLES // max(len(corners), 1), 32), 2048)
         self.table = lru_cache(maxsize=most)(self.to_goal)
 
@@ -105,7 +105,7 @@ class KeepOut:
         return len(self.circles)
 
     def _inflated(self, round_ones: FloatArray, room: BaseGeometry | None) -> FloatArray:
-        """Return round obstacles (n, 5) and the walls of a room as circles, (m, 7)."""
+        """Return round obstacles (n, 5) and the walls of a free space as circles, (m, 7)."""
         walls = edges_of([] if room is None else [room])
         circles = np.zeros((len(round_ones) + len(walls), 7))
         circles[: len(round_ones), :5] = round_ones
@@ -114,17 +114,13 @@ class KeepOut:
         return circles
 
     def _solid_circles(self) -> FloatArray:
-        """Return the circles of what is there without keep-outs."""
         if not self.area.settings.keep_outs:
             return self.circles
         room = self.area.room(self.radius + 0.1 * self.clearance, closed=False)
         return self._inflated(self.area.solid, room)
 
     def _corners(self, outline: BaseGeometry | None) -> FloatArray:
-        """Return what may be vertices of the visibility graph, (m, 2): around cylinders and walls.
-
-        Of walls those around which a path can bend.
-        """
+        """Return corners around cylinders and convex walls for the visibility graph, (m, 2)."""
         corners = [np.zeros((0, 2))]
         angles = 2.0 * math.pi * np.arange(CORNERS) / CORNERS
         ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -138,12 +134,12 @@ class KeepOut:
                     points = shapely.get_coordinates(edge)[:-1]
                     before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
                     one, two = points - before, after - points
-                    # The room is to the left.
+                    # Free space is to the left.
                     corners.append(points[one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]])
         return np.concatenate(corners)
 
     def pushing(self) -> FloatArray:
-        """Return the circles that the term of 001, eq. (14), is of: all but the sides of bounds."""
+        """Return the circles of the obstacle term (001, eq. (14)), without the sides of bounds."""
         low, high = self.area.bounds[:2].T
         middles = self.circles[:, :2] + 0.5 * self.circles[:, 5:]
         inside = ((middles >= low) & (middles <= high)).all(axis=1)
@@ -154,25 +150,25 @@ class KeepOut:
         return VisibilityGraph(self.around, 0.4 * self.clearance)
 
     def to_goal(self, goal: Vector) -> FloatArray:
-        """Return the table that `head_for` needs for a goal: lengths from the vertices, or inf."""
+        """Return the lengths of paths from the vertices to a goal for `head_for`, or inf."""
         if not len(self.around.vertices):
             return np.zeros(0)
         return self._graph.to_goal(goal)
 
     def is_free(self, position: ArrayLike) -> bool:
-        """Return whether a robot at `position` (3,) touches no obstacle and is inside."""
+        """Return whether a robot at `position` (3,) [m] is inside and touches no obstacle."""
         x, y, z = (float(value) for value in np.asarray(position, dtype=float))
         return bool(is_free_at((x, y, z), self.around))
 
     def path_length(self, position: ArrayLike, goal: ArrayLike) -> float:
-        """Return the length of the path between two positions (3,) [m]; inf: there is none."""
+        """Return the length of the path between two positions (3,) [m], or inf."""
         x, y, z = (float(value) for value in np.asarray(position, dtype=float))
         to_x, to_y, to_z = (float(value) for value in np.asarray(goal, dtype=float))
         to = (to_x, to_y, to_z)
         return float(length_to((x, y, z), to, self.table(to), self.around))
 
     def route(self, position: ArrayLike, goal: ArrayLike) -> list[Vector]:
-        """Return the corners of the path between two positions (3,) [m], the last is the goal."""
+        """Return the corners of the path between two positions (3,) [m]; the last is the goal."""
         x, y, z = np.asarray(position, dtype=float).tolist()
         to_x, to_y, to_z = np.asarray(goal, dtype=float).tolist()
         here, to = (x, y, z), (to_x, to_y, to_z)
@@ -196,11 +192,10 @@ class KeepOut:
         return np.array(head_for((x, y, z), to, wide.to_goal(to), wide.around, -1).target)
 
     def exit_from(self, position: ArrayLike) -> FloatArray | None:
-        """Return where a robot at a position (3,) leaves a zone that it is in, or None outside.
+        """Return where a robot at a position (3,) leaves the zone that it is in, or None outside.
 
-        It is the nearest position clear of all zones that a straight line reaches inside of the
-        border, past solid obstacles and past other zones if it can; where none is reached so, the
-        first point of the path there.
+        It is the nearest clear position that a straight line reaches without obstacles and, if
+        possible, other zones; otherwise the first point of the path there.
         """
         if self.is_free(position):
             return None
@@ -213,11 +208,11 @@ class KeepOut:
         if self._open.is_empty:
             return None
         point = shapely.Point(x, y)
-        # Past zones that it is not in; through them only where there is no other exit.
+        # Past other zones, or through them without another exit.
         zones = self.area.shapes['keep_out']
         others = [zone for zone in zones if zone.distance(point) > self.radius]
         past_others = self._solid.difference(shapely.union_all(others).buffer(self.radius))
-        # A robot does not follow a line exactly: with a margin if it can.
+        # With a margin if possible, as lines are not followed exactly.
         margin = 0.5 * self.clearance
         ample = past_others.buffer(-margin)
         allowed_ones = (ample, past_others, self._solid) if others else (ample, self._solid)
@@ -233,7 +228,7 @@ class KeepOut:
         return np.array([*heading.target[:2], z])
 
     def _straight_exit(self, point: shapely.Point, allowed: BaseGeometry) -> shapely.Point | None:
-        """Return the nearest clear point to which a straight line stays where it may be."""
+        """Return the nearest clear point that an allowed straight line reaches."""
         near = nearest_points(self._open, point)[0]
         shapely.prepare(allowed)
         if allowed.covers(shapely.LineString([point, near])):
@@ -248,7 +243,7 @@ class KeepOut:
 
     @cached_property
     def _open(self) -> BaseGeometry:
-        """Where robots that leave a zone may go: clear of everything by the clearance."""
+        """Region of robots that leave a zone: clear of everything by the clearance."""
         reach = self.circles[: self._round, 3] + 0.95 * self.clearance
         centres = shapely.points(self.circles[: self._round, :2])
         discs = shapely.buffer(centres, reach / math.cos(math.pi / 64), quad_segs=16)
@@ -257,7 +252,7 @@ class KeepOut:
 
     @cached_property
     def _solid(self) -> BaseGeometry:
-        """Where a robot may be that leaves a zone: inside of the border, clear of what is solid."""
+        """Region of a robot that leaves a zone: inside of the border, clear of obstacles."""
         solid = shapely.union_all(list(map(level_shape, self.area.settings.obstacles)))
         inside = self.area.border.difference(solid.buffer(self.radius))
         shapely.prepare(inside)
@@ -268,10 +263,9 @@ class KeepOut:
         return max(self.radius + self.clearance, 1e-3)
 
     def moved_out(self, robot: ArrayLike, waypoint: ArrayLike) -> FloatArray | None:
-        """Return a waypoint moved to the minimum admissible distance (001, section 4.3).
+        """Return a waypoint moved to the minimum admissible distance (001, section 4.3), or None.
 
-        It moves away from walls to the nearest place, and then out of round obstacles along the
-        line that joins robot and waypoint, towards the robot.
+        It is moved away from walls, and then out of round obstacles towards the robot.
         """
         start = np.asarray(robot, dtype=float)
         point = np.array(waypoint, dtype=float)
@@ -313,11 +307,11 @@ class KeepOut:
 
 
 def _simplified(room: BaseGeometry, detail: float) -> BaseGeometry:
-    """Return a room without finer detail than given [m], and within itself; as it is without."""
+    """Return a region without finer detail than given [m], inside of the original."""
     if shapely.get_num_coordinates(room.simplify(detail)) == shapely.get_num_coordinates(room):
         return room
     return room.buffer(-detail, join_style='mitre').simplify(detail)
 
 
-#: The KeepOut of robots of one kind in one area.
+#: Shared KeepOut of equal robots.
 shared_keep_out = lru_cache(maxsize=64)(KeepOut)

@@ -1,4 +1,4 @@
-"""When a robot measures: periodically, or by expected information (000, (24), (33))."""
+"""Times of measurements: periodic, or by expected information (000, (24), (33))."""
 
 from collections.abc import Sequence
 
@@ -29,12 +29,11 @@ def expected_use(
 
 
 class MeasurementSchedule:
-    """When one robot measures: at its waypoints, and each period between them if that is of use.
+    """Measurement times of one robot: at waypoints and, if of use, at each period between them.
 
-    With the trigger `relative` the use is compared with its mean along the predicted trajectory,
-    evaluated at the decision.
+    With the trigger `relative` the use is compared with its mean along the predicted trajectory.
 
-    due: whether it measures as soon as it can; number: of its measurements so far.
+    due: whether the robot measures as soon as it can; number: of measurements so far.
     """
 
     def __init__(
@@ -44,22 +43,21 @@ class MeasurementSchedule:
         self._settings = settings
         self.due = False
         self.number = 0
-        # Step from which the periods count, and that of the last decision.
+        # First step of the periods, and step of the last decision.
         self._since, self._turned_at = 0, -1
-        # Waypoint that was left for the next one, until its closest point, and that distance
-        # squared.
+        # Passed waypoint until the closest point, and the squared distance.
         self._passed: FloatArray | None = None
         self._nearest = 0.0
         self._mean = 0.0  # use along the predicted trajectory
 
     def phase(self, step: int) -> int:
-        """Return the steps to its next possible measurement."""
+        """Return the steps to the next possible measurement."""
         return (self._since - step) % self._period
 
     def is_of_use(
         self, pose: Pose, clusters: Sequence[Cluster], exploration: UnexploredMap
     ) -> bool:
-        """Return whether it measures at a pose between its waypoints."""
+        """Return whether to measure at a pose between waypoints."""
         settings = self._settings
         if settings.measurement == 'periodic':
             return True
@@ -68,8 +66,8 @@ class MeasurementSchedule:
         return use > settings.threshold * (self._mean if relative else 1.0)
 
     def turn(self, step: int, position: FloatArray, passed: FloatArray | None) -> None:
-        """Begin another path; passed: the waypoint that it passes without a stop, if any."""
-        # Of two waypoints passed in a row the first is measured now.
+        """Begin a path; passed: the waypoint passed without a stop, if any."""
+        # The first of two waypoints passed in a row is measured now.
         self.due = self.due or self._passed is not None
         self._passed, self._turned_at = passed, step
         if passed is None:
@@ -103,21 +101,21 @@ class MeasurementSchedule:
         clusters: Sequence[Cluster],
         exploration: UnexploredMap,
     ) -> None:
-        """Note where it is; underway: whether it may measure between waypoints."""
+        """Update with a pose; underway: whether the robot measures between waypoints."""
         if self._passed is not None and step != self._turned_at:
             distance = self._motion.squared_distance(pose.position, self._passed)
             if distance >= self._nearest:
                 self._passed, self._since = None, step
             self._nearest = distance
         gone = step - self._since
-        # At 0 it is at its last waypoint, or at the closest point.
+        # At 0 the robot is at its waypoint, or at the closest point.
         if gone == 0:
             self.due = True
         elif underway and gone % self._period == 0 and not self.due:
             self.due = self.is_of_use(pose, clusters, exploration)
 
     def begin(self) -> int:
-        """Begin a measurement that is due, and return its index."""
+        """Begin a due measurement, and return its index."""
         self.due = False
         self.number += 1
         return self.number - 1
@@ -127,7 +125,7 @@ class MeasurementSchedule:
         self._since = self._turned_at = step
 
     def cancel(self) -> None:
-        """Note that it has no path any more."""
+        """Note that the robot has no path."""
         self._passed, self.due = None, False
 
     def begin_again(self) -> None:

@@ -1,4 +1,4 @@
-"""The grid over obstacles that lists which are near to each of its cells."""
+"""Grid that lists the obstacles near each of its cells."""
 
 import math
 
@@ -9,14 +9,15 @@ from scipy.ndimage import distance_transform_edt
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.obstacles import Felt, Nearby, crossed_walls, from_centre
 
-_FEW = 48  # so many circles need no grid
+_FEW = 48  # circles that need no grid
 _HALF = math.sqrt(0.5)  # of the diagonal of a cell, by its width
 
 
 def nearby_of(circles: FloatArray, reach: float, extra: float) -> Nearby:
     """Return the grid over circles (n, 7).
 
-    reach: distance at which they matter [m]; extra: asked of lines beyond their radius, at most.
+    reach: distance at which they matter [m]; extra: largest distance of lines beyond their radius
+    [m].
     """
     far = circles[:, :2] + circles[:, 5:]
     radii = circles[:, 3:4]
@@ -39,7 +40,7 @@ def nearby_of(circles: FloatArray, reach: float, extra: float) -> Nearby:
     pairs, apart = _near(circles, head, listed, gaps)
     cells = np.zeros((*counts, 2))
     empty = np.isinf(gaps)
-    # Where no circle is listed the nearest one lies in a cell that has one.
+    # Without listed circles, the nearest one is in another cell.
     lower = (distance_transform_edt(empty) - 1.0) * size if empty.any() else gaps
     cells[..., 0] = np.where(empty, lower, gaps)
     by_row = _walls_by_row(circles, head, int(counts[1]))
@@ -56,7 +57,7 @@ def nearby_of(circles: FloatArray, reach: float, extra: float) -> Nearby:
 def _listed(
     pairs: IntArray, keys: FloatArray, number: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return where each of a number of lists begins, and rows and keys, of pairs (p, 2) by key."""
+    """Return begin, rows and sorted keys of lists, from pairs (p, 2) of list and row."""
     order = np.lexsort((keys, pairs[:, 0]))
     starts = np.searchsorted(pairs[order, 0], np.arange(number + 1))
     return starts.astype(np.int64), pairs[order, 1], keys[order]
@@ -66,7 +67,7 @@ def _listed(
 def _near(
     circles: FloatArray, head: FloatArray, listed: float, gaps: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Fill how far the circles are from the middle of each cell; return cells, circles and gaps."""
+    """Fill the distance of circles from the centre of each cell; return cells, circles and gaps."""
     nx, ny = gaps.shape
     size, number = head[2], 0
     out, apart = np.empty((64, 2), np.int64), np.empty(64)
@@ -95,7 +96,7 @@ def _near(
 
 @njit(cache=True)
 def _walls_by_row(circles: FloatArray, head: FloatArray, rows: int) -> IntArray:
-    """Return rows of cells and the walls that they meet, (p, 2)."""
+    """Return rows of cells and the walls in them, (p, 2)."""
     out = np.empty((64, 2), np.int64)
     number = 0
     for i in range(circles.shape[0]):
@@ -116,7 +117,7 @@ def _walls_by_row(circles: FloatArray, head: FloatArray, rows: int) -> IntArray:
 def _mark_rooms(
     circles: FloatArray, head: FloatArray, cells: FloatArray, starts: IntArray, walls: IntArray
 ) -> None:
-    """Mark cells that no wall is near to: 0 in the room that walls enclose, 1 beyond; others 2."""
+    """Mark cells without walls nearby: 0 inside of the walls, 1 outside; others 2."""
     size = head[2]
     for v in range(cells.shape[1]):
         y = head[1] + (v + 0.5) * size

@@ -1,8 +1,8 @@
-"""Obstacles, keep-outs and the border of the area as compiled code meets them at every step.
+"""Obstacles, keep-outs and the border of the area for compiled code.
 
-They are cylinders of any height (in 2D discs), spheres, and walls: the edges of polygons, all
-inflated by the radius of a robot (`keep_out.KeepOut` makes them). A grid over them lists which are
-near to each of its cells, so that a step costs about the same among a thousand as among ten.
+They are cylinders of any height (in 2D discs), spheres, and walls, which are edges of polygons, all
+inflated by the radius of a robot in `keep_out.KeepOut`. A grid lists those near each of its cells,
+so that the cost of a step hardly depends on their number.
 """
 
 import math
@@ -14,17 +14,17 @@ from numba import njit
 from maasi_filter.arrays import FloatArray, IntArray
 
 Vector = tuple[float, float, float]
-_BEYOND = 1.0  # second number of a cell outside of all walls; 0: in the room; 2: a wall is near
+_BEYOND = 1.0  # second number of a cell outside of the walls; 0: inside; 2: near a wall
 
 
 class Nearby(NamedTuple):
-    """Which circles are near to each cell of a level grid.
+    """Circles near each cell of a horizontal grid.
 
-    head (3,): lower corner and width of the cells [m]; cells (nx, ny, 2): how far the middle of a
-    cell is at least from all circles [m], and whether it is in the room that the walls enclose;
-    lists: where the rows of each cell begin, (nx ny + 1), where those of the walls that each row of
-    cells along x meets, (ny + 1), and these rows of `circles`, of a cell the nearest first; gaps:
-    of these from the middle of the cell [m].
+    head (3,): lower corner and width of the cells [m]; cells (nx, ny, 2): least distance of the
+    cell's centre from all circles [m], and whether the cell is inside of the walls; lists: begin of
+    the rows of each cell, (nx ny + 1), begin of the walls in each row of cells along x, (ny + 1),
+    and these rows of `circles`, nearest first for cells; gaps: their distances from the centre of
+    the cell [m].
     """
 
     head: FloatArray
@@ -36,10 +36,11 @@ class Nearby(NamedTuple):
 class Surroundings(NamedTuple):
     """Obstacles of a robot, inflated by its radius.
 
-    circles (n, 7): x, y, z, radius [m, map], 1 for a sphere, and x and y from there to the other
-    end of a wall [m]; vertices (m, 2): of the visibility graph [m, map]; clearance: kept beyond the
-    radius by planned paths [m]; nearby: of the circles; solid (s, 7): those that also a robot keeps
-    out of that leaves a closed zone; inflation: of all of them [m]; spheres: whether there are any.
+    circles (n, 7): x, y, z, radius [m, map], 1 for a sphere, and the vector to the other end of a
+    wall [m]; vertices (m, 2): of the visibility graph [m, map]; clearance: distance of planned
+    paths beyond the radius [m]; nearby: grid of the circles; solid (s, 7): circles without
+    keep-outs, for a robot that leaves a closed zone; inflation: of all circles [m]; spheres:
+    whether there are any.
     """
 
     circles: FloatArray
@@ -52,9 +53,9 @@ class Surroundings(NamedTuple):
 
 
 class Felt(NamedTuple):
-    """Circles that a robot minds at a position: those of `rows` from `first` to `last`.
+    """Circles that matter at a position: those of `rows` from `first` to `last`.
 
-    They come in order of their `gaps` from a point that is `off` the position [m].
+    They are in the order of their `gaps` from a point at the distance `off` from the position [m].
     """
 
     circles: FloatArray
@@ -89,10 +90,10 @@ def norm(a: Vector) -> float:
     return math.sqrt(dot(a, a))
 
 
-# Inlined: counting references to array arguments costs more than these functions themselves.
+# Inlined, as counting references to array arguments costs more than the functions.
 @njit(cache=True, forceinline=True)
 def from_centre(point: Vector, circles: FloatArray, i: int) -> Vector:
-    """Return the offset of a point from a circle's centre or a wall, level but for a sphere."""
+    """Return the offset of a point from a wall or a circle's centre; horizontal but for spheres."""
     height = point[2] - circles[i, 2] if circles[i, 4] > 0.5 else 0.0
     x, y = point[0] - circles[i, 0], point[1] - circles[i, 1]
     dx, dy = circles[i, 5], circles[i, 6]
@@ -104,7 +105,6 @@ def from_centre(point: Vector, circles: FloatArray, i: int) -> Vector:
 
 @njit(cache=True)
 def _wall_distance(start: Vector, end: Vector, circles: FloatArray, i: int) -> float:
-    """Return the level distance of a wall from a segment."""
     ax, ay = circles[i, 0] - start[0], circles[i, 1] - start[1]
     dx, dy = circles[i, 5], circles[i, 6]
     ex, ey = end[0] - start[0], end[1] - start[1]
@@ -140,9 +140,8 @@ def crossed_walls(point: Vector, felt: Felt) -> tuple[bool, bool]:
 
 @njit(cache=True, forceinline=True)
 def _cell(point: Vector, nearby: Nearby) -> tuple[int, int]:
-    """Return the cell of a position, or the one nearest to it."""
     head, cells = nearby.head, nearby.cells
-    # Before the conversion: numbers may be far outside.
+    # Clipped before the conversion, as numbers may be large.
     u = min(max((point[0] - head[0]) / head[2], 0.0), cells.shape[0] - 1.0)
     v = min(max((point[1] - head[1]) / head[2], 0.0), cells.shape[1] - 1.0)
     return int(u), int(v)
@@ -164,7 +163,7 @@ def felt_at(point: Vector, around: Surroundings) -> Felt:
 
 @njit(cache=True, forceinline=True)
 def beyond_walls(point: Vector, around: Surroundings) -> bool:
-    """Return whether a point is outside of the room that the walls enclose, if there are any."""
+    """Return whether a point is outside of the walls, if there are any."""
     nearby = around.nearby
     i, j = _cell(point, nearby)
     known = nearby.cells[i, j, 1]
@@ -178,14 +177,14 @@ def beyond_walls(point: Vector, around: Surroundings) -> bool:
 
 @njit(cache=True)
 def all_felt(circles: FloatArray) -> Felt:
-    """Return all circles, for a robot that minds each."""
+    """Return all circles."""
     number = circles.shape[0]
     return Felt(circles, np.arange(number), np.full(number, -np.inf), 0, number, 0.0)
 
 
 @njit(cache=True, forceinline=True)
 def segment_distance(start: Vector, end: Vector, circles: FloatArray, i: int) -> float:
-    """Return the distance of the centre of a circle, or of a wall, from a segment."""
+    """Return the distance of a circle's centre, or of a wall, from a segment."""
     if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
         return _wall_distance(start, end, circles, i)
     way = minus(end, start)
@@ -199,7 +198,7 @@ def segment_distance(start: Vector, end: Vector, circles: FloatArray, i: int) ->
 
 @njit(cache=True, forceinline=True)
 def is_far(start: Vector, end: Vector, circles: FloatArray, i: int, reach: float) -> bool:
-    """Return whether the boxes around a segment and a wall are more than `reach` apart."""
+    """Return whether the bounding boxes of a segment and a wall are more than `reach` apart."""
     x, y = circles[i, 0], circles[i, 1]
     dx, dy = circles[i, 5], circles[i, 6]
     if dx == 0.0 and dy == 0.0:
@@ -232,7 +231,7 @@ def is_clear(start: Vector, end: Vector, felt: Felt, extra: float, cylinders_onl
 
 @njit(cache=True, forceinline=True)
 def room_at(point: Vector, around: Surroundings) -> float:
-    """Return how far a position is at least from all circles [m]; minus infinity: not known."""
+    """Return a lower bound of the distance from all circles [m]; minus infinity if unknown."""
     nearby = around.nearby
     size = nearby.head[2]
     if size == np.inf:
@@ -247,7 +246,7 @@ def room_at(point: Vector, around: Surroundings) -> float:
 def is_visible(
     start: Vector, end: Vector, around: Surroundings, extra: float, cylinders_only: bool
 ) -> bool:
-    """Do as `is_clear` for all circles: in strides as long as nothing is near."""
+    """Do as `is_clear` for all circles, in long strides where nothing is near."""
     nearby = around.nearby
     if nearby.cells.shape[0] * nearby.cells.shape[1] == 1:
         return is_clear(start, end, felt_at(start, around), extra, cylinders_only)
@@ -269,14 +268,14 @@ def is_visible(
 
 @njit(cache=True, forceinline=True)
 def is_free_at(point: Vector, around: Surroundings) -> bool:
-    """Return whether a robot at a position touches nothing and is inside of the walls."""
+    """Return whether a robot at a position is inside of the walls and touches nothing."""
     clear = is_clear(point, point, felt_at(point, around), 0.0, False)
     return clear and not beyond_walls(point, around)
 
 
 @njit(cache=True)
 def clear_vertices(corners: FloatArray, around: Surroundings) -> FloatArray:
-    """Return those of some corners (n, 2) at which a robot has half of its clearance."""
+    """Return the corners (n, 2) at which a robot has half of its clearance."""
     kept, number = np.empty_like(corners), 0
     for x, y in corners:
         point = (x, y, 0.0)

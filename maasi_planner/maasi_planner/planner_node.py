@@ -43,16 +43,16 @@ _REFUSAL_PATIENCE = 10.0  # simulated time in which every goal is refused, until
 
 
 class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
-    """Plans for the whole team (000, algorithms 1 and 2), or independently for one robot.
+    """Plan for the whole team (000, algorithms 1 and 2), or independently for one robot.
 
-    In the namespace of its only robot it plans for that robot alone (002, section 4, independent
-    planner), and exchanges destinations with the planners of the other robots. At each step they
-    plan in the order of names, each with the destinations of the earlier ones.
+    In the namespace of its only robot, the node plans for that robot alone (002, section 4) and
+    exchanges destinations with the planners of the other robots. At each step they plan in the
+    order of names, each with the destinations of the earlier ones.
 
     Subscribes
     ----------
     `<robot>/state` (maasi_msgs/AgentState), `filter_update` (maasi_msgs/FilterUpdate);
-    `<robot>/destination` (geometry_msgs/PointStamped) of robots that plan for themselves;
+    `<robot>/destination` (geometry_msgs/PointStamped) of robots with their own planners;
     `found_targets` (maasi_msgs/FoundTargetArray, latched); running freely, `/diagnostics`
     (diagnostic_msgs/DiagnosticArray): heartbeats of the publishers of `filter_update`; in lockstep
     `lockstep/step` (maasi_msgs/LockstepStep)
@@ -65,7 +65,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     `<robot>/plan` (nav_msgs/Path); `exploration` (latched; 2D: nav_msgs/OccupancyGrid, 3D:
     sensor_msgs/PointCloud2); `markers` (visualization_msgs/MarkerArray);
     `lockstep/done` (maasi_msgs/LockstepDone), in lockstep, once all batches have their updates;
-    `<robot>/destination` (geometry_msgs/PointStamped), each step, where others plan for themselves
+    `<robot>/destination` (geometry_msgs/PointStamped), each step, if other planners exist
 
     Actions
     -------
@@ -73,19 +73,19 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     Services
     --------
-    `search/start`, `pause`, `resume`, `home`, `stop` (std_srvs/Trigger) for the team, and the same
-    below `<robot>/search/` for one robot; `search/keep_outs` (maasi_msgs/SetKeepOuts): other
-    keep-outs, which it publishes on `keep_outs` (maasi_msgs/KeepOuts, latched)
+    `search/start`, `pause`, `resume`, `home`, `stop` (std_srvs/Trigger) for the team, and
+    `<robot>/search/...` for one robot; `search/keep_outs` (maasi_msgs/SetKeepOuts): changes the
+    keep-outs, which the node publishes on `keep_outs` (maasi_msgs/KeepOuts, latched)
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__('planner_node', PlannerNodeSettings, **options)
 
     def prepare(self) -> None:
-        """Make the planner."""
+        """Create the planner."""
         self._dimension = self.settings.environment.dimension
         self.modes = SearchModes(self.settings.robots)
-        # Smallest difference of steps between states of a robot that counts as a jump.
+        # Smallest jump of steps between states of a robot.
         longest = max(1.0, 2.0 * self.settings.state_timeout)
         self._jump = round(longest / self.settings.step)
         self.coordinator = Coordinator(self.settings)
@@ -104,7 +104,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._expected: LockstepStep | None = None
         self._batches.reset(self.coordinator)
         self._decisions = 0
-        # Free running: why the robots are held; empty if they are not.
+        # Running freely: why the robots are held, or empty.
         self._held = ''
         self._planning_time = 0.0
         self._batteries = BatteryLog(self)
@@ -112,7 +112,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     # ---- life cycle --------------------------------------------------------------------------
 
     def set_up(self) -> None:
-        """Compile and connect."""
+        """Compile the kernels, create publishers, subscriptions and services."""
         warm_up()
         names = self.coordinator.names
         self._done_publisher: Publisher | None = None
@@ -124,7 +124,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self.create_subscription(
                 LockstepStep, self.team_topic('lockstep/step'), self._on_step, RELIABLE
             )
-        # Before the publisher of batches: a filter with batches must discover the kept targets.
+        # Before the publisher of batches: a filter must discover the retained targets first.
         self._keeper = FoundKeeper(self)
         self._batches.set_up()
         self._decision_publisher = self.create_publisher(PlanDecision, 'decisions', RELIABLE)
@@ -156,7 +156,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self.create_wall_timer(_CHECK_PERIOD, self._check_team)
 
     def start(self) -> None:
-        """Start the search, unless it has to wait for a command."""
+        """Start the search if `search_on_start`."""
         if self.settings.search_on_start:
             self.modes.command('start')
 
@@ -182,7 +182,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         super().destroy_node()
 
     def _restart(self, reason: str) -> None:
-        self.get_logger().warning(f'{reason}: starting anew')
+        self.get_logger().warning(f'{reason}: the search starts again')
         self.reset()
         self.step = -1
 
@@ -199,7 +199,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._keeper.forget()
 
     def fault(self) -> str:
-        """Return why the robots are held, or that they take no goals."""
+        """Return why the robots are held, or that they accept no goals."""
         if self._held:
             return f'robots are held: {self._held}'
         if alarms := self._batteries.alarms:
@@ -208,7 +208,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         return f'no goal accepted for {refused:.0f} s' if refused >= _REFUSAL_PATIENCE else ''
 
     def _command(self, word: str, names: list[str] | None) -> tuple[bool, str]:
-        """Execute a command for robots (None: all); return acceptance and an answer as text."""
+        """Execute a command for robots (None: all); return whether it was accepted, and a text."""
         if not self.active:
             return False, 'the planner is not active'
         asked = self.coordinator.names if names is None else names
@@ -228,9 +228,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             if name in self._away:
                 heard = self._heard.get(name)
                 why = heard.reason if heard is not None else f'no {name}/state yet'
-                answer += f'; {name} does not take part now: {why or "it is silent"}'
+                answer += f'; {name} is unavailable: {why or "no state received"}'
         for text in self._orders.warnings(follow):
-            answer += f'; {text}, which goes on'
+            answer += f'; {text}, which continues'
         self.get_logger().info(answer)
         return True, answer
 
@@ -241,7 +241,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             if not self.active:
                 raise ValueError('the planner is not active')
             self._keep_outs.change(request.zones)
-            response.message = f'keep-outs that hold now: {len(request.zones)}'
+            response.message = f'active keep-outs: {len(request.zones)}'
             response.success = True
         except ValueError as error:
             response.message = str(error)
@@ -261,22 +261,22 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         }
 
     def warnings(self) -> list[str]:
-        """Return robots that follow goals of other clients, and estimated charges."""
+        """Return warnings about goals of other clients and estimated charges."""
         return self._orders.warnings() + self.coordinator.homing.estimates()
 
     # ---- input -------------------------------------------------------------------------------
 
     def _on_step(self, message: LockstepStep) -> None:
-        """Plan when all states of a step are here; a repeated step is for a restarted node."""
+        """Plan once all states of a step are there; a repeated step serves a restarted node."""
         if not self.active:
             return
         if message.step < self.step:
-            self._restart(f'step {message.step} came after {self.step}')
+            self._restart(f'step {message.step} arrived after {self.step}')
         self.step = message.step
         before = self._expected
         if before is None and message.step == self._taken_step:
             self._batches.publish_again()
-            # If such a robot does answer later, it gets a new goal.
+            # A robot that answers later receives a new goal.
             for name, _ in sorted(self._goals.waiting):
                 self._orders.refuse(name)
             self._goals.waiting.clear()
@@ -299,15 +299,18 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if not (self.settings.lockstep or gate.accepts(int(message.step))):
             self.drop(
                 'bad state',
-                f'{name}/state.step: read {message.step}, which is far from the one before; '
-                'allowed if the next one follows it',
+                f'{name}/state.step: read {message.step}, far from the previous one; allowed once '
+                'the next state follows it',
             )
             return
         before = self._heard.get(name)
         if before is not None and message.step < before.step:
             back = before.step - message.step
             if not self.settings.lockstep and back <= 1.0 / self.settings.step:
-                self.drop('old state', f'{name}/state.step: read {message.step}, had {before.step}')
+                self.drop(
+                    'old state',
+                    f'{name}/state.step: read {message.step}, allowed is from {before.step}',
+                )
                 return
             self._restart(f'{name}/state.step went back from {before.step} to {message.step}')
         goal = message.goal_id, message.goal_status, message.reason
@@ -327,17 +330,16 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._leave(name, reason)
         elif name in self._away:
             self._away.discard(name)
-            self.get_logger().info(f'{name} takes part')
+            self.get_logger().info(f'{name} is available')
 
     def _leave(self, name: str, reason: str) -> None:
         if name in self._away or self.ending:
             return
         self._away.add(name)
         self._orders.leave(name)
-        self.get_logger().warning(f'{name} does not take part any more: {reason}')
+        self.get_logger().warning(f'{name} is unavailable: {reason}')
 
     def _check_team(self) -> None:
-        """Remove silent robots from planning; check filter and action."""
         if not self.active or self.ending:
             return
         now = time.monotonic()
@@ -351,7 +353,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 self.get_logger().error(f'{problem}: all robots are held')
                 self._orders.hold(self.coordinator.names)
             elif self._held and not problem:
-                self.get_logger().warning('the filter answers again: the search goes on')
+                self.get_logger().warning('the filter responds again: the search continues')
             self._held = problem
         waits = self.settings.lockstep or bool(self._held)
         if waits and now - self._batches.published_at > _ANSWER_PATIENCE:
@@ -375,7 +377,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     # ---- a step ------------------------------------------------------------------------------
 
     def _try_step(self) -> None:
-        """In lockstep: plan once the states of all participating robots have arrived."""
         expected = self._expected
         if expected is None:
             return
@@ -388,7 +389,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._expected = None
         for name in self.coordinator.names:
             if name not in names:
-                self._leave(name, 'it left')
+                self._leave(name, 'not in this step')
         for name in names:
             self._join_or_leave(name, self._heard[name].status, self._heard[name].reason)
         self._plan_step(
@@ -401,7 +402,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._try_done()
 
     def _try_free_step(self) -> None:
-        """Free running: plan once all participating robots have reached a new step."""
         present = [name for name in self.coordinator.names if name not in self._away]
         if not present:
             return
@@ -454,7 +454,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._views.publish(self.coordinator, robots, header, stamp * 1e-9)
 
     def _announce(self, decision: Any, header: Header) -> None:
-        """Publish a decision and send the goals."""
         self._decisions += 1
         indices = {name: self.coordinator.robots[name].plan.decision for name in decision.robots}
         self._decision_publisher.publish(
@@ -468,11 +467,14 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             )
         )
         if not decision.robots:
-            self.get_logger().info(f'nothing is left to gain: {decision.reason}')
+            found = self._batches.update.found
+            self.get_logger().info(
+                f'finished: the planner expects no further finds ({found} found): {decision.reason}'
+            )
         for name in sorted(decision.robots):
             robot, plan = decision.robots[name], self.coordinator.robots[name].plan
             if robot.stays:
-                # Only of a robot that cannot come home somebody has to know.
+                # A robot that cannot come home needs attention.
                 log = self.warn_throttled if CUT_OFF in robot.reason else self.tell_throttled
                 log(f'{name} stays', f'{name} {robot.reason}')
                 continue

@@ -1,4 +1,4 @@
-"""A robot in the eyes of the coordinator: facts, plan, measurements and battery."""
+"""A robot as the coordinator sees it: facts, plan, measurements and battery."""
 
 import math
 from dataclasses import dataclass, field
@@ -16,17 +16,16 @@ from maasi_planner.measurement_schedule import MeasurementSchedule
 from maasi_planner.motion import MotionModel, RobotState
 from maasi_planner.team import TAKEN, RobotDecision, RobotView
 
-# Speed below which a robot that follows another client stands [m/s].
+# Speed below which a robot with a goal of another client stands [m/s].
 _SLOW = 0.1
 
 
 @dataclass
 class PresentRobot:
-    """A robot that takes part in a step.
+    """An available robot at a step.
 
-    free: whether it has no goal, or its goal has ended; charge: of its battery, 0 to 1, or unknown;
-    searches: whether it goes where the planner sends it; returns: whether it leaves closed zones
-    and goes home by itself.
+    free: no goal, or an ended one; charge: of the battery, 0 to 1, or unknown; searches: follows
+    the planner; returns: leaves closed zones and goes home by itself.
     """
 
     state: RobotState
@@ -37,16 +36,16 @@ class PresentRobot:
 
 
 class Errand(Enum):
-    """What a leg is for that the planner did not decide."""
+    """Purpose of a leg that the planner did not decide."""
 
     LEAVE = 'leaves the closed zone'
     HOME = 'goes home'
-    ROOM = 'makes room at its charger'
+    ROOM = 'frees its charger for another robot'
 
 
 @dataclass(frozen=True)
 class Member:
-    """A robot that measures at a step: its name, decision index d and measurement index m."""
+    """A robot that measures at a step, with decision index d and measurement index m."""
 
     robot: str
     decision: int
@@ -55,10 +54,10 @@ class Member:
 
 @dataclass(frozen=True)
 class RobotFacts:
-    """What is known of a robot before the search.
+    """Constant properties of a robot.
 
-    period: steps between possible measurements; arrival_radius: distance from a waypoint at which
-    the next one is decided [m], 0: it stops at each.
+    period: steps from one possible measurement to the next; arrival_radius: distance from a
+    waypoint at which the next one is decided [m], 0: the robot stops at each.
     """
 
     motion: MotionModel
@@ -70,12 +69,11 @@ class RobotFacts:
 
 @dataclass
 class RobotPlan:
-    """What was decided for a robot last.
+    """The last decision for a robot.
 
-    decision: index of that decision, -1 before the first; chosen: None where it has no path;
-    staying: whether it has no goal: it never had one, refused it, or is commanded to stay;
-    turning_distance: of the present waypoint, see `RobotFacts.arrival_radius`; errand: what its
-    present leg is for, if the planner did not decide it.
+    decision: its index, -1 before the first; chosen: None without a path; staying: no goal, a
+    refused one, or the command to stay; turning_distance: `RobotFacts.arrival_radius` of the
+    present waypoint; errand: purpose of a leg that the planner did not decide.
     """
 
     decision: int = -1
@@ -88,40 +86,40 @@ class RobotPlan:
 
     @property
     def goal_id(self) -> int:
-        """Id of the goal of its last decision; 0 before the first."""
+        """Id of the last goal; 0 before the first."""
         return self.decision + 1
 
     @property
     def positions(self) -> FloatArray:
-        """Predicted trajectory, (K + 1, 3) [m]; empty where it has no path."""
+        """Predicted trajectory, (K + 1, 3) [m]; empty without a path."""
         return np.zeros((0, 3)) if self.chosen is None else self.chosen.positions
 
     @property
     def tour(self) -> FloatArray:
-        """Where it is to go after the waypoint, (n, 3) [m]."""
+        """Positions to visit after the waypoint, (n, 3) [m]."""
         return np.zeros((0, 3)) if self.chosen is None else self.chosen.tour
 
     @property
     def idle(self) -> bool:
-        """Whether it was decided to stay, as there is nothing to do for it."""
+        """Whether the robot stays as it has nothing to do."""
         chosen = self.chosen
         waits = chosen is not None and (chosen.blocked or chosen.reason.startswith('waits'))
         return chosen is not None and chosen.stays and not waits
 
     @property
     def queues(self) -> bool:
-        """Whether it waits until a charger is free, or goes there to wait."""
+        """Whether the robot waits for a free charger, or goes there to wait."""
         return self.chosen is not None and TAKEN in self.chosen.reason
 
     def remaining(self, step: int) -> tuple[FloatArray, FloatArray]:
-        """Return the rest of its predicted trajectory: positions (n, 3) and headings (n,)."""
+        """Return the remaining predicted trajectory: positions (n, 3) and headings (n,)."""
         if self.chosen is None:
             return np.zeros((0, 3)), np.zeros(0)
         first = min(step - (self.decided_at or 0), len(self.positions) - 1)
         return self.chosen.positions[first:], self.chosen.yaws[first:]
 
     def destination(self, state: RobotState) -> FloatArray:
-        """Return the final position of its plan at a state, (3,) [m]."""
+        """Return the final position of the plan, (3,) [m]."""
         if self.staying or not len(self.positions):
             return np.array(state.pose.position)
         return self.positions[-1].copy()
@@ -129,9 +127,9 @@ class RobotPlan:
 
 @dataclass
 class PlannedRobot:
-    """One robot of a team: facts, plan, measuring schedule, and battery where it has one.
+    """One robot of a team: facts, plan, measuring schedule, and an optional battery.
 
-    exploration: e after its own measurements, where it is not that of the team.
+    exploration: e after its own measurements, if it differs from that of the team.
     """
 
     facts: RobotFacts
@@ -144,10 +142,10 @@ class PlannedRobot:
     # ---- queries -----------------------------------------------------------------------------
 
     def is_due(self, step: int, present: PresentRobot) -> bool:
-        """Return whether it is to be planned for now.
+        """Return whether the robot needs a decision now.
 
-        It has arrived, or is near enough to pass its waypoint without a stop; one that was
-        commanded to stay replans at its next possible measurement.
+        It has arrived, or is near enough to pass its waypoint without a stop; a staying robot
+        replans at its next possible measurement.
         """
         plan = self.plan
         if present.free:
@@ -159,12 +157,12 @@ class PlannedRobot:
         return self.facts.motion.squared_distance(here, plan.waypoint) < plan.turning_distance**2
 
     def is_home(self, present: PresentRobot) -> bool:
-        """Return whether it stands at a charger of its own."""
+        """Return whether the robot stands at one of its chargers."""
         position = present.state.pose.position
         return present.free and self.endurance is not None and self.endurance.is_home(position)
 
     def view(self, step: int, present: PresentRobot, planning: bool) -> RobotView:
-        """Return what a planner sees of it."""
+        """Return the robot's view for a planner."""
         view = RobotView(
             state=present.state,
             candidates=self.candidates.at(present.state.pose.position),
@@ -186,7 +184,7 @@ class PlannedRobot:
     # ---- changes -----------------------------------------------------------------------------
 
     def adopt_area(self, area: Area) -> None:
-        """Take another area within the same bounds, as with other keep-outs."""
+        """Change keep-outs: `area` has the same bounds."""
         self.facts.motion.adopt_area(area, self.facts.radius)
         lasting, before = Area(area.settings.without_keep_outs()), self.candidates
         self.candidates = CandidateSet(before.settings, lasting, before.height)
@@ -204,13 +202,13 @@ class PlannedRobot:
             self.endurance.begin_again()
 
     def adopt(self, step: int, present: PresentRobot, chosen: RobotDecision) -> None:
-        """Take over what was decided for it."""
+        """Adopt a decision."""
         plan, facts = self.plan, self.facts
         here = present.state.pose.position
         self.schedule.turn(step, here, None if present.free else plan.waypoint)
         if self.endurance is not None:
             self.endurance.begin_path(step)
-        # A waypoint within the radius already is gone to until it is reached.
+        # A waypoint within the radius is approached until it is reached.
         near = facts.motion.squared_distance(here, chosen.waypoint) <= facts.arrival_radius**2
         self.plan = RobotPlan(
             plan.decision + 1,
@@ -222,21 +220,21 @@ class PlannedRobot:
         )
 
     def leave(self) -> None:
-        """Discard its plan: it does not take part."""
+        """Discard the plan, as the robot is unavailable."""
         self.plan = RobotPlan(self.plan.decision, waypoint=self.plan.waypoint)
         self.schedule.cancel()
 
     def stay(self, step: int) -> None:
-        """Note the decision that it stays where it is, as the search ends."""
+        """Note the decision to stay at the end of the search."""
         self.plan.decision += 1
         self.plan.decided_at, self.plan.staying = step, True
         self.schedule.restart(step)
 
     def on_external_goal(self, step: int) -> None:
-        """Note that it follows a goal of another client: it measures without a plan."""
+        """Note a goal of another client, on the path to which the robot measures without a plan."""
         began = self.plan.decided_at
         if began is not None and self.plan.staying and not len(self.plan.positions):
-            return  # it does so already
+            return  # already noted
         self.leave()
         if began is None:
             began = step
@@ -246,7 +244,7 @@ class PlannedRobot:
         self.plan.decision = max(self.plan.decision, 0)
 
     def update_battery(self, step: int, present: PresentRobot) -> None:
-        """Take its charge, and what its present leg still takes of it."""
+        """Update the charge, and the use of the remaining leg."""
         if self.endurance is None:
             return
         plan, state = self.plan, present.state

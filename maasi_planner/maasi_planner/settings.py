@@ -1,4 +1,4 @@
-"""Settings of candidates, robot motion and planners: checked models for files, parameters, code."""
+"""Settings of candidates, motion and planners: checked models for files, parameters and code."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PLANNERS = PluginGroup(
     'planner',
     'maasi_planner.planners.base:Planner',
     {
-        # `make_planner` takes this one, or `tour`.
+        # `make_planner` chooses this one or `tour`.
         'auto': 'maasi_planner.planners.intermittent:Intermittent',
         'maasi': 'maasi_planner.planners.intermittent:Intermittent',
         'asi': 'maasi_planner.planners.intermittent:Intermittent',
@@ -103,7 +103,7 @@ class CandidateSettings(Settings):
 
 
 class MotionSettings(Settings):
-    """How a robot moves to a waypoint: model, limits and controller."""
+    """Model, limits and controller of a robot's motion."""
 
     model: Annotated[str, MOTIONS, AfterValidator(MOTIONS.check)] = Field(
         'constant_speed', description='Motion model and controller, or your own module:Class'
@@ -189,7 +189,7 @@ class MotionSettings(Settings):
 
 
 class RobotModel(Settings):
-    """What planner, driver and simulation know of a robot."""
+    """Properties of a robot for planner, driver and simulation."""
 
     start: Vector3 = Field(
         [0.0, 0.0, 0.0],
@@ -205,12 +205,12 @@ class RobotModel(Settings):
 
     @classmethod
     def part_of(cls, robot: RobotModel) -> dict[str, Any]:
-        """Return the values of a robot's model that this one has."""
+        """Return the values of a robot's model that this model has."""
         return {key: getattr(robot, key) for key in cls.model_fields}
 
 
 class PlannerSettings(Settings):
-    """What all planners have; own planners have this and `settings`."""
+    """Settings of all planners; plugins have them and `settings`."""
 
     #: Whether robots stop at each waypoint, unless their `arrival_radius` says otherwise.
     stops: ClassVar[bool] = False
@@ -260,11 +260,11 @@ class PlannerSettings(Settings):
 
     @classmethod
     def chosen_by(cls, values: Any) -> type[PlannerSettings]:
-        """Return the model for these values: this one, or one of its kind."""
+        """Return the settings model for these values: this one, or one of its kind."""
         return cls
 
     def renamed(self, name: str) -> PlannerSettings:
-        """Return the settings of a planner by name, with what is set here and it has too."""
+        """Return the settings of another planner, with the values of this one that it shares."""
         given = {key: getattr(self, key) for key in self.model_fields_set}
         if name == self.name and isinstance(self, settings_model({**given, 'name': name})):
             return self
@@ -286,7 +286,7 @@ class JointSettings(PlannerSettings):
 
 
 def settings_model(values: Mapping[str, Any]) -> type[PlannerSettings]:
-    """Return the model of the keys under `planner`, by its name; ValueError: there is none."""
+    """Return the settings model for the keys under `planner`, by its name, or raise ValueError."""
     name = values.get('name', 'auto')
     try:
         planner: Any = PLANNERS.load(name)
@@ -298,15 +298,15 @@ def settings_model(values: Mapping[str, Any]) -> type[PlannerSettings]:
 
 
 def kept_by(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a planner that another one has too, but for its own settings."""
+    """Return the values of a planner that another one shares, without plugin settings."""
     known = PlannerSettings.model_fields
-    with suppress(ValueError):  # of a name that is not found yet, or refused later
+    with suppress(ValueError):  # unknown names are refused later
         known = settings_model({**values, 'name': name}).model_fields
     return {key: value for key, value in values.items() if key in known and key != 'settings'}
 
 
 def planner_settings(name: str = 'auto', **values: Any) -> PlannerSettings:
-    """Return the settings of a planner; those that it has not are refused."""
+    """Return the settings of a planner; unknown keys are refused."""
     values['name'] = name
     return settings_model(values).model_validate(values, strict=True)
 

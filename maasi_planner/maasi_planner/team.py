@@ -1,4 +1,4 @@
-"""Input and output of a planner: view of the team, and decision."""
+"""Input and output of planners: view of the team, and decisions."""
 
 import math
 from collections.abc import Sequence
@@ -14,28 +14,29 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.endurance import Endurance
 from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 
-# Reasons of robots that stay, by which the coordinator knows why.
-#: It lets others pass.
-CROSSED = 'waits: others are on its way'
-#: It waits for its turn to charge.
+# Reasons to stay, which the coordinator recognises.
+#: The robot lets others pass.
+CROSSED = 'waits: other robots are in its path'
+#: The robot waits for a charger.
 TAKEN = 'all chargers are taken'
-#: Others are in its way, for now.
+#: Other robots take all its candidates at the same step.
+ASSIGNED = 'every candidate is assigned to another robot'
+#: Other robots block the robot for now.
 BLOCKED = (
-    'other robots are on all ways',
-    'other robots stand at all candidates',
-    'another robot is sent to every candidate',
-    'another robot takes its candidates',
+    'other robots block all paths',
+    'other robots occupy all candidates',
+    ASSIGNED,
     TAKEN,
 )
-#: Nothing that is left is affordable.
-SAVES_BATTERY = 'it has to save its battery for the path home'
-#: Of a planner that gives it nothing; with a full battery there may be more.
-NOTHING_LEFT = 'nothing is left for it'
+#: The robot can afford nothing that remains.
+SAVES_BATTERY = 'its charge is needed for the path home'
+#: The planner has nothing for the robot, at least with its present charge.
+NOTHING_LEFT = 'no remaining position is worth a visit'
 
 
 @dataclass
 class RobotView:
-    """View of one robot at a step.
+    """One robot at a step.
 
     Parameters
     ----------
@@ -44,25 +45,25 @@ class RobotView:
     candidates : (W, 3) array
         Waypoints to choose from, metres, frame `map`; used when `planning`.
     motion : MotionModel
-        Predicts trajectories; knows where it may go.
+        Predicts trajectories.
     sensor : Sensor
-        With its probability of detection and noise.
+        Probability of detection and noise.
     period_steps : int
-        Steps between possible measurements, Delta.
+        Delta, steps from one possible measurement to the next.
     planning : bool
-        Whether the robot is in P_k: it chooses a waypoint now.
+        Whether the robot is in P_k and needs a waypoint now.
     remaining_path : (n, 3) array, optional
-        Remaining trajectory of a robot that is not planning: positions at steps now, now + 1 and
-        so on. None: it stands at its present position.
+        Remaining trajectory of a robot that is not planning, metres, frame `map`: positions at
+        this step and the following ones. None: the robot stands.
     remaining_yaws : (n,) array, optional
         Headings along the remaining path, radians. None: the present one.
     phase : int
-        Steps from now to the next possible measurement of a robot that is not planning. (One
-        that plans measures now.)
+        Steps to the next possible measurement of a robot that is not planning. (A planning robot
+        measures now.)
     radius : float
-        Radius of a circle around the robot, metres; separates waypoints of different robots.
+        Radius of a circle around the robot, metres, which keeps waypoints of robots apart.
     endurance : Endurance, optional
-        What its battery allows. None: everything.
+        Battery. None: unlimited.
     arrival_radius : float
         Distance from its waypoint at which the robot takes its next decision, metres.
     exploration : UnexploredMap, optional
@@ -95,14 +96,14 @@ class RobotView:
 
     @property
     def height(self) -> float:
-        """Height of its waypoints in a planar search, metres: its own without candidates."""
+        """Height of its waypoints in 2D, metres; without candidates that of the robot."""
         known = self.candidates[0] if len(self.candidates) else self.state.pose.position
         return float(known[2])
 
 
 @dataclass
 class TeamView:
-    """View of the whole team at one step.
+    """The whole team at one step.
 
     Parameters
     ----------
@@ -111,9 +112,9 @@ class TeamView:
     step_time : float
         Seconds per step.
     robots : dict
-        By name; always processed in the order of names.
+        Robots by name; always processed in the order of names.
     clusters : list of Cluster
-        Potential targets now.
+        Potential targets.
     exploration : UnexploredMap
         e after the last measurements.
     taken : sequence of (3,) array and float
@@ -133,12 +134,12 @@ class TeamView:
 
     @property
     def area(self) -> Area:
-        """Where targets may be and robots may go."""
+        """Search area."""
         return self.exploration.area
 
     @property
     def bounds(self) -> FloatArray:
-        """Bounds of the environment, (d, 2), metres."""
+        """Bounding box of the area, (d, 2), metres."""
         return self.exploration.bounds
 
     @property
@@ -151,7 +152,7 @@ class TeamView:
         return sorted(self.robots)
 
     def planning(self) -> list[str]:
-        """Return the names of the robots that plan now, in order."""
+        """Return the names of the planning robots in order."""
         return [name for name in self.names() if self.robots[name].planning]
 
 
@@ -159,8 +160,9 @@ class TeamView:
 class UsableCandidates:
     """Candidates of one planning robot.
 
-    points (W, 3): waypoints, moved out of obstacles, metres; prediction: to them; allowed (W,):
-    which are reachable, not the present place, and apart from where others will stand.
+    points (W, 3): waypoints moved out of obstacles, metres; prediction: trajectories to them;
+    allowed (W,): reachable, not the present position, and apart from the final positions of other
+    robots.
     """
 
     points: FloatArray
@@ -175,24 +177,24 @@ class RobotDecision:
     Attributes
     ----------
     chosen : int
-        Index into `candidates`; -1 means stay where it is (see `reason`).
+        Index into `candidates`; -1: the robot stays (see `reason`).
     waypoint : (3,) array
-        Chosen waypoint, metres, frame `map`; the present position when it stays.
+        Chosen waypoint, metres, frame `map`; the present position if the robot stays.
     positions, yaws : (K + 1, 3), (K + 1,) arrays
-        Predicted trajectory, from the present state.
+        Predicted trajectory from the present state, metres and radians.
     candidates : (W, 3) array
-        Waypoints that were compared, after moving them out of obstacles.
+        Compared waypoints, moved out of obstacles.
     control_cost, target_refinement, exploration, objective : (W,) arrays
         C, T, E and J of each, given the choices of the other robots; J is -inf for inadmissible
         candidates. With the objective `information`, T and E of the chosen ones sum to those of
-        the team. In very large teams T, E and J of other candidates neglect the other planning
+        the team. In very large teams, T, E and J of other candidates neglect the other planning
         robots.
     lengths, measurements : (W,) integer arrays
         Steps K and measurements M of each predicted trajectory.
     reason : str
         Explanation of the choice.
     tour : (n, 3) array
-        Places where it is to go after the waypoint, of planners that plan so far.
+        Positions to visit after the waypoint, metres, if the planner plans that far.
     """
 
     chosen: int
@@ -216,17 +218,17 @@ class RobotDecision:
 
     @property
     def blocked(self) -> bool:
-        """Whether it stays as others are in its way."""
+        """Whether the robot stays as others block it."""
         return self.stays and any(text in self.reason for text in (CROSSED, *BLOCKED))
 
     @property
     def saves_battery(self) -> bool:
-        """Whether it stays as nothing that is left is affordable."""
+        """Whether the robot stays as it can afford nothing that remains."""
         return self.stays and SAVES_BATTERY in self.reason
 
     @property
     def unaffordable(self) -> bool:
-        """Whether it stays, and a better charged battery may help."""
+        """Whether the robot stays, and a fuller battery may help."""
         return self.stays and any(text in self.reason for text in (SAVES_BATTERY, NOTHING_LEFT))
 
     @property
@@ -237,7 +239,7 @@ class RobotDecision:
 
 @dataclass
 class Decision:
-    """Joint decision of a planner for all robots that plan."""
+    """Joint decision for all planning robots."""
 
     step: int
     robots: dict[str, RobotDecision] = field(default_factory=dict)
@@ -250,7 +252,7 @@ class Decision:
 def single_choice(
     points: FloatArray, prediction: Trajectories, chosen: int, reason: str
 ) -> RobotDecision:
-    """Return a decision without the terms of J, for planners that do not use it."""
+    """Return a decision without the terms of J."""
     length = int(prediction.lengths[chosen])
     return RobotDecision(
         chosen=chosen,
@@ -269,7 +271,7 @@ def single_choice(
 
 
 def stay(view: RobotView, reason: str) -> RobotDecision:
-    """Return the decision to stay, the safe fallback without usable candidates."""
+    """Return the decision to stay."""
     empty = np.zeros(0)
     return RobotDecision(
         chosen=-1,

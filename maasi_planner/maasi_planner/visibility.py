@@ -1,4 +1,4 @@
-"""Shortest paths around obstacles: a graph of the corners that see each other."""
+"""Shortest paths around obstacles: a visibility graph of corners."""
 
 from heapq import heapify, heappop, heappush
 
@@ -10,15 +10,15 @@ from scipy.spatial import cKDTree
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.obstacles import Surroundings, Vector, is_visible
 
-# Pairs of vertices that are looked at. Among more vertices than allow all pairs each looks at the
-# nearest ones, which makes paths a little longer; robots cut them short where they see further.
+# Largest number of checked pairs. With more vertices, each checks only its nearest ones, which
+# makes paths slightly longer; robots shorten them where they see further.
 PAIRS = 150_000
 
 
 class VisibilityGraph:
-    """Vertices that see each other, and the lengths of the shortest paths from them to goals.
+    """Corners that see each other, and the lengths of the shortest paths from them to goals.
 
-    around: obstacles, with the vertices; extra: kept beyond the radius by the edges [m].
+    extra: distance kept from obstacles in addition to the radius [m].
     """
 
     def __init__(self, around: Surroundings, extra: float) -> None:
@@ -33,13 +33,13 @@ class VisibilityGraph:
         self._edges = edges.indptr.astype(np.int64), edges.indices.astype(np.int64), edges.data
 
     def to_goal(self, goal: Vector) -> FloatArray:
-        """Return the length of the shortest clear path from each vertex to a goal, (m,), or inf."""
+        """Return the length of the shortest clear path from each corner to a goal, (m,), or inf."""
         last = _last_legs(goal, self.around)
         return _shortest(*self._edges, last)
 
 
 def _pairs(vertices: FloatArray) -> IntArray:
-    """Return pairs of vertices (p, 2): all, or of each the nearest."""
+    """Return pairs of corners (p, 2): all, or the nearest of each."""
     number = len(vertices)
     if number * number <= 2 * PAIRS:
         return np.stack(np.triu_indices(number, 1), axis=1)
@@ -51,7 +51,6 @@ def _pairs(vertices: FloatArray) -> IntArray:
 
 @njit(cache=True)
 def _seen(pairs: IntArray, around: Surroundings, extra: float) -> BoolArray:
-    """Return which pairs of vertices see each other, (p,)."""
     out, vertices = np.zeros(pairs.shape[0], np.bool_), around.vertices
     for n in range(pairs.shape[0]):
         i, j = pairs[n]
@@ -62,7 +61,6 @@ def _seen(pairs: IntArray, around: Surroundings, extra: float) -> BoolArray:
 
 @njit(cache=True)
 def _last_legs(goal: Vector, around: Surroundings) -> FloatArray:
-    """Return the length of the straight line from each vertex to a goal, (m,); inf: not clear."""
     out, end = np.full(around.vertices.shape[0], np.inf), (goal[0], goal[1], 0.0)
     for j in range(out.shape[0]):
         x, y = around.vertices[j, 0], around.vertices[j, 1]
@@ -73,7 +71,7 @@ def _last_legs(goal: Vector, around: Surroundings) -> FloatArray:
 
 @njit(cache=True)
 def _shortest(first: IntArray, ends: IntArray, lengths: FloatArray, last: FloatArray) -> FloatArray:
-    """Return the shortest lengths from all vertices, (m,), by Dijkstra's algorithm on a heap."""
+    """Return the shortest lengths from all corners, (m,), by Dijkstra's algorithm on a heap."""
     out = last.copy()
     heap = [(out[vertex], vertex) for vertex in range(len(out)) if out[vertex] < np.inf]
     heapify(heap)

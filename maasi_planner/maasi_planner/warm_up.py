@@ -1,4 +1,4 @@
-"""Compile, or load from the cache, every kernel that a decision uses."""
+"""Compiles every kernel of a decision, or loads it from the cache."""
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from maasi_planner.team import RobotView, TeamView
 
 
 def _decide(team: TeamView) -> None:
-    """Run every planner for all robots together, and for the first one alone."""
     for settings in (
         planner_settings(objective='paper'),
         planner_settings(objective='information'),
@@ -42,7 +41,7 @@ def _decide(team: TeamView) -> None:
 
 
 def warm_up() -> None:
-    """Run small decisions of every kind, so that the first real one does not compile."""
+    """Take small decisions of every kind, so that the first real one does not compile."""
     zone = {'centre': [1.0, 1.0], 'radius': 0.1}
     bounds = [[0.0, 2.0], [0.0, 2.0]]
     area = Area(EnvironmentSettings.model_validate({'bounds': bounds, 'obstacles': [zone]}))
@@ -67,7 +66,7 @@ def warm_up() -> None:
                 )
             team = TeamView(0, 0.05, robots, clusters, exploration)
             _decide(team)
-            # Large teams have kernels of their own.
+            # Large teams have separate kernels.
             view = team.robots['0']
             many = {f'{index}': view for index in range(PAIRS_LIMIT + 1)}
             for objective in ('paper', 'information'):

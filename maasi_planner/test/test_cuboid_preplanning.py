@@ -65,7 +65,7 @@ def test_probability_by_distance():
         (
             None,
             {'centre': [135, 130], 'size': [2, 80, 80]},
-            {('west', 'another object stands in the view of a cuboid')},
+            {('west', 'the view')},
         ),
     ],
 )

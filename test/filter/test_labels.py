@@ -95,7 +95,7 @@ def test_an_identity_belongs_to_one_even_if_a_scan_has_it_twice():
 
 @pytest.mark.parametrize('score', [-0.1, 1.1, float('nan')])
 def test_scores_are_refused_that_are_no_probability(score):
-    with pytest.raises(ValueError, match=r'score: got .*allowed is 0 to 1'):
+    with pytest.raises(ValueError, match='score: '):
         Label('cup', score)
 
 

@@ -10,7 +10,7 @@ from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners.intermittent import Intermittent
 from maasi_planner.robot_plan import Member, PresentRobot
-from maasi_planner.team import Decision, single_choice, stay
+from maasi_planner.team import TAKEN, Decision, single_choice, stay
 
 ROBOT = {
     'candidates': {'grid': [4, 4], 'spacing': 2.0, 'corner': [2.0, 2.0]},
@@ -267,12 +267,12 @@ def test_a_robot_that_must_turn_home_does_so_as_soon_as_its_charger_is_free():
     low = {'a': PresentRobot(here, False, 0.1)}
     occupied = [(np.array([1.0, 1.0, 0.0]), 0.1)]
     chosen = coordinator.plan(1, low, occupied).robots['a']
-    assert chosen.reason.endswith('all chargers are taken')
+    assert chosen.reason.endswith(TAKEN)
     near = np.linalg.norm(chosen.waypoint - [1.0, 1.0, 0.0])
     assert 0.2 < near < 2.0
     # Near it, it waits; as soon as it is free it goes there.
     low = {'a': PresentRobot(RobotState.at_rest(chosen.waypoint), True, 0.1)}
-    assert coordinator.plan(20, low, occupied).robots['a'].reason == 'waits: all chargers are taken'
+    assert coordinator.plan(20, low, occupied).robots['a'].reason == f'waits: {TAKEN}'
     assert coordinator.plan(22, low, occupied) is None
     chosen = coordinator.plan(24, low).robots['a']
     assert chosen.reason.startswith('goes home') and chosen.waypoint.tolist() == [1.0, 1.0, 0.0]

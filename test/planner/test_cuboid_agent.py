@@ -204,7 +204,7 @@ CAGE = [
     ('make', 'words'),
     [
         (lambda: make_agent(home=[300.0, 0.0, 0.0]), r'purple: start: read .*inside the area'),
-        (lambda: make_agent(obstacles=CAGE), r'no cuboid can be reached: obstacles close it in'),
+        (lambda: make_agent(obstacles=CAGE), 'no cuboid can be reached'),
         (lambda: make_agent().observe(0, [np.nan, 0.0, 0.0], np.zeros(3)), r'purple: state: got'),
         (lambda: HazardSettings(recharge_steps=[5, 2]), 'recharge_steps: got'),
     ],

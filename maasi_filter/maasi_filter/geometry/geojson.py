@@ -1,4 +1,4 @@
-"""Polygons of GeoJSON as map programs write it."""
+"""Reads polygons and points from GeoJSON of map programs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from maasi_filter.geometry.polygons import short, sound, warn
 _FILES = ('.json', '.geojson')
 _ROLES = ('area', 'keep_out', 'prior')  # of polygons
 _POINT_ROLES = ('start', 'home', 'charger')
-_BEYOND = 10.0  # degrees by which areas across 180 degrees, as drawn on the page, go on
+_BEYOND = 10.0  # degrees by which areas of the page may exceed 180 degrees
 _SIMPLE = ('Point', 'LineString', 'Polygon')
 _KINDS = (*_SIMPLE, *(f'Multi{kind}' for kind in _SIMPLE), 'GeometryCollection')
-_NAMED = 5  # so many features that are left out are named
-# WGS 84 in degrees, longitude first, as programs call it; GeoJSON of today has no other system.
+_NAMED = 5  # most ignored features that a warning names
+# Names of WGS 84 in degrees, longitude first; RFC 7946 allows no other system.
 _WGS84 = re.compile(
     r'(CRS:?84h?|EPSG:{1,2}(4326|4979)|(?<!\d)4326|WGS[ _]?(19)?84)\)?$', re.IGNORECASE
 )
@@ -35,10 +35,7 @@ _CONVERT = 'convert it: ogr2ogr -f GeoJSON -t_srs EPSG:4326 wgs84.geojson FILE'
 
 @dataclass(frozen=True)
 class Feature:
-    """A feature of GeoJSON with polygons.
-
-    name: as in messages; shape: in degrees or, if it says so, in metres of the map.
-    """
+    """A GeoJSON feature with polygons in degrees, or in metres of the map."""
 
     name: str
     shape: BaseGeometry
@@ -46,19 +43,19 @@ class Feature:
 
     @property
     def in_metres(self) -> bool:
-        """Whether it is in metres of the map, as drawn on the page of a run without an origin."""
+        """Whether it was drawn on the page of a run without an origin, in metres of the map."""
         return bool(self.properties.get('unit') == 'm')
 
 
 def is_geojson(value: Any) -> bool:
-    """Return whether a value is GeoJSON, or the name of a file of it."""
+    """Return whether a value is GeoJSON or the name of a GeoJSON file."""
     if isinstance(value, str):
         return Path(value).suffix.lower() in _FILES
     return isinstance(value, Mapping) and 'type' in value
 
 
 def polygons_of(features: Sequence[Feature], origin: OriginSettings | None) -> BaseGeometry:
-    """Return the union of features on the map [m]; ValueError if it needs an origin."""
+    """Return the union of features [m, map]; ValueError if an origin is missing."""
     if all(feature.in_metres for feature in features):
         return shapely.union_all([feature.shape for feature in features])
     if origin is None:
@@ -72,13 +69,13 @@ def polygons_of(features: Sequence[Feature], origin: OriginSettings | None) -> B
     found = shapely.transform(shapely.union_all(shapes), project)
     if found.is_valid:
         return found
-    # Where corners lie on edges of others, which the map bends by fractions of a millimetre.
+    # Closes gaps of fractions of a millimetre, as straight edges bend on the map.
     parts = shapely.get_parts(shapely.make_valid(found))
     return shapely.union_all([part for part in parts if isinstance(part, (Polygon, MultiPolygon))])
 
 
 def _unwrapped(shape: BaseGeometry, around: float) -> BaseGeometry:
-    """Return a shape whose longitudes differ from `around` by at most 180 degrees."""
+    """Return a shape with longitudes at most 180 degrees from `around`."""
 
     def turn(degrees: FloatArray) -> FloatArray:
         turns = np.round((degrees[:, 0].mean() - around) / 360.0)
@@ -89,7 +86,7 @@ def _unwrapped(shape: BaseGeometry, around: float) -> BaseGeometry:
 
 
 def by_role(value: Any) -> dict[str, list[Feature]]:
-    """Return the features of an area's GeoJSON by role; programs write null or nothing for none."""
+    """Return the features of an area's GeoJSON by role; null or nothing means no role."""
     roles: dict[str, list[Feature]] = {role: [] for role in _ROLES}
     for feature in features_of(value):
         role = feature.properties.get('role')
@@ -106,16 +103,16 @@ def by_role(value: Any) -> dict[str, list[Feature]]:
 
 
 def origin_of(features: Sequence[Feature]) -> Mapping[str, Any] | None:
-    """Return the origin of the run on whose page features were drawn, or the middle of others."""
-    said = (item.properties.get('origin') for item in features)
-    # Other programs have other things under that name.
-    drawn_at = (item for item in said if isinstance(item, Mapping) and 'latitude' in item)
+    """Return the origin of the run on whose page features were drawn, or the centre of others."""
+    values = (item.properties.get('origin') for item in features)
+    # Other programs may use that name differently.
+    drawn_at = (item for item in values if isinstance(item, Mapping) and 'latitude' in item)
     in_metres = all(item.in_metres for item in features)
     return next(drawn_at, None if in_metres else _centre_of(features))
 
 
 def with_role(features: Sequence[Feature], wanted: str, key: str) -> list[Feature]:
-    """Return those with a role or none for a key; other ones are left out, by name."""
+    """Return the features with the wanted role or without one; warn about others by name."""
     others = [item for item in features if item.properties.get('role') in _ROLES]
     others = [item for item in others if item.properties['role'] != wanted]
     words = '; '.join(f'{item.name}: role {item.properties["role"]}' for item in others[:5])
@@ -127,7 +124,7 @@ def with_role(features: Sequence[Feature], wanted: str, key: str) -> list[Featur
 
 
 def weight_of(feature: Feature) -> float:
-    """Return the weight of a polygon of the prior; null or nothing is 1."""
+    """Return the weight of a prior polygon; null or nothing is 1."""
     weight = feature.properties.get('weight')
     if weight in (None, ''):
         return 1.0
@@ -143,7 +140,6 @@ def weight_of(feature: Feature) -> float:
 
 
 def _centre_of(features: Sequence[Feature]) -> dict[str, float]:
-    """Return an origin in the middle of features in degrees; halves at 180 degrees are one area."""
     whole = shapely.union_all([feature.shape for feature in features])
     west, _, east, _ = whole.bounds
     if east - west > 180.0:
@@ -157,7 +153,7 @@ def _centre_of(features: Sequence[Feature]) -> dict[str, float]:
 def points_of(value: Any) -> list[tuple[str, str, list[float]]]:
     """Return role, robot, and longitude and latitude of points with a role of robots.
 
-    The name of a start is that of its robot where it has no property robot.
+    The robot of a start is its property robot, or else its name.
     """
     found = []
     for row in _rows(value)[1]:
@@ -165,19 +161,16 @@ def points_of(value: Any) -> list[tuple[str, str, list[float]]]:
         if isinstance(facts, Mapping) and facts.get('role') in _POINT_ROLES:
             geometry = row.get('geometry')
             if isinstance(geometry, Mapping) and geometry.get('type') == 'Point':
-                (place,) = _position(geometry.get('coordinates'), 'a point').tolist()
+                (position,) = _position(geometry.get('coordinates'), 'a point').tolist()
                 role, owner = str(facts['role']), facts.get('robot')
                 if not owner and role == 'start':
                     owner = facts.get('name')
-                found.append((role, str(owner or ''), place))
+                found.append((role, str(owner or ''), position))
     return found
 
 
 def features_of(value: Any) -> list[Feature]:
-    """Return the features with polygons of GeoJSON: values, text or the name of a file.
-
-    What is no polygon is left out, with one warning that names it.
-    """
+    """Return the features with polygons of GeoJSON values, text, or a file; warn about others."""
     source, rows = _rows(value)
     found, left = [], []
     for number, row in enumerate(rows, 1):
@@ -198,7 +191,7 @@ def features_of(value: Any) -> list[Feature]:
 
 
 def _rows(value: Any) -> tuple[str, list[Any]]:
-    """Return where GeoJSON comes from, for messages, and its features as they are."""
+    """Return the source of GeoJSON, for messages, and its raw features."""
     named = isinstance(value, str) and is_geojson(value) and not value.lstrip().startswith('{')
     source = f'{value}: ' if named else ''
     data = _parsed(value, named)
@@ -212,7 +205,7 @@ def _rows(value: Any) -> tuple[str, list[Any]]:
         if data.get('type') not in _KINDS:
             raise ValueError(
                 f'{source}type: read {short(data.get("type"))}, allowed are FeatureCollection, '
-                'Feature and Polygon: this is no GeoJSON'
+                'Feature and Polygon: this is not GeoJSON'
             )
         rows = [{'type': 'Feature', 'geometry': data}]
     if not isinstance(rows, list):
@@ -231,20 +224,20 @@ def _parsed(value: Any, named: bool) -> Any:
     except OSError as error:
         raise ValueError(f'{value}: {error.strerror}') from None
     except UnicodeDecodeError:
-        raise ValueError(f'{value}: is no text in UTF-8') from None
+        raise ValueError(f'{value}: is not UTF-8 text') from None
     except (ValueError, RecursionError) as error:
         line = f' in line {error.lineno}' if isinstance(error, json.JSONDecodeError) else ''
-        raise ValueError(f'{short(value)}: is no JSON{line}') from None
+        raise ValueError(f'{short(value)}: is not JSON{line}') from None
 
 
 def _check_system(data: Mapping[str, Any], source: str) -> None:
-    """Raise ValueError if the member `crs` of GeoJSON names another system than WGS 84."""
+    """Raise ValueError if the member `crs` of GeoJSON is not WGS 84."""
     crs = data.get('crs')
     if crs is None:
         return
     properties = crs.get('properties') if isinstance(crs, Mapping) else None
     facts = properties if isinstance(properties, Mapping) else {'name': crs}
-    # Of old files: {type: EPSG, properties: {code: 4326}}.
+    # Old files have {type: EPSG, properties: {code: 4326}}.
     name = facts.get('name', f'EPSG:{facts["code"]}' if 'code' in facts else None)
     if not isinstance(name, str) or not _WGS84.search(name.strip()):
         raise ValueError(
@@ -253,15 +246,15 @@ def _check_system(data: Mapping[str, Any], source: str) -> None:
 
 
 def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature | None, list[str]]:
-    """Return a feature, None if it has no polygon, and words about what of it is no polygon."""
+    """Return a feature, or None without a polygon, and texts about its other parts."""
     properties = row.get('properties')
     if properties is not None and not isinstance(properties, Mapping):
         raise ValueError(
             f'{source}feature {number}: properties: read {short(properties)}, allowed is an object'
         )
     facts = properties or {}
-    said = [facts.get('name'), facts.get('title'), row.get('id'), facts.get('id')]
-    title = next((str(word) for word in said if word not in (None, '')), '')
+    values = [facts.get('name'), facts.get('title'), row.get('id'), facts.get('id')]
+    title = next((str(word) for word in values if word not in (None, '')), '')
     name = f'feature {number}' + (f' ({title[:40]})' if title else '')
     where, left, shapes = f'{source}{name}', [], []
     parts = list(_parts(row.get('geometry'), where)) or [('empty', None)]
@@ -283,7 +276,6 @@ def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature 
 
 
 def _parts(geometry: Any, where: str) -> Iterator[tuple[str, Any]]:
-    """Yield kind and coordinates of the simple parts of a geometry."""
     if geometry is None:
         yield 'no geometry', None
         return
@@ -303,20 +295,18 @@ def _parts(geometry: Any, where: str) -> Iterator[tuple[str, Any]]:
 
 
 def _position(coordinates: Any, where: str) -> FloatArray:
-    """Return the position of a point, (1, 2)."""
     try:
-        place = np.array([coordinates[:2]], dtype=float)
+        position = np.array([coordinates[:2]], dtype=float)
     except (TypeError, ValueError):
-        place = np.empty(0)
-    if place.shape != (1, 2) or not np.isfinite(place).all():
+        position = np.empty(0)
+    if position.shape != (1, 2) or not np.isfinite(position).all():
         raise ValueError(
             f'{where}: coordinates: read {short(coordinates)}, allowed are longitude and latitude'
         )
-    return place
+    return position
 
 
 def _rings(coordinates: Any, where: str) -> list[FloatArray]:
-    """Return the rings of a polygon; of positions, which may have heights, the first two."""
     try:
         rings = [np.array([row[:2] for row in ring], dtype=float) for ring in coordinates]
         if any(ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 3 for ring in rings):
@@ -332,10 +322,10 @@ def _rings(coordinates: Any, where: str) -> list[FloatArray]:
 
 
 def _short_way(rings: Sequence[FloatArray], where: str) -> list[FloatArray]:
-    """Return rings [degrees] whose edges take the short way round, and warn if some did not."""
+    """Return rings [degrees] whose edges take the shorter direction; warn if some did not."""
     if not any((np.abs(np.diff(ring[:, 0])) > 180.0).any() for ring in rings):
         return list(rings)
-    warn(f'{where}: has edges longer than 180 degrees: taken as an area across 180 degrees')
+    warn(f'{where}: has edges longer than 180 degrees: read as an area across 180 degrees')
     east = [np.unwrap(ring[:, 0], period=360.0) for ring in rings]
     turns = [np.round((axis.mean() - east[0].mean()) / 360.0) for axis in east]
     columns = zip(east, turns, rings)
@@ -343,7 +333,7 @@ def _short_way(rings: Sequence[FloatArray], where: str) -> list[FloatArray]:
 
 
 def _check_degrees(degrees: FloatArray, where: str) -> None:
-    """Raise ValueError with the likely cause if coordinates are no degrees."""
+    """Raise ValueError with the likely cause if coordinates are not in degrees."""
     x, y = degrees.T
     wrong = np.flatnonzero((np.abs(x) > 180.0 + _BEYOND) | (np.abs(y) > 90.0))
     if not len(wrong):

@@ -1,4 +1,4 @@
-"""Maps of Nav2 (YAML with an image) as polygons, and the grey values of images."""
+"""Reads Nav2 maps (YAML with an image) as polygons, and grey values of images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHANNELS = ('grey', 'red', 'green', 'blue', 'alpha')
 
 
 def check_pixels(shape: Sequence[int]) -> None:
-    """Raise ValueError if a raster has more cells than what needs them can hold."""
+    """Raise ValueError if a raster has too many cells."""
     if math.prod(shape) > _MOST_PIXELS:
         raise ValueError(
             f'got {" x ".join(map(str, shape))} cells, allowed are at most {_MOST_PIXELS} in all: '
@@ -39,14 +39,13 @@ def read_channels(path: str) -> FloatArray:
 
     try:
         with warnings.catch_warnings():
-            # Sizes are checked here.
             warnings.simplefilter('ignore', Image.DecompressionBombWarning)
             with Image.open(path) as image:
                 check_pixels((image.height, image.width))
                 if not image.height or not image.width:
                     raise ValueError('is empty')
                 if image.mode == 'F':
-                    raise ValueError('has values that are no integers: save it as .npy')
+                    raise ValueError('has values that are not integers: save it as .npy')
                 if image.mode.startswith('I'):
                     grey = np.asarray(image, dtype=float) / 257.0
                     if grey.max() > 255.0 or grey.min() < 0.0:
@@ -56,15 +55,15 @@ def read_channels(path: str) -> FloatArray:
     except Image.DecompressionBombError:
         raise ValueError(f'is larger than {_MOST_PIXELS} pixels: scale it down') from None
     except UnidentifiedImageError:
-        raise ValueError('is no image') from None
+        raise ValueError('is not an image') from None
     except OSError as error:
-        raise ValueError(error.strerror or 'is no complete image') from None
+        raise ValueError(error.strerror or 'is not a complete image') from None
 
 
 def read_image(path: str, band: str | None = None) -> FloatArray:
-    """Return the grey values of an image, 0 to 255 (rows, columns), or those of a channel.
+    """Return the grey values of an image, 0 to 255 (rows, columns), or one of its `CHANNELS`.
 
-    ValueError if it is not grey and opaque, and no channel of `CHANNELS` is named.
+    ValueError if no channel is named and the image is not grey and opaque.
     """
     channels = read_channels(path)
     if band is not None:
@@ -79,26 +78,26 @@ def read_image(path: str, band: str | None = None) -> FloatArray:
     elif (channels[:, :, 1:3] != channels[:, :, :1]).any():
         wrong = 'has colours'
     if wrong:
-        raise ValueError(f'{wrong}: name the band that counts, one of {", ".join(CHANNELS)}')
+        raise ValueError(f'{wrong}: set band to one of {", ".join(CHANNELS)}')
     return np.asarray(channels[:, :, 0])
 
 
 def read_map(path: str) -> BaseGeometry:
-    """Return the occupied cells of a map of Nav2 as polygons [m, map].
+    """Return the occupied cells of a Nav2 map as polygons [m, map].
 
-    Cells are occupied as for Nav2's map server in each of its modes (trinary, scale, raw); what is
-    unknown is free. ValueError names the key that is wrong.
+    Cells are occupied as for Nav2's map server in each of its modes (trinary, scale, raw); unknown
+    cells are free. ValueError names the wrong key.
     """
     import yaml
 
     try:
         facts = yaml.safe_load(Path(path).read_text(encoding='utf-8-sig'))
     except OSError as error:
-        raise ValueError(f'{path}: is no map of Nav2: {error.strerror}') from None
+        raise ValueError(f'{path}: is not a Nav2 map: {error.strerror}') from None
     except (ValueError, yaml.YAMLError):
-        raise ValueError(f'{path}: is no map of Nav2: is no YAML') from None
+        raise ValueError(f'{path}: is not a Nav2 map: not YAML') from None
     if not isinstance(facts, Mapping):
-        raise ValueError(f'{path}: is no map of Nav2: allowed are keys with values')
+        raise ValueError(f'{path}: is not a Nav2 map: allowed are keys with values')
     try:
         cell = _number(facts, 'resolution')
         if cell <= 0.0:
@@ -109,7 +108,7 @@ def read_map(path: str) -> BaseGeometry:
         west, south, yaw = (_number({'origin': value}, 'origin') for value in origin)
         occupied = _occupied(facts, Path(path).parent)
     except ValueError as error:
-        raise ValueError(f'{path}: is no map of Nav2: {error}') from None
+        raise ValueError(f'{path}: is not a Nav2 map: {error}') from None
     if not occupied.any():
         raise ValueError(f'{path}: no cell of the map is occupied')
     cells = _boxes(occupied, cell, west, south)
@@ -129,7 +128,7 @@ def _number(facts: Mapping[str, Any], key: str) -> float:
 
 
 def _occupied(facts: Mapping[str, Any], folder: Path) -> BoolArray:
-    """Return which cells are occupied, (rows, columns), first row north."""
+    """Return which cells are occupied, (rows, columns), first row in the north."""
     mode, image = facts.get('mode', 'trinary'), facts.get('image')
     if mode not in _MODES:
         raise ValueError(f'mode: read {mode}, allowed are {", ".join(_MODES)}')
@@ -156,11 +155,11 @@ def _occupied(facts: Mapping[str, Any], folder: Path) -> BoolArray:
 
 
 def _boxes(occupied: BoolArray, cell: float, west: float, south: float) -> BaseGeometry:
-    """Return the union of cells; a box for each run in a row, as one for each takes seconds."""
+    """Return the union of cells, with one box per run in a row, which is fast."""
     ends = np.diff(np.pad(occupied, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, first = np.nonzero(ends == 1)
     last = np.nonzero(ends == -1)[1]
-    # The same number for the same edge, so that cells that touch become one.
+    # Shared edges have the same numbers, so that touching cells merge.
     x = west + cell * np.arange(occupied.shape[1] + 1)
     y = south + cell * np.arange(len(occupied), -1, -1)
     boxes = shapely.box(x[first], y[row + 1], x[last], y[row])

@@ -1,4 +1,4 @@
-"""Where one robot may be: in an area, and between lowest and highest coordinates."""
+"""The volume of one robot: an area with lowest and highest coordinates."""
 
 import math
 from collections.abc import Sequence
@@ -9,15 +9,14 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 
-MARGIN = 0.5  # how far outside a robot may drift before its driver acts [m]
+MARGIN = 0.5  # drift outside at which the driver acts [m]
 
 
 @dataclass(eq=False)
 class OperatingVolume:
-    """Where one robot may be: in an area, between lowest and highest coordinates of goals.
+    """Volume of one robot: an area, and limits (3, 2) of its goals, the geofence [m, map].
 
-    radius: by which it may be beyond the sides of bounds [m]; limits (3, 2): of x, y, z, the
-    geofence [m, map]; none: only those of the area.
+    radius: how far the robot may be beyond the sides of the bounds [m].
     """
 
     area: Area
@@ -25,7 +24,7 @@ class OperatingVolume:
     limits: FloatArray = field(default_factory=lambda: np.tile([-math.inf, math.inf], (3, 1)))
 
     def goal_problem(self, position: Sequence[float]) -> str:
-        """Return why a robot is not sent to a position (3,), or nothing."""
+        """Return why a position (3,) is not allowed as a goal; empty if it is."""
         bounds = self.area.bounds + np.array([-self.radius, self.radius])
         if problem := _beyond(bounds, position):
             return problem
@@ -36,20 +35,20 @@ class OperatingVolume:
         return problem and f'{problem}, the geofence'
 
     def nearest_inside(self, position: FloatArray) -> FloatArray:
-        """Return the position between the limits that is nearest to a position (3,)."""
+        """Return the nearest position inside the limits."""
         return np.clip(position, self.limits[:, 0], self.limits[:, 1])
 
     def distance_outside(self, position: FloatArray) -> float:
-        """Return how far a position (3,) is outside of the limits along an axis [m]; 0: inside."""
+        """Return the distance of a position (3,) from the limits along an axis [m]; 0 inside."""
         return float(np.abs(position - self.nearest_inside(position)).max())
 
     def beyond_border(self, position: FloatArray) -> tuple[float, float]:
-        """Return how far a position (3,) is outside of the area, and how far goals may be [m]."""
+        """Return the distance of a position (3,) from the area, and that allowed for goals [m]."""
         overhang = self.radius if self.area.settings.area is None else 0.0
         return self.area.outside_by(position), overhang
 
     def drift_problem(self, position: FloatArray) -> str:
-        """Return where a robot is too far outside of the limits; below them it may land."""
+        """Return how a robot is too far outside of the limits; below them it may land."""
         for axis, value, (low, high) in zip('xyz', position.tolist(), self.limits.tolist()):
             lowest = -math.inf if axis == 'z' else low - MARGIN
             if not lowest <= value <= high + MARGIN:
@@ -58,7 +57,6 @@ class OperatingVolume:
 
 
 def _beyond(limits: FloatArray, position: Sequence[float]) -> str:
-    """Return which coordinate of a position is beyond limits (2 or 3, 2), and what is allowed."""
     for axis, value, (low, high) in zip('xyz', position, limits.tolist()):
         if not low <= value <= high:
             return f'.{axis}: read {value}, allowed is {low:g} to {high:g} [m]'

@@ -1,4 +1,4 @@
-"""Polygons from corners and from well-known text; what is no polygon is refused by name."""
+"""Polygons from corners and well-known text; invalid ones are refused."""
 
 import json
 import re
@@ -13,11 +13,11 @@ from shapely.geometry.base import BaseGeometry
 
 
 class InputWarning(UserWarning):
-    """What was assumed of an input, or left out of it."""
+    """An assumption about an input, or an ignored part of it."""
 
 
 def warn(text: str) -> None:
-    """Warn of what was assumed of an input, or left out of it."""
+    """Issue an InputWarning."""
     warnings.warn(text, InputWarning, stacklevel=3)
 
 
@@ -28,15 +28,15 @@ def short(value: Any) -> str:
 
 
 def sound(found: BaseGeometry, words: str, unit: str = 'm') -> BaseGeometry:
-    """Return polygons if they are some; words: what was read."""
+    """Return valid polygons; ValueError with `words`, what was read, for others."""
     if not isinstance(found, (Polygon, MultiPolygon)) or found.is_empty:
         raise ValueError(f'{words}, allowed are polygons')
     if not found.is_valid:
         reason = str(shapely.is_valid_reason(found))
-        what, place = re.fullmatch(r'([^\[]*)(?:\[(.*)\])?', reason).groups()  # type: ignore[union-attr]
+        what, location = re.fullmatch(r'([^\[]*)(?:\[(.*)\])?', reason).groups()  # type: ignore[union-attr]
         where = ''
-        if place:
-            x, y = (float(number) for number in place.split()[:2])
+        if location:
+            x, y = (float(number) for number in location.split()[:2])
             named = (f'longitude {x:.6f}, latitude {y:.6f}', f'({x:.2f}, {y:.2f}) m')
             where = f' at {named[unit == "m"]}'
         raise ValueError(f'{words}: {what.lower()}{where}; allowed are polygons that are simple')
@@ -44,7 +44,7 @@ def sound(found: BaseGeometry, words: str, unit: str = 'm') -> BaseGeometry:
 
 
 def is_wkt(value: Any) -> bool:
-    """Return whether a value is the well-known text of polygons."""
+    """Return whether a value is well-known text of polygons."""
     return isinstance(value, str) and value.lstrip().upper().startswith(('POLYGON', 'MULTIPOLYGON'))
 
 
@@ -59,7 +59,7 @@ def of_text(value: str) -> BaseGeometry:
 
 
 def of_rings(value: Sequence[Any]) -> BaseGeometry:
-    """Return the polygon of corners, or of several rings, the first around the others [m]."""
+    """Return the polygon of corners, or of rings, of which the first is the outer one [m]."""
     try:
         rings = value if np.ndim(value[0][0]) else [value]
         corners = [np.array([[*row] for row in ring], dtype=float) for ring in rings]

@@ -19,9 +19,9 @@ _CORNERS = (0, 0), (1, 0), (1, 1), (0, 1)
 
 @dataclass(frozen=True)
 class Raster:
-    """Densities: values (rows, columns), and how x, y [m, map] become columns and rows.
+    """Densities (rows, columns), and the map from x, y [m, map] to columns and rows.
 
-    corners (4, 2): where its file says that it lies [m, map].
+    corners (4, 2): position of the raster by its own file [m, map].
     """
 
     values: FloatArray
@@ -29,7 +29,7 @@ class Raster:
     corners: FloatArray | None = None
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the values at places, 0 outside."""
+        """Return the values at positions [m, map], 0 outside."""
         rows, columns = self.values.shape
         column, row = self.cells(x, y)
         known = (column >= 0.0) & (column < columns) & (row >= 0.0) & (row < rows)
@@ -39,10 +39,7 @@ class Raster:
 
 
 def read_raster(environment: EnvironmentSettings) -> Raster:
-    """Return the raster of an environment's prior: .npy or an image, first row north; or GeoTIFF.
-
-    ValueError if it cannot be read, or is not of finite numbers from 0.
-    """
+    """Return the raster of an environment's prior; ValueError if it is invalid."""
     path = str(environment.prior.raster)
     key = f'environment.prior.raster: {path}'
     try:
@@ -65,12 +62,12 @@ def read_raster(environment: EnvironmentSettings) -> Raster:
 
 
 def scaled(values: FloatArray) -> FloatArray:
-    """Return values from 0, at most 1, by a power of two: exact, and their sums are finite."""
+    """Return values scaled by a power of two to at most 1, exactly and with finite sums."""
     return np.asarray(np.ldexp(values, -np.frexp(values.max(initial=0.0))[1]))
 
 
 def _read_array(path: str) -> FloatArray:
-    """Return the array of a .npy file; it is looked at before it is read."""
+    """Return the array of a .npy file after a check of its header."""
     array = np.load(path, mmap_mode='r')
     if not isinstance(array, np.ndarray):
         raise ValueError('holds several arrays, allowed is one')
@@ -79,7 +76,6 @@ def _read_array(path: str) -> FloatArray:
 
 
 def _over(values: FloatArray, extent: list[list[float]]) -> Raster:
-    """Return a raster over bounds on x and y [m, map]."""
     (west, east), (south, north) = extent
 
     def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -90,7 +86,7 @@ def _over(values: FloatArray, extent: list[list[float]]) -> Raster:
 
 
 def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> Raster:
-    """Return a band of a GeoTIFF in its own coordinates; what has no data is 0."""
+    """Return a band of a GeoTIFF in its own coordinates; cells without data are 0."""
     try:
         import rasterio
         from rasterio.warp import transform
@@ -105,7 +101,7 @@ def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> R
         bands = [str(number) for number in file.indexes]
         if band not in (None, *bands) or (band is None and len(bands) > 1):
             read = 'several' if band is None else band
-            raise ValueError(f'band: read {read}, name the one that counts: {", ".join(bands)}')
+            raise ValueError(f'band: read {read}, allowed are {", ".join(bands)}')
         crs, grid = file.crs, list(~file.transform)
         a, b, c, d, e, f = list(file.transform)[:6]
         u, v = np.transpose(_CORNERS) * [[file.width], [file.height]]
@@ -115,8 +111,8 @@ def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> R
 
     def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)
-        places = transform('EPSG:4326', crs, degrees[:, 1], degrees[:, 0])
-        east, north = (np.reshape(axis, x.shape) for axis in places)
+        coordinates = transform('EPSG:4326', crs, degrees[:, 1], degrees[:, 0])
+        east, north = (np.reshape(axis, x.shape) for axis in coordinates)
         a, b, c, d, e, f = grid[:6]
         return a * east + b * north + c, d * east + e * north + f
 

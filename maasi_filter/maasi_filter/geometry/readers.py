@@ -1,8 +1,4 @@
-"""Readers of the shapes of an environment, each in its format, into polygons in metres of the map.
-
-Shapes are given in metres of the map, as GeoJSON (degrees, RFC 7946), as well-known text, or as
-maps of Nav2.
-"""
+"""Readers of the shapes of an environment, into polygons in metres of the map."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -30,21 +26,20 @@ from maasi_filter.geometry.occupancy_map import read_map
 from maasi_filter.geometry.polygons import is_wkt, of_rings, of_text, warn
 from maasi_filter.settings import Settings
 
-_NUMBER = '-+.0123456789'  # with which a number begins
+_NUMBER = '-+.0123456789'  # first characters of numbers
 _MAPS = ('.yaml', '.yml')
-# Of files that an environment names.
 _IMAGES = ('.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff')
 FILES = ('.geojson', '.json', *_MAPS, *_IMAGES)
 _ROLE_OF = {'keep_outs': 'keep_out', 'obstacles': 'keep_out', 'prior': 'prior'}  # by key
-_DEGREES = 0.1  # an area that is shorter is not in metres, but in degrees [m]
-_LARGEST = 10e9  # of an area in degrees; larger ones are mistakes [m^2]
+_DEGREES = 0.1  # shorter areas are in degrees [m]
+_LARGEST = 10e9  # of an area in degrees [m^2]
 _FARTHEST = 100e3  # of an area from the origin of its map, which is flat [m]
 
 
 def read_shape(value: Any, origin: OriginSettings | None = None) -> BaseGeometry:
-    """Return the polygons of a value: rings [m], well-known text, a map of Nav2, or GeoJSON.
+    """Return the polygons of a value: rings [m], well-known text, a Nav2 map, or GeoJSON.
 
-    ValueError where GeoJSON in degrees has to do without an origin, or what is read is no polygon.
+    ValueError if a polygon is invalid, or GeoJSON in degrees has no origin.
     """
     if isinstance(value, BaseGeometry):
         return value
@@ -58,14 +53,14 @@ def read_shape(value: Any, origin: OriginSettings | None = None) -> BaseGeometry
     return polygons_of(features_of(value), origin)
 
 
-#: Polygons in metres of the map, as text well-known text.
+#: Polygons in metres of the map; as text, well-known text.
 Shape = Annotated[BaseGeometry, PlainValidator(read_shape), PlainSerializer(str, return_type=str)]
 
 
 def environment_in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of an environment with all shapes in the map, and the bounds of its area.
 
-    An area of GeoJSON may have the origin, keep-outs and the prior with it, by role.
+    GeoJSON of an area may contain the origin, keep-outs and the prior, by role.
     """
     values = dict(given)
     area, origin = values.get('area'), values.get('origin')
@@ -100,14 +95,14 @@ def environment_in_metres(given: Mapping[str, Any]) -> dict[str, Any]:
                 if found.disjoint(values[key][-1]['polygon']):
                     warn(
                         f'{item.name}: role keep_out: as environment.{key}[{len(values[key]) - 1}] '
-                        'it touches nothing of the area'
+                        'it does not touch the area'
                     )
     prior = _prior(read, values.get('prior'), roles.get('prior', []))
     return values if prior is None else {**values, 'prior': prior}
 
 
 def _read(origin: OriginSettings | None, value: Any, *key: str | int) -> BaseGeometry:
-    """Return the polygons of a value at a key, to a tenth of a millimetre where that is valid."""
+    """Return the polygons of a value at a key, rounded to 0.1 mm where that is valid."""
     if isinstance(value, BaseGeometry):
         return value
     with errors_at(value, *key):
@@ -119,7 +114,6 @@ def _read(origin: OriginSettings | None, value: Any, *key: str | int) -> BaseGeo
 
 
 def _zone(read: Callable[..., BaseGeometry], item: Any, *key: str | int) -> Any:
-    """Return a zone with its polygon in the map; a round one as it is."""
     round_one = isinstance(item, Settings) or (isinstance(item, Mapping) and 'centre' in item)
     row = isinstance(item, str) and Path(item).suffix.lower() not in FILES
     if round_one or (row and item[:1] in _NUMBER):
@@ -131,7 +125,7 @@ def _zone(read: Callable[..., BaseGeometry], item: Any, *key: str | int) -> Any:
 def _prior(
     read: Callable[..., BaseGeometry], prior: Any, parts: Sequence[Feature]
 ) -> dict[str, Any] | None:
-    """Return a prior with polygons in the map, None: as it is; parts: of the file of the area."""
+    """Return a prior with polygons in the map, with the parts from the file of the area."""
     found = [('area', item) for item in parts]
     if isinstance(prior, list) or is_geojson(prior):
         with errors_at(prior, 'prior'):
@@ -159,7 +153,7 @@ def _prior(
 
 @contextmanager
 def errors_at(value: Any, *key: str | int) -> Iterator[None]:
-    """Make what is wrong with a value an error at its key."""
+    """Turn a ValueError into one at the key of its value."""
     problems: list[Any]
     try:
         yield
@@ -174,10 +168,7 @@ def errors_at(value: Any, *key: str | int) -> Iterator[None]:
 
 
 def _check_area(area: BaseGeometry, drawn: bool, origin: Any) -> None:
-    """Raise ValueError if an area is so far away, large or small that it has other units.
-
-    drawn: whether it is of GeoJSON; origin: that was given.
-    """
+    """Raise ValueError if distance or size of an area suggest wrong units."""
     west, south, east, north = area.bounds
     gap, length = area.distance(shapely.Point(0.0, 0.0)), max(east - west, north - south)
     if drawn and origin and gap > _FARTHEST:
@@ -198,7 +189,7 @@ def _check_area(area: BaseGeometry, drawn: bool, origin: Any) -> None:
 
 
 def shapes_of_texts(zones: Iterable[str]) -> list[Any]:
-    """Return zones that were received as texts; ValueError if one could name a file of this host.
+    """Return zones of received texts; ValueError if a text could name a file of this host.
 
     Allowed are `x y radius`, well-known text, GeoJSON, and rings as JSON.
     """
@@ -210,7 +201,7 @@ def shapes_of_texts(zones: Iterable[str]) -> list[Any]:
             try:
                 shape = json.loads(text)
             except (ValueError, RecursionError):
-                raise ValueError(f'keep_outs: {index}: got {text[:60]!r}, is no JSON') from None
+                raise ValueError(f'keep_outs: {index}: got {text[:60]!r}, is not JSON') from None
             known = isinstance(shape, list) or 'polygon' not in shape
         elif text and text[0] in _NUMBER:
             known = len(text.split()) in (3, 4)

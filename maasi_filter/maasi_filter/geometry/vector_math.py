@@ -1,4 +1,4 @@
-"""Elementary functions that compilers vectorise; the last bit depends on the processor."""
+"""Elementary functions for vectorised loops; the last bit depends on the processor."""
 
 import math
 from typing import Any
@@ -18,10 +18,10 @@ LEAST_EXPONENT = -708.0  # below this exp(x) is taken as 0
 
 
 def _generate_wide_vectors(context: Any) -> Any:
-    """Have the calling kernel's loops use the widest vectors, where compilers use half of them."""
+    """Let loops of the calling kernel use the widest vectors; compilers default to half of them."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        # The set's own `add` knows only attributes without a value.
+        # The attributes' own `add` rejects attributes with a value.
         set.add(builder.function.attributes, '"prefer-vector-width"="512"')
         return context.get_dummy_value()
 
@@ -33,7 +33,7 @@ use_wide_vectors: Any = intrinsic(_generate_wide_vectors)
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})
 def arctan2(y: float, x: float) -> float:
-    """Return the angle of (x, y) to about a last place (fdlibm's polynomial); 0 at the origin."""
+    """Return the angle of (x, y) with an error of about one ulp (fdlibm's polynomial); 0 at 0."""
     ax = abs(x)
     ay = abs(y)
     small = min(ax, ay)
@@ -63,7 +63,7 @@ def arctan2(y: float, x: float) -> float:
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})
 def exponential(x: float) -> float:
-    """Return exp(x), x up to 700, to a last place; 0 below -708. `math.exp` is not vectorised."""
+    """Return exp(x) for x up to 700 with an error of about one ulp; 0 below -708."""
     exponent = max(x, LEAST_EXPONENT)
     shifted = exponent * LOG2_E + MAGIC
     k = shifted - MAGIC

@@ -1,4 +1,4 @@
-"""Births of particles (000, section 3.2; 001, (A1); 003), and resampling of all of them."""
+"""Births of particles (000, section 3.2; 001, (A1); 003) and resampling."""
 
 import math
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ def measurement_births(
 ) -> tuple[FloatArray, FloatArray]:
     """Return J births at each of m measurements, x = g^-1(z + N(0, R)), (m J, d), and b (m, J).
 
-    Their intensity is N0 / V, times the prior. Divided by the density of the draw and multiplied by
+    Their intensity is N0 / V times the prior. Divided by the density of the draw and multiplied by
     the probability that robots `before` missed them, b = (N0 / V) pi(x, q) |dx/dz|
     prod(1 - pi_before) / J, where |dx/dz| = r in 2D and r^2 cos(elevation) in 3D; 0 outside E.
-    b / C(z) is the posterior weight. A birth counts for its own measurement only: the sum of its b
-    is <psi_z, Y>.
+    b / C(z) is the posterior weight. A birth counts for its own measurement only: its b sum to
+    <psi_z, Y>.
     """
     sensor, pose = member.sensor, member.pose
     count, d = member.values.shape
@@ -35,8 +35,8 @@ def measurement_births(
     level = z[:, 0] * (np.cos(z[:, 2]) if d == 3 else 1.0)
     jacobian = level * z[:, 0] if d == 3 else level
     inside = (z[:, 0] > 0.0) & (level > 0.0)
-    for place, (low, high) in zip(particles.T, area.bounds):
-        inside &= (place >= low) & (place <= high)
+    for coordinate, (low, high) in zip(particles.T, area.bounds):
+        inside &= (coordinate >= low) & (coordinate <= high)
     intensity = (area.expected_targets / area.volume / number) * jacobian
     intensity *= area.density(particles)
     intensity *= sensor.detection.probability(particles, pose)
@@ -65,10 +65,9 @@ def gaussian_births(
 ) -> tuple[FloatArray, FloatArray]:
     """Return births from one Gaussian over all measured positions (003, section 3.3).
 
-    Weights are Y / (J p(x)), times the prior, with p the Gaussian density; draws outside the bounds
-    are left out.
-    The covariance of the noise, `spread`, is added to the empirical one, which is singular for few
-    measurements: a deviation from the paper.
+    Weights are Y / (J p(x)) times the prior, with the Gaussian density p; draws outside the bounds
+    are dropped. Unlike in the paper, the noise covariance `spread` is added to the empirical one,
+    which is singular for few measurements.
     """
     d = area.dimension
     mean = centres.mean(axis=0)
@@ -90,7 +89,7 @@ def gaussian_births(
 
 
 def noise_in_space(member: CheckedMeasurement) -> FloatArray:
-    """Return the mean covariance of the noise of detections in space, square metres."""
+    """Return the mean covariance of the detections' noise in map coordinates [m^2]."""
     model, pose = member.sensor.measurement, member.pose
     inverse = np.linalg.pinv(model.jacobian(model.inverse(member.values, pose), pose))
     spreads = inverse @ member.sensor.covariance @ inverse.transpose(0, 2, 1)
@@ -99,13 +98,12 @@ def noise_in_space(member: CheckedMeasurement) -> FloatArray:
 
 @njit(cache=True, error_model='numpy')
 def _drawn(weights, gaps):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Return the index of the particle at each of the points with these gaps, by weight."""
     cumulative, points = np.cumsum(weights), np.cumsum(gaps)
     scale = cumulative[-1] / points[-1]
     cumulative[-1] = np.inf
     index = np.empty(len(gaps) - 1, np.int64)
     i = j = 0
-    # Without a branch: processors would guess every other one wrong.
+    # Branchless: a branch would be mispredicted half of the time.
     while i < len(index):
         index[i] = j
         below = np.int64(cumulative[j] <= points[i] * scale)
@@ -115,21 +113,20 @@ def _drawn(weights, gaps):  # type: ignore[no-untyped-def]  # pragma: no cover -
 
 
 def resample(weights: FloatArray, number: int, generator: np.random.Generator) -> IntArray:
-    """Return indices (number,) of particles, drawn with replacement by weight; they increase."""
+    """Return increasing indices (number,) of particles, drawn with replacement by weight."""
     # Uniform points in order, from exponential gaps.
     return np.asarray(_drawn(weights, generator.standard_exponential(number + 1)))
 
 
 @njit(cache=True, error_model='numpy')
 def _moved(particles, index, noise, bounds):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Return drawn particles; a copy of the one before is moved by the next row of the noise."""
     moved = np.empty((len(index), particles.shape[1]))
     copies = 0
     for i in range(len(index)):
         copy = i > 0 and index[i] == index[i - 1]
         for a in range(particles.shape[1]):
-            place = particles[index[i], a] + (noise[copies, a] if copy else 0.0)
-            moved[i, a] = min(max(place, bounds[a, 0]), bounds[a, 1]) if copy else place
+            coordinate = particles[index[i], a] + (noise[copies, a] if copy else 0.0)
+            moved[i, a] = min(max(coordinate, bounds[a, 0]), bounds[a, 1]) if copy else coordinate
         copies += copy
     return moved
 
@@ -141,7 +138,7 @@ def jittered(
     bounds: FloatArray,
     generator: np.random.Generator,
 ) -> FloatArray:
-    """Return resampled particles (number, d), repeated ones moved apart: not in the papers."""
+    """Return resampled particles (number, d) with copies moved apart; not in the papers."""
     copies = np.count_nonzero(index[1:] == index[:-1])
     noise = deviation * generator.standard_normal((copies, particles.shape[1]))
     return np.asarray(_moved(particles, index, noise, bounds))

@@ -1,4 +1,4 @@
-"""Clusters of particles by K-means: potential targets (000, section 3.3)."""
+"""Clusters of particles by K-means, the potential targets (000, section 3.3)."""
 
 import numpy as np
 from numba import njit
@@ -6,7 +6,7 @@ from numba import njit
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.records import Cluster
 
-PART = 128  # particles of a part: resampling keeps copies together, so that most lie in a small box
+PART = 128  # particles per block; after resampling most blocks are small boxes
 # Columns of a covariance's entries in sums of products.
 SQUARES = np.array([[1, 2, 4], [2, 3, 5], [4, 5, 6]])
 
@@ -55,7 +55,6 @@ def _assign(particles, low, high, centres, label, owner, changed):  # type: igno
 
 @njit(cache=True, error_model='numpy')
 def _move_centres(particles, weights, label, owner, changed, centres):  # type: ignore[no-untyped-def]
-    """Move the centres that changed to the weighted means; an empty one stays where it was."""
     mass, sums = np.zeros(len(centres)), np.zeros(centres.shape)
     for part in range(len(owner)):
         if owner[part] < 0 or changed[owner[part]]:
@@ -72,9 +71,9 @@ def _move_centres(particles, weights, label, owner, changed, centres):  # type: 
 
 @njit(cache=True, error_model='numpy')
 def _iterate(particles, weights, low, high, centres, iterations):  # type: ignore[no-untyped-def]
-    """Move the centres until no particle changes its own; return the label of each particle."""
+    """Move the centres until no particle changes its cluster; return the label of each particle."""
     label, owner = np.full(len(particles), -1), np.full(len(low), -1)
-    # The last one is of label -1.
+    # The last entry belongs to label -1.
     changed = np.empty(len(centres) + 1, np.bool_)
     for _ in range(iterations):
         _assign(particles, low, high, centres, label, owner, changed)
@@ -86,7 +85,7 @@ def _iterate(particles, weights, low, high, centres, iterations):  # type: ignor
 
 @njit(cache=True, error_model='numpy')
 def _add_moments(particles, weights, label, means, sums):  # type: ignore[no-untyped-def]
-    """Add mass, and the weighted products of SQUARES of the offsets from the means, to (k, 7)."""
+    """Add mass and weighted products of offsets from the means, by label, to (k, 7)."""
     for i in range(len(particles)):
         g = label[i]
         x = particles[i, 0] - means[g, 0]
@@ -98,7 +97,6 @@ def _add_moments(particles, weights, label, means, sums):  # type: ignore[no-unt
 
 @njit(cache=True, error_model='numpy')
 def _keep_least(particles, centre, least):  # type: ignore[no-untyped-def]
-    """Lower `least` (n,) to the squared distance from a centre where that is smaller."""
     d = particles.shape[1]
     for i in range(len(particles)):
         x = particles[i, 0] - centre[0]
@@ -114,7 +112,7 @@ def _starting_centres(
     start: FloatArray,
     generator: np.random.Generator,
 ) -> FloatArray:
-    """Return starting centres: the given ones first, then K-means++."""
+    """Return starting centres: the given ones first, others by K-means++."""
     centres = start[:number]
     least = np.full(len(particles), np.inf)
     for centre in centres if len(centres) < number else ():
@@ -138,7 +136,7 @@ def kmeans(
     start: FloatArray,
     iterations: int = 20,
 ) -> tuple[IntArray, FloatArray]:
-    """Return labels (n,) and centres (k, d) of weighted K-means from `start`, else K-means++."""
+    """Return labels (n,) and centres (k, d) of weighted K-means from `start`, or from K-means++."""
     centres = _starting_centres(particles, weights, number, start, generator)
     starts = np.arange(0, len(particles), PART)
     low, high = np.minimum.reduceat(particles, starts), np.maximum.reduceat(particles, starts)
@@ -148,7 +146,7 @@ def kmeans(
 def clusters_of(
     particles: FloatArray, weights: FloatArray, label: IntArray, means: FloatArray
 ) -> dict[int, Cluster]:
-    """Return the clusters that have mass, by label; the radius is the weighted rms distance."""
+    """Return the clusters with mass, by label; their radius is the weighted rms distance."""
     sums, d = np.zeros((len(means), 7)), means.shape[1]
     _add_moments(particles, weights, label, means, sums)
     mass = sums[:, 0]

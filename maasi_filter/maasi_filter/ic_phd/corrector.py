@@ -21,11 +21,10 @@ X, Y, Z, RANGE, BEARING, ELEVATION, ROWS = range(7)  # rows of a chunk's working
 
 
 class PhdScan(NamedTuple):
-    """Detections of one robot, and how its sensor saw them.
+    """Detections of one robot and its sensor, as the kernels need them.
 
-    values (m, d) in m and rad; information (d, d) the inverse of R; log_norm the logarithm of the
-    Gaussian's peak; kind and parameters of pi(x, q); position (3,) [m], cosine and sine of the
-    robot's yaw.
+    values (m, d) in m and rad; information (d, d) is the inverse of R; log_norm is the logarithm of
+    the Gaussian's peak; kind and parameters describe pi(x, q); position (3,) in m.
     """
 
     values: FloatArray
@@ -39,7 +38,7 @@ class PhdScan(NamedTuple):
 
 
 def phd_scan(values: FloatArray, sensor: Sensor, pose: Pose) -> PhdScan:
-    """Return detections (m, d) as the corrector takes them."""
+    """Return detections (m, d) in the form of the corrector."""
     kind, parameters = sensor.detection.kernel()
     _, log_determinant = np.linalg.slogdet(2.0 * math.pi * sensor.covariance)
     return PhdScan(
@@ -56,7 +55,6 @@ def phd_scan(values: FloatArray, sensor: Sensor, pose: Pose) -> PhdScan:
 
 @njit(cache=True, error_model='numpy')
 def _fill_offsets(particles, scan, rows):  # type: ignore[no-untyped-def]
-    """Fill offset, range and angles of particles (n, d) from the sensor."""
     use_wide_vectors()
     number, d = particles.shape
     for i in range(number):
@@ -103,7 +101,7 @@ def _fill_psi(z, scan, rows, weights, psi):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _explain_chunks(particles, weights, scan, probability, psi, sums, first, last):  # type: ignore[no-untyped-def]
-    """Fill pi (n,), psi (m, n), and the weighted sums (chunks, m) of psi in chunks."""
+    """Fill pi (n,), psi (m, n) and the weighted sums (chunks, m) of psi."""
     rows = np.empty((ROWS, CHUNK))
     for chunk in range(first, last):
         begin = chunk * CHUNK
@@ -129,7 +127,7 @@ def phd_correct(
     """Return the factor of each particle's weight, and C(z) (000, (13), (16)).
 
     The factor is 1 - pi + sum over z of psi_z / C(z), with C(z) = background + <psi_z, D>, where
-    `background` (m,) are the intensities of clutter and of births at each detection, above 0.
+    `background` (m,) is the intensity of clutter and births at each detection, above 0.
     """
     number, count, chunks = len(weights), len(scan.values), max(1, -(-len(weights) // CHUNK))
     psi, sums = np.empty((count, number)), np.empty((chunks, count))
@@ -139,7 +137,6 @@ def phd_correct(
     firsts = range(0, chunks, part)
     lasts = [min(first + part, chunks) for first in firsts]
     run = map if pool is None else pool.map
-    # A list, so that all of them are done.
     list(run(explain, firsts, lasts))
     factor = 1.0 - probability
     normaliser = background + sums.cumsum(axis=0)[-1]

@@ -143,7 +143,6 @@ class IcPhdFilter(SearchFilter):
         self.weights = np.concatenate([self.weights, weights])
 
     def _resample(self) -> None:
-        """Resample to l particles per expected target, within bounds."""
         numbers = self._numbers
         expected = self.expected_number
         if not expected > 1e-12:
@@ -200,7 +199,6 @@ class IcPhdFilter(SearchFilter):
     def _without_found(
         self, member: CheckedMeasurement, dropped: dict[str, int]
     ) -> CheckedMeasurement:
-        """Return a measurement without detections of found targets or beyond the maximum range."""
         member = within_range(member, dropped)
         if not self.found_targets:
             return member

@@ -1,4 +1,4 @@
-"""Probability of detection pi(x, q), as kernels whose parameters are alike for all kinds."""
+"""Probability of detection pi(x, q), as kernels with the same parameters for all kinds."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from maasi_filter.models.pose import Pose
 
 EXPONENTIAL, GAUSSIAN, BOX, CUSTOM = 0, 1, 2, 3
 PARAMETERS = 9
-# Entries of the parameters of CUSTOM; those before are as of the radial models: number and address
+# Further parameters of CUSTOM, after those of the radial models: number and address
 # of the function, address of its values, and how many there are.
 REACH, NUMBER, FUNCTION, VALUES, LENGTH = 4, 5, 6, 7, 8
 
-# Entries from NUMBER on of functions with their values, by number: the latest of each.
+# Latest entries from NUMBER on of each function, by number.
 _known: dict[float, FloatArray] = {}
 
 
 @intrinsic
 def _call(typing_context, function, values, length, forward, left, up):  # type: ignore[no-untyped-def]
-    """Return what the function at an address, with the values at another, gives at an offset."""
+    """Call the function at an address, with the values at another, for an offset."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         integer, number = (context.get_value_type(kind) for kind in (types.int64, types.float64))
@@ -46,13 +46,13 @@ def _call(typing_context, function, values, length, forward, left, up):  # type:
 
 
 def register(function: Callable[..., float], values: FloatArray) -> FloatArray:
-    """Return the entries from NUMBER on of a function and values; its number follows from both."""
+    """Return the entries from NUMBER on for a function and its values, which give its number."""
     entries = _entries(function, np.asarray(values, dtype=float).tobytes())
     _known[entries[0]] = entries
     return entries
 
 
-# Both caches keep what kernels read by its address.
+# The caches keep alive what kernels read by address.
 @cache
 def _entries(function: Callable[..., float], content: bytes) -> FloatArray:
     name = f'{function.__module__}:{function.__qualname__}'
@@ -75,11 +75,11 @@ def _compiled(function: Callable[..., float]) -> Any:
 
 
 def renew_addresses(kinds: FloatArray, parameters: FloatArray) -> None:
-    """Put the addresses of this process into saved parameters (n, PARAMETERS), in place."""
+    """Replace the addresses in saved parameters (n, PARAMETERS) by those of this process."""
     for row in np.flatnonzero(kinds == CUSTOM).tolist():
         if parameters[row, NUMBER] not in _known:
             raise ValueError(
-                'it was saved with a detection model of your own, which no sensor of this process '
+                'it was saved with a detection model of a plugin, which no sensor of this process '
                 'has: make the sensors, with the same settings, before it is loaded'
             )
         parameters[row, NUMBER:] = _known[parameters[row, NUMBER]]
@@ -89,8 +89,8 @@ def renew_addresses(kinds: FloatArray, parameters: FloatArray) -> None:
 def detection_probability_at(kind, parameters, dx, dy, dz, cos_yaw, sin_yaw):  # type: ignore[no-untyped-def]
     """Return pi for a target at offset (dx, dy, dz) [m, map axes] from the sensor.
 
-    `kind` is EXPONENTIAL (000, eq. (3), (4)), GAUSSIAN (003, section 2.2) or BOX (000, eq. (25)
-    and (34)), or CUSTOM, a user's own function; `parameters` come from the model's `kernel()`.
+    `kind` is EXPONENTIAL (000, eq. (3), (4)), GAUSSIAN (003, section 2.2), BOX (000, eq. (25) and
+    (34)), or CUSTOM, a plugin's function; `parameters` come from the model's `kernel()`.
     """
     x, y = dx, dy
     if kind == CUSTOM or (kind == BOX and parameters[8] > 0.5):
@@ -102,7 +102,7 @@ def detection_probability_at(kind, parameters, dx, dy, dz, cos_yaw, sin_yaw):  #
         address, values = np.int64(parameters[FUNCTION]), np.int64(parameters[VALUES])
         length = np.int64(parameters[LENGTH])
         value = parameters[0] * _call(address, values, length, x, y, dz)  # type: ignore[call-arg]
-        # What is not a number is not above 0 either.
+        # Also false for NaN.
         return min(value, 1.0) if value > 0.0 else 0.0
     if kind == BOX:
         inside = min(x - parameters[1], parameters[4] - x)
@@ -136,7 +136,7 @@ def fill_probabilities(kind, parameters, x, y, z, cos_yaw, sin_yaw, out):  # typ
 
 
 class DetectionModel:
-    """Probability of detection of a target, by the formula in `detection_probability_at`."""
+    """Probability of detection of a target."""
 
     _kind: int
 
@@ -152,9 +152,9 @@ class DetectionModel:
         return self._kind, self._parameters
 
     def probability(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Return pi(x, q), shape (n,), in [0, 1], of targets at positions (n, d) [m, map].
+        """Return pi(x, q) in [0, 1], (n,), for targets at positions (n, d) [m, map].
 
-        With d = 2 the sensor's height plays no part.
+        In 2D the height of the sensor is ignored.
         """
         array = np.asarray(positions, dtype=float)
         if array.ndim != 2 or array.shape[1] not in (2, 3):
@@ -184,14 +184,14 @@ class ExponentialDetection(_RadialDetection):
     probability : float
         G, in [0, 1].
     size : sequence of 2 or 3 floats
-        F on each map axis, metres. With two numbers height plays no part.
+        F on each map axis, metres. With two numbers the height is ignored.
     """
 
     _kind = EXPONENTIAL
 
 
 class GaussianDetection(_RadialDetection):
-    """pi = G exp(-|zeta|^2 / 2) (003, section 2.2); arguments as `ExponentialDetection`."""
+    """pi = G exp(-|zeta|^2 / 2) (003, section 2.2); parameters as `ExponentialDetection`."""
 
     _kind = GAUSSIAN
 
@@ -202,14 +202,13 @@ class BoxDetection(DetectionModel):
     Parameters
     ----------
     lower, upper : sequences of 2 or 3 floats
-        Corners of the box as offsets from the sensor, metres; it need not be centred. With two
-        numbers height plays no part.
+        Corners of the box relative to the sensor, metres. With two numbers the height is ignored.
     probability : float
-        G inside; the papers have 1.
+        G inside; 1 in the papers.
     frame : {'robot', 'world'}
         Whether the box turns with the robot's heading or stays aligned with the map.
     edge : float
-        Half width of a linear ramp across the box's faces, metres; 0 is the papers' hard edge.
+        Half width of a linear ramp across the box's faces, metres; 0, as in the papers: a step.
     """
 
     _kind = BOX

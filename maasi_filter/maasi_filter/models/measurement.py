@@ -1,7 +1,6 @@
-"""A sensor measures range and angles of a target: g(x, q), its inverse and Jacobian.
+"""Measurement model of range and angles: g(x, q), its inverse and Jacobian (000, eq. (6) to (9)).
 
-Range, bearing and, in 3D, elevation (000, eq. (6) to (9)). Bearings are in the map's axes, not
-relative to the robot's heading. In 2D the range is horizontal.
+Bearings are relative to the map's axes, not to the robot's heading. In 2D the range is horizontal.
 """
 
 import math
@@ -41,9 +40,9 @@ class RangeAndAngles:
     dimension: int
 
     def measure(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Return g(x, q), shape (n, d) [m, rad, rad], of targets at positions (n, d) [m, map].
+        """Return g(x, q), (n, d) [m, rad, rad], of targets at positions (n, d) [m, map].
 
-        A target at the robot itself has all angles 0; one straight above has bearing 0.
+        All angles are 0 at the robot itself; the bearing is 0 straight above it.
         """
         x, y, z = self._offsets(positions, pose)
         level = np.hypot(x, y)
@@ -51,14 +50,14 @@ class RangeAndAngles:
         values[:, 0] = np.hypot(level, z)
         values[:, 1] = np.arctan2(y, x)
         if self.dimension == 3:
-            # That is the arcsin of (9), and keeps its digits next to the vertical.
+            # Equal to the arcsin of (9), but precise near the vertical.
             values[:, 2] = np.arctan2(z, level)
         return values
 
     def inverse(self, z: ArrayLike, pose: Pose) -> FloatArray:
-        """Return the positions (n, d) [m, map] that measurements (n, d) point at.
+        """Return the positions (n, d) [m, map] of measurements (n, d) [m, rad, rad].
 
-        A negative range, which noise can produce, points the opposite way.
+        A negative range, which noise can produce, points in the opposite direction.
         """
         values, origin = self._array('z', z), pose.position
         distance, bearing = values[:, 0], values[:, 1]
@@ -72,10 +71,9 @@ class RangeAndAngles:
         return positions
 
     def jacobian(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Return dg/dx, shape (n, d, d).
+        """Return dg/dx, (n, d, d).
 
-        At a pole (zero range, or straight above for the bearing) the derivative does not exist;
-        the rows of the angles concerned, and of a zero range, are zero there.
+        Where it does not exist (zero range, or straight above for the bearing), its rows are zero.
         """
         x, y, z = self._offsets(positions, pose)
         level = np.hypot(x, y)
@@ -99,7 +97,6 @@ class RangeAndAngles:
         return difference
 
     def _offsets(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Return x, y and z of positions from the robot, (3, n); z is 0 in 2D."""
         array = self._array('positions', positions)
         offsets = np.zeros((3, len(array)))
         offsets[: self.dimension] = (array - pose.position[: self.dimension]).T

@@ -1,4 +1,4 @@
-"""Detection models of a user's own: pi as a compiled function, or as one of NumPy."""
+"""Detection models of plugins: pi as a compiled function or a NumPy function."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,39 +14,39 @@ from maasi_filter.plugins import PluginError
 from maasi_filter.unexplored_map import interpolate_at
 
 _CELLS = {2: 256, 3: 48}  # cells from the robot to the reach, on each axis, by dimension
-_TRIALS = 64  # places at which a compiled function is tried
+_TRIALS = 64  # positions at which a compiled function is tried
 
 
 class OwnDetection(DetectionModel):
-    """pi(x, q) by a function of one's own, of where a target is as seen from the robot.
+    """pi(x, q) by your own function of the target's position relative to the robot.
 
-    A subclass has `reach`, and either `compiled` with `values`, or `evaluate`. The result is
-    multiplied with `probability` of the settings, and 0 beyond the reach. In two dimensions `up`
-    is 0. Both ways are compared in docs/plugins.md.
+    A subclass has `reach`, and either `compiled` with `values`, or `evaluate`; docs/plugins.md
+    compares both. The result is multiplied by `probability` of the settings, and 0 beyond the
+    reach. In 2D `up` is 0.
 
     Parameters
     ----------
     settings : BaseModel, optional
         Instance of `Settings`.
     probability : float
-        G, what the function is multiplied with, in [0, 1].
+        G, factor on the result, in [0, 1].
     dimension : int
         2 or 3.
 
     Attributes
     ----------
     Settings : type or None
-        Model of the settings that a scenario may give.
+        Model of the settings that a scenario can set.
     compiled : function or None
-        pi(forward, left, up, values) of floats [m] and the array `values`, for Numba: decorated
-        with `numba.njit`, or plain.
+        pi(forward, left, up, values) of floats [m] and the array `values`, decorated with
+        `numba.njit` or plain.
     own : BaseModel or None
         The settings.
 
     Raises
     ------
     PluginError
-        If the function returns something else than finite numbers in [0, 1].
+        If the function does not return finite numbers in [0, 1].
     """
 
     Settings: ClassVar[type[BaseModel] | None] = None
@@ -65,37 +65,36 @@ class OwnDetection(DetectionModel):
             function, values = _interpolated, self._table(reach)
         else:
             values = self._numbers('values', self.values()).ravel()
-            # At some places, where an exception would still be seen.
-            places = np.random.default_rng(1).uniform(-reach, reach, (_TRIALS, 3))
-            places[:, dimension:] = places[0] = 0.0
-            results = [function(*place, values) for place in places.tolist()]
+            # Tried first where exceptions are still visible.
+            positions = np.random.default_rng(1).uniform(-reach, reach, (_TRIALS, 3))
+            positions[:, dimension:] = positions[0] = 0.0
+            results = [function(*position, values) for position in positions.tolist()]
             self._probabilities('compiled', results, _TRIALS)
-        # As of the radial models: the inverse of half the width of the view.
+        # As for the radial models: the inverse of half the width of the view.
         self._parameters[1 : 1 + dimension] = 2.0 / reach
         self._parameters[REACH] = reach
         self._parameters[NUMBER:] = register(function, values)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Build it anew in another process: the function is elsewhere there."""
         return type(self), (self.own, self.gain, self.dimension)
 
     def reach(self) -> float:
-        """Return the distance beyond which nothing is detected, metres."""
+        """Return the largest distance of a detection, metres."""
         self._refuse('lacks reach')
 
     def values(self) -> Sequence[float]:
-        """Return what the compiled function needs to know."""
+        """Return the numbers that the compiled function uses."""
         return ()
 
     def evaluate(self, forward: FloatArray, left: FloatArray, up: FloatArray) -> FloatArray:
-        """Return pi, (n,), of targets at offsets (n,) each in the robot's axes, metres."""
+        """Return pi (n,) of targets at offsets (n,) each in the robot's axes, metres."""
         self._refuse('lacks compiled or evaluate')
 
     def _refuse(self, problem: str) -> NoReturn:
         raise PluginError(f'{type(self).__module__}:{type(self).__qualname__}: {problem}')
 
     def _numbers(self, what: str, value: Any, shape: tuple[int, ...] | None = None) -> FloatArray:
-        """Return what a method gave as numbers, of a shape if one is given."""
+        """Return the result of a method as numbers, of a shape if one is given."""
         try:
             found = np.asarray(value, dtype=float)
         except (TypeError, ValueError):  # rows of unequal lengths too
@@ -112,18 +111,17 @@ class OwnDetection(DetectionModel):
         return found
 
     def _table(self, reach: float) -> FloatArray:
-        """Return the numbers of `_interpolated`: corner, step and shape of a grid, and pi on it."""
+        """Return corner, step and shape of a grid, and pi on it, for `_interpolated`."""
         cells = _CELLS[self.dimension]
         axis = np.linspace(-reach, reach, 2 * cells + 1)
         height = axis if self.dimension == 3 else np.zeros(1)
-        places = np.stack(np.meshgrid(axis, axis, height, indexing='ij')).reshape(3, -1)
-        table = self._probabilities('evaluate', self.evaluate(*places), places.shape[1])
+        positions = np.stack(np.meshgrid(axis, axis, height, indexing='ij')).reshape(3, -1)
+        table = self._probabilities('evaluate', self.evaluate(*positions), positions.shape[1])
         return np.concatenate([[-reach] * 3, [reach / cells] * 3, [len(axis), len(height)], table])
 
 
 @njit(cache=True, error_model='numpy')
 def _interpolated(forward, left, up, values):  # type: ignore[no-untyped-def]
-    """Return pi between the nodes of a table of `OwnDetection`."""
     width, depth = np.int64(values[6]), np.int64(values[7])
     grid = values[8:].reshape((width, width, depth))
     return interpolate_at(grid, values[:3], values[3:6], forward, left, up)

@@ -1,4 +1,4 @@
-"""Puts the measurements of each batch together, in the order of the batches."""
+"""Assembles the measurements of each batch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ _MOST_EARLY = 64  # capacity of the buffer of detections that arrive before thei
 
 @dataclass
 class PendingBatch:
-    """A batch whose measurements have not all arrived."""
+    """A batch with missing measurements."""
 
     id: int
     step: int
@@ -36,7 +36,7 @@ class PendingBatch:
 
 
 class BatchAssembly:
-    """Matches batches and detections; what is refused is dropped and counted by the node."""
+    """Matches detections to batches; the node counts what is dropped."""
 
     def __init__(
         self,
@@ -45,12 +45,12 @@ class BatchAssembly:
         progress: Progress,
     ) -> None:
         self._node, self._sensors, self._progress = node, sensors, progress
-        #: Batches that have not been taken, by id.
+        #: Incomplete batches, by id.
         self.pending: dict[int, PendingBatch] = {}
         self._early: dict[tuple[int, str], DetectionArray] = {}
 
     def add(self, batch: MeasurementBatch) -> None:
-        """Take a batch, and the detections that arrived before it."""
+        """Add a batch and the detections that arrived before it."""
         node, last = self._node, self._progress.batch
         number = int(batch.id)
         stamp = stamp_from_ros(batch.stamp)
@@ -78,13 +78,13 @@ class BatchAssembly:
         members.sort(key=lambda item: item.robot)
         pending = PendingBatch(number, int(batch.step), stamp, members, silence=Silence(node))
         if node.settings.lockstep:
-            # A planner waits for each batch: older pending ones are from a planner that is gone.
+            # A planner waits for each batch: older ones are from a planner that has ended.
             for other in self.pending.values():
                 other.failed.update(other.missing)
         self.pending[number] = pending
         for member in members:
             early = self._early.pop((number, member.robot), None)
-            # Stamped before the batch: it answered an earlier planner's batch with that number.
+            # Stamped before the batch: for a batch of an earlier planner with that number.
             if (
                 early is not None
                 and 0 <= stamp_from_ros(early.header.stamp) - stamp <= _STAMP_AHEAD
@@ -92,7 +92,7 @@ class BatchAssembly:
                 self._receive(pending, early)
 
     def receive(self, name: str, message: DetectionArray) -> PendingBatch | None:
-        """Take detections; return a batch of their own if they are late or were not asked for."""
+        """Add detections; return a separate batch if they are late or were not requested."""
         node = self._node
         number = int(message.batch_id)
         pending = self.pending.get(number)
@@ -115,13 +115,15 @@ class BatchAssembly:
             if len(self._early) > _MOST_EARLY:
                 oldest = next(iter(self._early))
                 del self._early[oldest]
-                node.drop('no batch', f'{oldest[1]}/detections.batch_id: no batch {oldest[0]} came')
+                node.drop(
+                    'no batch', f'{oldest[1]}/detections.batch_id: batch {oldest[0]} did not arrive'
+                )
         else:
             return self._late(name, message)
         return None
 
     def next_complete(self) -> PendingBatch | None:
-        """Remove and return the first batch if no measurement of it is missing."""
+        """Remove and return the first batch if it is complete."""
         first = self.first
         if first is None or not first.failed.issuperset(first.missing):
             return None
@@ -137,13 +139,13 @@ class BatchAssembly:
         return self.pending[min(self.pending)] if self.pending else None
 
     def give_up(self, timeout: float) -> bool:
-        """Return whether the first batch goes on without what is missing after `timeout` [s]."""
+        """Complete the first batch after `timeout` [s] without its missing measurements."""
         first = self.first
         if first is None or first.silence is None or first.silence.length <= timeout:
             return False
         missing = [name for name in first.missing if name not in first.failed]
         self._node.warn_throttled(
-            'missing', f'batch {first.id}: no detections from {", ".join(missing)}, goes on'
+            'missing', f'batch {first.id}: processed without detections from {", ".join(missing)}'
         )
         first.failed.update(missing)
         return True
@@ -168,7 +170,7 @@ class BatchAssembly:
         elif message.batch_id > self._progress.batch:
             return None  # its batch may still arrive
         else:
-            # The first one, where no planner sends batches, may have any stamp up to now.
+            # Without batches of a planner, the first stamp can be any up to now.
             now = self._node.get_clock().now().nanoseconds
             earliest, latest = last, max(self._progress.stamp, last, now) + _STAMP_AHEAD
         if earliest <= stamp <= latest:
@@ -205,7 +207,9 @@ class BatchAssembly:
             return None
         if message.batch_id:
             self._node.warn_throttled(
-                'late', f'{name}/detections: batch {message.batch_id} came late: a batch of its own'
+                'late',
+                f'{name}/detections: late detections for batch {message.batch_id}: processed as a '
+                'separate batch',
             )
         return PendingBatch(
             int(message.batch_id),

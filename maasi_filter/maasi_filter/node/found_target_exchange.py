@@ -15,7 +15,7 @@ from maasi_msgs.msg import FoundTargetArray
 
 
 class SharedFoundTargets:
-    """Found targets that the filters of other robots publish."""
+    """Found targets received from the filters of other robots."""
 
     def __init__(self, node: LockstepLifecycleNode[FilterNodeSettings]) -> None:
         self._node = node
@@ -23,7 +23,6 @@ class SharedFoundTargets:
         self.reset()
 
     def __len__(self) -> int:
-        """Return the number of other filters."""
         return len(self._waiting)
 
     def reset(self) -> None:
@@ -44,7 +43,7 @@ class SharedFoundTargets:
             node.expect_publisher(topic)
 
     def merge_into(self, search: SearchFilter, stamp: int) -> bool:
-        """Merge what was found before a stamp [ns]; return whether anything changed."""
+        """Merge targets found before a stamp [ns] into a filter; return whether it changed."""
         for subscription in self._subscriptions:
             # Lockstep only guarantees that the messages have arrived, not that they were read.
             handle, raw = subscription.handle, subscription.raw
@@ -57,7 +56,7 @@ class SharedFoundTargets:
                 last = waiting.popleft()
             if last is None:
                 continue
-            # Targets that it received itself arrive from the filter that found them.
+            # Targets that it received from others arrive from their own filters.
             theirs = [item for item in last.targets if item.robot == name]
             try:
                 targets = [found_target_from_ros(item, search.dimension) for item in theirs]

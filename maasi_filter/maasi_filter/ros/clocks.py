@@ -1,4 +1,4 @@
-"""Time of a node: stamps of messages, silence of sources, jumps of a simulated clock."""
+"""Time of a node: stamps, silent sources, and jumps of a simulated clock."""
 
 import time
 from collections.abc import Callable
@@ -14,7 +14,7 @@ JUMP = _NANOSECONDS  #: smallest difference of consecutive stamps that counts as
 
 LAST_STAMP = 2**31 - 1  #: largest valid stamp [s]
 
-# Limit of the first batch id, and of the lead of later ids over the last one.
+# Largest first batch id, and largest step from one id to the next.
 _FIRST_IDS = 2**62
 _IDS_AHEAD = 10**6
 
@@ -24,7 +24,7 @@ _LEAST_BACKWARD, _LEAST_FORWARD = 1_000_000, 200_000_000
 
 
 def stamp_problem(message: Any) -> str | None:
-    """Return the error of the stamp of a message: field, what was read, what is allowed."""
+    """Return the error of a message's stamp: field, read and allowed values."""
     name, owner = 'header.stamp', getattr(message, 'header', None)
     if owner is None:
         name, owner = 'stamp', message
@@ -39,12 +39,12 @@ def stamp_problem(message: Any) -> str | None:
 
 
 def batch_id_limit(last: int) -> int:
-    """Return the highest batch id after `last`: none could follow near the bound of uint64."""
+    """Return the highest id allowed after `last`; higher ones could exhaust uint64."""
     return max(last, _FIRST_IDS) + _IDS_AHEAD
 
 
 class StampGate:
-    """Distinguishes a jump of a stream, which the next stamp follows, from a single wrong stamp."""
+    """Distinguishes a jump of a stream, confirmed by the next stamp, from a single wrong stamp."""
 
     def __init__(self, jump: int = JUMP) -> None:
         self.jump = jump
@@ -65,22 +65,21 @@ class StampGate:
         return True
 
 
-# An arrival clock uses ticks of this time [s of the steady clock], and continues after the last one
-# for so many.
+# An arrival clock uses ticks of this period, and extrapolates the last one for so long [s of the
+# steady clock].
 _MEMORY, _AHEAD = 0.5, 2
 
 
 class ArrivalClock:
     """The node's time at any recent instant of the steady clock.
 
-    A simulated time comes in ticks, of which some are handled late, and passes more slowly than
-    the steady clock where the simulation does not keep up.
+    Simulated time arrives in ticks, some of them late, and may be slower than the steady clock.
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        # Instants [s] and the times that began there [ns]. Replaced as a whole: a tick may be
-        # handled in another thread.
+        # Instants [s] and their times [ns]; replaced as a whole, as ticks may be handled in
+        # another thread.
         self._ticks: tuple[tuple[float, int], ...] = ()
         # rclpy 7.1 only borrows the pointer: until its clock keeps a reference to it, a jump
         # after the loss of this handle segfaults.
@@ -97,12 +96,12 @@ class ArrivalClock:
         ticks = self._ticks
         if ticks and not 0 < begun - ticks[-1][1] <= JUMP:
             ticks = ()
-        # The last but one stays: the length of a tick.
+        # Two entries give the length of a tick.
         recent = [tick for tick in ticks[:-1] if tick[0] >= now - _MEMORY]
         self._ticks = (*recent, *ticks[-1:], (now, begun)) if begun > 0 else ()
 
     def stamp(self, instant: float) -> int | None:
-        """Return the node's time [ns] at an instant [s]; None while it had not begun."""
+        """Return the node's time [ns] at an instant [s]; None before it began."""
         now = time.monotonic()
         if not (isinstance(self._clock, ROSClock) and self._clock.ros_time_is_active):
             return int(self._clock.now().nanoseconds) - round(1e9 * (now - instant))
@@ -112,44 +111,44 @@ class ArrivalClock:
         (first, begun), (_, latest) = ticks[0], ticks[-1]
         if len(ticks) == 1:
             return latest if instant >= first else None
-        # At the mean rate from each tick on: the latest time is by a tick that was not late.
+        # Extrapolated from each tick at the mean rate; late ticks give earlier times.
         rate = (latest - begun) / (now - first)
         at = max(tick + rate * (instant - when) for when, tick in ticks)
         return min(round(at), latest + _AHEAD * (latest - ticks[-2][1]))
 
     def close(self) -> None:
-        """Stop to follow the clock."""
+        """Stop following the clock."""
         if self._handle is not None:
             self._handle.unregister()
             self._handle = None
 
 
 class Silence:
-    """Time since the last message of a source, simulated where the node's time is."""
+    """Time without a message from a source, in simulated time if the node uses it."""
 
     def __init__(self, node: Node) -> None:
         self._clock = node.get_clock()
         self.end()
 
     def end(self) -> None:
-        """Note that a message was received."""
+        """Note a received message."""
         self._wall = time.monotonic()
         self._simulated = self._time()
 
     def _time(self) -> int | None:
-        """Return the simulated time [ns]; 0 before it begins, None where it is not used."""
+        """Return the simulated time [ns]; 0 before it begins, None without it."""
         if isinstance(self._clock, ROSClock) and self._clock.ros_time_is_active:
             return int(self._clock.now().nanoseconds)
         return None
 
     @property
     def wall(self) -> float:
-        """Wall time since then [s]."""
+        """Wall time without a message [s]."""
         return time.monotonic() - self._wall
 
     @property
     def length(self) -> float:
-        """Time since then [s]; 0 if simulated time had not begun then, or has jumped back."""
+        """Time without a message [s]; 0 if simulated time had not begun, or has jumped back."""
         now = self._time()
         if now is None:
             return self.wall
@@ -159,10 +158,10 @@ class Silence:
 
 
 class ClockWatch:
-    """Informs a node that its time starts again.
+    """Reports backward jumps of the node's time.
 
-    With one publisher of `/clock` a backward jump counts at once, with several only after the time
-    has stayed back. `warn` takes a key and a text; `on_restart` takes the size of the jump [s].
+    With one publisher of `/clock` a jump counts at once, with several only if the time stays back.
+    `warn` takes a key and a text; `on_restart` takes the size of the jump [s].
     """
 
     def __init__(
@@ -209,7 +208,7 @@ class ClockWatch:
             self._pending = (now - delta, time.monotonic())
 
     def look(self) -> None:
-        """Confirm pending jumps; call about once per second."""
+        """Confirm pending jumps; call it about once per second."""
         if self._pending is not None and time.monotonic() - self._pending[1] >= _CONFIRMATION:
             before, self._pending = self._pending[0], None
             gap = before - self._node.get_clock().now().nanoseconds

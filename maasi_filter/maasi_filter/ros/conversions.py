@@ -1,4 +1,4 @@
-"""Conversions between messages and records of the library, in pairs."""
+"""Conversions between messages and library records, in pairs."""
 
 import array
 import math
@@ -29,8 +29,7 @@ from maasi_msgs.msg import Cluster as ClusterMessage
 from maasi_msgs.msg import Detection, DetectionArray, FoundFixArray, RangeMeasurement
 from maasi_msgs.msg import FoundTarget as FoundTargetMessage
 
-#: Largest number of detections used of one message, against unbounded computation times; no sensor
-#: of a search sees so many targets at once.
+#: Largest number of detections used from one message, which bounds the computation time.
 MOST_DETECTIONS = 200
 
 FARTHEST = 4e7  #: largest accepted coordinate [m]: the circumference of the Earth
@@ -51,12 +50,12 @@ def stamp_from_ros(stamp: Time) -> int:
 
 
 def stamp_of_step(step: int, duration: float) -> int:
-    """Return the time of a step of `duration` seconds in nanoseconds."""
+    """Return the time [ns] of a step of `duration` seconds."""
     return round(step * duration * 1e9)
 
 
 def bounded(name: str, values: Iterable[float], limit: float) -> None:
-    """Refuse numbers of a field that are not finite, or would overflow in later arithmetic."""
+    """Raise ValueError for numbers of a field that are not finite or would overflow later."""
     # Also false for NaN.
     if not all(abs(value) <= limit for value in values):
         raise ValueError(
@@ -86,14 +85,14 @@ def pose_to_ros(pose: Pose) -> PoseMessage:
 def pose_from_ros(message: PoseMessage) -> Pose:
     """Return a pose."""
     turn = message.orientation
-    place = message.position
-    bounded('position', (place.x, place.y, place.z), FARTHEST)
+    position = message.position
+    bounded('position', (position.x, position.y, position.z), FARTHEST)
     bounded('orientation', (turn.w, turn.x, turn.y, turn.z), 1e6)
     return Pose(point_from_ros(message.position), np.array([turn.w, turn.x, turn.y, turn.z]))
 
 
 def covariance_to_ros(covariance: FloatArray) -> list[float]:
-    """Return a covariance of two or three coordinates as nine numbers, row-major."""
+    """Return a covariance (2, 2) or (3, 3) as nine numbers, row-major."""
     values: list[float] = np.pad(covariance, (0, 3 - len(covariance))).ravel().tolist()
     return values
 
@@ -115,8 +114,8 @@ def cluster_to_ros(cluster: Cluster) -> ClusterMessage:
 
 def cluster_from_ros(message: ClusterMessage, dimension: int) -> Cluster:
     """Return a cluster."""
-    place = message.position
-    bounded('clusters: position', (place.x, place.y, place.z), FARTHEST)
+    position = message.position
+    bounded('clusters: position', (position.x, position.y, position.z), FARTHEST)
     bounded('clusters: covariance', message.covariance, FARTHEST**2)
     bounded('clusters: radius, mass', (message.radius, message.mass), FARTHEST)
     if message.mass < 0.0:
@@ -161,8 +160,8 @@ def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundT
 def found_fixes_to_ros(
     targets: Sequence[FoundTarget], origin: OriginSettings, header: Header, batch: int
 ) -> FoundFixArray:
-    """Return found targets on the earth; in 2D at the altitude of the origin, with variance 0."""
-    places = [geodetic(target.position[None], origin)[0].tolist() for target in targets]
+    """Return geographic positions of found targets; in 2D at the origin's altitude."""
+    fixes = [geodetic(target.position[None], origin)[0].tolist() for target in targets]
     fixes = [
         NavSatFix(
             header=Header(stamp=stamp_to_ros(round(target.time * 1e9)), frame_id=header.frame_id),
@@ -173,7 +172,7 @@ def found_fixes_to_ros(
             position_covariance=covariance_to_ros(target.covariance),
             position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN,
         )
-        for target, (latitude, longitude, altitude) in zip(targets, places)
+        for target, (latitude, longitude, altitude) in zip(targets, fixes)
     ]
     ids = [target.id for target in targets]
     return FoundFixArray(header=header, batch_id=batch, ids=ids, fixes=fixes)
@@ -199,18 +198,18 @@ def detections_to_ros(
 
 
 def label_from_ros(message: Detection | RangeMeasurement | FoundTargetMessage) -> Label:
-    """Return the label of a message; its score may miss 0 or 1 by rounding."""
+    """Return the label of a message; its score may exceed [0, 1] by rounding."""
     return Label(message.class_id, rounded_score(message.score), message.identity)
 
 
 def labels_of(messages: Sequence[Detection] | Sequence[RangeMeasurement]) -> tuple[Label, ...]:
-    """Return their labels; empty if none has one."""
+    """Return the labels of messages; empty if none has one."""
     labels = tuple(map(label_from_ros, messages))
     return labels if any(label != UNLABELLED for label in labels) else ()
 
 
 def label_problem(message: Detection | RangeMeasurement | Label) -> str | None:
-    """Return the error of a class, score or identity: field, what was read, what is allowed."""
+    """Return the error of a class, score or identity: field, read and allowed values."""
     if not 0.0 <= rounded_score(message.score) <= 1.0:
         return f'score: read {message.score}, allowed is 0 to 1'
     for name in ('class_id', 'identity'):
@@ -221,7 +220,7 @@ def label_problem(message: Detection | RangeMeasurement | Label) -> str | None:
 
 
 def detection_problem(detection: Detection, dimension: int) -> str | None:
-    """Return the error of a detection: field, what was read, what is allowed."""
+    """Return the error of a detection: field, read and allowed values."""
     if not 0.0 <= detection.range < math.inf:
         return f'range: read {detection.range}, allowed are finite numbers from 0 [m]'
     for name, limit in (('bearing', math.pi), ('elevation', 0.5 * math.pi)):
@@ -244,7 +243,7 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
 def measurement_from_ros(
     message: DetectionArray, sensor: Sensor, drop: Callable[[str, str, int], None]
 ) -> AgentMeasurement:
-    """Return a robot's measurement; invalid, equal and surplus detections go to `drop`."""
+    """Return a robot's measurement; `drop` receives invalid, equal and surplus detections."""
     pose = pose_from_ros(message.pose.pose)
     errors = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
     if not np.isfinite(errors).all():
@@ -285,7 +284,7 @@ def measurement_from_ros(
 
 
 def particles_to_ros(positions: FloatArray, weights: FloatArray, header: Header) -> PointCloud2:
-    """Return particles as a cloud of x, y, z [m] and weight, each float32."""
+    """Return particles as a cloud of x, y, z [m] and weight, all float32."""
     number, dimension = positions.shape
     data = np.zeros((number, 4), dtype='<f4')
     data[:, :dimension] = positions
@@ -325,7 +324,7 @@ def sphere_marker(
     diameter: float,
     tint: ColorRGBA,
 ) -> Marker:
-    """Return a sphere; namespace and number identify the object between messages."""
+    """Return a sphere, which namespace and number identify between messages."""
     marker = Marker(header=header, ns=namespace, id=number, type=Marker.SPHERE, action=Marker.ADD)
     marker.pose.position = point_to_ros(position)
     marker.pose.orientation.w = 1.0
@@ -337,7 +336,7 @@ def sphere_marker(
 def filter_markers(
     header: Header, clusters: Iterable[Cluster], found: Iterable[FoundTarget], size: float
 ) -> MarkerArray:
-    """Return markers of clusters (orange, scaled by their width) and found targets (green)."""
+    """Return markers of clusters (orange, scaled by width) and found targets (green)."""
     markers = [
         sphere_marker(
             header,
@@ -355,13 +354,13 @@ def filter_markers(
 
 
 class MarkerBoard:
-    """Makes each array of markers replace the previous one, the first all that are shown."""
+    """Lets each array of markers replace the previous one."""
 
     def __init__(self) -> None:
         self._shown: dict[tuple[str, int], Marker] | None = None
 
     def replace(self, markers: MarkerArray) -> MarkerArray:
-        """Return an array that shows these markers and no others of this node."""
+        """Return an array that shows only these markers of the node."""
         now = {(item.ns, item.id): item for item in markers.markers if item.action == Marker.ADD}
         if self._shown is None:
             header = markers.markers[0].header if markers.markers else Marker().header

@@ -1,4 +1,4 @@
-"""What a node reports: diagnostics, discarded data, and log messages at a limited rate."""
+"""Diagnostics of a node, counts of dropped data, and throttled log messages."""
 
 import time
 from collections import Counter
@@ -41,7 +41,7 @@ class ReportingNode(LifecycleNode):
         return []
 
     def check_peers(self) -> list[str]:
-        """Check what the node shares with others, once a second; return warnings."""
+        """Check once a second what the node shares with others; return warnings."""
         return []
 
     def stamp_of_diagnostics(self) -> Time:
@@ -49,7 +49,7 @@ class ReportingNode(LifecycleNode):
         return self.get_clock().now().to_msg()
 
     def drop(self, reason: str, text: str, number: int = 1) -> None:
-        """Count discarded data by a reason, and warn, throttled: what was read, what is allowed."""
+        """Count dropped data by reason, and warn, throttled, with read and allowed values."""
         self.dropped[reason] += number
         self.warn_throttled(reason, f'dropped: {text}')
 

@@ -1,4 +1,4 @@
-"""Keep-outs that change while a search runs: the topic `keep_outs` of the team."""
+"""The topic `keep_outs` of the team, for keep-outs that change during a search."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,25 +15,25 @@ from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
 from maasi_filter.wording import problems
 from maasi_msgs.msg import KeepOuts
 
-# Most zones and corners of their polygons in a request.
+# Most zones, and most corners of their polygons, in a request.
 ZONES, CORNERS = 1000, 10_000
 
 
 class KeepOutTopic:
-    """The area with the keep-outs that hold now; `keep`: published again, to outlive a sender."""
+    """The area with the active keep-outs; `keep` republishes them, to outlive their sender."""
 
     def __init__(
         self, node: LockstepLifecycleNode[Any], on_change: Callable[[Area], None], keep: bool
     ) -> None:
         self._node, self._on_change = node, on_change
         self._latest = KeepOuts()
-        self._asked = False  # whether `change` of this node made the latest ones
+        self._asked = False  # whether the latest ones are from `change`
         topic = node.team_topic('keep_outs')
         self._publisher = node.create_publisher(KeepOuts, topic, LATCHED) if keep else None
         node.create_subscription(KeepOuts, topic, self._take, LATCHED_ALL)
 
     def change(self, zones: Sequence[str]) -> None:
-        """Publish other keep-outs; ValueError says which is wrong."""
+        """Publish other keep-outs; ValueError names an invalid one."""
         frame, version = self._node.settings.frame, self._latest.version + 1
         header = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=frame)
         self._adopt(KeepOuts(header=header, version=version, zones=list(zones)))
@@ -42,7 +42,7 @@ class KeepOutTopic:
     def _take(self, message: KeepOuts) -> None:
         latest = self._latest
         if self._asked and message.version >= latest.version and _stamp(message) < _stamp(latest):
-            # A node that started again has changed them before it received those of before.
+            # Changed after a restart, before the earlier ones arrived.
             latest.version = message.version + 1
             self._adopt(latest)
         if message.version <= latest.version:
@@ -57,7 +57,7 @@ class KeepOutTopic:
         area = with_keep_outs(self._node.settings.environment, message.zones)
         message.zones = [str(zone) for zone in area.settings.keep_outs]
         self._latest = message
-        self._node.get_logger().info(f'keep-outs that hold now: {len(message.zones)}')
+        self._node.get_logger().info(f'active keep-outs: {len(message.zones)}')
         for doubt in area.doubts:
             self._node.get_logger().warning(doubt)
         if self._publisher is not None:
@@ -71,7 +71,7 @@ def _stamp(message: KeepOuts) -> int:
 
 def with_keep_outs(environment: EnvironmentSettings, zones: Sequence[str]) -> Area:
     """Return the area of an environment with other keep-outs, given as texts."""
-    # Before they are read: so many can be taken in a second.
+    # Counted first: reading them takes up to a second.
     for read, what, most in (
         (len(zones), 'zones', ZONES),
         (sum(zone.count(',') for zone in zones), 'corners', CORNERS),

@@ -1,4 +1,4 @@
-"""Base of all nodes of a search: parameters and life cycle."""
+"""Base of all nodes: parameters and life cycle."""
 
 import traceback
 from collections.abc import Callable
@@ -23,7 +23,7 @@ class LockstepLifecycleNode(ReadyNode, Generic[SettingsT]):
     Parameters
     ----------
     in_robot : bool
-        Whether its namespace is that of a robot: topics of the team are one level up.
+        Whether the node is in the namespace of a robot, one level below the team's.
     """
 
     settings: SettingsT  #: read in *configure*, and valid until the next one
@@ -37,7 +37,7 @@ class LockstepLifecycleNode(ReadyNode, Generic[SettingsT]):
         #: Why *configure* failed; empty if it succeeded.
         self.problem = ''
         self._prepared = False
-        self.ending = False  #: whether it is asked to end, as the others may be too
+        self.ending = False  #: whether a shutdown was requested
         self.step = -1
         self._clock_watch = ClockWatch(self, self.warn_throttled, self._on_restart)
 
@@ -63,19 +63,19 @@ class LockstepLifecycleNode(ReadyNode, Generic[SettingsT]):
         )
         service.callback = answer
 
-    # ---- what a node does ----------------------------------------------------------------------
+    # ---- hooks of nodes ------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Create the objects that the settings describe, before `set_up`. In *configure*."""
+        """Create the objects that the settings describe, in *configure* before `set_up`."""
 
     def set_up(self) -> None:
-        """Create publishers and subscriptions, compile and warm up. In *configure*."""
+        """Create publishers and subscriptions, and compile, in *configure*."""
 
     def start(self) -> None:
         """Start operation, in *activate*."""
 
     def halt(self) -> None:
-        """Stop all motion, in *deactivate* and at shutdown. May be called more than once."""
+        """Stop all motion, in *deactivate* and at shutdown; may be called more than once."""
 
     def tear_down(self) -> None:
         """Undo `prepare` and `set_up`, in *cleanup* and after a failed *configure*."""
@@ -175,6 +175,6 @@ class LockstepLifecycleNode(ReadyNode, Generic[SettingsT]):
         self.reset()
 
     def check_peers(self) -> list[str]:
-        """See `ReadyNode.check_peers`; confirms jumps of the clock, too."""
+        """Also confirm jumps of the clock."""
         self._clock_watch.look()
         return super().check_peers()

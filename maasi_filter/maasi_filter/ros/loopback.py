@@ -1,4 +1,4 @@
-"""The loopback interface, through which nodes on one host discover each other."""
+"""The loopback interface, over which nodes on one host discover each other."""
 
 import socket
 
@@ -6,13 +6,13 @@ _ANY_PORT = 7400
 
 
 def loopback_fault() -> str:
-    """Return why the loopback interface cannot be used and what mends it; empty if it can."""
+    """Return why the loopback interface is unusable and how to fix it; empty if it is usable."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(('127.0.0.1', _ANY_PORT))
         except OSError as error:
             return (
-                f'the loopback interface cannot be used ({error.strerror}), and nodes talk '
-                'through it: sudo ip link set lo up'
+                'nodes need the loopback interface, which cannot be used '
+                f'({error.strerror}): run sudo ip link set lo up'
             )
     return ''

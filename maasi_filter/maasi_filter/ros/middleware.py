@@ -1,4 +1,4 @@
-"""Whether the middleware that the environment names is there."""
+"""Check that the middleware named in the environment is installed."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ _VARIABLE = 'RMW_IMPLEMENTATION'
 
 
 def is_missing() -> bool:
-    """Print an error and return True where rclpy would end the process with rcl's own text."""
+    """Print an error and return True if it is missing, before rclpy ends the process."""
     name = os.environ.get(_VARIABLE)
     installed = sorted(get_resources('rmw_typesupport').keys() - {'rmw_implementation'})
     if not name or name in installed:

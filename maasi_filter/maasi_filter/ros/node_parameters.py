@@ -31,14 +31,14 @@ SettingsT = TypeVar('SettingsT', bound=NodeSettings)
 
 
 class SettingsError(Exception):
-    """Invalid parameters; the text says which and why."""
+    """Invalid parameters, named with their reasons."""
 
 
 class NodeParameters(Generic[SettingsT]):
     """Declares the parameters of a node, and reads its settings from them.
 
-    Those that were not set have the settings' defaults, once configured those of a preset, too.
-    Optional ones are declared with a value only: a file of `ros2 param dump` cannot represent None.
+    Parameters that are not set have the default of the settings or, once configured, of a preset.
+    Optional ones are declared only with a value, as `ros2 param dump` cannot store None.
     """
 
     def __init__(self, node: Node, model: type[SettingsT]) -> None:
@@ -58,7 +58,7 @@ class NodeParameters(Generic[SettingsT]):
         for name in sorted(set(given) - known):
             close = get_close_matches(name, sorted(known), 1)
             hint = f'; did you mean {close[0]}?' if close else ''
-            node.get_logger().warning(f'parameter {name}: is not known, and ignored{hint}')
+            node.get_logger().warning(f'parameter {name}: is unknown and ignored{hint}')
         node.add_on_set_parameters_callback(self._judge)
         node.add_post_set_parameters_callback(self._note)
 
@@ -76,7 +76,7 @@ class NodeParameters(Generic[SettingsT]):
         self._settings = None
 
     def _complete(self, resolved: SettingsT | None = None) -> None:
-        """Declare what is missing, such as parameters of a new robot; show resolved settings."""
+        """Declare missing parameters, such as those of a new robot, with resolved settings."""
         _, problems = check(self._model, self._given)
         self._changing = True
         for item in parameter_fields(self._model, self._given):
@@ -104,14 +104,14 @@ class NodeParameters(Generic[SettingsT]):
         _, problems = check(self._model, values)
         for item in ours:
             if item.name not in known and not self._node.has_parameter(item.name):
-                yield f'parameter {item.name}: is not known'
+                yield f'parameter {item.name}: is unknown'
             elif self._settings is not None and item.name not in self._model.live:
                 yield (
                     f'parameter {item.name}: is read in configure; set it while the node is '
                     'unconfigured (deactivate and cleanup before)'
                 )
             elif item.value is not None:
-                # Errors of other parameters, or of several together, may still be corrected.
+                # Later changes can correct other parameters.
                 wrong = [item.name] if self._settings is None else list(problems)
                 yield from (problems[name] for name in wrong if name in problems)
 
@@ -149,7 +149,7 @@ def check(
     missing = []
     for item in items:
         keys = [str(key) for key in item['loc']]
-        # The parameter that the error is in, or one of those that it is about.
+        # Parameter with the error, or one of several.
         field = next(field for field in fields if all(map(str.__eq__, field.keys, keys)))
         name = '.'.join(field.name.split('.')[: len(keys)])
         if item['type'] == 'missing' or not values:

@@ -1,4 +1,4 @@
-"""Settings that nodes share, and those of the filter node."""
+"""Settings of all nodes and of the filter node."""
 
 from typing import Annotated, ClassVar
 
@@ -18,7 +18,7 @@ class NodeSettings(Settings):
 
     live: ClassVar[frozenset[str]] = frozenset()  #: parameters that can be set while the node runs
 
-    # First: what names a class of a plugin is checked after it.
+    # First, as names of plugins are checked after it.
     plugin_path: Annotated[list[str], AfterValidator(add_folders)] = Field(
         [], description='Folders with the modules of plugins (module:Class)'
     )

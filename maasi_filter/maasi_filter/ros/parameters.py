@@ -1,10 +1,9 @@
-"""Conversion between settings and flat ROS parameters, and their help. Without ROS.
+"""Conversion between settings and flat ROS parameters, and their help, without ROS.
 
-Nested settings become names with dots, and `None` is omitted. Lists of lists of fixed length
-become one list, `bounds: [-0.3, 2.4, -0.3, 2.4]`; other lists of lists, and of small settings,
-become lists of strings of numbers, `obstacles: ['0.8 1.2 0.1']`, a form that is also accepted for
-the former.
-Settings by name, `robots`, become the list `robots` and `robot.<name>.<key>`.
+Names of nested settings are joined by dots, and None is omitted. Lists of lists of fixed length
+become one list, `bounds: [-0.3, 2.4, -0.3, 2.4]`. Other lists of lists and of small settings become
+lists of strings, `obstacles: ['0.8 1.2 0.1']`, which are also accepted for the former. Settings by
+name, `robots`, become the list `robots` and `robot.<name>.<key>`.
 """
 
 import inspect
@@ -26,7 +25,7 @@ from maasi_filter.plugins import ChosenSettings, PluginGroup, own_settings
 
 @dataclass(frozen=True)
 class ParameterField:
-    """One parameter of a node: its name with dots, its keys in nested settings, its field."""
+    """One parameter of a node: its dotted name, its keys in nested settings, its field."""
 
     name: str
     keys: tuple[str, ...]
@@ -34,7 +33,7 @@ class ParameterField:
 
     @property
     def default(self) -> Any:
-        """Default value; None: there is none."""
+        """Default value, or None without one."""
         if self.info.is_required() or _by_name(self.info.annotation):
             return None
         value = self.info.get_default(call_default_factory=True)
@@ -42,7 +41,7 @@ class ParameterField:
 
     @property
     def constraints(self) -> str:
-        """What is allowed, in words."""
+        """Text of the allowed values."""
         words = {'ge': 'at least', 'gt': 'above', 'le': 'at most', 'lt': 'below'}
         limits = {key: self.bound(key) for key in words}
         parts = [f'{words[key]} {limit}' for key, limit in limits.items() if limit is not None]
@@ -63,32 +62,31 @@ class ParameterField:
 def parameter_fields(
     model: type[BaseModel], given: Mapping[str, Any], prefix: str = '', keys: tuple[str, ...] = ()
 ) -> Iterator[ParameterField]:
-    """Yield the parameters of settings; the `given` ones determine which robots and parts exist."""
+    """Yield the parameters of settings; the `given` values determine robots and parts."""
     for name, info in model.model_fields.items():
         key = info.alias or name
-        full, place = prefix + key, (*keys, key)
+        full, path = prefix + key, (*keys, key)
         inside = partial(_inside, given, f'{full}.')
         nested = own_settings(info, lambda selector: given.get(prefix + selector), inside)
         nested = nested or _nested(info.annotation)
         if nested is None:
-            yield ParameterField(full, place, info)
+            yield ParameterField(full, path, info)
             if by_name := _by_name(info.annotation):
                 for item in given.get(full) or []:
                     inner = f'{full.removesuffix("s")}.{item}.'
-                    yield from parameter_fields(by_name, given, inner, (*place, item))
+                    yield from parameter_fields(by_name, given, inner, (*path, item))
         elif type(None) not in get_args(info.annotation) or any(
             item.startswith(f'{full}.') for item in given
         ):
-            yield from parameter_fields(nested, given, f'{full}.', place)
+            yield from parameter_fields(nested, given, f'{full}.', path)
 
 
 def _inside(given: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Return the values whose names begin with a prefix, without it."""
     return {key.removeprefix(prefix): given[key] for key in given if key.startswith(prefix)}
 
 
 def flatten(settings: BaseModel, prefix: str = '') -> dict[str, Any]:
-    """Return settings as flat parameters, with a prefix of all names."""
+    """Return settings as flat parameters, whose names begin with a prefix."""
     flat: dict[str, Any] = {}
     for name, info in type(settings).model_fields.items():
         value = getattr(settings, name)
@@ -107,10 +105,10 @@ def flatten(settings: BaseModel, prefix: str = '') -> dict[str, Any]:
 
 
 def unflatten(model: type[BaseModel], flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Return flat parameters as nested values; a ValueError names the parameter without rows."""
+    """Return flat parameters as nested values; ValueError names an invalid one."""
     nested: dict[str, Any] = {}
     for item in parameter_fields(model, flat):
-        # Parts without a value are made too, so that errors name what is missing in them.
+        # Parts without values are created, too, so that errors name the missing keys.
         owner = nested
         for key in item.keys[:-1]:
             owner = owner.setdefault(key, {})
@@ -133,7 +131,7 @@ def unflatten(model: type[BaseModel], flat: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _as_parameter(value: Any, annotation: Any) -> Any:
-    """Return a value; rows in a list become numbers, or texts if their length is not fixed."""
+    """Return a value with rows of a list as numbers or, for variable lengths, texts."""
     if not isinstance(value, (list, tuple)):
         return str(value) if isinstance(value, BaseGeometry) else value
     rows = [_as_row(item) for item in value]
@@ -143,7 +141,6 @@ def _as_parameter(value: Any, annotation: Any) -> Any:
 
 
 def _as_row(item: Any) -> Any:
-    """Return the numbers of a list, or the text of settings, such as a zone."""
     if isinstance(item, BaseModel):
         return str(item)
     return [float(number) for number in item] if isinstance(item, (list, tuple)) else item
@@ -151,7 +148,7 @@ def _as_row(item: Any) -> Any:
 
 def _from_list(value: Sequence[Any], annotation: Any) -> list[Any]:
     element, width = _argument(annotation, list), _width(annotation)
-    # Small settings read their own texts.
+    # Small settings such as zones read texts.
     if _nested(element) is not None or _argument(element, list) is None:
         return list(value)
     if width is not None and not any(isinstance(item, str) for item in value):
@@ -163,7 +160,7 @@ def _from_list(value: Sequence[Any], annotation: Any) -> list[Any]:
 
 
 def choices(annotation: Any) -> list[Any]:
-    """Return the types of an annotation: the members of a union, without metadata."""
+    """Return the types of an annotation: members of a union, without metadata."""
     if get_origin(annotation) is Annotated:
         return choices(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
@@ -198,9 +195,9 @@ def _by_name(annotation: Any) -> type[BaseModel] | None:
 
 
 def parameters_of(node: type) -> Iterator[ParameterField]:
-    """Yield the parameters of a class of nodes, its type argument; each robot's as of NAME.
+    """Yield the parameters of a class of nodes by its type argument, with NAME for robots.
 
-    Where values choose a model, those of all models are yielded.
+    If values choose a model, the parameters of all models are yielded.
     """
     model = next(
         argument
@@ -220,13 +217,13 @@ def parameters_of(node: type) -> Iterator[ParameterField]:
 
 
 def node_help(node: type, name: str, base: type) -> str:
-    """Return the help of a class of nodes; topics are from docstrings, up to that of `base`."""
+    """Return the help of a class of nodes from its docstrings, down to `base`, and settings."""
     text = [
         f'usage: {name} [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r __ns:=/TEAM] ...]'
     ]
     for kind in node.__mro__[: node.__mro__.index(base) + 1]:
         doc = inspect.cleandoc(kind.__dict__.get('__doc__') or '')
-        # Without the sections for who writes code.
+        # Without sections for programmers.
         text.append(re.split(r'\n(?:Parameters|Attributes)\n-+\n', doc)[0].strip())
     text.append('ROS parameters\n--------------')
     for item in parameters_of(node):

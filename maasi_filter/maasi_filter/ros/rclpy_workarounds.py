@@ -1,6 +1,6 @@
-"""Entities of a node that survive their peers: what rclpy 7.1 (Jazzy) does not do itself.
+"""Workarounds for rclpy 7.1 (Jazzy): entities of a node survive their peers.
 
-A comment at each part names what would let it be deleted.
+Comments name the fix that makes each part obsolete.
 """
 
 from collections.abc import Callable, Hashable
@@ -28,7 +28,7 @@ _ERRORS: dict[str, tuple[type[Exception], ...]] = {
 
 
 class SafeNode(ReportingNode):
-    """A node whose entities may be destroyed while it spins, and whose peers cannot end it."""
+    """A node whose entities may be destroyed while it spins, and that survives bad requests."""
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
@@ -41,7 +41,6 @@ class SafeNode(ReportingNode):
                 service.callback = answer
 
     def _answer(self, name: str, errors: Any, callback: Any, request: Any, response: Any) -> Any:
-        """Answer a bad request with an empty response."""
         try:
             return callback(request, response)
         except errors as error:
@@ -51,7 +50,7 @@ class SafeNode(ReportingNode):
     # ---- entities ----------------------------------------------------------------------------
 
     def permanent(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return the entity of a key, made at the first call, which lives as long as the node."""
+        """Return the entity of a key, made at the first call and kept as long as the node."""
         # Actions, and entities with event callbacks: destroyed with an event in the queue they
         # crash the events executor (https://github.com/ros2/rclpy/issues/1644).
         if key not in self._permanent:
@@ -60,11 +59,11 @@ class SafeNode(ReportingNode):
         return made
 
     def mark_entities(self) -> None:
-        """Mark the present entities as kept: `clear_entities` destroys only later ones."""
+        """Exempt the present entities from `clear_entities`."""
         self._kept = [item for item, _ in self._entities()]
 
     def clear_entities(self) -> None:
-        """Destroy the entities created since the mark; nothing without one."""
+        """Destroy the entities created after `mark_entities`."""
         if self._kept is None:
             return
         kept = {id(item) for item in (*self._kept, *self._permanent.values())}
@@ -74,7 +73,7 @@ class SafeNode(ReportingNode):
                 destroy(item)
 
     def _entities(self) -> list[tuple[Any, Callable[[Any], object]]]:
-        # Of plugins; owners destroy their event handlers.
+        # Event handlers are destroyed by their owners.
         waitables = [item for item in self.waitables if not isinstance(item, EventHandler)]
         kinds: list[tuple[Any, Callable[[Any], object]]] = [
             (waitables, methodcaller('destroy')),
@@ -104,7 +103,7 @@ class SafeNode(ReportingNode):
         return self.create_timer(period, callback, clock=STEADY)
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
-        """Return a publisher without event callbacks; `check_peers` warns in their place."""
+        """Return a publisher without event callbacks, which `check_peers` replaces."""
         # https://github.com/ros2/rclpy/issues/1644
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         return super().create_publisher(
@@ -114,7 +113,7 @@ class SafeNode(ReportingNode):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
-        """Return a subscription that drops invalid stamps and sizes; silent once destroyed."""
+        """Return a subscription that drops invalid stamps and sizes, and messages after its end."""
         # https://github.com/ros2/rclpy/issues/1644
         quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
         receive = callback

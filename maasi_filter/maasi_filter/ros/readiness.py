@@ -1,4 +1,4 @@
-"""When a node is ready: all peers are there, and messages would reach them."""
+"""Readiness of a node: all peers are connected."""
 
 import math
 import time
@@ -13,7 +13,7 @@ from maasi_filter.ros.rclpy_workarounds import SafeNode
 from maasi_msgs.msg import LockstepDone
 
 _PEERS_PERIOD = 0.02  # of the check for peers [s]
-_NOTICE_DELAY = 3.0  # from activation until a node says what it waits for [s]
+_NOTICE_DELAY = 3.0  # from activation to the report of missing peers [s]
 # Longest time from the discovery of an endpoint to its connection [s].
 _CONNECTION_PATIENCE = 5.0
 _OBSERVERS = ('recorder', 'guard', 'rosbag2_recorder')
@@ -27,11 +27,11 @@ class ReadyNode(SafeNode):
         super().__init__(name, **options)
         self._peers: list[Callable[[], bool]] = []
         self._peers_timer: Any = None
-        # When to say what nobody publishes [s of wall time].
+        # Wall time of the report of missing publishers [s].
         self._notice_at = math.inf
         self._ready_publisher: Publisher | None = None
-        # Since when an endpoint has been known, but not connected [s of wall time], and which of
-        # these count as never connected.
+        # Wall time of discovery of endpoints that are not connected [s], and endpoints that never
+        # connect.
         self._unconnected: dict[str, float] = {}
         self._lasting: set[str] = set()
 
@@ -45,10 +45,10 @@ class ReadyNode(SafeNode):
         number: int = 1,
         names: Collection[str] = (),
     ) -> None:
-        """Be ready only when a message would reach all expected subscribers.
+        """Be ready only when messages reach `number` subscribers and all nodes of `names`.
 
-        `publisher` may be a function that returns the present one; `number` does not count mere
-        observers; nodes of these `names`, without namespace, have to be among the subscribers.
+        Mere observers do not count; `publisher` may be a function that returns it; `names` are
+        without namespace.
         """
 
         def reached() -> bool:
@@ -62,24 +62,21 @@ class ReadyNode(SafeNode):
         self.expect(lambda: self.count_publishers(topic) > 0)
 
     def offer_ready(self, topic: str) -> None:
-        """Create the publisher, after all others.
-
-        Publishers are discovered in the order of their creation: who receives it knows them all.
-        """
+        """Create the publisher last: receivers of its message have discovered all others."""
         self._ready_publisher = self.create_publisher(LockstepDone, topic, LATCHED)
 
     def await_peers(self) -> None:
-        """Begin to look for peers."""
+        """Begin to check for peers."""
         self._peers_timer = self.create_wall_timer(_PEERS_PERIOD, self._look_for_peers)
         self._notice_at = time.monotonic() + _NOTICE_DELAY
 
     def end_wait(self) -> None:
-        """Look for peers no more."""
+        """Stop checking for peers."""
         self._notice_at = math.inf
         self._end_timer()
 
     def forget_peers(self) -> None:
-        """Forget what was expected, before the entities are destroyed."""
+        """Forget the expected peers before the entities are destroyed."""
         self._peers.clear()
         self._ready_publisher = self._peers_timer = None
 
@@ -97,7 +94,6 @@ class ReadyNode(SafeNode):
             self._ready_publisher.publish(LockstepDone(node=self.get_fully_qualified_name()))
 
     def _reaches(self, publisher: Publisher, number: int, names: Collection[str]) -> bool:
-        """Return whether a message would reach so many subscribers, and nodes of all names."""
         topic = publisher.topic_name
         known = [info.node_name for info in self.get_subscriptions_info_by_topic(topic)]
         peers = [name for name in known if name not in _OBSERVERS and not name.startswith('_')]
@@ -108,7 +104,7 @@ class ReadyNode(SafeNode):
         return late or publisher.get_subscription_count() >= len(known)
 
     def check_peers(self) -> list[str]:
-        """Name, once, the topics that nobody publishes; warn of endpoints that never connect."""
+        """Log, once, topics without publisher; warn of endpoints that never connect."""
         now = time.monotonic()
         if now >= self._notice_at:
             self._notice_at = math.inf

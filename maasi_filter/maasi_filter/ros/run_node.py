@@ -23,16 +23,16 @@ from maasi_filter.ros.parameters import node_help
 
 
 class _NoNode:
-    """Beside the node of an events executor, which crashes with one (rclpy 7.1, pull 1718)."""
+    """A second node for the events executor, which crashes with only one (rclpy 7.1, pull 1718)."""
 
     executor: Any = None
     subscriptions = timers = clients = services = waitables = guards = ()
 
 
 def executor_of(node: Node, context: Context | None = None) -> Executor:
-    """Return an executor for one node: rclpy's events executor if it is there, which is fast.
+    """Return an executor for one node: rclpy's fast events executor if it exists.
 
-    In both, an exception in a callback ends the spin, and neither may spin after its `shutdown`.
+    An exception in a callback ends the spin; after its `shutdown` an executor must not spin.
     """
     try:
         from rclpy.experimental.events_executor import EventsExecutor
@@ -40,8 +40,8 @@ def executor_of(node: Node, context: Context | None = None) -> Executor:
         executor: Executor = SingleThreadedExecutor(context=context)
     else:
         executor = EventsExecutor(context=context)
-        beside: Any = _NoNode()
-        executor.add_node(beside)
+        dummy: Any = _NoNode()
+        executor.add_node(dummy)
     executor.add_node(node)
     return executor
 
@@ -55,7 +55,7 @@ def run(
     arguments: list[str] | None = None,
     kind: type[LockstepLifecycleNode[Any]] | None = None,
 ) -> int:
-    """Run a node until it is asked to end and has stopped all motion; return the exit code."""
+    """Run a node until it is asked to end and all motion is stopped; return the exit code."""
     if {'-h', '--help'} & set(sys.argv[1:] if arguments is None else arguments):
         explained = kind or (make_node if isinstance(make_node, type) else LockstepLifecycleNode)
         try:
@@ -96,10 +96,10 @@ def run(
         # Objects created so far are permanent: exclude them from garbage collection.
         gc.collect()
         gc.freeze()
-        # Messages are freed without it: it looks for what is left seldom.
+        # Rare collections suffice, as messages are freed without them.
         gc.set_threshold(50_000, 20, 100)
         while rclpy.ok() and not asked:
-            # Returns only to look for signals; `spin_once` would after each callback.
+            # Returns only to check for signals; `spin_once` returns after each callback.
             executor.spin_until_future_complete(Future(), _SIGNAL_PERIOD)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -110,7 +110,7 @@ def run(
             if rclpy.ok() and node.configured:
                 node.halt()
             node.destroy_node()
-            time.sleep(_FAREWELL)  # a context takes with it what nobody has received yet
+            time.sleep(_FAREWELL)  # messages that are not received yet end with the context
         rclpy.try_shutdown()
         # Explicit: a forked process ends with `os._exit`, without clean-up by the interpreter.
         get_default_context(shutting_down=True).destroy()

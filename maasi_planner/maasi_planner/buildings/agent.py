@@ -1,6 +1,6 @@
 """One robot of the distributed search of 004: knowledge, messages, decisions and snapshots.
 
-What robots tell each other, and how they share the cuboids: (10) to (14).
+Robots share messages and cuboids by (10) to (14).
 """
 
 import math
@@ -26,25 +26,24 @@ from maasi_planner.buildings.settings import (
 
 @dataclass(frozen=True)
 class Broadcast:
-    """Message of a robot to those in range at a step (V-B)."""
+    """Message of a robot to others in range at a step (V-B)."""
 
     robot: str
     step: int  # t
     position: FloatArray  # (3,) [m]
     velocity: FloatArray  # (3,) [m/s]
-    searching: bool  # whether it takes part; on its way home it still shares its search map
+    searching: bool  # whether it searches; on its path home it still shares its search map
     visited: BoolArray  # (N,): V, its search map
     flight_steps: int  # t_Fl, since its last recharge
-    plan: Mapping[int, int]  # steps from now until the visit, by cuboid, of the plan before
+    plan: Mapping[int, int]  # steps to the visit by cuboid, of the previous plan
     hazard: HazardSettings  # of its battery
-    predicted: FloatArray  # (3,): position at t + tau* + 1 in the plan before [m]
+    predicted: FloatArray  # (3,): position at t + tau* + 1 in the previous plan [m]
 
 
 def assigned(places: FloatArray, row: int, centres: FloatArray, unvisited: IntArray) -> int | None:
-    """Return the cuboid assigned to robot `row` of robots at places (m, 3): (10); None: too few."""
+    """Return the cuboid assigned to robot `row` of robots at positions (m, 3): (10), or None."""
     if not len(unvisited):
         return None
-    # Deferred: SciPy takes long to import, and searches for targets do not need it.
     from scipy.optimize import linear_sum_assignment
 
     cost = np.sqrt(((places[:, None, :] - centres[unvisited][None, :, :]) ** 2).sum(axis=2))
@@ -60,7 +59,7 @@ def rewards(
     heard: Sequence[Broadcast],
     draws: FloatArray,
 ) -> BoolArray:
-    """Return r(n) for all cuboids, (N,): (11) to (14), from as many numbers drawn from 0 to 1."""
+    """Return r(n) for all cuboids, (N,): (11) to (14), for random numbers `draws` in [0, 1]."""
     result = np.ones(len(draws), dtype=bool)
     failing = hazard.failure(flight_steps + settings.horizon)
     low = failing <= 0.5
@@ -94,7 +93,7 @@ class Activity(Enum):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Snapshot of a cell, by a robot at a step."""
+    """Snapshot of a cell."""
 
     robot: str
     step: int
@@ -106,18 +105,18 @@ class Snapshot:
 
 
 def decision_stream(seed: int, robot: str, step: int) -> np.random.Generator:
-    """Return the generator of a robot's decision at a step: the same in every process."""
+    """Return the random generator of a robot's decision at a step, the same in every process."""
     key = (seed, crc32(robot.encode()), step, crc32(b'cuboid'))
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
 
 
 def inflated(boxes: FloatArray, clearance: float) -> FloatArray:
-    """Return boxes (n, 3, 2) with a clearance [m] on all sides."""
+    """Return boxes (n, 3, 2) extended by a clearance [m] on all sides."""
     return boxes + np.array([-clearance, clearance])
 
 
 class SearchAgent:
-    """A robot with its own planner: at each step it observes, sends, and decides."""
+    """A robot with its own planner: at each step it observes, sends and decides."""
 
     def __init__(
         self,
@@ -156,19 +155,19 @@ class SearchAgent:
         if not ((self.home >= area[:, 0]) & (self.home <= area[:, 1])).all():
             problem = f', allowed is what lies inside the area, {area.tolist()} [m]'
         elif self.mission.hits(self.home):
-            problem = ', which is inside an object or obstacle, allowed is a place outside'
+            problem = ', which is inside an object or obstacle, allowed is a position outside'
         elif not any(self._ways.reaches(self.home, centre) for centre in self.mission.centres):
-            problem = ', from where no cuboid can be reached: obstacles close it in'
+            problem = ', from which no cuboid can be reached: obstacles enclose it'
         if problem:
             raise ValueError(f'{self.name}: start: read {self.home.tolist()}{problem}')
 
     @property
     def done(self) -> bool:
-        """Whether all cuboids are visited, as far as it knows."""
+        """Whether all cuboids are visited as far as the robot knows."""
         return bool(self.visited.all())
 
     def observe(self, step: int, position: ArrayLike, velocity: ArrayLike) -> Broadcast | None:
-        """Update its own state; return the message to the others, None while it recharges."""
+        """Update the robot's state; return its message to the others, None while it recharges."""
         place = np.array(position, dtype=float)
         speed = np.array(velocity, dtype=float)
         if not (np.isfinite(place).all() and np.isfinite(speed).all()):
@@ -176,7 +175,7 @@ class SearchAgent:
                 f'{self.name}: state: got {place}, {speed}, allowed are finite numbers'
             )
         if self.plan is not None and step != self.step + 1:
-            # After a recharge or a missed step the plan is not that of the previous step.
+            # After a recharge or a missed step there is no previous plan.
             self.plan = None
         self.step = step
         self.position, self.velocity = place, speed
@@ -220,7 +219,7 @@ class SearchAgent:
     def decide(
         self, heard: Sequence[Broadcast], rng: np.random.Generator, wanted: BoolArray | None = None
     ) -> Plan:
-        """Decide for the step that was observed last; `wanted` (N,) replaces the drawn rewards."""
+        """Decide for the last observed step; `wanted` (N,) replaces the drawn rewards."""
         fails, minutes = rng.random(2)
         if self.activity is not Activity.RECHARGING:
             for message in heard:
@@ -265,17 +264,17 @@ class SearchAgent:
         return self.position if chosen is None else centres[chosen]
 
     def _predicted(self) -> FloatArray:
-        """Return x at t + tau* + 1 of the previous plan; the present position without a plan."""
+        """Return x at t + tau* + 1 of the previous plan, or the present position."""
         if self.plan is None:
             return self.position
         last = len(self.plan.positions) - 1
         return np.asarray(self.plan.positions[min(self.settings.guided + 1, last)])
 
     def follow(self, plan: Plan | None) -> Plan:
-        """Take over a plan; without one, the rest of the previous plan, or to brake."""
+        """Adopt a plan or, without one, the rest of the previous plan, or brake."""
         if plan is None:
             self.failed += 1
-            # The rest of the previous plan, if that holds, with braking at its end.
+            # The rest of the previous plan, with braking at its end, or braking.
             last, controls, visits = self.plan, [], []
             if last is not None and (
                 np.abs(last.positions[1] - self.position).max() <= _SAME_STATE
@@ -287,7 +286,7 @@ class SearchAgent:
             plan = Plan(*flown, visits, 'shifted' if controls else 'brake')
         before = [k - 1 for k, _ in self.plan.visits if k > 1] if self.plan else []
         now = [k for k, _ in plan.visits]
-        # Count postponements: otherwise a robot can postpone its visit for ever.
+        # Without this count a robot can postpone its visit forever.
         self.put_off = self.put_off + 1 if before and now and min(now) > min(before) else 0
         self.plan = plan
         if self.activity is not Activity.RECHARGING:

@@ -1,4 +1,4 @@
-"""The quadratic problem of one axis of 004, P2: rows, costs, and a dual active-set method."""
+"""The quadratic problem of one axis of P2 (004): rows, costs, and a dual active-set method."""
 
 import math
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from numba import njit
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.buildings.dynamics import Dynamics
 
-SCALE = 1e4  # the objective is scaled so that its rows are of the size of one
-TOLERANCE = 1e-7  # a row is met when it is this close to its bounds [m, m/s, N]
-DEPENDENT = 1e-10  # a row is a combination of active ones when this share of its length is left
+SCALE = 1e4  # of the objective, so that its rows are of magnitude 1
+TOLERANCE = 1e-7  # of the bounds of rows [m, m/s, N]
+DEPENDENT = 1e-10  # share of a row's length below which active rows span it
 
 
 class AxisRoom(NamedTuple):
-    """Scratch of `solve_axis` for n forces: (n + 1,) twice, (n + 1, n + 1), (2, n + 1)."""
+    """Scratch arrays of `solve_axis` for n forces: (n + 1,) twice, (n + 1, n + 1), (2, n + 1)."""
 
     active: IntArray
     multipliers: FloatArray
@@ -26,7 +26,7 @@ class AxisRoom(NamedTuple):
 
 @dataclass(frozen=True)
 class AxisRows:
-    """What is linear in the forces u_0 to u_{T-1} of an axis, m rows; P_1 is given by the state."""
+    """Linear functions of the forces u_0 to u_{T-1} of an axis, m rows; the state gives P_1."""
 
     matrix: FloatArray
     gram: FloatArray  # (m, m): matrix H^-1 matrix', H the Hessian of the objective
@@ -37,7 +37,7 @@ class AxisRows:
 def axis_rows(
     dynamics: Dynamics, horizon: int, pull: FloatArray, smoothness: float, rolling: FloatArray
 ) -> AxisRows:
-    """Return the rows of an axis for unscaled weights and ways to roll to a halt (J,) [m]."""
+    """Return the rows of an axis for unscaled weights and rolling distances (J,) [m]."""
     forces = np.eye(horizon)
     gamma = dynamics.step / dynamics.mass
     velocities = np.zeros((horizon + 1, horizon))
@@ -70,7 +70,7 @@ def solve_axis(
 ) -> float:
     """Minimise over the rows' values y = free + gram lambda in their bounds (Goldfarb, Idnani).
 
-    Returns the objective above that of the free minimum; inf: no solution, or above `cutoff`.
+    Return the objective above that of the free minimum; inf without a solution, or above `cutoff`.
     """
     active, multipliers, factor, work = room
     m = free.shape[0]

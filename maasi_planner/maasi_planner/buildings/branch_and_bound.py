@@ -1,8 +1,8 @@
-"""Exact branch and bound over visits and obstacle faces: 004, P2 for one robot.
+"""Exact branch and bound over visits and obstacle faces: P2 of 004 for one robot.
 
-A node fixes visits in the order of their steps, and which faces of obstacles segments stay beyond;
-its relaxation is a quadratic problem for each axis. An *open* node stands for every plan with these
-visits and perhaps later ones, a *closed* one for those with no other.
+A node fixes visits in the order of their steps, and the faces of obstacles beyond which segments
+stay; its relaxation is a quadratic problem for each axis. An *open* node stands for every plan with
+these visits and possibly later ones, a *closed* one for those without others.
 """
 
 import math
@@ -15,22 +15,22 @@ from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.buildings.axis_problem import solve_axis
 from maasi_planner.buildings.search_tree import Tree, copy_node, free, pop, push
 
-GAP = 1e-3  # a plan must be better than the best by this much, scaled objective
-FACE_TOLERANCE = 1e-6  # a position beyond a face by no less than minus this is beyond it [m]
-GIVEN_TOLERANCE = 1e-3  # the same for the first two positions, which are given [m]
+GAP = 1e-3  # least improvement of the scaled objective
+FACE_TOLERANCE = 1e-6  # tolerance of positions beyond a face [m]
+GIVEN_TOLERANCE = 1e-3  # tolerance of the first two positions, which are given [m]
 
 FOUND, EXHAUSTED, UNFINISHED, FULL = 0, 1, 2, 3
 
 
 class Instance(NamedTuple):
-    """One problem for the compiled search, Q visits to choose from; objectives scaled."""
+    """One problem for the compiled search with Q possible visits; objectives are scaled."""
 
     gram: FloatArray  # (m, m) of each axis
     free: FloatArray  # (3, m): values of the rows at the free minimum, and their bounds
     lower: FloatArray
     upper: FloatArray
-    rise: FloatArray  # (3, J): what ways to brake are longer by than their rows, going up, and
-    sink: FloatArray  # going down [m]
+    rise: FloatArray  # (3, J): excess of braking distances over their rows, upwards and
+    sink: FloatArray  # downwards [m]
     given: FloatArray  # (2, 3): P_0 and P_1 [m]
     area: FloatArray  # (3, 2) [m]
     horizon: int
@@ -57,12 +57,12 @@ def _ahead(instance: Instance, tree: Tree, node: int) -> float:
 
 @njit(cache=True)
 def _solve(instance: Instance, tree: Tree, node: int, cutoff: float) -> bool:
-    """Solve the axes of a node that have changed; return whether it is of use."""
+    """Solve the changed axes of a node; return whether it can improve the best plan."""
     horizon = instance.horizon
     last = horizon + 1
     steps = instance.rise.shape[1]
     first = 3 * horizon - 1
-    # What an axis cost before it changed is the least that it costs now.
+    # The earlier cost of a changed axis is a lower bound.
     total = tree.cost[node, 0] + tree.cost[node, 1] + tree.cost[node, 2]
     lower, upper = tree.scratch[0], tree.scratch[1]
     for a in range(3):
@@ -106,7 +106,7 @@ def _position(instance: Instance, tree: Tree, node: int, a: int, k: int) -> floa
 
 @njit(cache=True)
 def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int) -> tuple[int, int]:
-    """Return the first segment from begin to end through an obstacle, and that; or (-1, -1)."""
+    """Return the first segment from begin to end in an obstacle, and that one, or (-1, -1)."""
     horizon = instance.horizon
     steps = instance.rise.shape[1]
     first = 3 * horizon - 1
@@ -173,7 +173,7 @@ def _branch_on_faces(
 
 @njit(cache=True)
 def begin(instance: Instance, tree: Tree, hint: IntArray) -> None:
-    """Start a search: the root, and the visits of an earlier plan as a closed node."""
+    """Start a search with the root, and the visits of an earlier plan as a closed node."""
     size = tree.heap.shape[0]
     tree.counts[:] = 0
     tree.counts[1] = size - 1
@@ -194,7 +194,7 @@ def begin(instance: Instance, tree: Tree, hint: IntArray) -> None:
         tree.closed[child] = True
         for i in range(hint.shape[0]):
             _visit(instance, tree, child, hint[i])
-        # Before all others: its objective prunes.
+        # First, as its objective prunes others.
         tree.bound[child] = -math.inf
         push(tree, child)
     push(tree, 0)
@@ -209,7 +209,7 @@ def _visit(instance: Instance, tree: Tree, node: int, q: int) -> None:
         tree.high[node, a, k] = min(tree.high[node, a, k], high)
         place = tree.values[node, a, k - 2]
         if place < low or place > high:
-            tree.dirty[node] |= 1 << a  # where it lies inside already, nothing changes
+            tree.dirty[node] |= 1 << a  # unless it is inside already
     tree.visits[node, tree.number[node]] = q
     tree.number[node] += 1
     tree.reward[node] += instance.visit_reward[q]
@@ -250,9 +250,9 @@ def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
 
 @njit(cache=True)
 def search(instance: Instance, tree: Tree, most: int) -> int:
-    """Continue a search by at most `most` nodes; return whether the best is the optimum (FOUND).
+    """Continue a search by at most `most` nodes; return FOUND if the best plan is optimal.
 
-    EXHAUSTED: there is no plan; UNFINISHED: nodes are left; FULL: there was no room for more.
+    EXHAUSTED: no plan exists; UNFINISHED: nodes remain; FULL: the capacity was reached.
     """
     horizon = instance.horizon
     end = horizon + 1
@@ -320,7 +320,7 @@ def longest_chains(
     fall: FloatArray,
     climb: FloatArray,
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which visits may follow which, and the most reward that can follow each."""
+    """Return which visits may follow which, and the highest reward that can follow each."""
     number = visit_step.shape[0]
     follows = np.zeros((number, number), dtype=np.bool_)
     ahead = np.zeros(number)

@@ -1,4 +1,4 @@
-"""Between messages and the records of the search of buildings."""
+"""Conversions between messages and records of the search of buildings."""
 
 from collections.abc import Sequence
 
@@ -102,7 +102,7 @@ def broadcast_from_ros(message: SearchLink, cuboids: int) -> Broadcast:
 def decision_to_ros(
     agent: SearchAgent, plan: Plan, shots: list[Snapshot], header: Header
 ) -> CuboidDecision:
-    """Return a decision with the snapshots since the one before; robots heard are not set."""
+    """Return a decision with its new snapshots; received robots are not set."""
     return CuboidDecision(
         header=header,
         step=agent.step,
@@ -141,7 +141,7 @@ def mission_markers(mission: CoveragePlan, header: Header) -> MarkerArray:
 def agent_markers(
     agent: SearchAgent, plan: Plan, header: Header, team: Sequence[str] = ()
 ) -> MarkerArray:
-    """Return markers of a robot of a team, its plan, search map, and camera direction."""
+    """Return markers of a robot, its plan, search map and camera direction."""
     name = agent.name
     tint_of_robot = colour_of(robot_colours({name, *team})[name])
     markers = []

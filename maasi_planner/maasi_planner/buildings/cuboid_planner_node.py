@@ -1,4 +1,4 @@
-"""The planner node of one robot that searches buildings beside others (004)."""
+"""The planner node of one robot that searches buildings with others (004)."""
 
 import time
 from typing import Any
@@ -52,13 +52,15 @@ _REASONS = {
     Activity.RETURNING: 'battery failed: flies to its station',
     Activity.RECHARGING: 'recharges',
 }
+# What the robot does without a new plan, by `Plan.how`.
+_FALLBACKS = {'shifted': 'following the rest of the previous plan', 'brake': 'braking'}
 
 
 class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
-    """Plans for the robot of its namespace, with the messages of robots in range.
+    """Plan for the robot of this namespace, with the messages of robots in range.
 
-    At each step it reads its state, sends to the others, receives from them, decides, and commands
-    the velocity of its plan. It does not wait for robots that are out of range.
+    At each step the node reads the robot's state, sends it, receives messages of others, decides,
+    and commands the velocity of its plan. It does not wait for robots out of range.
 
     Subscribes
     ----------
@@ -104,7 +106,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._wanted_step = -1
         self._board = MarkerBoard()
         self._sent_step = -1
-        # Whether the agent has observed the state of that step, but not decided.
+        # Whether the agent has observed that step, but not decided.
         self._observed = False
         self._decided_step = -1
         self._link: SearchLink | None = None
@@ -112,11 +114,11 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._command: TwistStamped | None = None
         self._sent_at = 0.0
         self._solve_time = 0.0
-        # Snapshots of the agent that were published. A step may pass without a decision.
+        # Number of published snapshots of the agent.
         self._published_shots = 0
 
     def set_up(self) -> None:
-        """Compile and connect."""
+        """Compile the kernels, create publishers, subscriptions and services."""
         agent = self._make_agent()
         agent.observe(0, self.settings.start, np.zeros(3))
         agent.decide([], decision_stream(self.settings.seed, self.name, 0))
@@ -148,11 +150,11 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             self.create_wall_timer(0.02, self._check_link)
         for cell, reason in self._mission.lost:
             self.get_logger().warning(
-                f'the {cell.face} face of object {cell.target} is not searched whole: {reason}'
+                f'the {cell.face} face of object {cell.target} is only partly searched: {reason}'
             )
 
     def start(self) -> None:
-        """Start the search, unless it waits for the service."""
+        """Start the search if `search_on_start`."""
         if self.settings.search_on_start:
             self.modes.command('start')
 
@@ -160,7 +162,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         """End the search: the robot stops."""
         self.modes.command('stop')
         self._stop_robot()
-        # A process that ends takes with it what nobody has received yet.
+        # Messages that are not received yet end with the process.
         if self.configured:
             self._command_publisher.wait_for_all_acked(_STOP_TIME)
 
@@ -177,7 +179,10 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         if not self.active:
             return False, 'the planner is not active'
         if word == 'home':
-            return False, f'{self.name}: no home in a search of buildings, allowed is pause, stop'
+            return (
+                False,
+                f'{self.name}: read home, allowed in a search of buildings are pause, stop',
+            )
         if not self.modes.command(word):
             return False, f'{self.name}: {self.modes.describe()}; {word} changes nothing'
         if not self._searching and not self.settings.lockstep:
@@ -228,10 +233,12 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         bounded('twist', velocity, FASTEST)
         if not (lockstep or self._gate.accepts(stamp)):
             raise ValueError(
-                f'{read}, which is far from the one before; allowed if the next one follows it'
+                f'{read}, far from the previous one; allowed once the next one follows it'
             )
         if step < self._decided_step:
-            self.get_logger().warning(f'odom.header.stamp went back to step {step}: starting anew')
+            self.get_logger().warning(
+                f'odom.header.stamp went back to step {step}: the search starts again'
+            )
             self.reset()
         # Odometry is relative to the start.
         pose = compose(Pose.from_yaw(self.settings.start, self.settings.yaw), reading)
@@ -254,7 +261,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             return
         patience = self.settings.link_patience * self.settings.step
         if self._decided_step < self._sent_step and time.monotonic() - self._sent_at > patience:
-            self.warn_throttled('link', f'step {self._sent_step}: nothing on link/rx')
+            self.warn_throttled('link', f'step {self._sent_step}: no message on link/rx')
             self._decide([])
 
     def _header(self, step: int) -> Header:
@@ -314,8 +321,8 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             plan = agent.decide(heard, decision_stream(self.settings.seed, self.name, step))
             self._solve_time = time.perf_counter() - begun
             velocity = plan.velocities[1]
-            if plan.how in ('shifted', 'brake'):
-                text = f'step {step}: no plan was found, it does this: {plan.how}'
+            if plan.how in _FALLBACKS:
+                text = f'step {step}: no new plan was found: {_FALLBACKS[plan.how]}'
                 self.warn_throttled('how', text)
             shots = agent.snapshots[self._published_shots :]
             decision = decision_to_ros(agent, plan, shots, header)

@@ -1,4 +1,4 @@
-"""The mass point of 004, (1) and (2)."""
+"""Dynamics of a mass point: 004, (1) and (2)."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ class Dynamics:
     """The three independent axes of (1), sampled every `step` seconds.
 
     `retained` is phi = 1 - eta, `weight` is u_g (3,) [N], and `deceleration` (2, 3) is the largest
-    loss of speed in a step beyond air resistance, going up and down [m/s].
+    loss of speed per step beyond air resistance, upwards and downwards [m/s].
     """
 
     def __init__(self, settings: DynamicsSettings | None = None, step: float = 1.0) -> None:
@@ -46,7 +46,7 @@ class Dynamics:
         controls: Sequence[FloatArray] | FloatArray,
         steps: int,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return positions and velocities (steps + 1, 3), and forces: those given, then braking."""
+        """Return positions and velocities (steps + 1, 3), and forces: given ones, then braking."""
         positions, velocities, used = [position], [velocity], []
         for k in range(steps):
             brakes = k >= len(controls)
@@ -57,7 +57,7 @@ class Dynamics:
         return np.array(positions), np.array(velocities), np.array(used)
 
     def control_for(self, velocity: ArrayLike, wanted: ArrayLike) -> FloatArray:
-        """Return the force (3,) [N] within its bounds that gets closest to a wanted velocity."""
+        """Return the feasible force (3,) [N] for the velocity closest to the wanted one."""
         change = np.asarray(wanted, dtype=float) - self.retained * np.asarray(velocity, dtype=float)
         return np.clip(self.mass / self.step * change + self.weight, -self.force, self.force)
 
@@ -70,11 +70,11 @@ class Dynamics:
         return steps
 
     def rolling_ways(self, steps: int) -> FloatArray:
-        """Return the way [m] from a speed of 1 after each step of braking by air resistance."""
+        """Return the distance [m] after each step of braking from 1 m/s by air resistance."""
         return self.step * np.cumsum(self.retained ** np.arange(steps))
 
     def shorter_ways(self, steps: int) -> FloatArray:
-        """Return by how much full force shortens these ways, going up and down, (2, 3, steps)."""
+        """Return the reduction of these distances by full force, up and down, (2, 3, steps)."""
         lost = np.zeros((2, 3))
         ways = np.zeros((2, 3, steps))
         for j in range(1, steps):

@@ -1,4 +1,4 @@
-"""Pre-planning: from objects to cuboids, 004, IV; and paths around obstacles."""
+"""Pre-planning: from objects to cuboids (004, IV), and paths around obstacles."""
 
 import heapq
 import math
@@ -22,7 +22,7 @@ _THINNEST = 1.0  # least thickness of a cuboid [m]
 
 
 def detection_probability(distance: float, camera: SearchCameraSettings) -> float:
-    """Return p_d at a distance from the face [m]: (4), but 0 only below d_min, not at it."""
+    """Return p_d at a distance from the face [m]: (4), but 0 only below d_min, not at d_min."""
     if distance < camera.least_distance:
         return 0.0
     span = camera.largest_distance - camera.least_distance
@@ -30,13 +30,13 @@ def detection_probability(distance: float, camera: SearchCameraSettings) -> floa
 
 
 def footprint(distance: float, camera: SearchCameraSettings) -> float:
-    """Return r, the side of the square footprint of the camera at a distance [m] (III-C)."""
+    """Return r, the side length of the camera's square footprint at a distance [m] (III-C)."""
     return 2.0 * distance * math.tan(0.5 * camera.angle)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A part of a face and the cuboid that it is searched from."""
+    """A part of a face, and the cuboid from which it is searched."""
 
     target: int  # index of the object
     face: str  # west, east, south, north, bottom or top
@@ -46,28 +46,28 @@ class Cell:
     box: FloatArray  # (3, 2): lower and upper corner of the cuboid [m]
 
     def sides(self) -> FloatArray:
-        """Return lower and upper corner of the cell, (3, 2) [m]: flat along its normal."""
+        """Return lower and upper corner of the cell, (3, 2) [m], equal along its normal."""
         half = np.zeros(3)
         half[self.normal == 0.0] = 0.5 * self.size
         return np.stack([self.centre - half, self.centre + half], axis=1)
 
     def distance(self, position: ArrayLike) -> float:
-        """Return how far a position (3,) is from the face [m]."""
+        """Return the distance of a position (3,) from the face [m]."""
         return float((np.asarray(position, dtype=float) - self.centre) @ self.normal)
 
 
 @dataclass(frozen=True)
 class CoveragePlan:
-    """Cells of the faces to search and their cuboids, planned before take-off."""
+    """Cells of the searched faces with their cuboids, planned before take-off."""
 
     cells: list[Cell]
-    lost: list[tuple[Cell, str]]  # other cells, and why they are lost
+    lost: list[tuple[Cell, str]]  # other cells, with reasons
     area: FloatArray  # (3, 2): admissible positions [m]
     objects: FloatArray  # (n, 3, 2): true size, without clearance [m]
     obstacles: FloatArray
     distance: float  # d [m]
     footprint: float  # r [m]
-    coverage: float  # share of the searchable faces that the snapshots cover, 0 to 1
+    coverage: float  # share of the faces that snapshots cover, 0 to 1
     boxes: FloatArray = field(init=False)
     centres: FloatArray = field(init=False)
     solids: FloatArray = field(init=False)  # objects and obstacles
@@ -79,7 +79,7 @@ class CoveragePlan:
         object.__setattr__(self, 'solids', np.concatenate([self.objects, self.obstacles]))
 
     def inside(self, position: ArrayLike) -> BoolArray:
-        """Return which cuboids a position (3,) is in, (N,)."""
+        """Return which cuboids contain a position (3,), (N,)."""
         place = np.asarray(position, dtype=float)
         return np.asarray(
             ((self.boxes[:, :, 0] <= place) & (place <= self.boxes[:, :, 1])).all(axis=1)
@@ -96,13 +96,12 @@ class CoveragePlan:
 
 
 def _inside(position: FloatArray, boxes: FloatArray) -> BoolArray:
-    """Return whether positions (..., 3) are inside boxes (n, 3, 2) on each axis, (..., n, 3)."""
     place = position[..., None, :]
     return np.asarray((boxes[:, :, 0] < place) & (place < boxes[:, :, 1]))
 
 
 def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolArray:
-    """Return which boxes (n, 3, 2) have an interior that segments (..., 3) cut, (..., n)."""
+    """Return which boxes (n, 3, 2) have interiors that segments (..., 3) cut, (..., n)."""
     way = end - begin
     with np.errstate(divide='ignore', invalid='ignore'):
         first = (boxes[:, :, 0] - begin[..., None, :]) / way[..., None, :]
@@ -117,14 +116,13 @@ def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolA
 
 
 def plan_mission(settings: CuboidSettings, area: ArrayLike) -> CoveragePlan:
-    """Return the cuboids of a mission in an area (3, 2) [m]."""
+    """Return the coverage plan of a mission in an area (3, 2) [m]."""
     bounds = np.asarray(area, dtype=float)
     if not settings.objects:
         raise ValueError('objects: got none, allowed is at least one object to search')
     objects = _boxes('objects', settings.objects, bounds)
     obstacles = _boxes('obstacles', settings.obstacles, bounds)
     solids = np.concatenate([objects, obstacles])
-    # The largest distance at which p_d is as wanted.
     camera = settings.camera
     span = camera.largest_distance - camera.least_distance
     distance = camera.least_distance + (1.0 - settings.detection_probability) * span
@@ -141,13 +139,12 @@ def plan_mission(settings: CuboidSettings, area: ArrayLike) -> CoveragePlan:
                 if reason:
                     lost.append((cell, reason))
                     continue
-                # The share of the cell that a snapshot covers.
                 seen += float(np.prod(np.minimum(side / cell.size, 1.0))) * size
                 cells.append(replace(cell, box=box))
     if not cells:
         reasons = '; '.join(sorted({reason for _, reason in lost}))
         raise ValueError(
-            f'objects: no cuboid can be reached ({reasons}); allowed is an area that leaves room '
+            f'objects: no cuboid can be reached ({reasons}); allowed is an area that leaves space '
             f'at {distance:.1f} m from a face'
         )
     return CoveragePlan(cells, lost, bounds, objects, obstacles, distance, side, seen / total)
@@ -213,7 +210,7 @@ def _usable(
         wall = solid + np.array([-settings.clearance, settings.clearance])
         if ((box[:, 0] >= wall[:, 1]) | (box[:, 1] <= wall[:, 0])).any():
             continue
-        # Keep the largest part beside the solid.
+        # Keep the largest part next to the solid.
         parts = []
         for axis in range(3):
             below, above = box.copy(), box.copy()
@@ -231,7 +228,7 @@ def _usable(
     middle = box.mean(axis=1)
     near = cell.centre + 1e-6 * cell.normal
     if segment_cuts(middle, near, solids).any():
-        return box, 'another object stands in the view of a cuboid'
+        return box, 'another object blocks the view from a cuboid'
     return box, ''
 
 
@@ -239,7 +236,7 @@ _BERTH = 3.0  # distance of intermediate targets from the corners of obstacles [
 
 
 class WayFinder:
-    """Paths around boxes (n, 3, 2) [m]: a visibility graph over their corners, by travel time."""
+    """Fastest paths around boxes (n, 3, 2) [m] by a visibility graph of their corners."""
 
     def __init__(self, solids: FloatArray, area: FloatArray, speed: float, climb: float) -> None:
         self.solids, self.area = solids, area
@@ -247,7 +244,7 @@ class WayFinder:
         self._down = speed
 
     def first_corner(self, place: FloatArray, target: FloatArray) -> FloatArray:
-        """Return the next corner (3,) of the path to a target; without any, the target."""
+        """Return the next corner (3,) of the path to a target, or the target."""
         if not segment_cuts(place, target, self.solids).any():
             return target
         points = np.vstack([place, target, self._corners(place, target)])

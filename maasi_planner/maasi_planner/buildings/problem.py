@@ -1,7 +1,7 @@
-"""The problem of one robot at one step, 004, P2, and its exact solution; and that of all, P1.
+"""P2 of 004, the problem of one robot at a step, and P1, the joint one, with exact solutions.
 
-Without (5j) P1 decomposes into one P2 per robot; best-first search forbids a cuboid that two robots
-plan to visit to one or the other, and the first node without one is the optimum.
+Without (5j) P1 decomposes into one P2 per robot. Best-first search forbids a cuboid that two robots
+plan to visit to one or the other; the first node without conflicts is the optimum.
 """
 
 import heapq
@@ -24,9 +24,9 @@ from maasi_planner.buildings.settings import CuboidMethodSettings
 How = Literal['optimal', 'best_so_far', 'shifted', 'brake']
 
 GIVE = 1e-4  # relaxation of bounds if rounding leaves the state outside of them [m, m/s]
-TOUCH = 1e-6  # tolerance of the present position in a cuboid: plans touch faces, up to rounding [m]
-_SLICE, _ROOM = 500, 16384  # nodes between two checks of the time limit, and capacity of open nodes
-# Share of the smoothness weight of a robot that flies home, so that its forces are unique.
+TOUCH = 1e-6  # tolerance of the present position in a cuboid, whose faces plans touch [m]
+_SLICE, _ROOM = 500, 16384  # nodes between checks of the time limit; capacity of open nodes
+# Share of the smoothness weight on the flight home, which makes forces unique.
 _HOMING_SMOOTHNESS = 1e-2
 
 
@@ -41,33 +41,33 @@ class Problem:
     wanted: BoolArray  # (N,): which are unvisited and have a reward of 1
     obstacles: FloatArray  # (O, 3, 2): objects and obstacles, clearance included [m]
     area: FloatArray  # (3, 2): admissible positions [m]
-    homing: bool = False  # whether it only flies to its target, without search (8)
-    hint: list[tuple[int, int]] = field(default_factory=list)  # of the plan before, as of now
+    homing: bool = False  # whether it only flies to its target (8)
+    hint: list[tuple[int, int]] = field(default_factory=list)  # visits of the previous plan
     put_off: int = 0  # consecutive postponements of the first visit, if rewards are discounted
 
 
 @dataclass
 class Plan:
-    """A plan, starting at P_0."""
+    """A plan from P_0 on."""
 
     positions: FloatArray  # (T + 1, 3), from now on [m]
     velocities: FloatArray  # (T + 1, 3) [m/s]
     controls: FloatArray  # (T, 3): forces [N]
     visits: list[tuple[int, int]]  # step, from 1, and cuboid, each once, in order
-    how: How  # best_so_far: a limit ended the solve; shifted, brake: there was no solution
+    how: How  # best_so_far: a limit was reached; shifted, brake: no solution
     objective: float = float('nan')  # value of (9), without cuboids visited earlier
     nodes: int = 0  # number of solved relaxations
 
 
 class PlanSolver:
-    """Solves the problems of one kind of robot, with at most so many nodes or seconds."""
+    """Solves the problems of one kind of robot within a number of nodes or seconds."""
 
     def __init__(self, dynamics: Dynamics, settings: CuboidMethodSettings) -> None:
         self.dynamics, self.settings = dynamics, settings
         horizon, smoothness = settings.horizon, settings.smoothness_weight
         pull = np.zeros(horizon + 1)
         pull[settings.guided] = settings.guidance_weight
-        # As printed, nothing is asked of the way after the horizon.
+        # As printed, the path after the horizon is unconstrained.
         steps = dynamics.braking_steps() if settings.brake_at_end else 0
         self._rolling = dynamics.rolling_ways(steps)
         self._rise, self._sink = dynamics.shorter_ways(steps)
@@ -80,7 +80,7 @@ class PlanSolver:
         self._tree = make_tree(_ROOM, horizon, len(self._search.matrix))
 
     def solve(self, problem: Problem) -> Plan | None:
-        """Return the best plan, or None; bounds give by `GIVE` if rounding left a state outside."""
+        """Return the best plan or None; `GIVE` relaxes bounds that rounding violates."""
         plan = self._solve(problem, 0.0)
         return plan if plan is not None else self._solve(problem, GIVE)
 
@@ -123,7 +123,7 @@ class PlanSolver:
         )
 
     def _instance(self, problem: Problem, give: float) -> tuple[bb.Instance, float, list[int]]:
-        """Return the compiled form, the unconstrained objective, and visits that are due."""
+        """Return the compiled form, the unconstrained objective, and due visits."""
         horizon, dynamics = self.settings.horizon, self.dynamics
         rows = self._homing if problem.homing else self._search
         # Without forces.
@@ -187,7 +187,7 @@ class PlanSolver:
     def _visits(
         self, problem: Problem, first: FloatArray, wanted: BoolArray
     ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return possible visits from P_1, and lowest and highest ways until each (3, T + 1)."""
+        """Return possible visits from P_1, and lowest and highest paths to each (3, T + 1)."""
         dynamics, sums = self.dynamics, np.zeros((2, 3, self.settings.horizon + 1))
         for side, sign in enumerate((-1.0, 1.0)):
             speed = np.array(problem.velocity, dtype=float)
@@ -223,7 +223,7 @@ _GAP = 1e-7  # tolerance of equal objectives [1]
 
 
 def solve_jointly(solver: PlanSolver, problems: Sequence[Problem]) -> list[Plan] | None:
-    """Return the optimal plans of all robots, in the order of the problems; None: one has none."""
+    """Return the optimal plans of all robots, in the order of the problems, or None."""
     known: dict[tuple[int, frozenset[int]], Plan | None] = {}
 
     def plan_of(robot: int, forbidden: frozenset[int], hint: list[tuple[int, int]]) -> Plan | None:

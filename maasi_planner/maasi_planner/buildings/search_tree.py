@@ -1,4 +1,4 @@
-"""Nodes of the branch and bound search, best bound first, in arrays of fixed size."""
+"""Nodes of the branch and bound search in arrays of fixed size, best bound first."""
 
 from typing import NamedTuple
 
@@ -10,20 +10,20 @@ from maasi_planner.buildings.axis_problem import AxisRoom
 
 
 class Tree(NamedTuple):
-    """n nodes of the search, best bound first, in arrays that are reused."""
+    """Nodes of the search in reusable arrays, best bound first."""
 
     bound: FloatArray  # (n,): lower bound of the objective
     reward: FloatArray  # (n,) of the visits made
     cost: FloatArray  # (n, 3): of each axis
     dirty: IntArray  # (n,): bit mask of the axes that have to be solved again
     closed: BoolArray  # (n,): whether no further visits are made
-    visits: IntArray  # (n, V): the visits made
+    visits: IntArray  # (n, V): visits
     number: IntArray  # (n,) of them
-    low: FloatArray  # (n, 3, T + 2): bounds of P_0 to P_T and, last, of the way to brake [m]
+    low: FloatArray  # (n, 3, T + 2): bounds of P_0 to P_T and the braking distance [m]
     high: FloatArray
     values: FloatArray  # (n, 3, m): of the rows
     heap: IntArray  # (n,): nodes by bound
-    spare: IntArray  # (n,): nodes that are free
+    spare: IntArray  # (n,): free nodes
     counts: IntArray  # sizes of heap and spare, nodes solved, best node (or -1), out of nodes
     best: FloatArray  # (1,): objective of the best node
     scratch: FloatArray  # (3, m): bounds of an axis while it is solved
@@ -99,7 +99,7 @@ def free(tree: Tree, node: int) -> None:
 
 @njit(cache=True)
 def copy_node(tree: Tree, source: int) -> int:
-    """Return a copy of a node whose bounds can be tightened; -1: there is no room."""
+    """Return a copy of a node whose bounds can be tightened, or -1 without capacity."""
     if tree.counts[1] == 0:
         tree.counts[4] = 1
         return -1

@@ -1,4 +1,4 @@
-"""Settings of the search of buildings (004), and of the planner node of one of its robots."""
+"""Settings of the search of buildings (004) and of its planner node."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FACES: tuple[Face, ...] = ('west', 'east', 'south', 'north', 'bottom', 'top')
 
 
 class BoxSettings(Settings):
-    """A rectangular cuboid along the axes of the map."""
+    """A box along the axes of the map."""
 
     centre: list[Finite] = Field(
         min_length=2,
@@ -29,13 +29,13 @@ class BoxSettings(Settings):
     size: list[Positive] = Field(min_length=3, max_length=3, description='Size along x, y, z [m]')
 
     def array(self, floor: float) -> FloatArray:
-        """Return its lower and upper corner, (3, 2) [m], on a floor at that height [m]."""
+        """Return lower and upper corner, (3, 2) [m]; floor: its height [m]."""
         size = np.array(self.size)
         centre = np.array([*self.centre, floor + 0.5 * size[2]])[:3]
         return np.stack([centre - 0.5 * size, centre + 0.5 * size], axis=1)
 
     def numbers(self, floor: float) -> list[float]:
-        """Return centre and size as six numbers, on a floor at that height [m]."""
+        """Return centre and size as six numbers [m]; floor: its height [m]."""
         return [*self.array(floor).mean(axis=1).tolist(), *self.size]
 
 
@@ -50,7 +50,7 @@ class ObjectSettings(BoxSettings):
 
 
 class SearchCameraSettings(Settings):
-    """The camera of a searching robot, and how well it detects people (004, III-C)."""
+    """The camera of a robot, and how well it detects people (004, III-C)."""
 
     angle: float = Field(
         1.0471975511965976, gt=0.0, lt=3.0, description='Opening angle of the field of view [rad]'
@@ -115,7 +115,7 @@ class HazardSettings(Settings):
         return self
 
     def failure(self, steps: float) -> float:
-        """Return p_b(t), t steps after the battery was charged: (3)."""
+        """Return p_b(t), t steps after the last recharge: (3)."""
         if not self.failures:
             return 0.0
         exponent = min(max(-self.beta * (steps - self.alpha), -700.0), 700.0)
@@ -138,7 +138,7 @@ class SearcherSettings(Settings):
 
 
 class CuboidMethodSettings(Settings):
-    """The distributed model predictive control of 004, without its mission."""
+    """The distributed model predictive control of 004."""
 
     detection_probability: float = Field(
         0.88, gt=0.0, le=1.0, description='p_d that each snapshot must reach (eq. 4) [1]'
@@ -209,11 +209,11 @@ class CuboidMethodSettings(Settings):
 
     @property
     def guided(self) -> int:
-        """Index of the position that is drawn to a cuboid, tau* + 1."""
+        """Index of the position that is guided to a cuboid, tau* + 1."""
         return min(self.guidance_step, self.horizon - 1) + 1
 
     def rewards(self, put_off: int = 0) -> FloatArray:
-        """Return the reward of a visit at P_0 to P_T, (T + 1,); it was put off as often [1]."""
+        """Return the reward of a visit at P_0 to P_T, (T + 1,), postponed `put_off` times [1]."""
         steps = np.maximum(np.arange(self.horizon + 1) - 1, 0)
         return np.asarray(self.visit_weight * self.discount ** ((1 + put_off) * steps))
 
@@ -262,7 +262,7 @@ class CuboidPlannerSettings(NodeSettings, SearcherSettings):
     )
 
     def search(self) -> CuboidSettings:
-        """Return the search with its objects; `ValueError` if the faces do not fit them."""
+        """Return the search with its objects; ValueError if the number of faces does not fit."""
         if self.faces and len(self.faces) != len(self.objects):
             raise ValueError(
                 f'faces: got {len(self.faces)}, allowed is one for each of {len(self.objects)} '

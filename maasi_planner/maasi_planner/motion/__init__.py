@@ -1,4 +1,4 @@
-"""Motion models: each has its controller, its prediction and its body."""
+"""Motion models: controller, prediction and body of robots."""
 
 from maasi_filter.geometry.area import Area
 from maasi_planner.motion.base import Body, MotionModel, RobotState, Trajectories
@@ -28,9 +28,9 @@ def make_motion(
     settings : MotionSettings
         Model, limits and controller.
     area : Area, optional
-        Where it may go: its ways lead around what is not in it; none: anywhere.
+        Area of the robot, in which its paths stay; default: unlimited.
     radius : float
-        Of the robot, metres.
+        Radius of the robot, metres.
     """
     model: MotionModel = MOTIONS.load(settings.model)(settings, area, radius)
     return model

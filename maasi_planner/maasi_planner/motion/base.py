@@ -23,16 +23,16 @@ STEPS_LIMIT = 20_000
 
 @dataclass
 class RobotState:
-    """State of a robot that every model understands.
+    """State of a robot in a form that every model supports.
 
     Parameters
     ----------
     pose : Pose
-        In frame `map`.
+        Pose in frame `map`.
     velocity : (3,) array
-        m/s, axes of `map`.
+        Velocity, m/s, axes of `map`.
     angular_velocity : (3,) array
-        rad/s, body axes.
+        Angular velocity, rad/s, body axes.
 
     Raises
     ------
@@ -53,7 +53,7 @@ class RobotState:
 
     @classmethod
     def at_rest(cls, position: ArrayLike, yaw: float = 0.0) -> RobotState:
-        """Return a state at rest at `position` [m, map] facing `yaw` [rad]."""
+        """Return a state at rest at `position` [m, map] with heading `yaw` [rad]."""
         return cls(Pose.from_yaw(position, yaw))
 
 
@@ -64,16 +64,16 @@ class Trajectories:
     Attributes
     ----------
     positions : (W, Kmax + 1, 3) array
-        Metres, frame `map`, one per step, from the present state (column 0). After its own
-        length a trajectory stays at its last position.
+        Metres, frame `map`, one per step, from the present state (column 0). Shorter trajectories
+        repeat their last position.
     yaws : (W, Kmax + 1) array
         Headings, radians.
     lengths : (W,) integer array
-        K, steps until the waypoint is reached; 0 if the robot is there already.
+        K, steps until the waypoint is reached; 0 if the robot is already there.
     control_cost : (W,) array
         C, sum of squared inputs (000, eq. (18), (28)).
     reached : (W,) array of bool
-        Whether the waypoint is reached at all.
+        Whether the waypoint can be reached.
     """
 
     positions: FloatArray
@@ -89,7 +89,7 @@ class Trajectories:
 
 
 class Body(ABC):
-    """A robot's body under velocity commands: what the simulator steps."""
+    """A robot's body under velocity commands, which the simulator steps."""
 
     @abstractmethod
     def step(self, velocity_command: ArrayLike, dt: float) -> None:
@@ -98,38 +98,38 @@ class Body(ABC):
         Parameters
         ----------
         velocity_command : (4,) array
-            vx, vy, vz [m/s, body axes turned by the heading only] and yaw rate [rad/s], held
-            for the whole time. Limits are applied here.
+            vx, vy, vz [m/s, body axes rotated only by the heading] and yaw rate [rad/s], constant
+            during `dt`. The body applies its limits.
         dt : float
             Seconds.
         """
 
     @abstractmethod
     def robot_state(self) -> RobotState:
-        """Return the state that a driver would know."""
+        """Return the state that a driver measures."""
 
 
 class MotionModel(ABC):
     """A robot's controller and its prediction.
 
-    Prediction, driver and simulator share one closed loop: `command` is what a driver sends,
-    `body` is what receives it, and `predict` runs the one against the other.
+    Prediction, driver and simulator share one closed loop: the driver sends `command`, `body`
+    receives it, and `predict` runs both.
 
     Parameters
     ----------
     settings : MotionSettings
         Limits and controller.
     area : Area, optional
-        Where it may go; none: anywhere.
+        Area of the robot; default: unlimited.
     radius : float
-        Of the robot, metres; obstacles are inflated by it.
+        Radius of the robot, metres, by which obstacles are inflated.
 
     Attributes
     ----------
     rate : float
-        Speed per distance left, near the waypoint [1/s].
+        Speed per remaining distance near the waypoint [1/s].
     Settings : type or None
-        Model of the settings of a user's own model; `settings.settings` is an instance.
+        Model of a plugin's own settings, of which `settings.settings` is an instance.
     """
 
     rate: float = 1.0
@@ -142,12 +142,12 @@ class MotionModel(ABC):
         self.adopt_area(area, radius)
 
     def adopt_area(self, area: Area | None, radius: float) -> None:
-        """Take where it may go, also another area while it moves."""
+        """Set the area, also while the robot moves."""
         self.keep_out = shared_keep_out(area, radius, self.settings.clearance, self.reach())
         self.table = self.keep_out.table
 
     def reach(self) -> float:
-        """Return the distance at which an obstacle may change what the controller does [m]."""
+        """Return the distance at which an obstacle can influence the controller [m]."""
         return math.inf
 
     def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
@@ -158,7 +158,7 @@ class MotionModel(ABC):
         state : RobotState
             Present state.
         waypoints : (W, 3) array
-            Metres, frame `map`.
+            Waypoints, metres, frame `map`.
         step : float
             Seconds between positions, and between commands.
         """
@@ -182,11 +182,11 @@ class MotionModel(ABC):
     def roll_out(
         self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
     ) -> None:
-        """Run controller and body against each other to each waypoint, and fill `out`.
+        """Run controller and body to each waypoint, and fill `out`.
 
-        Rows are filled up to the length of each trajectory; one that does not arrive gets a length
-        beyond the last column, or minus the number of columns that are filled. The models of the
-        suite override this by compiled loops; this one calls `command` and `body`, some ten
+        Rows are filled up to the length of each trajectory. A trajectory that does not arrive gets
+        a length beyond the last column, or minus the number of filled columns. Models of the suite
+        override this by compiled loops; this one calls `command` and `body`, with about ten
         microseconds per step.
         """
         limit = out.positions.shape[1] - 1
@@ -225,11 +225,11 @@ class MotionModel(ABC):
         return float(offset @ offset)
 
     def braking_distance(self) -> float:
-        """Return the distance from a waypoint below which the robot gets slower [m]."""
+        """Return the distance from a waypoint below which the robot slows down [m]."""
         return self.settings.speed / self.rate
 
     def steps_limit(self, state: RobotState, waypoints: FloatArray, step: float) -> int:
-        """Return the steps after which a waypoint counts as out of reach."""
+        """Return the steps after which a waypoint counts as unreachable."""
         gaps = ((waypoints - state.pose.position) ** 2).sum(axis=1)
         farthest = math.sqrt(gaps.max(initial=0.0))
         around = 0.0
@@ -242,12 +242,12 @@ class MotionModel(ABC):
 
 
 def check_waypoint(waypoint: ArrayLike) -> FloatArray:
-    """Return a waypoint as a (3,) array; errors as of `check_waypoints`."""
+    """Return a waypoint as a (3,) array; ValueError if it is invalid."""
     return check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
 
 
 def check_waypoints(waypoints: ArrayLike) -> FloatArray:
-    """Return waypoints as a (W, 3) array."""
+    """Return waypoints as a (W, 3) array; ValueError if one is invalid."""
     array = np.ascontiguousarray(waypoints, dtype=float)
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f'waypoints: got shape {array.shape}, allowed is (W, 3)')
@@ -258,7 +258,7 @@ def check_waypoints(waypoints: ArrayLike) -> FloatArray:
 
 
 def check_command(velocity_command: ArrayLike) -> FloatArray:
-    """Return a velocity command as a (4,) array."""
+    """Return a velocity command as a (4,) array; ValueError if it is invalid."""
     array = np.array(velocity_command, dtype=float)
     if array.shape != (4,) or not all(map(math.isfinite, array.tolist())):
         raise ValueError(f'velocity command: got {array.tolist()}, allowed are four finite numbers')
@@ -266,7 +266,7 @@ def check_command(velocity_command: ArrayLike) -> FloatArray:
 
 
 def check_step(step: float) -> float:
-    """Return a duration."""
+    """Return a valid duration, or raise ValueError."""
     if not (math.isfinite(step) and step > 0.0):
         raise ValueError(f'step: got {step}, allowed are finite numbers above 0 [s]')
     return float(step)
@@ -274,7 +274,7 @@ def check_step(step: float) -> float:
 
 @njit(cache=True)
 def _trim(positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: BoolArray) -> int:
-    """Fill what was reached, cut lengths, extend trajectories; return the longest length."""
+    """Mark reached waypoints, cut lengths, extend trajectories; return the longest length."""
     limit = positions.shape[1] - 1
     for w in range(positions.shape[0]):
         reached[w] = 0 <= lengths[w] <= limit

@@ -1,12 +1,12 @@
 """Parrot Mambo: linear model of 12 states under a discrete LQR (000, section 5.1).
 
-The set-point of the LQR leads the position by a limited distance. Then position drops out of the
+The set-point of the LQR leads the position by a limited distance. The position then cancels in the
 feedback, u = -K_v (velocity - v) - K_a angles - K_w rates, with v = (K_p / K_v) lead: a velocity
-command and a set-point at limited distance are the same thing. So the controller here turns a
-waypoint into the velocity command that a driver publishes, and the body flies any such command.
+command and a set-point at limited distance are equivalent. The controller turns a waypoint into the
+velocity command of the driver, and the body follows any such command.
 
-Frames: `map` is ENU, body axes are forward, left, up; roll and pitch are right-handed about
-them, so that pitch > 0 accelerates forward and roll > 0 to the right.
+Frames: `map` is ENU, body axes are forward, left, up; roll and pitch are right-handed about them,
+so that pitch > 0 accelerates forward and roll > 0 to the right.
 
 state (12,): position [m, map], yaw, roll, pitch [rad], velocity [m/s, map], angular velocity
 [rad/s].
@@ -30,7 +30,7 @@ PERIOD = 0.005
 
 @njit(cache=True)
 def _product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a b in plain sums, which do not depend on a linear algebra library."""
+    """Return a b in plain sums, independent of linear algebra libraries."""
     out = np.zeros((a.shape[0], b.shape[1]))
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
@@ -49,7 +49,7 @@ def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: float) -> FloatArra
             size += b[i] * pb[i, 0]
         before, gain = gain, _product(b.reshape(1, -1), pa)[0] / size
         p = _product(a.T.copy(), pa) - np.outer(gain, gain) * size + np.diag(q)
-        # Rounding must not make it asymmetric.
+        # Symmetric in spite of rounding.
         p = np.tril(p) + np.tril(p, -1).T
         if (np.abs(gain - before) / (np.abs(gain) + 1e-300)).max() < 1e-13:
             break
@@ -81,10 +81,10 @@ def double_integrator(inertia: float) -> tuple[FloatArray, FloatArray]:
 def lqr_gains(settings: MotionSettings) -> dict[str, FloatArray]:
     """Return the LQR gains by chain: `pitch` and `roll` (4,), `yaw` and `height` (2,).
 
-    The 12-state model decomposes into these chains, and with diagonal weights so does its LQR.
-    The paper prints four weights, 1/15, 1000, 1000, 100, and does not say which; read here as
-    those of the inputs with the first one garbled (it would make roll 15,000 times cheaper than
-    pitch), so that roll has the weight of pitch, and states have weight 1.
+    The 12-state model decomposes into these chains and, with diagonal weights, so does its LQR. The
+    paper prints four weights, 1/15, 1000, 1000, 100, without naming them. They are read as weights
+    of the inputs with an error in the first one (roll would be 15,000 times cheaper than pitch):
+    roll has the weight of pitch, and states have weight 1.
     """
     q = settings.state_weights
     r = settings.input_weights
@@ -104,7 +104,7 @@ def _dot(a: list[float], b: list[float]) -> float:
 
 
 def _response_size(a: FloatArray, b: FloatArray, gain: FloatArray) -> tuple[FloatArray, float]:
-    """Return the impulse response from velocity command to velocity, and the tilt's peak gain."""
+    """Return the impulse response from commanded to actual velocity, and the tilt's peak gain."""
     # Lists: many small steps are slow in NumPy.
     rows, inputs, weights = a[1:, 1:].tolist(), b[1:].tolist(), gain.tolist()
     state = [0.0, 0.0, 0.0]
@@ -129,21 +129,21 @@ def _response_size(a: FloatArray, b: FloatArray, gain: FloatArray) -> tuple[Floa
 # Entries of the parameter array of `mambo_step`.
 K_VX, K_PITCH, K_Q, K_VY, K_ROLL, K_P, K_VZ, K_R = range(8)
 TILT, LIFT, SPEED, YAW_RATE, COUNT_FORCE = range(8, 13)
-RATE = 13  # speed per distance left of the position loop [1/s]
+RATE = 13  # speed per remaining distance of the position loop [1/s]
 
 
 _PARAMETERS: dict[str, FloatArray] = {}
 
 
 def mambo_parameters(settings: MotionSettings) -> FloatArray:
-    """Return the parameter array of `mambo_step` for settings."""
+    """Return the parameter array of `mambo_step`."""
     key = settings.model_dump_json(exclude={'clearance'})
     if key in _PARAMETERS:
         return _PARAMETERS[key].copy()
     gains = lqr_gains(settings)
     out = np.zeros(14)
     out[K_VX], out[K_PITCH], out[K_Q] = gains['pitch'][1:]
-    # Roll to the right is positive, left is positive: the sign of the velocity gain turns.
+    # Roll is positive to the right, velocity to the left: the gain changes its sign.
     out[K_VY], out[K_ROLL], out[K_P] = gains['roll'][1:]
     out[K_VZ] = gains['height'][1]
     out[K_R] = gains['yaw'][1]
@@ -157,7 +157,7 @@ def mambo_parameters(settings: MotionSettings) -> FloatArray:
     tilt = min(settings.tilt, acceleration / GRAVITY / math.sqrt(2.0))
     out[TILT] = tilt / max(pitch_tilt, roll_tilt)
     out[LIFT] = MASS * min(acceleration, GRAVITY)
-    # A little less, as the axes differ and may turn under a command.
+    # Slightly less, as the axes differ and may turn.
     out[SPEED] = settings.speed / (1.015 * overshoot)
     out[YAW_RATE] = settings.yaw_rate
     out[COUNT_FORCE] = 1.0 if settings.control_inputs == 'all' else 0.0
@@ -203,11 +203,11 @@ def _chain(
 
 @njit(cache=True)
 def closed_loop(parameters: FloatArray, periods: int, h: float) -> FloatArray:
-    """Return what `periods` control periods do at once while nothing is cut off, (3, 24).
+    """Return the effect of `periods` control periods without saturation, (3, 24).
 
     For deviations s = (velocity - command, angle, rate) of a chain: the matrix of the deviations
     afterwards, the travel beyond command times time, the sum of u'u as a quadratic form, and the
-    largest |velocity - command| on the way for each unit deviation.
+    largest |velocity - command| for each unit deviation.
     """
     out = np.zeros((3, ENTRIES))
     _chain(out[PITCH_CHAIN], parameters[0:3], GRAVITY, INERTIA[1], periods, h)
@@ -227,7 +227,6 @@ def closed_loop(parameters: FloatArray, periods: int, h: float) -> FloatArray:
 
 @njit(cache=True)
 def _most(row: FloatArray, v: float, a: float, w: float) -> float:
-    """Return the largest |velocity - command| of one chain on the way."""
     return row[BOUND] * abs(v) + row[BOUND + 1] * abs(a) + row[BOUND + 2] * abs(w)
 
 
@@ -273,10 +272,10 @@ def mambo_step(
 def _step_at_once(
     state: FloatArray, wanted: Command, parameters: FloatArray, table: FloatArray, time: float
 ) -> float:
-    """Fly all periods without turning, in place; return the sum of u'u, -1 if a limit would act."""
+    """Fly all periods without turning, in place; return the sum of u'u, or -1 at a limit."""
     cx, cy, cz, _ = wanted
     yaw, roll, pitch = state[3], state[4], state[5]
-    # Deviations of the velocity along the heading, to its left, and upwards.
+    # Velocity deviations along the heading, to its left, and upwards.
     df, dl = turned(state[6], state[7], -yaw)
     df, dl, dz = df - cx, dl - cy, state[8] - cz
     front, side, up = table[PITCH_CHAIN], table[ROLL_CHAIN], table[HEIGHT_CHAIN]
@@ -300,7 +299,7 @@ def _step_at_once(
 def _step_in_periods(
     state: FloatArray, wanted: Command, parameters: FloatArray, periods: int, h: float
 ) -> float:
-    """Fly one period after the other within the limits, in place; return the sum of u'u."""
+    """Fly one period after another within the limits, in place; return the sum of u'u."""
     cx, cy, cz, cr = wanted
     x, y, z, yaw, roll, pitch = state[0], state[1], state[2], state[3], state[4], state[5]
     p, q, r = state[9], state[10], state[11]
@@ -345,7 +344,7 @@ def _step_in_periods(
             turn = r * h + ar * h2
             yaw += turn
             r += ar * h
-            # The velocity stays what it is in the map while the axes turn under it.
+            # The velocity is constant in the map while the axes turn.
             vf, vl = turned(vf, vl, -turn)
             cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     state[0], state[1], state[2], state[3], state[4], state[5] = x, y, z, yaw, roll, pitch

@@ -1,4 +1,4 @@
-"""The motion models of the suite: one compiled closed loop of controller and body for all."""
+"""Motion models of the suite with one compiled closed loop of controller and body."""
 
 from __future__ import annotations
 
@@ -43,17 +43,16 @@ from maasi_planner.settings import MotionSettings
 
 POINT, UNICYCLE, MAMBO, QUADROTOR = range(4)
 APPROACH_RATE = 5.0
-# A path takes so many times as long as at full speed at most, and so long [1, s].
+# Limits of the time of a path: factor on the time at full speed, and constant [1, s].
 _SLOWEST, _AT_LEAST = 20.0, 60.0
 
 
 class Kernel(NamedTuple):
-    """What the compiled functions of a model need for steps of `periods` times `h` seconds.
+    """Data of the compiled functions of a model, for steps of `periods` times `h` seconds.
 
     States are arrays that begin with the position [m, map] and the heading [rad]. obstructed:
-    whether there are obstacles, which it gets around, or in place of that the obstacle term acts;
-    parameters: of a flying robot's body; table: what `periods` do at once (Mambo); tolerance:
-    distance at which a waypoint is reached [m].
+    whether there are obstacles to avoid, or the obstacle term acts; parameters: body of a flying
+    robot; table: result of `closed_loop` (Mambo); tolerance: distance of arrival [m].
     """
 
     kind: int
@@ -70,7 +69,7 @@ class Kernel(NamedTuple):
 
 @njit(cache=True, forceinline=True)
 def _point_step(state: FloatArray, command: Command, steering: Steering, dt: float) -> None:
-    """Move a point for `dt`, in place, with a limited change of its velocity."""
+    """Move a point for `dt`, in place, with limited acceleration."""
     x, y = turned(command[0], command[1], state[3])
     wanted = (x, y, command[2])
     if dot(wanted, wanted) > steering.speed * steering.speed:
@@ -91,7 +90,7 @@ def _point_step(state: FloatArray, command: Command, steering: Steering, dt: flo
     state[3] += dt * state[7]
 
 
-# Arrays are arguments only of what needs them: counting references to them costs more than a step.
+# Arrays are passed only where needed: counting references to them costs more than a step.
 @njit(cache=True, forceinline=True)
 def _freely(kind: int, steering: Steering, state: FloatArray, goal: Vector) -> Command:
     if kind == UNICYCLE:
@@ -103,9 +102,9 @@ def _freely(kind: int, steering: Steering, state: FloatArray, goal: Vector) -> C
 def steer(
     kernel: Kernel, state: FloatArray, goal: Vector, to_goal: FloatArray, vertex: int
 ) -> tuple[Command, int]:
-    """Return the command of a robot's controller towards a waypoint, and the vertex on its path.
+    """Return the controller's command towards a waypoint, and the vertex on its path.
 
-    vertex: the one of the step before, or -1.
+    vertex: that of the step before, or -1.
     """
     position, yaw, steering = (state[0], state[1], state[2]), state[3], kernel.steering
     if kernel.obstructed and not kernel.term.kind:
@@ -129,7 +128,7 @@ def _move(kind: int, steering: Steering, state: FloatArray, command: Command, h:
 
 @njit(cache=True)
 def advance(kernel: Kernel, state: FloatArray, command: Command) -> float:
-    """Move a body for a step under a command, in place; return the sum of its squared inputs."""
+    """Move a body for a step, in place; return the sum of its squared inputs."""
     periods, h = kernel.periods, kernel.h
     if kernel.kind == MAMBO:
         return mambo_step(state, command, kernel.parameters, kernel.table, periods, h)
@@ -147,9 +146,9 @@ def _close_loop(
     positions: FloatArray,
     yaws: FloatArray,
 ) -> tuple[int, float]:
-    """Run controller and body on `state`; return steps, one too many if not there, and u'u.
+    """Run controller and body on `state`; return steps, one too many if not arrived, and u'u.
 
-    positions (K + 1, 3) and yaws (K + 1,): to fill, of K steps at most.
+    positions (K + 1, 3) and yaws (K + 1,) are filled for at most K steps.
     """
     kind, steering, obstructed, _, _, parameters, table, tolerance, periods, h = kernel
     cost, vertex = 0.0, -1
@@ -177,7 +176,7 @@ def _close_loop(
 def _go_straight(
     kernel: Kernel, state: FloatArray, goal: Vector, positions: FloatArray, yaws: FloatArray
 ) -> tuple[int, float]:
-    """Do as `_close_loop` for a point that nothing diverts: its speed depends on what is left."""
+    """Do as `_close_loop` for a point without obstacles."""
     steering = kernel.steering
     x, y, z = goal[0] - state[0], goal[1] - state[1], goal[2] - state[2]
     left, cost = norm((x, y, z)), 0.0
@@ -213,7 +212,7 @@ def _roll_out(
     for w in range(waypoints.shape[0]):
         goal, last = (waypoints[w, 0], waypoints[w, 1], waypoints[w, 2]), yaws.shape[1]
         if bound:
-            # What cannot be reached is not tried; what is takes so many times as long at most.
+            # Unreachable goals are skipped; others have a time limit.
             path = length_to(here, goal, tables[w], kernel.around)
             seconds = _SLOWEST * path / steering.speed + _AT_LEAST
             last = int(min(seconds / (kernel.periods * kernel.h), last)) if path < np.inf else 1
@@ -249,7 +248,7 @@ class CompiledBody(Body):
 
 
 class CompiledMotion(MotionModel):
-    """Motion model of the suite: its controller and its body are compiled, by their `kind`."""
+    """Motion model with compiled controller and body, by their `kind`."""
 
     kind: int
     steering: Steering
@@ -277,7 +276,7 @@ class CompiledMotion(MotionModel):
         speed, clearance = self.steering.speed, self.settings.clearance
         if self.settings.obstacle_term != 'none':
             return math.inf
-        # Four times what it needs to stop; without a limit, where the barrier begins to act.
+        # Four times the stopping distance or, without a limit, the range of the barrier.
         braking = 2.0 * speed * speed / self.steering.acceleration
         barrier = 1.5 * speed / self.steering.barrier
         return max(min(braking, barrier) if braking else barrier, 1.5 * speed + 4.0 * clearance)
@@ -289,22 +288,21 @@ class CompiledMotion(MotionModel):
 
     @abstractmethod
     def _limits(self) -> tuple[float, float, float]:
-        """Set parameters and approach rate; return speed, barrier and acceleration of steering."""
+        """Set parameters and approach rate; return speed, barrier and acceleration for steering."""
 
     def _push(self, gain: float) -> Command:
-        """Return the change of the velocity command whose input is `gain`."""
+        """Return the change of the velocity command that changes the input by `gain`."""
         return gain, gain, gain, gain
 
     @abstractmethod
     def _to_array(self, state: RobotState) -> FloatArray:
-        """Return the array of a state."""
+        """Return the state as an array."""
 
     @abstractmethod
     def _to_state(self, array: FloatArray) -> RobotState:
         """Return the state in an array."""
 
     def _make_kernel(self, step: float) -> Kernel:
-        """Return what the compiled functions need for steps of `step` seconds."""
         periods = max(1, round(step / mambo.PERIOD)) if self.kind >= MAMBO else 1
         h = step / periods
         settings, keep_out, table = self.settings, self.keep_out, np.zeros((0, 0))
@@ -353,7 +351,7 @@ class CompiledMotion(MotionModel):
 
 
 class ConstantSpeed(CompiledMotion):
-    """A point with a largest speed and, if wanted, acceleration; its input is the command."""
+    """A point with limited speed and optionally limited acceleration; its input is the command."""
 
     kind = POINT
 
@@ -362,7 +360,7 @@ class ConstantSpeed(CompiledMotion):
         self.rate = settings.approach_rate or APPROACH_RATE
         if settings.acceleration is None:
             return settings.speed, self.rate, math.inf
-        # Slow enough that braking at the limit follows the approach.
+        # Slow enough for braking at the limit.
         self.rate = min(self.rate, settings.acceleration / settings.speed)
         return settings.speed, 0.25 * self.rate, settings.acceleration
 
@@ -376,7 +374,7 @@ class ConstantSpeed(CompiledMotion):
 
 
 class Unicycle(CompiledMotion):
-    """A robot that drives forward and turns; the tolerance is horizontal."""
+    """A robot that drives forward and turns; its tolerance is horizontal."""
 
     kind = UNICYCLE
 
@@ -409,11 +407,10 @@ class Unicycle(CompiledMotion):
 
 
 class Mambo(CompiledMotion):
-    """The 12-state linear Mambo, its attitude and velocity loops at 200 Hz, and its limits.
+    """The linear Mambo with 12 states, attitude and velocity loops at 200 Hz, and limits.
 
-    Speed, acceleration and tilt stay within the settings: commands are cut to a speed that the
-    loop's overshoot cannot carry beyond `speed`, and the tilt asked for to the smaller of `tilt`
-    and what `acceleration` allows; the tilt follows it without overshoot.
+    Commands are limited so that the loop's overshoot does not exceed `speed`. The commanded tilt,
+    which is followed without overshoot, is at most `tilt` and what `acceleration` allows.
     """
 
     kind = MAMBO
@@ -429,7 +426,7 @@ class Mambo(CompiledMotion):
         return float(self.parameters[mambo.SPEED]), barrier, math.inf
 
     def _push(self, gain: float) -> Command:
-        # A roll torque of -k_obs tips the robot to its left: the roll gain has the other sign.
+        # A roll torque of -k_obs tilts the robot to its left: the roll gain has the opposite sign.
         per_input = self.parameters[[mambo.K_VX, mambo.K_VY, mambo.K_VZ, mambo.K_R]].tolist()
         return tuple(gain / size for size in per_input)
 
@@ -454,7 +451,7 @@ class Mambo(CompiledMotion):
 
 
 class Quadrotor(CompiledMotion):
-    """A rigid body with thrust along its axis and torques, and its inner loops at 200 Hz."""
+    """A rigid body with thrust along its axis and torques, and inner loops at 200 Hz."""
 
     kind = QUADROTOR
 
@@ -463,7 +460,7 @@ class Quadrotor(CompiledMotion):
         self.parameters = limits = np.zeros(6)
         acceleration = settings.acceleration or math.inf
         limits[quadrotor.SPEED] = settings.speed / 1.08
-        # Level and vertical acceleration share the limit, so that together they stay within it.
+        # Horizontal and vertical acceleration share the limit.
         limits[quadrotor.LEVEL] = min(0.8 * acceleration, 100.0)
         limits[quadrotor.VERTICAL] = min(0.5 * acceleration, 0.5 * mambo.GRAVITY)
         limits[quadrotor.SLOPE] = math.tan(settings.tilt / 1.03)
@@ -476,7 +473,7 @@ class Quadrotor(CompiledMotion):
         return float(limits[quadrotor.SPEED]), barrier, math.inf
 
     def _push(self, gain: float) -> Command:
-        # Inputs are the force that the velocity stage asks for, and the yaw torque.
+        # Inputs are the commanded force of the velocity stage, and the yaw torque.
         by_force = gain / (quadrotor.MASS * quadrotor.C2)
         return by_force, by_force, by_force, gain / (quadrotor.INERTIA[2] * quadrotor.C4)
 

@@ -1,14 +1,14 @@
-"""Full nonlinear quadrotor under backstepping (003, section 4, after Sun and others, 2014).
+"""Nonlinear quadrotor under backstepping (003, section 4, after Sun and others, 2014).
 
-The stages of the backstepping, each the virtual control of the one before:
+Each stage is the virtual control of the one before:
 
     position      v_d = -c1 (p - p_d)                              the velocity command
-    velocity      a_d = c2 (v_d - v),  f = m (a_d + g e3)          force asked for
-    attitude      omega_d = c3 (b3 x f / |f|)                      turns the thrust b3 towards f
+    velocity      a_d = c2 (v_d - v),  f = m (a_d + g e3)          commanded force
+    attitude      omega_d = c3 (b3 x f / |f|)                      rotates the thrust b3 towards f
     turn rates    tau = omega x J omega + J c4 (omega_d - omega)   torques
 
-The first stage is the controller's (`command`), the others fly any velocity command. Derivatives
-of the virtual controls are left out, as c1 < c2 < c3 < c4 are far enough apart. The papers do not
+The first stage is the controller's (`command`); the others follow any velocity command. Derivatives
+of the virtual controls are neglected, as c1 < c2 < c3 < c4 are far enough apart. The papers do not
 print mass, inertia and gains; those here are of a quadrotor of 1.2 kg.
 
 state (14,): position [m, map], heading [rad], quaternion w x y z, velocity [m/s, map], angular
@@ -37,7 +37,6 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 @njit(cache=True, forceinline=True)
 def _axes(state: FloatArray) -> tuple[Vector, Vector, Vector]:
-    """Return the body axes forward, left and up in the map: columns of the rotation matrix."""
     w, x, y, z = state[4], state[5], state[6], state[7]
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
@@ -48,7 +47,7 @@ def _axes(state: FloatArray) -> tuple[Vector, Vector, Vector]:
 
 @njit(cache=True, forceinline=True)
 def _force(state: FloatArray, command: Command, limits: FloatArray) -> Vector:
-    """Return the force per mass that a velocity command asks for, within the limits [m/s^2]."""
+    """Return the limited force per mass for a velocity command [m/s^2]."""
     size = norm(command[:3])
     scale = limits[SPEED] / size if size > limits[SPEED] else 1.0
     b1x, b1y, _ = _axes(state)[0]
@@ -67,11 +66,11 @@ def _force(state: FloatArray, command: Command, limits: FloatArray) -> Vector:
 
 @njit(cache=True, forceinline=True)
 def _inputs(state: FloatArray, force: Vector, turn: float) -> tuple[float, Vector]:
-    """Return thrust [N] and torques [N m] that turn the thrust towards `force`."""
+    """Return thrust [N] and torques [N m] that rotate the thrust towards `force`."""
     forward, left, up = _axes(state)
     strength = norm(force)
     thrust = MASS * max(0.0, dot(force, up))
-    # The way from the thrust to the force.
+    # Rotation from the thrust to the force.
     way = _cross(up, (force[0] / strength, force[1] / strength, force[2] / strength))
     p, q, r = state[11], state[12], state[13]
     jx, jy, jz = INERTIA
@@ -84,7 +83,7 @@ def _inputs(state: FloatArray, force: Vector, turn: float) -> tuple[float, Vecto
 
 @njit(cache=True, forceinline=True)
 def _move(state: FloatArray, thrust: float, torque: Vector, h: float) -> None:
-    """Integrate the rigid body for `h` seconds, in place: speeds before positions."""
+    """Integrate the rigid body for `h` seconds, in place: velocities before positions."""
     p, q, r = state[11], state[12], state[13]
     jx, jy, jz = INERTIA
     new_p = p + h * (torque[0] - (jz - jy) * q * r) / jx
@@ -104,7 +103,6 @@ def _move(state: FloatArray, thrust: float, torque: Vector, h: float) -> None:
 
 @njit(cache=True, forceinline=True)
 def _rotate(state: FloatArray, rates: Vector, h: float) -> None:
-    """Turn the attitude in place by constant rates [rad/s, body] for `h` seconds."""
     w, x, y, z = state[4], state[5], state[6], state[7]
     rate = norm(rates)
     half = 0.5 * rate * h

@@ -1,9 +1,8 @@
-"""Velocity commands of robots that can move in any direction, also around obstacles.
+"""Velocity commands of robots that move in any direction, also around obstacles.
 
 The obstacle term of 001, eq. (14) and (15), subtracts k_obs from each input while an obstacle is
-nearer than d_l. Inputs grow in proportion to the velocity command, so that this equals a change of
-the command, and needs no access to a robot's torques. As printed the term has no direction; `away`
-gives it the direction from the obstacle to the robot.
+nearer than d_l. Inputs are proportional to the velocity command, so that the term is a change of
+the command. As printed it has no direction; `away` directs it from the obstacle to the robot.
 """
 
 import math
@@ -21,13 +20,13 @@ Command = tuple[float, float, float, float]
 
 
 class Steering(NamedTuple):
-    """How a robot approaches its waypoint.
+    """Approach of a waypoint.
 
-    rate: speed per distance left [1/s]; speed: at most [m/s]; barrier: speed towards an obstacle
-    per distance to it, at most [1/s]; acceleration: at most [m/s^2], next to obstacles the speed
-    is what it can stop; yaw_rate, yaw_acceleration: at most [rad/s and rad/s^2]; infinite: no such
-    limit; face_travel: whether the heading turns to the direction of travel; window: whether a
-    ground robot avoids obstacles by the dynamic window.
+    rate: speed per remaining distance [1/s]; speed: limit [m/s]; barrier: limit of the speed
+    towards an obstacle per distance [1/s]; acceleration: limit [m/s^2], by which the robot stops
+    before obstacles; yaw_rate, yaw_acceleration: limits [rad/s and rad/s^2]; inf disables a limit;
+    face_travel: the heading turns to the direction of travel; window: a ground robot uses the
+    dynamic window.
     """
 
     rate: float
@@ -42,13 +41,13 @@ class Steering(NamedTuple):
 
 @njit(cache=True, forceinline=True)
 def wrapped(angle: float) -> float:
-    """Return an angle from -pi to below pi."""
+    """Return an angle in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @njit(cache=True, forceinline=True)
 def turned(x: float, y: float, yaw: float) -> tuple[float, float]:
-    """Return a level vector turned by `yaw`."""
+    """Return a horizontal vector rotated by `yaw`."""
     if yaw == 0.0:
         return x, y
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
@@ -59,7 +58,7 @@ def turned(x: float, y: float, yaw: float) -> tuple[float, float]:
 def _stoppable(
     position: Vector, way: Vector, steering: Steering, felt: Felt, beyond: bool
 ) -> float:
-    """Return the speed that can be stopped before the nearest circle, at most the largest.
+    """Return the speed, at most the limit, that can be stopped before the nearest circle.
 
     A circle that the robot is in, or walls that it is beyond, are left at full speed.
     """
@@ -69,7 +68,7 @@ def _stoppable(
         offset = from_centre(position, circles, i)
         gap = norm(offset)
         if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
-            # Along a wall nothing has to be stopped.
+            # Motion along a wall needs no stop.
             towards = -dot(offset, way) / max(gap * norm(way), 1e-9)
             if towards > 0.0 and not beyond:
                 room = min(room, (gap - circles[i, 3]) / towards)
@@ -81,7 +80,6 @@ def _stoppable(
 
 @njit(cache=True, forceinline=True)
 def _towards(way: Vector, velocity: Vector, yaw: float, steering: Steering) -> Command:
-    """Return the command of a velocity in the map, on a way."""
     turn = 0.0
     if steering.face_travel and way[0] * way[0] + way[1] * way[1] > 1e-6:
         turn = 2.0 * wrapped(math.atan2(way[1], way[0]) - yaw)
@@ -92,7 +90,7 @@ def _towards(way: Vector, velocity: Vector, yaw: float, steering: Steering) -> C
 
 @njit(cache=True, forceinline=True)
 def fly_freely(position: Vector, yaw: float, goal: Vector, steering: Steering) -> Command:
-    """Return the command towards a waypoint: `rate` times the distance left, at most `speed`."""
+    """Return the command towards a waypoint: `rate` times the distance, at most `speed`."""
     way = minus(goal, position)
     size, scale = norm(way), steering.rate
     if scale * size > steering.speed:
@@ -110,9 +108,9 @@ def fly_among(
     around: Surroundings,
     vertex: int,
 ) -> tuple[Command, int]:
-    """Return the command towards a waypoint around obstacles, and the vertex it heads for.
+    """Return the command towards a waypoint around obstacles, and the next vertex.
 
-    vertex: the one of the step before, or -1.
+    vertex: that of the step before, or -1.
     """
     target, left, manner, vertex = head_for(position, goal, to_goal, around, vertex)
     felt, beyond = minded(position, manner, around)
@@ -137,9 +135,9 @@ PRINTED = 1
 class ObstacleTerm(NamedTuple):
     """Obstacle term of a robot.
 
-    kind: index in TERMS; distance: d_l [m]; push: change of the velocity command whose input is
-    k_obs [m/s, rad/s], to the left 0 for a robot that cannot move sideways; circles (n, 5):
-    obstacles: x, y, z, radius, 1 for a sphere; the nearest surface counts.
+    kind: index in TERMS; distance: d_l [m]; push: change of the velocity command for an input of
+    k_obs [m/s, rad/s], 0 to the left for a robot that cannot move sideways; circles (n, 5): x, y,
+    z, radius, 1 for a sphere, of which the nearest surface counts.
     """
 
     kind: int
@@ -167,6 +165,6 @@ def with_obstacle_term(
     if term.kind == PRINTED:
         return x - by_x, y - by_y, z - by_z, turn - by_turn
     forward, left = turned(way[0], way[1], -yaw)
-    # What cannot move sideways turns to that side.
+    # A robot that cannot move sideways turns to that side.
     turn += by_turn * left if by_y == 0.0 else 0.0
     return x + abs(by_x) * forward, y + abs(by_y) * left, z + by_z * way[2], turn

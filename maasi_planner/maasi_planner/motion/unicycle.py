@@ -5,14 +5,14 @@ distance rho and bearing error alpha,
 
     v = k_rho rho cos(alpha),    omega = k_alpha alpha + (v / rho) sin(alpha),
 
-so that rho' = -v cos(alpha) <= 0 and alpha' = -k_alpha alpha from any heading. Speeds are cut to
-the limits, and the robot turns on the spot while the waypoint is not ahead.
+so that rho' = -v cos(alpha) <= 0 and alpha' = -k_alpha alpha from any heading. Speeds are limited,
+and the robot turns on the spot while the waypoint is not ahead.
 
 state (6,): position [m, map], heading [rad], forward speed [m/s], turn rate [rad/s].
 
 Dynamic window (section 7.2): pairs of forward speed and turn rate within the acceleration limits
-are simulated as arcs. Those that could not stop before an obstacle are discarded; of the others the
-one is chosen that ends nearest to the target point, facing it, with clearance from obstacles.
+are simulated as arcs. Arcs that cannot stop before an obstacle are discarded; the best of the
+others ends near the target point, faces it, and has clearance from obstacles.
 """
 
 import math
@@ -25,21 +25,20 @@ from maasi_planner.guidance import approach_limit, head_for, hold_back, minded
 from maasi_planner.motion.steering import Command, Steering, wrapped
 from maasi_planner.obstacles import Felt, Surroundings, Vector, from_centre, is_far
 
-# Seconds until the next command at which the window is taken, and for which arcs are followed.
+# Seconds to the next command of the window, and of simulated arcs.
 WINDOW = 0.2
 LOOK_AHEAD = 1.2
 ARC_STEPS = 8
 FORWARD_SAMPLES = 6
 TURN_SAMPLES = 13
-# How far a robot may turn while it brakes [rad]; one with less than this share of its speed stands.
+# Largest turn during braking [rad], and share of the speed below which a robot stands.
 _TURNS, _STANDS = 0.35, 0.05
-_AWAY = 0.2  # and so much it turns away from what it touches [rad]
-_TOUCHES = 1e-9  # distance of what a robot touches [m]
+_AWAY = 0.2  # turn away from a touched obstacle [rad]
+_TOUCHES = 1e-9  # distance that counts as touching [m]
 
 
 @njit(cache=True, forceinline=True)
 def _before_disc(along: float, across: float, radius: float) -> float:
-    """Return how far straight ahead a disc is; infinite: not there."""
     if along > 0.0 and abs(across) < radius:
         return max(along - math.sqrt(radius * radius - across * across), 0.0)
     return np.inf
@@ -47,9 +46,9 @@ def _before_disc(along: float, across: float, radius: float) -> float:
 
 @njit(cache=True, forceinline=True)
 def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: bool) -> float:
-    """Return how far straight ahead is free of circles, at most `reach` metres.
+    """Return the distance straight ahead that is free of circles, at most `reach` metres.
 
-    beyond: whether walls do not count, as the robot is beyond them.
+    beyond: whether the robot is beyond the walls, so that they do not count.
     """
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
@@ -63,7 +62,7 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: 
             continue
         out_x, out_y, _ = from_centre(here, circles, i)
         if math.hypot(out_x, out_y) <= circles[i, 3] + _TOUCHES:
-            # Where it touches or is inside, rounding must not hold it: outwards is free.
+            # A robot that touches a circle, or is inside, may move outwards.
             if out_x * cos_yaw + out_y * sin_yaw < 0.0:
                 return 0.0
             continue
@@ -77,7 +76,7 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: 
             ahead = circles[i, 5] * cos_yaw + circles[i, 6] * sin_yaw
             aside = circles[i, 5] * sin_yaw - circles[i, 6] * cos_yaw
             free = min(free, _before_disc(along + ahead, across + aside, radius))
-            # Both long sides of the wall, where it lies across the way.
+            # Both long sides of a wall across the path.
             length = math.hypot(ahead, aside)
             for side in (-radius / length, radius / length):
                 start, start_across = along - side * aside, across + side * ahead
@@ -92,8 +91,7 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: 
 def _speed_ahead(
     position: tuple[float, float], yaw: float, steering: Steering, felt: Felt, beyond: bool
 ) -> float:
-    """Return how fast it may drive straight ahead [m/s]; beyond: see `way_ahead`."""
-    # Farther than where it may drive at full speed nothing counts.
+    # Farther obstacles allow full speed.
     reach = 1.001 * steering.speed / steering.barrier
     free = way_ahead(position[0], position[1], yaw, reach, felt, beyond)
     return approach_limit(free, (steering.barrier, steering.acceleration))
@@ -103,7 +101,7 @@ def _speed_ahead(
 def _along(
     here: Vector, way: tuple[float, float], steering: Steering, felt: Felt
 ) -> tuple[float, float]:
-    """Return the direction in which a robot gets along what it touches, and a little away."""
+    """Return the direction along what the robot touches, and slightly away from it."""
     share = steering.speed / max(math.hypot(way[0], way[1]), 1e-9)
     limits = steering.barrier, steering.acceleration
     x, y, _ = hold_back(here, felt, False, limits, (share * way[0], share * way[1], 0.0))
@@ -117,7 +115,7 @@ def _along(
 def _arc(
     state: FloatArray, v: float, w: float, time: float, stopping: float, felt: Felt
 ) -> tuple[float, float, float, float]:
-    """Return the end of an arc and its clearance, -inf if the robot could not stop in time."""
+    """Return the end of an arc and its clearance, -inf if the robot cannot stop in time."""
     px, py, heading = state[0], state[1], state[3]
     room, circles = np.inf, felt.circles
     dt = time / ARC_STEPS
@@ -161,7 +159,7 @@ def window_command(
     best = -np.inf
     best_forward = best_turn = 0.0
     for i in range(FORWARD_SAMPLES + 1):
-        # Zero forward speed is always a choice: turning on the spot is safe.
+        # Zero forward speed is always included: turning on the spot is safe.
         v = low + (high - low) * (i - 1) / (FORWARD_SAMPLES - 1) if i > 0 else 0.0
         stopping = 0.5 * v * v / deceleration + v * WINDOW
         for j in range(TURN_SAMPLES):
@@ -187,7 +185,7 @@ AHEAD = 0.6  # beyond this bearing error the robot turns on the spot
 
 @njit(cache=True, forceinline=True)
 def unicycle_step(state: FloatArray, command: Command, steering: Steering, dt: float) -> None:
-    """Move for `dt`, in place, along the arc of the mean of old and new speeds."""
+    """Move for `dt`, in place, on the arc of the mean of old and new speeds."""
     yaw, forward, turn = state[3], state[4], state[5]
     acceleration, yaw_acceleration = steering.acceleration, steering.yaw_acceleration
     wanted = min(max(command[0], -steering.speed), steering.speed)
@@ -209,7 +207,7 @@ def unicycle_step(state: FloatArray, command: Command, steering: Steering, dt: f
 def _drive(
     dx: float, dy: float, left: float, yaw: float, steering: Steering, least: float
 ) -> tuple[float, float]:
-    """Return speed and turn rate towards a point; turning counts `left`, or at least `least` m."""
+    """Return speed and turn rate towards a point, with at least `least` metres for turning."""
     rho = math.sqrt(dx * dx + dy * dy)
     if rho < 1e-9:
         return 0.0, 0.0
@@ -243,9 +241,9 @@ def drive_among(
     around: Surroundings,
     vertex: int,
 ) -> tuple[Command, int]:
-    """Return the command towards a waypoint around obstacles, and the vertex it heads for.
+    """Return the command towards a waypoint around obstacles, and the next vertex.
 
-    vertex: the one of the step before, or -1.
+    vertex: that of the step before, or -1.
     """
     x, y, yaw, clearance = state[0], state[1], state[3], around.clearance
     here = (x, y, goal[2])
@@ -262,7 +260,7 @@ def drive_among(
     forward, turn = _drive(dx, dy, left, yaw, steering, clearance)
     forward = min(forward, allowed)
     if state[4] > stands:
-        # It brakes before it turns to where it could not stop, also while its turn ends.
+        # It brakes before it turns towards obstacles, also at the end of a turn.
         ahead = yaw + 0.5 * state[5] * abs(state[5]) / steering.yaw_acceleration
         off = wrapped(math.atan2(dy, dx) - ahead)
         off = min(max(off, -_TURNS), _TURNS)

@@ -1,4 +1,4 @@
-"""Measurement batches of the planner node, and the filter's updates of them."""
+"""Measurement batches of the planner node, and their updates from the filter."""
 
 import time
 from collections import deque
@@ -15,11 +15,11 @@ from maasi_planner.node.filter_guard import FilterGuard
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.robot_plan import Member
 
-_MEASUREMENTS_KEPT = 1000  # measurements that are remembered, to recognise duplicate updates
+_MEASUREMENTS_KEPT = 1000  # remembered to detect duplicate updates
 
 
 class Batches:
-    """Requests measurements, and hands the filter's updates to the coordinator."""
+    """Requests measurements, and passes updates of the filter to the coordinator."""
 
     def __init__(
         self,
@@ -32,11 +32,11 @@ class Batches:
     def reset(self, coordinator: Coordinator) -> None:
         """Reset for a new search."""
         self._coordinator = coordinator
-        # Ids of the last batch and of the last update used; measurements of all.
+        # Ids of the last batch and of the last used update; number of measurements.
         self.last = self.used = self.measurements = 0
         self.waiting = False
         self.published_at = time.monotonic()
-        self.update = FilterUpdate()  # the one used last
+        self.update = FilterUpdate()  # last used one
         self._message = MeasurementBatch()
         self._before = 0  # last batch of an earlier planner process
         # Robot and index of the last measurements whose update was used.

@@ -1,4 +1,4 @@
-"""What the planner node logs of batteries."""
+"""Log messages about batteries."""
 
 from typing import Any
 
@@ -7,14 +7,14 @@ from maasi_planner.homing import Homing
 
 
 class BatteryLog:
-    """Logs what has changed about batteries; alarms: of robots that reach no charger, by name."""
+    """Logs changes of batteries; alarms are robots that reach no charger, by name."""
 
     def __init__(self, node: LockstepLifecycleNode[Any]) -> None:
         self._node = node
         self.alarms: dict[str, str] = {}
 
     def report(self, homing: Homing) -> None:
-        """Log news, estimated charges, and alarms that begin or end."""
+        """Log news, estimated charges, and the begin and end of alarms."""
         logger = self._node.get_logger()
         for text in homing.news:
             logger.warning(text)
@@ -22,7 +22,7 @@ class BatteryLog:
         for name in sorted(homing.alarms.keys() - self.alarms.keys()):
             logger.error(f'{name}: {homing.alarms[name]}')
         for name in sorted(self.alarms.keys() - homing.alarms.keys()):
-            logger.warning(f'{name}: a charger is in its reach again')
+            logger.warning(f'{name}: it can reach a charger again')
         self.alarms = dict(homing.alarms)
         for text in homing.estimates():
             self._node.warn_throttled(text.partition(':')[0], text)

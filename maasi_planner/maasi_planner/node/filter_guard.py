@@ -1,4 +1,4 @@
-"""Supervision of the filter by the planner node, and found targets kept for it."""
+"""Supervision of the filter by the planner node, and found targets retained for its restart."""
 
 import math
 import time
@@ -13,14 +13,14 @@ from maasi_planner.node_settings import PlannerNodeSettings
 
 
 class FilterWatch:
-    """Detects a silent filter by its heartbeat and the oldest batch without an update; 0: never.
+    """Detects a silent filter by its heartbeat and the oldest batch without update; 0 disables it.
 
-    A filter that never sent a heartbeat, while no batch is open, is no fault.
+    A filter without any heartbeat counts as present while no batch is open.
     """
 
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
-        #: When the executor of the filter last gave a heartbeat.
+        #: Time of the last heartbeat of the filter's executor.
         self.beat: float | None = None
         self._open: dict[int, float] = {}
 
@@ -29,17 +29,17 @@ class FilterWatch:
         self._open[batch] = now
 
     def answered(self, batch: int) -> None:
-        """Note the update of a batch: updates of earlier ones will not arrive any more."""
+        """Note the update of a batch, after which none of earlier batches can arrive."""
         self._open = {number: since for number, since in self._open.items() if number > batch}
 
     def stalled(self, seconds: float) -> None:
-        """Note that the planner itself was suspended: messages of that time are not read yet."""
+        """Note that the planner was suspended, and has not read the messages of that time yet."""
         if self.beat is not None:
             self.beat += seconds
         self._open = {number: since + seconds for number, since in self._open.items()}
 
     def problem(self, now: float) -> str:
-        """Return why the filter counts as absent; empty if it does not."""
+        """Return why the filter counts as absent; empty if it is present."""
         if not self.timeout:
             return ''
         if self.beat is not None and now - self.beat > self.timeout:
@@ -52,13 +52,13 @@ class FilterWatch:
         return ''
 
 
-# A longer gap between two checks means that the planner itself was suspended [s].
+# A longer gap between checks means that the planner was suspended [s].
 _LONGEST_GAP = 1.0
 _NAMES_PERIOD = 1.0  # period of updates of the names of filters [s]
 
 
 class FilterGuard:
-    """Tells a planner that runs freely while its filter is silent; robots are held then."""
+    """Detects a silent filter of a planner that runs freely; robots are held then."""
 
     def __init__(self, node: LockstepLifecycleNode[PlannerNodeSettings]) -> None:
         self._node = node
@@ -72,7 +72,7 @@ class FilterGuard:
         self._checked_at = time.monotonic()
 
     def set_up(self) -> None:
-        """Subscribe to heartbeats, where they are used."""
+        """Subscribe to heartbeats if they are used."""
         settings = self._node.settings
         if not settings.lockstep and settings.filter_timeout:
             self._node.create_subscription(
@@ -84,7 +84,7 @@ class FilterGuard:
             self.watch.beat = time.monotonic()
 
     def problem(self, now: float) -> str:
-        """Return why the filter counts as absent at a wall time [s]; empty if it does not."""
+        """Return why the filter counts as absent at a wall time [s]; empty if it is present."""
         since, self._checked_at = now - self._checked_at, now
         if since > _LONGEST_GAP:
             self.watch.stalled(since)
@@ -98,17 +98,17 @@ class FilterGuard:
 
 
 class FoundKeeper:
-    """Republishes found targets, latched, until a new search, even if the filter has lost them.
+    """Republishes found targets, latched, until a new search, also if the filter has lost them.
 
-    A target that a filter published and then leaves out is withdrawn; one that a restarted filter
-    has not published yet is kept.
+    A target that a filter no longer publishes is withdrawn; one that a restarted filter has not
+    published yet is retained.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._targets: dict[int, FoundTarget] = {}
-        self._filters: set[bytes] = set()  # publishers so far, by endpoint
-        self._published: set[int] = set()  # ids in the last message of the newest one
+        self._filters: set[bytes] = set()  # earlier publishers, by endpoint
+        self._published: set[int] = set()  # ids in the last message of the newest publisher
         self._publisher = node.create_publisher(FoundTargetArray, 'found_targets/kept', LATCHED)
         self._publisher.publish(FoundTargetArray())
         found = node.create_subscription(FoundTargetArray, 'found_targets', self._on_found, LATCHED)

@@ -1,4 +1,4 @@
-"""Goals of the robots: those of decisions, the way home, and those of other clients."""
+"""Goals of the robots: decisions, paths home, and goals of other clients."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -18,7 +18,7 @@ from maasi_planner.node_settings import PlannerNodeSettings
 
 
 class Orders:
-    """Sends goals, and tells which robot can take one."""
+    """Sends goals, and detects which robots accept one."""
 
     def __init__(
         self,
@@ -32,17 +32,17 @@ class Orders:
     def reset(self, coordinator: Coordinator) -> None:
         """Reset for a new search."""
         self._coordinator = coordinator
-        #: Robots that follow a goal of another client, with its number.
+        #: Goal numbers of other clients by robot.
         self.external_goals: dict[str, int] = {}
-        # Robots on their way to their start, with the number of that goal; 0: arrived, -1: to be
-        # sent there as soon as they are free.
+        # Goal numbers of robots on their path home; 0: arrived, -1: to be sent there as soon
+        # as they are free.
         self._homing: dict[str, int] = {}
-        # Simulated time since which each goal was refused, and for how long by now [s].
+        # Simulated time from which each goal was refused, and the duration [s].
         self._refused_since: float | None = None
         self.refused_for = 0.0
 
     def set_up(self, names: Sequence[str], answered: Callable[[], None]) -> TeamGoals:
-        """Create the clients of the robots; `answered` is called after an answer to a goal."""
+        """Create the action clients; `answered` is called after each answer to a goal."""
         self._answered = answered
         self.goals = TeamGoals(self._node, names, self._on_answer)
         return self.goals
@@ -54,7 +54,7 @@ class Orders:
             self._coordinator.robots[name].leave()
 
     def hold(self, names: Iterable[str]) -> None:
-        """Stop robots where they are, but for those on their way home; they get new goals."""
+        """Stop robots, except on their path home; they receive new goals afterwards."""
         for name in names:
             plan = self._coordinator.robots[name].plan
             if name not in self._homing and (plan.errand is None or plan.staying):
@@ -62,7 +62,7 @@ class Orders:
                 plan.staying = True
 
     def set_homing(self, names: Iterable[str], home: bool) -> None:
-        """Send robots to their starts as soon as they are free, or no more."""
+        """Send robots to their starts as soon as they are free, or cancel that."""
         for name in names:
             self._homing.pop(name, None)
             if home:
@@ -70,12 +70,12 @@ class Orders:
                 self._coordinator.homing.release(name)
 
     def interrupt_homing(self, name: str) -> None:
-        """Note that a robot which was sent to its start goes elsewhere before that."""
+        """Note that a robot goes elsewhere before its start."""
         if name in self._homing:
             self._homing[name] = -1
 
     def leave(self, name: str) -> None:
-        """Forget the goals of a robot that takes part no more."""
+        """Forget the goals of an unavailable robot."""
         self.goals.cancel(name)
         self.external_goals.pop(name, None)
         if name in self._homing:
@@ -91,10 +91,7 @@ class Orders:
         self.goals.send(name, goal)
 
     def send_home(self, name: str, state: RobotState, header: Header) -> bool:
-        """Send a free robot to its start, and return whether it has to go there now.
-
-        One whose battery does not allow it goes later.
-        """
+        """Send a free robot to its start, if it has to go there and its battery suffices now."""
         plan, homing = self._coordinator.robots[name].plan, self._coordinator.homing
         if name not in self._homing or homing.occupies(name):
             return False
@@ -102,7 +99,7 @@ class Orders:
         if not homing.may_go(name, state, start, step):
             self._node.warn_throttled(
                 f'{name} cannot go home',
-                f'{name}: its battery does not allow the path to its start',
+                f'{name}: its charge is too low for the path to its start',
             )
             return False
         plan.decision += 1
@@ -111,13 +108,13 @@ class Orders:
         return True
 
     def describe_external(self) -> str:
-        """Return the robots that follow goals of other clients, with these, as text."""
+        """Return robots with their goals of other clients as text."""
         return ', '.join(
             f'{name} (goal {goal})' for name, goal in sorted(self.external_goals.items())
         )
 
     def warnings(self, names: Iterable[str] | None = None) -> list[str]:
-        """Return that robots (default: all) follow goals of other clients."""
+        """Return warnings about robots (default: all) with goals of other clients."""
         goals = self.external_goals
         return [
             f'{name} follows goal {goals[name]} of another client'
@@ -132,7 +129,7 @@ class Orders:
         self._answered()
 
     def refuse(self, name: str) -> None:
-        """Note that a robot did not take its goal: it gets another one."""
+        """Note that a robot did not accept its goal, and needs another one."""
         now = self._node.step * self._node.settings.step
         if self._refused_since is None:
             self._refused_since = now
@@ -141,9 +138,9 @@ class Orders:
         self._coordinator.robots[name].plan.staying = True
 
     def is_free(self, name: str, heard: HeardState, step: int) -> bool:
-        """Return whether a robot can take a goal: it has none, from any client."""
+        """Return whether a robot has no goal from any client."""
         plan, logger = self._coordinator.robots[name].plan, self._node.get_logger()
-        # Without one, the last has ended and the search is over: no other follows.
+        # A staying robot has no goal: its last one has ended.
         if not plan.staying and self.goals.has(name):
             number = plan.goal_id
             if heard.goal == number:
@@ -156,7 +153,7 @@ class Orders:
                 return True
             self.goals.forget(name)
             if course is GoalProgress.LOST:
-                logger.warning(f'{name} has not taken goal {number}, or lost it')
+                logger.warning(f'{name} did not accept goal {number}, or lost it')
                 self.refuse(name)
         number = self._homing.get(name, -1)
         if number > 0:
@@ -171,7 +168,7 @@ class Orders:
                 self._on_external_goal(name, heard, step)
             return False
         if self.external_goals.pop(name, None) is not None:
-            logger.info(f'{name} takes goals of the planner again')
+            logger.info(f'{name} accepts goals of the planner again')
         return True
 
     def _on_external_goal(self, name: str, heard: HeardState, step: int) -> None:
@@ -181,6 +178,6 @@ class Orders:
             self._coordinator.robots[name].on_external_goal(step)
         if new:
             self._node.get_logger().warning(
-                f'{name} follows goal {heard.goal} of another client: it measures, and gets no '
-                'goal of the planner until that one has ended'
+                f'{name} follows goal {heard.goal} of another client: it measures, but '
+                'receives no goals from the planner until that goal has ended'
             )

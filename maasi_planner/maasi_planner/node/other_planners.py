@@ -1,4 +1,4 @@
-"""Destinations that planners of single robots tell each other (002, section 4)."""
+"""Destinations exchanged between planners of single robots (002, section 4)."""
 
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
@@ -17,7 +17,7 @@ from maasi_planner.node_settings import PlannerNodeSettings
 
 
 class OtherPlanners:
-    """Exchanges destinations with the planners of other robots; they plan in the order of names."""
+    """Exchanges destinations with planners of other robots, which plan in the order of names."""
 
     def __init__(
         self,
@@ -32,17 +32,17 @@ class OtherPlanners:
         self.reset()
 
     def reset(self) -> None:
-        """Reset for a new search, from the starts of the others."""
+        """Reset for a new search, with the others at their starts."""
         others = self._node.settings.others
-        # By step: the last two received.
+        # The last two received, by step.
         self._destinations: dict[str, dict[int, FloatArray]] = {
             name: {-1: np.array(others[name].start)} for name in sorted(others)
         }
         self._silence: dict[str, Silence] = {}
-        self.before: set[str] = set()  #: in lockstep, who took part in the step before
+        self.before: set[str] = set()  #: in lockstep, robots of the step before
 
     def set_up(self) -> None:
-        """Create publishers and subscriptions, where there are others."""
+        """Create publishers and subscriptions if there are others."""
         node = self._node
         others = sorted(node.settings.others)
         for name in self._own if others else ():
@@ -77,7 +77,7 @@ class OtherPlanners:
         self._heard()
 
     def missing(self, step: int, robots: Collection[str]) -> bool:
-        """Return whether destinations are awaited, in lockstep: of later names the last step's."""
+        """Return whether destinations are missing in lockstep; later names: of the last step."""
         for name, known in self._destinations.items():
             if name not in robots:
                 continue
@@ -89,7 +89,7 @@ class OtherPlanners:
         return False
 
     def taken(self, step: int, robots: Collection[str] | None) -> list[tuple[FloatArray, float]]:
-        """Return destinations of other planners' robots, and radii; recent ones if free running."""
+        """Return destinations and radii of other planners' robots; running freely, recent ones."""
         settings = self._node.settings
         taken = []
         for name, known in self._destinations.items():
@@ -107,7 +107,7 @@ class OtherPlanners:
         return taken
 
     def publish(self, header: Header, destinations: Mapping[str, FloatArray]) -> None:
-        """Publish where the own robots that take part go."""
+        """Publish the destinations of this planner's robots."""
         for name in sorted(self._publishers.keys() & destinations.keys()):
             message = PointStamped(header=header, point=point_to_ros(destinations[name]))
             self._publishers[name].publish(message)

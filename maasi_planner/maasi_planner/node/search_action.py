@@ -19,7 +19,7 @@ Result: TypeAlias = SearchTargets.Result
 class SearchAction:
     """Server of `search`, which starts a search or takes over a running one.
 
-    A newer goal aborts an older one, while the robots continue: a dead client blocks nobody.
+    A new goal aborts the previous one while the robots continue, so that dead clients do not block.
     """
 
     def __init__(
@@ -49,11 +49,7 @@ class SearchAction:
     def update(
         self, time: float, feedback: SearchTargets.Feedback, finished: str, robots: bool
     ) -> None:
-        """Publish feedback, and conclude the goal when the search has ended.
-
-        time: of the run [s]; finished: why no gain is left, or empty; robots: whether any is
-        available, as far as is known.
-        """
+        """Publish feedback, and conclude the goal if the search has ended."""
         goal = self._goal
         if goal is None:
             return
@@ -63,13 +59,13 @@ class SearchAction:
         if goal.is_cancel_requested:
             end = Result.CANCELED, 'cancelled'
         elif request.targets and feedback.found >= request.targets:
-            end = Result.TARGETS_FOUND, f'{feedback.found} targets are found'
+            end = Result.TARGETS_FOUND, f'{feedback.found} targets found'
         elif finished:
             end = Result.DONE, finished
         elif 0.0 < request.time_limit <= time - self._began:
-            end = Result.TIME_LIMIT, f'{request.time_limit:g} s are over'
+            end = Result.TIME_LIMIT, f'the time limit of {request.time_limit:g} s is reached'
         elif not robots:
-            end = Result.NO_ROBOT, 'no robot can go on'
+            end = Result.NO_ROBOT, 'no robot is available'
         else:
             goal.publish_feedback(feedback)
             return
@@ -95,7 +91,7 @@ class SearchAction:
             self._conclude(Result.CANCELED, 'replaced by another goal')
         self._goal, self._outcome, self._began = handle, Future(), None
         self._on_begin()
-        # It is EXECUTING until it is concluded.
+        # The goal is EXECUTING until it is concluded.
         handle.execute(partial(_conclusion, self._outcome))
 
     def _conclude(self, reason: int, text: str) -> None:
@@ -123,7 +119,7 @@ async def _conclusion(outcome: Future, handle: Any) -> Result:
     return result
 
 
-# Takes a command and robots (none: all), returns whether it was accepted, and an answer as text.
+# Takes a command and robots (None: all); returns whether it was accepted, and a text.
 Commander = Callable[[str, 'list[str] | None'], 'tuple[bool, str]']
 
 

@@ -1,11 +1,11 @@
-"""The mode of each robot of a team in a search, and its commands. Without ROS."""
+"""Modes of the robots in a search, and their commands, without ROS."""
 
 from collections.abc import Collection, Iterable
 from enum import Enum
 
 
 class Mode(Enum):
-    """The mode of a robot."""
+    """Mode of a robot."""
 
     WAITING = 'waiting for start'
     SEARCHING = 'searching'
@@ -27,7 +27,7 @@ _ALLOWED: dict[str, tuple[frozenset[Mode] | None, Mode]] = {
 
 
 class SearchModes:
-    """Mode of each robot, and its transitions by commands."""
+    """Modes of robots, which commands change."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.of = dict.fromkeys(sorted(names), Mode.WAITING)
@@ -38,7 +38,7 @@ class SearchModes:
         return any(mode in (Mode.SEARCHING, Mode.PAUSED, Mode.HOME) for mode in self.of.values())
 
     def command(self, word: str, names: Collection[str] | None = None) -> list[str]:
-        """Apply a command to robots."""
+        """Apply a command; return the robots that follow it."""
         allowed, mode = _ALLOWED[word]
         follow = [
             name

@@ -21,8 +21,8 @@ from maasi_planner.motion import RobotState
 
 ENDED = (AgentState.IDLE, AgentState.REACHED, AgentState.CANCELED, AgentState.ABORTED)
 REPLACED = 'replaced'  # reason in the result of a preempted goal, set by the driver
-_DRIVER_STOPS = 'the driver stops'  # reason of a driver that ends, as it does at the end of a run
-# Time after acceptance from which a state with another goal means that the goal is lost [s].
+_DRIVER_STOPS = 'the driver stops'  # reason of a driver that shuts down
+# Time after acceptance after which a state with another goal means a lost goal [s].
 _PATIENCE = 1.0
 
 
@@ -36,12 +36,12 @@ class HeardState:
     status: int
     reason: str
     silence: Silence
-    charge: float  # of its battery, 0 to 1; else unknown
+    charge: float  # of the battery, 0 to 1; otherwise unknown
     heard_at: float = field(default_factory=time.monotonic)
 
 
 class GoalProgress(Enum):
-    """Progress of a goal of a robot."""
+    """Progress of a goal."""
 
     UNDER_WAY = 0
     ENDED = 1
@@ -54,21 +54,20 @@ class _Sent:
     number: int
     handle: Any = None
     accepted_at: float | None = None
-    # From the result, once it has arrived.
+    # From the result.
     status: int | None = None
     reason: str = ''
     ended_at: float = math.inf
-    # The goal that it replaces, which the robot keeps if it refuses this one.
+    # The replaced goal, which the robot retains if it refuses this one.
     before: _Sent | None = None
 
     def cancel(self) -> None:
-        """Cancel it, if it has been accepted and has not ended."""
         if self.handle is not None and self.status is None:
             self.handle.cancel_goal_async()
 
 
 class TeamGoals:
-    """Clients of the action `go_to` of all robots of a team, in lockstep by their states only."""
+    """Clients of the action `go_to` of all robots; in lockstep only states of robots count."""
 
     def __init__(
         self,
@@ -87,13 +86,13 @@ class TeamGoals:
             )
             node.expect(self.clients[name].server_is_ready)
         self._sent: dict[str, _Sent] = {}
-        # Numbers of goals that were cancelled last, with wall time.
+        # Numbers of the last cancelled goals, with wall time.
         self._cancelled: dict[str, tuple[set[int], float]] = {}
-        #: Goals that have not been answered: robot and number.
+        #: Unanswered goals: robot and number.
         self.waiting: set[tuple[str, int]] = set()
 
     def send(self, name: str, goal: GoToWaypoint.Goal) -> None:
-        """Send a goal to a robot; it replaces the one that the robot has."""
+        """Send a goal to a robot, which replaces its present one."""
         sent = _Sent(int(goal.goal_id), before=self._sent.get(name))
         if sent.before is not None:
             sent.before.before = None
@@ -103,7 +102,7 @@ class TeamGoals:
         future.add_done_callback(partial(self._answered, name, sent))
 
     def cancel(self, name: str) -> None:
-        """Cancel the goal of a robot, even if it has not been answered yet: the robot stops."""
+        """Cancel the goal of a robot, also before it is answered: the robot stops."""
         sent = self._sent.pop(name, None)
         if sent is None:
             return
@@ -117,7 +116,7 @@ class TeamGoals:
         self._sent.pop(name, None)
 
     def has(self, name: str) -> bool:
-        """Return whether a robot has a goal of ours that has not been seen to end."""
+        """Return whether a robot has a goal of ours whose end was not observed yet."""
         return name in self._sent
 
     def course(self, name: str, number: int, heard: HeardState) -> GoalProgress:
@@ -153,12 +152,12 @@ class TeamGoals:
         return self._other(name, sent, heard)
 
     def _other(self, name: str, sent: _Sent, heard: HeardState, after: bool = True) -> GoalProgress:
-        """Return the progress of a goal that a robot does not have, if heard after its answer."""
+        """Return the progress of a goal that a robot does not have, by a state after its answer."""
         if heard.status != AgentState.MOVING:
             return GoalProgress.LOST
         before = sent.before
         if before is not None and heard.goal == before.number:
-            # It has refused this one, and goes on to the one before.
+            # The robot refused this goal, and continues to the one before.
             self._cancelled[name] = ({before.number}, time.monotonic())
             before.cancel()
             return GoalProgress.LOST
@@ -170,7 +169,7 @@ class TeamGoals:
         return heard.status == AgentState.MOVING or heard.reason == REPLACED
 
     def ends(self, name: str, heard: HeardState) -> bool:
-        """Return whether a robot is still moving to a goal that has just been cancelled."""
+        """Return whether a robot still moves to a goal that was just cancelled."""
         numbers, at = self._cancelled.get(name, (set(), -math.inf))
         return heard.goal in numbers and time.monotonic() - at < _PATIENCE
 
@@ -184,7 +183,7 @@ class TeamGoals:
                 sent.handle = handle
                 handle.get_result_async().add_done_callback(partial(self._ended, name, sent))
             else:
-                handle.cancel_goal_async()  # the goal was cancelled before it was answered
+                handle.cancel_goal_async()  # cancelled before it was answered
         self._on_answer(name, sent.number, accepted)
 
     def _ended(self, name: str, sent: _Sent, future: Any) -> None:
@@ -194,7 +193,7 @@ class TeamGoals:
         sent.status, sent.reason = int(answer.status), str(answer.result.reason)
         sent.ended_at = time.monotonic()
         aborted = sent.status == GoalStatus.STATUS_ABORTED and self._sent.get(name) is sent
-        # Of a driver that ends the states of the robot say that it takes part no more.
+        # The states of a driver that shuts down report it.
         if aborted and sent.reason != _DRIVER_STOPS:
             text = f'{name}: goal {sent.number} was aborted: {sent.reason}'
             self._warn(f'{name}: {sent.reason}', text)

@@ -1,4 +1,4 @@
-"""What the planner node publishes for viewers, at a limited rate."""
+"""Topics of the planner node for viewers, at a limited rate."""
 
 import math
 
@@ -19,7 +19,7 @@ from maasi_planner.robot_plan import PresentRobot
 
 
 class PlannerViews:
-    """The exploration function, and markers of robots and their ways."""
+    """The exploration function, and markers of robots and their paths."""
 
     def __init__(self, node: LockstepLifecycleNode[PlannerNodeSettings]) -> None:
         self._node = node
@@ -52,7 +52,7 @@ class PlannerViews:
             self._exploration.publish(exploration_to_ros(exploration, header))
         else:
             unseen = np.ravel(exploration.unseen())
-            # Viewers leave out what is no number.
+            # Viewers omit NaN.
             unseen[unseen < 0.0] = np.nan
             self._exploration.publish(particles_to_ros(exploration.nodes(), unseen, header))
         shown = {}
@@ -61,7 +61,7 @@ class PlannerViews:
             place = np.asarray(robot.state.pose.position)
             waypoint = plan.positions[-1] if len(plan.positions) else place
             shown[name] = (place, waypoint, plan.positions, plan.tour)
-        # Of the whole team, so that a robot that plans for itself has its colour of the team.
+        # Colours are those of the whole team, also for a robot with its own planner.
         tints = robot_colours([*coordinator.names, *self._node.settings.others])
         markers = planner_markers(shown, tints, header, self._size)
         markers.markers += area_markers(coordinator.area, header, self._size).markers

@@ -1,4 +1,4 @@
-"""All candidates of a team, and the value J of one given the choices of others: 000, (17), (26)."""
+"""All candidates of a team, and the value J of one given the others' choices (000, (17), (26))."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from maasi_planner.objective.terms import Terms, exploration_given, refinement_g
 class CandidateTable(NamedTuple):
     """G candidates of R planning robots.
 
-    By information, what two see counts for the one with the shorter path.
+    By information, what two robots see counts for the one with the shorter path.
     """
 
     allowed: BoolArray
@@ -36,9 +36,9 @@ def part_of_table(table: CandidateTable, begin: int, end: int) -> CandidateTable
 
 @njit(cache=True, forceinline=True)
 def candidate_value(table: CandidateTable, g: int, chosen: IntArray) -> tuple[float, float, float]:
-    """Return T, E and J (17), (26) of g, given the others' choices (R,), -1 for none."""
+    """Return T, E and J (17), (26) of g, given the others' choices (R,); -1: none."""
     robot = table.planned.robot[g]
-    # Chosen candidates whose measurements g gets no credit for.
+    # Chosen candidates that count before g.
     others, number = np.empty(chosen.shape[0], np.int64), 0
     for r in range(chosen.shape[0]):
         other = chosen[r]
@@ -95,10 +95,10 @@ def values_given(table: CandidateTable, first: int, last: int, chosen: IntArray)
 
 
 class Ranking(NamedTuple):
-    """The admissible candidates, robot after robot, each robot's best first.
+    """The admissible candidates of one robot after another, best first.
 
-    order (A,): these; robot r has start[r] to start[r + 1]; alone (G,): J of a candidate without
-    the other planning robots, an upper bound of J with them.
+    order (A,): candidates; those of robot r are start[r] to start[r + 1]; alone (G,): J without the
+    other planning robots, an upper bound of J.
     """
 
     table: CandidateTable

@@ -1,4 +1,4 @@
-"""Terms by information: T about clusters, and E as expected new targets."""
+"""Terms of the objective `information`: T about clusters, and E as expected new targets."""
 
 import math
 from collections.abc import Sequence
@@ -22,17 +22,17 @@ from maasi_planner.objective.settings import InformationSettings
 from maasi_planner.objective.terms import IndexArray, Terms
 from maasi_planner.team import RobotView, TeamView
 
-# Up to so many numbers rows have all nodes, which is faster where robots are few.
+# Rows up to this size have all nodes, which is faster for few robots.
 MOST_WHOLE = 4_000_000
-# Information about a cluster in units of its covariance that is neglected in large teams.
+# Neglected information about a cluster in large teams, in units of its covariance.
 LEAST_GAIN = 1e-7
 
 
 class Nodes(NamedTuple):
-    """L nodes where targets are unseen.
+    """L nodes with unseen targets.
 
-    numbers (nx, ny, nz): which of them a cell is, or -1; lower (3,) and step (3,) of the grid [m];
-    places (3, L) [m]; unseen (L,), the expected targets of each.
+    numbers (nx, ny, nz): index of each cell or -1; lower (3,) and step (3,) of the grid [m]; places
+    (3, L) [m]; unseen (L,): expected targets.
     """
 
     numbers: IndexArray
@@ -51,7 +51,7 @@ def _add_information(
     cluster: IntArray,
     out: FloatArray,
 ) -> None:
-    """Add pi H' R^-1 H to out; rows H (n, d, d) become H in units of the noise, in place."""
+    """Add pi H' R^-1 H to out; rows H (n, d, d) are scaled by the noise, in place."""
     d = lower.shape[0]
     for i in range(chance.shape[0]):
         for a in range(d):
@@ -77,7 +77,7 @@ def _information(
         chance = chances(part, first, centres)
         owner, index, cluster = np.nonzero(chance)
         offsets = (centres[cluster] - part.places[owner, index])[:, :d]
-        # Nearer than the noise of the range the linear model would promise too much.
+        # Nearer than the noise of the range, the linear model would be too optimistic.
         distance = np.sqrt((offsets * offsets).sum(axis=1))
         offsets *= np.maximum(1.0, lower[0, 0] / np.maximum(distance, 1e-12))[:, None]
         jacobian = view.sensor.measurement.jacobian(offsets, Pose(np.zeros(3)))
@@ -87,13 +87,13 @@ def _information(
 
 
 def _nodes(team: TeamView, settings: InformationSettings, every_node: bool) -> Nodes:
-    """Return the nodes of e, or blocks of them, with the targets that are unseen there."""
+    """Return the nodes of e, or blocks of them, with their unseen targets."""
     values, lower, step = team.exploration.kernel()
     volumes = team.exploration.cell_volumes().reshape(values.shape)
     most, stride = settings.exploration_nodes, 1
     while not every_node and np.prod([-(-size // stride) for size in values.shape]) > most:
         stride += 1
-    # Nodes of each axis by the block that they are in.
+    # Nodes of each axis by block.
     x, y, z = np.ix_(*(np.arange(size) // stride for size in values.shape))
     shape = [int(blocks.max()) + 1 for blocks in (x, y, z)]
     block = (x * shape[1] + y) * shape[2] + z
@@ -106,7 +106,7 @@ def _nodes(team: TeamView, settings: InformationSettings, every_node: bool) -> N
 
 
 def _without(nodes: Nodes, settled: Measurements) -> Nodes:
-    """Return the nodes that robots which do not plan leave something of."""
+    """Return the nodes that are still unseen after the measurements of robots that do not plan."""
     unseen = nodes.unseen.copy()
     counts, node, miss = rows_of(settled, 0, nodes, False)
     for last, count in zip(counts.cumsum().tolist(), counts.tolist()):
@@ -122,7 +122,7 @@ def _without(nodes: Nodes, settled: Measurements) -> Nodes:
 def _miss_near(
     measured: Measurements, g: int, first: int, nodes: Nodes, miss: FloatArray, seen: IndexArray
 ) -> int:
-    """Multiply miss (L,) by 1 - pi within the reach; fill and count the nodes it is not 1 at."""
+    """Multiply miss (L,) by 1 - pi within the reach; fill and count the changed nodes."""
     robot, count = measured.robot[g], 0
     reach, shape = measured.reach[robot], nodes.numbers.shape
     low, high = np.zeros(2, np.int64), np.zeros(2, np.int64)
@@ -158,10 +158,10 @@ def _miss_near(
 def rows_of(
     measured: Measurements, first: int, nodes: Nodes, whole: bool
 ) -> tuple[IntArray, IndexArray, FloatArray]:
-    """Return the nodes that the planned measurements from `first` on see, trajectory by trajectory.
+    """Return the nodes seen by the planned measurements from `first` on, by trajectory.
 
-    How many each sees (G,), these nodes in order and the product of 1 - pi there (N,). With `whole`
-    all nodes are in each row.
+    These are the number of each (G,), the nodes in order, and the product of 1 - pi there (N,).
+    With `whole` each row has all nodes.
     """
     total, number = measured.own.shape[0], nodes.unseen.shape[0]
     counts, used = np.zeros(total, np.int64), 0
@@ -195,23 +195,15 @@ def rows_of(
 
 
 def starts_of(counts: IntArray) -> IntArray:
-    """Return where rows of so many entries (G,) begin, and where the last one ends, (G + 1,)."""
+    """Return the begin of rows of so many entries (G,), and the end of the last one, (G + 1,)."""
     return np.concatenate([[0], counts.cumsum()])
 
 
 class InformationTerms:
-    """The terms of the candidates of each robot, then of all of them together.
+    """Terms of the candidates of each robot, then of all of them.
 
-    Parameters
-    ----------
-    team : TeamView
-        The team.
-    settings : InformationSettings
-        Of the planner.
-    settled : sequence of RobotView, and Measurements
-        Robots whose measurements do not depend on the choice, and these.
-    kinds : (R,) array
-        Kinds of pi of the robots that plan.
+    settled: robots whose measurements do not depend on the choice, and these measurements; kinds
+    (R,): kinds of pi of the planning robots.
     """
 
     def __init__(
@@ -237,11 +229,11 @@ class InformationTerms:
         self._covariance = covariance.reshape(-1, d, d)
 
     def are_few(self, candidates: int) -> bool:
-        """Return whether rows of so many candidates may have all nodes."""
+        """Return whether rows of so many candidates can have all nodes."""
         return candidates * len(self._nodes.unseen) <= MOST_WHOLE
 
     def of(self, view: RobotView, planned: Measurements, first: int, whole: bool) -> Terms:
-        """Return the terms of one robot's candidates by measurements from `first` on."""
+        """Return the terms of one robot's candidates for measurements from `first` on."""
         counts, node, miss = rows_of(planned, first, self._nodes, whole)
         gains = _information(view, planned, first, self._centres, self._d)
         if whole:
@@ -265,7 +257,7 @@ class InformationTerms:
 
 
 def reduced(terms: Terms, kept: BoolArray) -> Terms:
-    """Return terms without the rows of candidates that are not kept (G,)."""
+    """Return terms with only the rows of `kept` candidates (G,)."""
     if kept.all():
         return terms
     counts, gains = np.diff(terms.first), np.diff(terms.gain_first)

@@ -1,4 +1,4 @@
-"""The joint choice of a team: 000, (26)."""
+"""The joint choice of a team (000, (26))."""
 
 import math
 
@@ -16,7 +16,7 @@ from maasi_planner.objective.candidate_table import (
 from maasi_planner.objective.large_teams import search_in_turn
 from maasi_planner.objective.settings import InformationSettings
 
-PAIRS_LIMIT = 5  # moves of two robots at once are tried in teams up to this size
+PAIRS_LIMIT = 5  # largest team with moves of two robots at once
 
 
 @njit(cache=True)
@@ -96,7 +96,7 @@ def _search_in_turn(
 def _improve_in_pairs(
     ranking: Ranking, total: float, budget: int, chosen: IntArray
 ) -> tuple[float, int]:
-    """Improve a choice by moves of two robots at once, while the budget of evaluations lasts."""
+    """Improve a choice by moves of two robots at once within a budget of evaluations."""
     table, order, start, _ = ranking
     moving: IntArray = np.flatnonzero(chosen >= 0)
     evaluated, improved = 0, True
@@ -122,7 +122,7 @@ def _improve_in_pairs(
 
 
 def ranking_of(table: CandidateTable, alone: FloatArray) -> Ranking:
-    """Return the admissible candidates of each robot, the best ones first."""
+    """Return the admissible candidates of each robot, best first."""
     order = np.lexsort((-alone, table.planned.robot))
     order = order[alone[order] > -np.inf]
     counts = np.bincount(table.planned.robot[order], minlength=len(table.radii))
@@ -134,8 +134,8 @@ def search(
 ) -> tuple[IntArray, float, bool, int]:
     """Return the best joint choice, its value, whether it is exact, and choices evaluated.
 
-    `alone` (G,) is J of each candidate without the others, -inf for inadmissible ones. The choice
-    (R,) has indices into all candidates, -1 for a robot with none admissible.
+    `alone` (G,) is J of each candidate without the others, -inf if inadmissible. The choice (R,)
+    has indices into all candidates; -1: none is admissible.
     """
     robots = len(table.radii)
     if robots == 1:

@@ -1,8 +1,8 @@
-"""The joint choice in large teams: robots choose in turn, each the best for all.
+"""The joint choice in large teams: robots choose in turn, each best for all.
 
-The value of the team changes with one robot's candidate only where it sees what others see, or
-what they would have seen. What the others have chosen is summed up once for all candidates of a
-robot: node by node and cluster by cluster by information, robot by robot as printed.
+The value of the team depends on one robot's candidate only where it sees what others see, or would
+have seen. The choices of the others are summed up once for all candidates of a robot: by node and
+cluster with the objective `information`, by robot with that of the paper.
 """
 
 import math
@@ -22,13 +22,13 @@ from maasi_planner.objective.terms import Terms, exploration_given, left_by, log
 
 
 class Others(NamedTuple):
-    """What the k other robots have chosen, in the order in which it counts, by information.
+    """Choices of the k other robots in the order in which they count, by information.
 
-    candidate (k,), and its norm (k,). The rows begin[n] to begin[n + 1] - 1 of node n are of those
-    that see it: place (E,) in that order, before (E,) what those before it leave of the node, and
-    after (E,) what it and later ones see there, each over its norm; the last row has no place. The
-    rows of a cluster are alike, from cluster_begin[c] on: place (F,), known (F, d, d) before it,
-    and content (F,), the log determinant of that.
+    candidate (k,), and its norm (k,). Rows begin[n] to begin[n + 1] - 1 are of the robots that see
+    node n: place (E,) in that order, before (E,) what earlier ones leave of the node, and after
+    (E,) what it and later ones see, each over its norm; the last row has no place. Rows of cluster
+    c begin at cluster_begin[c]: place (F,), known (F, d, d) before it, and content (F,), its log
+    determinant.
     """
 
     candidate: IntArray
@@ -58,7 +58,7 @@ def _content(terms: Terms, cluster: int, known: FloatArray, gain: FloatArray) ->
 
 @njit(cache=True)
 def _in_order(table: CandidateTable, chosen: IntArray, r: int) -> IntArray:
-    """Return the choices of the others, those that count first before the others."""
+    """Return the choices of the others in the order in which they count."""
     others, number = np.empty(len(chosen), np.int64), 0
     for s in range(len(chosen)):
         if s == r or chosen[s] < 0:
@@ -73,7 +73,6 @@ def _in_order(table: CandidateTable, chosen: IntArray, r: int) -> IntArray:
 
 @njit(cache=True)
 def _others(table: CandidateTable, chosen: IntArray, r: int) -> Others:
-    """Sum up what the robots but r have chosen."""
     terms, candidate = table.terms, _in_order(table, chosen, r)
     number, clusters = len(candidate), len(terms.mass)
     norm = np.empty(number)
@@ -86,7 +85,7 @@ def _others(table: CandidateTable, chosen: IntArray, r: int) -> Others:
             begin[terms.node[row] + 1] += 1
         for row in range(terms.gain_first[g], terms.gain_first[g + 1]):
             cluster_begin[terms.cluster[row] + 1] += 1
-    # One more row at each node that is seen at all, and at each cluster.
+    # One additional row for each seen node and each cluster.
     for n in range(len(terms.unseen)):
         begin[n + 1] += begin[n] + (begin[n + 1] > 0)
     for c in range(clusters):
@@ -129,7 +128,6 @@ def _others(table: CandidateTable, chosen: IntArray, r: int) -> Others:
 
 @njit(cache=True)
 def _value_of_others(table: CandidateTable, others: Others) -> float:
-    """Return the sum of J of the others."""
     terms, total = table.terms, 0.0
     for i in range(len(others.candidate)):
         total -= table.cost[others.candidate[i]] / others.norm[i]
@@ -170,7 +168,7 @@ def _explored(table: CandidateTable, others: Others, g: int, place: int) -> tupl
 
 @njit(cache=True)
 def _refined(table: CandidateTable, others: Others, g: int, place: int) -> float:
-    """Return what T of candidate g adds to the sum of J; it counts from `place` on."""
+    """Return what T of candidate g, which counts from `place` on, adds to the sum of J."""
     terms, norm, total = table.terms, table.norm[g], 0.0
     for row in range(terms.gain_first[g], terms.gain_first[g + 1]):
         c = terms.cluster[row]
@@ -191,7 +189,6 @@ def _refined(table: CandidateTable, others: Others, g: int, place: int) -> float
 
 @njit(cache=True)
 def _best_by_information(ranking: Ranking, r: int, chosen: IntArray) -> tuple[int, float, int]:
-    """Return the best candidate of one robot for the team, its total, and the work done."""
     table, order, start, alone = ranking
     others = _others(table, chosen, r)
     value = _value_of_others(table, others)
@@ -211,7 +208,7 @@ def _best_by_information(ranking: Ranking, r: int, chosen: IntArray) -> tuple[in
         total = value - table.cost[g] / table.norm[g]
         if table.beta > 0.0:
             without, explored = _explored(table, others, g, place)
-            # T is at most that without the others.
+            # T without the others is an upper bound.
             if value + alone[g] + table.beta * (explored - without) <= best_value:
                 continue
             total += table.beta * explored
@@ -223,7 +220,6 @@ def _best_by_information(ranking: Ranking, r: int, chosen: IntArray) -> tuple[in
 
 @njit(cache=True)
 def _best_as_printed(ranking: Ranking, r: int, chosen: IntArray) -> tuple[int, float, int]:
-    """Return the best candidate of one robot for the team, its total, and the work done."""
     table, order, start, alone = ranking
     terms, planned = table.terms, table.planned
     others = np.array([g for s, g in enumerate(chosen) if s != r and g >= 0], np.int64)
@@ -249,7 +245,7 @@ def _best_as_printed(ranking: Ranking, r: int, chosen: IntArray) -> tuple[int, f
             gain += table.beta * exploration_given(terms, planned, g, others)
         total = value + gain / table.norm[g]
         for s in range(len(others)):
-            # What g takes from the others only makes it less.
+            # What g takes from the others only reduces it.
             if total <= best_value or not table.beta > 0.0:
                 break
             kept, lost = left_by(terms, planned, others[s], g), 0.0

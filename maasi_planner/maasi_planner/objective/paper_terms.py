@@ -1,4 +1,4 @@
-"""The terms T and E as they are printed: 000, (18) to (22), (31), (32)."""
+"""The terms T and E as printed (000, (18) to (22), (31), (32))."""
 
 import numpy as np
 from numba import njit
@@ -21,7 +21,7 @@ def _unseen_nodes(
 ) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
     """Return count, value, place and time of `Terms`, without the other planning robots.
 
-    (22) interpolates e between grid nodes: each has its weight times what is unseen there. With
+    (22) interpolates e between grid nodes: each has its weight times its unseen share. With
     `own_counts` a measurement itself is in its product (21).
     """
     values, lower, step = grid
@@ -69,10 +69,10 @@ def paper_terms(
     centres: FloatArray,
     grid: Grid,
 ) -> Terms:
-    """Return the terms of candidates with their predicted measurements, from `first` on.
+    """Return the terms of candidates for their predicted measurements from `first` on.
 
-    T is the sum of pi at cluster centres (000, (19), (31)). `settled` are the measurements of the
-    robots that do not plan, `grid` the values, first node and distances of e.
+    T is the sum of pi at cluster centres (000, (19), (31)). `settled` are the measurements of
+    robots that do not plan; `grid` has the values, first node and distances of e.
     """
     count, value, place, time = _unseen_nodes(planned, settled, first, own_counts, grid)
     total = len(planned.own)

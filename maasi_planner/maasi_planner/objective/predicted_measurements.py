@@ -24,18 +24,18 @@ from maasi_planner.motion.base import Trajectories
 from maasi_planner.team import RobotView
 
 NEVER = 1 << 60  # after every measurement [steps]
-MOST_CHANCES = 500_000  # numbers that a part of `chances` has at most
-# x, y and z (n,) [m]: each on its own, so that loops over them become vector instructions.
+MOST_CHANCES = 500_000  # largest part of `chances`
+# x, y and z (n,) [m] in separate arrays, so that loops are vectorised.
 Places = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class Measurements(NamedTuple):
     """Predicted measurements on G trajectories of R robots, in order of time.
 
-    Trajectory g is of robot[g] and has number[g] of them: the first own[g] are planned, the others
-    only expected by other robots. times (G, n) [steps from now], places (G, n, 3) [m], in 2D with
-    z = 0, yaws (G, n) [rad]. Of each robot the kernel of pi, kind (R,) and parameters
-    (R, PARAMETERS), and its reach (R,), beyond which pi is 0 [m].
+    Trajectory g of robot[g] has number[g] measurements: own[g] planned ones, and others that only
+    other robots expect. times (G, n) [steps from now], places (G, n, 3) [m], in 2D with z = 0, yaws
+    (G, n) [rad]. For each robot kind (R,) and parameters (R, PARAMETERS) of pi, and its reach (R,)
+    [m].
     """
 
     robot: IntArray
@@ -50,10 +50,10 @@ class Measurements(NamedTuple):
 
 
 class Ways(NamedTuple):
-    """Trajectories (W, K + 1) of a robot of `lengths` steps, and when it measures on them.
+    """Trajectories (W, K + 1) of `lengths` steps of a robot, and its measurements on them.
 
-    First after `phase` steps, then in every period, and with `arrival` at the end. Positions are
-    `stride` steps apart, of which phase and period are multiples, and at the end.
+    The first is after `phase` steps, others follow in every period and, with `arrival`, at the end.
+    Positions are `stride` steps apart, of which phase and period are multiples, and at the end.
     """
 
     view: RobotView
@@ -67,7 +67,7 @@ class Ways(NamedTuple):
 
 @dataclass
 class CoarseTrajectories(Trajectories):
-    """Trajectories of which only each `stride`-th position, and the end, is kept."""
+    """Trajectories with only each `stride`-th position and the end."""
 
     stride: int
     metres: FloatArray
@@ -93,19 +93,19 @@ class CoarseTrajectories(Trajectories):
 
 
 def planned_way(view: RobotView, prediction: Trajectories, arrival: bool) -> Ways:
-    """Return the trajectories of a robot that plans, and measures now."""
+    """Return the trajectories of a planning robot, which measures now."""
     stride = prediction.stride if isinstance(prediction, CoarseTrajectories) else 1
     return Ways(view, prediction.positions, prediction.yaws, prediction.lengths, 0, arrival, stride)
 
 
 def remaining_way(view: RobotView) -> Ways:
-    """Return the trajectory of a robot that does not plan; one that plans measures where it is."""
+    """Return the trajectory of a robot that does not plan."""
     path, yaws = view.remaining_path, view.remaining_yaws
     if view.planning or path is None or len(path) == 0:
         path, yaws = np.array(view.state.pose.position)[None, :], None
     if yaws is None:
         yaws = np.full(len(path), view.state.pose.yaw)
-    # Where its path ends the robot measures in any case: it plans there.
+    # The robot plans, and therefore measures, at the end of its path.
     lengths, arrival = np.array([len(path) - 1]), view.planning or len(path) > 1
     return Ways(view, path[None], yaws[None], lengths, max(0, view.phase), arrival)
 
@@ -144,8 +144,8 @@ def _fill(
 def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurements:
     """Return the measurements of robots on their trajectories.
 
-    With `extend` robots go on where they end until `horizon` (000, section 6: appended constant
-    states), which others see in e but it does not count for themselves.
+    With `extend` robots continue to measure at their ends until `horizon` (000, section 6: appended
+    constant states), which counts only for others.
     """
     counts = [len(ways.lengths) for ways in robots]
     total, most = sum(counts), 1
@@ -175,7 +175,7 @@ def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurement
 
 
 def reach_of(detection: DetectionModel) -> float:
-    """Return the horizontal distance beyond which pi is 0, metres; inf if there is none."""
+    """Return the horizontal distance beyond which pi is 0 [m], or inf."""
     kind, parameters = detection.kernel()
     if kind == CUSTOM:
         return float(parameters[REACH])
@@ -192,7 +192,7 @@ def part_of(measured: Measurements, begin: int, end: int) -> Measurements:
 
 
 def parts_of(measured: Measurements, points: int) -> Iterator[tuple[slice, Measurements]]:
-    """Yield parts of the trajectories, so small that `chances` at the points need little memory."""
+    """Yield parts of the trajectories, for each of which `chances` needs little memory."""
     total, each = len(measured.own), measured.times.shape[1] * max(1, points)
     number = max(1, MOST_CHANCES // each)
     for begin in range(0, total, number):
@@ -238,7 +238,7 @@ def apply_misses(
     reach = measured.reach[robot]
     number, begin = left.shape[0], 0
     room = np.empty((4, number))
-    # Only for boxes and own models the heading counts.
+    # The heading counts only for boxes and plugins.
     cosine, sine = 1.0, 0.0
     for e in range(first, last):
         while begin < number and until[begin] < measured.times[g, e]:
@@ -256,7 +256,7 @@ def apply_misses(
                         kind, parameters, dx, dy, places[2][i] - z0, cosine, sine
                     )
             continue
-        # Slices: an index that might be negative keeps loops from becoming vector instructions.
+        # Slices, as possibly negative indices prevent vectorised loops.
         width = number - begin
         x, y, z, chance = room[0, :width], room[1, :width], room[2, :width], room[3, :width]
         px, py, pz, after = places[0][begin:], places[1][begin:], places[2][begin:], left[begin:]

@@ -1,4 +1,4 @@
-"""Settings of `maasi`: the objective, its candidates and the joint choice."""
+"""Settings of the planner `maasi`."""
 
 from typing import Any, ClassVar, Literal
 

@@ -17,20 +17,19 @@ from maasi_planner.team import RobotView, TeamView, UsableCandidates
 # Above this number of pairs of a candidate and another robot, reported values of candidates that
 # were not chosen neglect the other planning robots.
 REPORT_LIMIT = 600
-# Most nodes that the candidates of all robots see together; above, the joint choice is among the
-# candidates of each robot that are best without the others. 12 bytes each.
+# Most nodes seen by the candidates of all robots together; above, the joint choice has only the
+# best candidates of each robot without the others. 12 bytes each.
 MOST_ENTRIES = 8_000_000
-LEAST_KEPT = 8  # candidates of a robot that the joint choice has in any case
+LEAST_KEPT = 8  # fewest candidates of a robot in the joint choice
 
 
 class TeamObjective:
     """Objective of all joint candidates at one step.
 
-    team: the team; robots that do not plan count with the rest of their trajectories; settings:
-    weights; options: candidates of the planning robots that have some; names: these, in order;
-    start (R + 1,): where the candidates of each begin among all; table: all candidates; alone
-    (G, 3): T, E and J of each candidate without the other planning robots; kept (G,): which of
-    them the joint choice is among.
+    Robots that do not plan count with their remaining trajectories. names: planning robots with
+    candidates, in order; start (R + 1,): begin of the candidates of each; table: all candidates;
+    alone (G, 3): T, E and J without the other planning robots; kept (G,): candidates of the joint
+    choice.
     """
 
     def __init__(
@@ -46,13 +45,13 @@ class TeamObjective:
             for view, option in zip(views, choices)
         ]
         rest = [remaining_way(team.robots[name]) for name in team.names() if name not in self.names]
-        # The first measurement that counts: the present one does not depend on the choice.
+        # First counted measurement: the present one does not depend on the choice.
         first = 0 if settings.count_present else 1
         if first and informed:
             rest += map(remaining_way, views)
         lengths = np.concatenate([way.lengths for way in ways])
         cost = np.concatenate([option.prediction.control_cost for option in choices])
-        # By information, what a robot measures at its end counts for nobody.
+        # By information, later measurements at a robot's end do not count.
         extend = settings.extension == 'measuring' and not informed
         planned = predicted(ways, int(lengths.max()), extend)
         settled = predicted(rest, int(lengths.max()), extend)
@@ -111,13 +110,13 @@ class TeamObjective:
 
     @property
     def bounds(self) -> FloatArray:
-        """Largest J (G,) that a candidate of the joint choice can have; -inf for the others."""
+        """Upper bound of J (G,) of candidates of the joint choice; -inf for others."""
         return np.where(self.kept, self.alone[:, 2], -np.inf)
 
     def given(self, robot: int, chosen: IntArray) -> FloatArray:
         """Return T, E and J of each candidate of one robot, given the others' choices, (W, 3).
 
-        In teams too large for that, all but the chosen one without the other planning robots.
+        In very large teams only the chosen one accounts for the other planning robots.
         """
         others, g = len(self.names) - 1, int(chosen[robot])
         first, last = self.start[robot : robot + 2].tolist()
@@ -130,7 +129,7 @@ class TeamObjective:
 
 
 def best_of(values: FloatArray, counts: IntArray, most: int) -> BoolArray:
-    """Return the best candidates (W,), as many as see at most `most` nodes together."""
+    """Return the best candidates (W,) that see at most `most` nodes together."""
     order = np.argsort(-values, kind='stable')
     fits = counts[order].cumsum() <= most
     fits[:LEAST_KEPT] = True

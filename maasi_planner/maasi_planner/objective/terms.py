@@ -11,22 +11,22 @@ from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.objective.predicted_measurements import Measurements, apply_misses
 
 IndexArray = NDArray[np.int32]
-CACHE_ROWS = 8000  # rows kept of what one candidate leaves of another
+CACHE_ROWS = 8000  # cached rows of what one candidate leaves of another
 CACHE_KEYS = 1 << 15  # entries of their hash table, a power of two
 
 
 class Terms(NamedTuple):
-    """What T and E of G candidates consist of, for E as printed or by information.
+    """Data for T and E of G candidates, with E as printed or by information.
 
-    By information E is what a candidate sees of the unseen targets (L,) of L nodes. Rows first[g]
-    to first[g + 1] have the nodes (N,) that it sees, in order, and miss (N,): what it leaves there.
+    By information, E is what a candidate sees of the unseen targets (L,) of L nodes. Rows first[g]
+    to first[g + 1] have its nodes (N,), in order, and the unseen factor miss (N,).
 
-    As printed E is what others leave of value (G, n), of which filled[g] numbers are used: their
-    product with what each other candidate leaves, by its measurements until time (G, n) [steps
-    from now] at place (3, G, n) [m]. The search needs that many times: rows (S, n) keep it by pair
-    of candidates, in a hash table of keys and slots; used (1,) counts rows.
+    As printed, E is what others leave of value (G, n), of which filled[g] numbers are used: their
+    product with what each other candidate leaves by its measurements until time (G, n) [steps from
+    now] at place (3, G, n) [m]. Rows (S, n) cache it by pair of candidates, in a hash table of keys
+    and slots; used (1,) counts rows.
 
-    T is refinement (G,), and of C clusters with mass (C,) and covariance (C, d, d) the information
+    T is refinement (G,), and for C clusters with mass (C,) and covariance (C, d, d) the information
     that a candidate adds to base (C, d, d), both sums of pi H' R^-1 H. Rows gain_first[g] to
     gain_first[g + 1] have its clusters, in order, and gains (M, d, d).
     """
@@ -55,7 +55,7 @@ class Terms(NamedTuple):
 
 @njit(cache=True)
 def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArray:
-    """Return what the measurements of candidate `other` leave of the value of g, as printed."""
+    """Return what candidate `other` leaves of the value of g, as printed."""
     count, key = terms.filled[g], g * terms.filled.shape[0] + other
     mask = terms.keys.shape[0] - 1
     index = ((key ^ (key >> 15)) * 2654435761) & mask
@@ -66,7 +66,7 @@ def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArr
     out = np.ones(count)
     until, number, place = terms.time[g, :count], planned.number[other], terms.place
     at = place[0, g, :count], place[1, g, :count], place[2, g, :count]
-    # Not a literal, for which it would be compiled once more.
+    # A literal would be compiled separately.
     apply_misses(at, until, out, planned, other, np.int64(0), number)
     if terms.used[0] < terms.rows.shape[0]:
         for i in range(count):
@@ -78,7 +78,7 @@ def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArr
 
 @njit(cache=True)
 def seen_by(terms: Terms, g: int) -> FloatArray:
-    """Return the expected new targets that candidate g sees at each of its nodes."""
+    """Return the expected new targets seen by candidate g at each of its nodes."""
     begin, end = terms.first[g], terms.first[g + 1]
     if end - begin == terms.unseen.shape[0]:
         return terms.unseen * (1.0 - terms.miss[begin:end])
@@ -90,7 +90,6 @@ def seen_by(terms: Terms, g: int) -> FloatArray:
 
 @njit(cache=True)
 def _multiply_by_misses(terms: Terms, g: int, other: int, values: FloatArray) -> None:
-    """Multiply values at the nodes of g by what `other` leaves there."""
     i, i_end = terms.first[g], terms.first[g + 1]
     j, j_end = terms.first[other], terms.first[other + 1]
     if i_end - i == terms.unseen.shape[0] and j_end - j == i_end - i:

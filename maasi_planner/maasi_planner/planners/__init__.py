@@ -23,9 +23,9 @@ __all__ = [
 
 
 def takes_tour(volume: float, width: float, dimension: int) -> bool:
-    """Return whether `auto` is `tour` in an area, by the width that robots see [m]; else `maasi`.
+    """Return whether `auto` is `tour` rather than `maasi`, by volume and width of view [m].
 
-    docs/search_quality.md has the measurements that the rule is from.
+    docs/search_quality.md has the measurements behind this rule.
     """
     return volume >= 30 * width**dimension
 
@@ -40,21 +40,21 @@ def make_planner(
     name : str
         As in `PlannerSettings.name`.
     settings : PlannerSettings, optional
-        Its parameters; `name` overrides the name in them.
+        Its settings, whose name `name` replaces.
     team : TeamView, optional
-        The team that it plans for first, by which `auto` is chosen: `tour` or `maasi`.
+        The team at the first decision, by which `auto` becomes `tour` or `maasi`.
 
     Raises
     ------
     ValueError
-        If there is no planner of that name, its own settings are wrong, or `auto` has no team.
+        If the name is unknown, its settings are wrong, or `auto` has no team.
     """
     own = planner_settings(name) if settings is None else settings.renamed(name)
     if name != 'auto':
         planner: Planner = PLANNERS.load(name)(own)
         return planner
     if team is None:
-        raise ValueError('planner auto: got no team, which it is chosen by')
+        raise ValueError('planner auto: got no team, allowed is the team to choose a planner for')
     many = takes_tour(team.exploration.volume, lanes_of(team)[0], team.dimension)
     chosen = 'tour' if many else 'maasi'
     planner = PLANNERS.load(chosen)(own)

@@ -1,11 +1,10 @@
 """Active search with one measurement at each waypoint, AS and MAAS (001, 002, 003).
 
-Single robot, 001, eq. (9) to (13): sequences of `horizon` position changes, scored by
-T + alpha E with E the sum of e at the positions and T either the sum of pi at the cluster centres
-or the mutual information with the empty measurement set. Several robots, 002, section 4: jointly
-with the sum of T and the product of the robots' own e (12), (14) to (16), or independently (10),
-with one instance of planner and filter for each robot. e and the clusters are kept constant during
-prediction.
+For a single robot (001, eq. (9) to (13)), sequences of `horizon` position changes have the value
+T + alpha E. E is the sum of e at the positions; T is the sum of pi at the cluster centres or the
+mutual information with the empty measurement set. Several robots (002, section 4) choose jointly
+by the sum of T and the product of the robots' own e (12), (14) to (16), or independently (10),
+each with its own planner and filter. e and the clusters are constant during prediction.
 """
 
 import math
@@ -23,6 +22,7 @@ from maasi_planner.planners.options import usable_options
 from maasi_planner.planners.separation import all_apart
 from maasi_planner.settings import JointSettings, NotNegative
 from maasi_planner.team import (
+    ASSIGNED,
     Decision,
     RobotDecision,
     RobotView,
@@ -49,10 +49,10 @@ class ActiveSearchSettings(JointSettings):
 
 
 class Sequences:
-    """All sequences of positions of one robot, with their T and e.
+    """All sequences of positions of one robot.
 
-    first (S,): index of the first position among the candidates; refinement (S,): T of each
-    sequence; explored (S, horizon): e at each position.
+    first (S,): index of the first position among the candidates; refinement (S,): T; explored
+    (S, horizon): e at each position.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Sequences:
                     for place, inside in zip(following, team.area.inside(following))
                     if inside and view.motion.keep_out.is_free(place)
                 ]
-                # Extend a dead end by staying, so that the sequence is kept.
+                # Extend a dead end by staying.
                 for place in free or [places[-1]]:
                     longer.append((index, [*places, place]))
             kept = longer
@@ -127,10 +127,10 @@ class Sequences:
 
 
 class ActiveSearch(Planner):
-    """Waypoints at a fixed distance, one measurement at each; candidates from a ring.
+    """Waypoints from a ring at a fixed distance, with one measurement at each.
 
-    Sequences of `horizon` waypoints use the same displacements as the candidates; only the first
-    waypoint is executed before replanning (receding horizon).
+    Sequences of `horizon` waypoints use the displacements of the candidates; only the first
+    waypoint is executed (receding horizon).
     """
 
     measures_underway = False
@@ -151,7 +151,7 @@ class ActiveSearch(Planner):
         for name, option in options.items():
             if chosen[name] < 0:
                 view = team.robots[name]
-                decision.robots[name] = stay(view, 'stays: another robot takes its candidates')
+                decision.robots[name] = stay(view, f'stays: {ASSIGNED}')
             else:
                 decision.robots[name] = self._report(name, option, sequences, chosen)
         return explain(decision)
@@ -203,7 +203,6 @@ class ActiveSearch(Planner):
         sequences: dict[str, Sequences],
         chosen: dict[str, int],
     ) -> RobotDecision:
-        """Return the decision of one robot: for each waypoint the best sequence through it."""
         mine = sequences[name]
         number = len(option.points)
         refinement = np.zeros(number)
@@ -222,8 +221,8 @@ class ActiveSearch(Planner):
             option.points,
             option.prediction,
             best,
-            f'T = {refinement[best]:.4g}, E = {explored[best]:.4g} over {self.settings.horizon} '
-            f'waypoints, the best of {len(mine.first)}',
+            f'target refinement T = {refinement[best]:.3g}, exploration E = {explored[best]:.3g}, '
+            f'the best of {len(mine.first)} sequences of {self.settings.horizon} waypoints',
         )
         result.target_refinement = refinement
         result.exploration = explored

@@ -1,4 +1,4 @@
-"""Interface of the planners, and the check of what they decide."""
+"""Interface of the planners, and the check of their decisions."""
 
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
@@ -16,21 +16,21 @@ from maasi_planner.team import Decision, RobotDecision, TeamView
 
 
 class Planner(ABC):
-    """Decides where the robots that plan at a step go next.
+    """Decides the next waypoints of the robots that plan at a step.
 
     Parameters
     ----------
     settings : PlannerSettings
-        Which planner, and its numbers.
+        Name and parameters of the planner.
 
     Attributes
     ----------
     measures_underway : bool
-        Whether robots measure on their way, or only at their waypoints.
+        Whether robots measure on their path, or only at their waypoints.
     keys : type
-        Model of its settings, the keys under `planner`.
+        Settings model of the keys under `planner`.
     Settings : type or None
-        Model of the settings of a planner of your own; with it, `settings.settings` is an instance.
+        Model of a plugin's own settings, of which `settings.settings` is an instance.
     own : BaseModel or None
         That instance.
     """
@@ -45,21 +45,21 @@ class Planner(ABC):
 
     @property
     def own(self) -> Any:
-        """The planner's own settings."""
+        """The plugin's own settings."""
         return self.settings.settings
 
     @abstractmethod
     def decide(self, team: TeamView) -> Decision:
-        """Return a decision for every robot in the team that plans.
+        """Return a decision for every planning robot of the team.
 
-        A robot for which nothing is admissible is told to stay, with the reason.
+        A robot without an admissible waypoint stays, with the reason.
         """
 
     def finished(self, team: TeamView) -> str | None:
-        """Return why nothing is left to gain, or None while something is.
+        """Return why the search has ended, or None.
 
-        That is when the environment is explored to `explored_threshold` and no cluster with a
-        mass of `mass_threshold` or more is left.
+        It ends when `explored_threshold` of the area is explored and no cluster has a mass of
+        `mass_threshold` or more.
         """
         explored = team.exploration.explored_fraction()
         if explored < self.settings.explored_threshold:
@@ -67,7 +67,7 @@ class Planner(ABC):
         return self._settled(team, f'{100.0 * explored:.1f} % of the environment is explored')
 
     def searching(self, team: TeamView) -> list[str]:
-        """Return the names of the robots that still search, in order: not those that are done."""
+        """Return the names of the robots that continue to search, in order."""
         views = team.robots
         return [
             name
@@ -76,7 +76,7 @@ class Planner(ABC):
         ]
 
     def _settled(self, team: TeamView, reason: str) -> str | None:
-        return None if self.heavy(team) else f'{reason} and no potential target is left'
+        return None if self.heavy(team) else f'{reason} and no potential target remains'
 
     def heavy(self, team: TeamView) -> list[Cluster]:
         """Return the clusters that are worth a visit."""
@@ -85,7 +85,7 @@ class Planner(ABC):
 
 
 def check_decision(planner: Planner, team: TeamView, decision: Decision) -> None:
-    """Refuse a decision that robots cannot follow."""
+    """Raise PluginError for a decision that robots cannot follow."""
     origin = f'planner {type(planner).__module__}:{type(planner).__qualname__}'
     if not (isinstance(decision, Decision) and isinstance(decision.robots, dict)):
         raise PluginError(f'{origin}: decide returned {decision!r:.80}, allowed is a Decision')
@@ -103,7 +103,6 @@ def check_decision(planner: Planner, team: TeamView, decision: Decision) -> None
 
 
 def _problem_of(robot: RobotDecision, area: Area) -> str:
-    """Return what is wrong with a decision for one robot; empty if nothing is."""
     terms = ('control_cost', 'target_refinement', 'exploration', 'objective')
     rows, steps = np.shape(robot.candidates)[:1], np.shape(robot.positions)[:1]
     shapes = {'waypoint': (3,), 'positions': (*steps, 3), 'yaws': steps, 'candidates': (*rows, 3)}

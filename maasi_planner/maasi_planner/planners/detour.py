@@ -1,4 +1,4 @@
-"""Past robots that stand on a path, as those that charge or are done: to wait would not help."""
+"""Detours around robots that stand in a path, such as those that charge or are done."""
 
 import numpy as np
 
@@ -8,11 +8,11 @@ from maasi_planner.planners.options import affordable
 from maasi_planner.planners.separation import crossed, free_of_robots
 from maasi_planner.team import Decision, TeamView
 
-PASSES = 'passes robots that stand on its path'
+PASSES = 'goes around robots that stand in its path'
 
 
 def others_move(team: TeamView, name: str, decision: Decision) -> bool:
-    """Return whether another robot is on its way, or has just been sent somewhere."""
+    """Return whether another robot moves, or has just received a waypoint."""
     return any(not robot.stays for robot in decision.robots.values()) or any(
         not view.planning and view.remaining_path is not None and len(view.remaining_path) > 1
         for other, view in team.robots.items()
@@ -23,7 +23,7 @@ def others_move(team: TeamView, name: str, decision: Decision) -> bool:
 def past_standing(
     team: TeamView, name: str, waypoint: FloatArray, decision: Decision
 ) -> tuple[FloatArray, Trajectories] | None:
-    """Return the next point (1, 3) of a path to a waypoint past the others, and the prediction.
+    """Return the next point (1, 3) of a path past other robots to a waypoint, with its prediction.
 
     None if they stand at the waypoint, or leave no path.
     """

@@ -12,14 +12,14 @@ from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.objective.terms import Terms
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.options import centres_of, usable_options
-from maasi_planner.team import Decision, TeamView, single_choice, stay
+from maasi_planner.team import ASSIGNED, Decision, TeamView, single_choice, stay
 
 
 class Intermittent(Planner):
-    """Joint choice of waypoints anywhere, with several measurements on the way.
+    """Joint choice of waypoints, with several measurements on the path.
 
-    Robots that plan at the same step choose jointly (000, algorithm 2); with one robot it is ASI
-    (algorithm 1). Moving robots count with the rest of their trajectories, extended by constant
+    Robots that plan at the same step choose jointly (000, algorithm 2); a single one is ASI
+    (algorithm 1). Moving robots count with their remaining trajectories, extended by constant
     states.
     """
 
@@ -28,8 +28,8 @@ class Intermittent(Planner):
 
     def __init__(self, settings: InformationSettings) -> None:
         super().__init__(settings)
-        # Of each robot, how many unseen targets its candidates show together: at its last decision,
-        # and at most until now.
+        # Expected unseen targets that the candidates of each robot show together, at its last
+        # decision and at most so far.
         self._prospects: dict[str, float] = {}
         self._most: dict[str, float] = {}
         self._area: Area | None = None
@@ -38,7 +38,7 @@ class Intermittent(Planner):
         """See `Planner.decide`."""
         self._adopt_area(team)
         decision = Decision(step=team.step)
-        # Whole trajectories to all candidates of all robots of a large team need much memory.
+        # Complete trajectories of large teams need much memory.
         coarse = len(team.planning()) > PAIRS_LIMIT
 
         def kept(name: str, exact: Trajectories) -> Trajectories:
@@ -60,14 +60,15 @@ class Intermittent(Planner):
                 self._prospects[name] = shown
                 self._most[name] = max(shown, self._most.get(name, 0.0))
             if chosen[index] < 0:
-                reason = 'stays: another robot is sent to every candidate'
-                decision.robots[name] = stay(team.robots[name], reason)
+                decision.robots[name] = stay(team.robots[name], f'stays: {ASSIGNED}')
                 continue
             best = int(chosen[index]) - first
             refinement, exploration, value = terms[best]
+            seconds = option.prediction.lengths[best] * team.step_time
             reason = (
-                f'J = {value:.4g} with T = {refinement:.4g}, E = {exploration:.4g} over '
-                f'{option.prediction.lengths[best]} steps, the best of {len(option.points)}'
+                f'arrives in {seconds:.3g} s; J = {value:.3g} is the best of '
+                f'{len(option.points)} candidates, with target refinement T = {refinement:.3g} and '
+                f'exploration E = {exploration:.3g}'
             )
             result = single_choice(option.points, option.prediction, best, reason)
             if coarse:
@@ -81,20 +82,18 @@ class Intermittent(Planner):
         return explain(decision)
 
     def _adopt_area(self, team: TeamView) -> None:
-        """Forget what candidates showed before zones were opened or closed."""
         if team.area is not self._area:
             self._prospects.clear()
             self._area = team.area
 
     def _centres(self, team: TeamView, name: str) -> FloatArray | None:
-        """Return the cluster centres as further candidates of a robot, if enabled."""
         heavy = self.heavy(team) if self.settings.cluster_candidates else []
         return centres_of(team, team.robots[name], heavy) if heavy else None
 
     def finished(self, team: TeamView) -> str | None:
-        """See `Planner.finished`; also when the candidates of no robot show much any more.
+        """See `Planner.finished`; also if the candidates of all robots show too few unseen targets.
 
-        That is judged by the share that they show together of what they showed at most.
+        Too few are at most `gain_threshold` of the most that they ever showed.
         """
         reason = super().finished(team)
         if reason is not None or self.settings.objective == 'paper':
@@ -109,14 +108,14 @@ class Intermittent(Planner):
         explored = 100.0 * team.exploration.explored_fraction()
         return self._settled(
             team,
-            f'no candidate of any robot promises to show more ({explored:.1f} % of the '
+            f'no candidate of any robot would reveal more ({explored:.1f} % of the '
             'environment is explored)',
         )
 
 
 @njit(cache=True)
 def _shown_by(terms: Terms, first: int, last: int, allowed: BoolArray) -> float:
-    """Return how many unseen targets the allowed candidates from `first` on show together."""
+    """Return the expected number of unseen targets that the allowed candidates show together."""
     left = terms.unseen.copy()
     for g in range(first, last):
         if allowed[g - first]:

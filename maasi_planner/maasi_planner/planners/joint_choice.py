@@ -1,4 +1,4 @@
-"""The joint choice of a team for objectives that are plain functions."""
+"""Joint choices of a team for objectives that are plain functions."""
 
 import itertools
 import math
@@ -20,8 +20,8 @@ def search_jointly(
 ) -> tuple[dict[str, int], float, bool, int]:
     """Return the best joint choice, its value, whether it is exact, and choices evaluated.
 
-    All joint choices of `indices` into the waypoints are compared, or above the limit robots choose
-    in turn and improve in rounds. One is better by more than `margin`; -1: none is admissible.
+    Above the limit robots choose in turn and improve in rounds. A better choice exceeds the best by
+    more than `margin`; -1: no candidate is admissible.
     """
     best: dict[str, int] = dict.fromkeys(indices, -1)
     best_value, evaluated = -math.inf, 0

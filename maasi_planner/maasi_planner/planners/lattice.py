@@ -1,4 +1,4 @@
-"""Places that show an area on passing: a lattice, and a choice that covers what is unseen."""
+"""A lattice of positions, and a choice of those from which the unseen area is seen in passing."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import half_view
 from maasi_planner.team import RobotView, TeamView
 
-# A place is left out if others have taken its gain but for this share, or if it gains less than
-# that share of what the best place does.
+# A cell is omitted if others leave less than this share of its gain, or if its gain is less than
+# that share of the best cell's.
 OVERLAP = 0.3
 LEAST = 0.01
-# Squares of half the best detection in an area from which on lanes of them are regular enough.
+# Number of cells for half of the best detection above which lanes are regular enough.
 MANY = 30
-# Parts of a cell of the map along each axis: each lies in one square. Even: none on a border. On
-# fine maps, with more than so many parts, there are fewer.
+# Parts of a map cell on each axis, each in one lattice cell; even, so that none is on a border.
+# Maps with more parts in all than this have fewer.
 PARTS, FEWER, FINE = 4, 2, 2_000_000
-# A square that holds less than this share of a whole one belongs to its neighbour.
+# A cell with less than this share of a full one belongs to its neighbour.
 SMALL = 0.3
-# A square of which less than this share is unseen is passed in the middle of that.
+# A cell with less than this share unseen is passed in the centre of that part.
 WHOLE = 0.95
-# Squares are turned if they are so many times as wide then, in areas of so many squares.
+# Cells are turned if that makes them wider by this factor, in areas of so many cells.
 ASKEW, LARGE = 1.1, 200
 
 
 def passing(
     view: RobotView, step_time: float, reach: float, heading: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Return distances beside a way, (n,) [m], and the probability of detection on passing them.
+    """Return lateral distances from a path, (n,) [m], and the probability of detection in passing.
 
-    reach: the largest distance of interest [m]; heading: of the way [rad].
+    reach: the largest distance of interest [m]; heading: of the path [rad].
     """
     half = min(half_view(view.sensor), reach)
     spacing = view.motion.settings.speed * step_time * view.period_steps
-    # All measurements nearer than `far` along the way, of targets at four places between two.
+    # All measurements within `far` along the path, for targets at four positions between two.
     far = min(8.0 * half, reach)
     beside = np.linspace(-far, far, 641)
     places = np.zeros((4, len(beside), 2))
@@ -62,7 +62,7 @@ def passing(
 
 
 def turned(heading: float, dimension: int) -> FloatArray:
-    """Return a rotation about the vertical (d, d)."""
+    """Return a rotation about the vertical axis (d, d)."""
     turn = np.eye(dimension)
     cos, sin = math.cos(heading), math.sin(heading)
     turn[:2, :2] = [[cos, -sin], [sin, cos]]
@@ -70,7 +70,7 @@ def turned(heading: float, dimension: int) -> FloatArray:
 
 
 def pitch_of(exploration: UnexploredMap, beside: FloatArray, detected: FloatArray) -> float:
-    """Return how wide squares are [m], by what `passing` returned."""
+    """Return the width of cells [m] by the result of `passing`."""
     sure, half = (
         2.0 * float(beside[detected >= share * detected.max()].max()) for share in (0.9, 0.5)
     )
@@ -78,9 +78,9 @@ def pitch_of(exploration: UnexploredMap, beside: FloatArray, detected: FloatArra
 
 
 def lanes_of(team: TeamView) -> tuple[float, FloatArray, FloatArray, float]:
-    """Return pitch [m], what is seen beside, and heading of lanes, for who sees least to its sides.
+    """Return pitch [m], the result of `passing`, and heading of lanes for the narrowest view.
 
-    In the plane they lie askew where that shows more, as with a box that does not turn.
+    In 2D they are diagonal if that shows more, as with a box that does not turn.
     """
     reach = float(np.linalg.norm(team.bounds[:, 1] - team.bounds[:, 0]))
 
@@ -90,7 +90,7 @@ def lanes_of(team: TeamView) -> tuple[float, FloatArray, FloatArray, float]:
         return min(lanes, key=lambda lane: lane[0])
 
     level = narrowest(0.0)
-    # In small areas the corners that turned squares leave take the gain again.
+    # In small areas the corners of turned cells cancel the gain.
     if team.dimension == 3 or team.exploration.volume < LARGE * level[0] ** 2:
         return level
     askew = narrowest(0.25 * math.pi)
@@ -98,13 +98,12 @@ def lanes_of(team: TeamView) -> tuple[float, FloatArray, FloatArray, float]:
 
 
 class Lattice:
-    """Squares (in 3D: cubes) as wide as is seen on passing: with half the best detection or more.
+    """Cells as wide as is seen in passing with at least half of the best detection, in 2D or 3D.
 
-    Where that gives few squares, as wide as with 0.9 of it, so that places can be chosen finely.
+    If that gives few cells, 0.9 replaces the half, for a finer choice of positions.
 
-    turn (d, d): axes of the squares, in columns; kernel: probability of detection on passing, by
-    offset in squares from the place that is passed; trust (n,): in what a visit gains, for its
-    user to reduce. Beside and detected are those of `passing`, for ways of the heading [rad].
+    turn (d, d): axes of the cells, in columns; kernel: probability of detection in passing, by
+    offset in cells; trust (n,): factor on the gain of a visit, which its user can reduce.
     """
 
     def __init__(
@@ -129,7 +128,7 @@ class Lattice:
         squares = _joined(held, sums[:, :d] / np.maximum(held, 1e-12)[:, None])[squares]
         self.shape = (*counts.tolist(), 1)[:3]
         self.trust = np.ones(number)
-        # Share of each cell of the map that lies in each square.
+        # Share of each map cell in each lattice cell.
         table = _shares(squares, samples.parts, number)
         self._parts = csr_array(table, (number, nodes))
         self._cells = _cell_sizes(samples)
@@ -146,13 +145,13 @@ class Lattice:
         self.kernel = np.interp(np.sqrt(square), beside, detected, right=0.0)
 
     def unseen(self, exploration: UnexploredMap) -> FloatArray:
-        """Return the share of all targets that is unseen in each square, (nx, ny, nz)."""
+        """Return the share of all targets that is unseen in each cell, (nx, ny, nz)."""
         volumes = exploration.cell_volumes()
         share = exploration.values * volumes / volumes.sum()
         return np.ascontiguousarray((self._parts @ share.ravel()).reshape(self.shape))
 
     def points(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
-        """Return where to pass squares, (m, d) [m]: in the middle, or that of what is unseen."""
+        """Return where to pass cells, (m, d) [m]: their centres, or those of the unseen part."""
         unseen = exploration.values.ravel() * self._cells
         parts, nodes = self._parts[chosen], np.meshgrid(*exploration.axes(), indexing='ij')
         held = np.maximum(parts @ unseen, 1e-12)
@@ -161,23 +160,19 @@ class Lattice:
         return np.where(whole[:, None], self._centres[chosen], middles)
 
     def choose(self, exploration: UnexploredMap, enough: int = 1) -> tuple[IntArray, FloatArray]:
-        """Return places from which what is unseen is seen, and the share each adds (m,).
-
-        enough: so many are chosen even if they overlap.
-        """
+        """Return at least `enough` cells that show the unseen area, and their gains (m,)."""
         unseen = self.unseen(exploration)
         return _choose(unseen, self.kernel, self.trust, OVERLAP, LEAST, enough)
 
     def gains(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
-        """Return the share that each of some places adds to those before it, (m,)."""
+        """Return the gain of each of some cells after those before it, (m,)."""
         return self.trust[chosen] * _gains(self.unseen(exploration), self.kernel, chosen)
 
 
 class _Samples(NamedTuple):
-    """Parts of the map's cells, in rows along each axis; in 2D the third one has one part.
+    """Parts of the map's cells on each axis; in 2D the third axis has one part of size 1.
 
-    axes: positions [m]; sizes: lengths, in 2D 1 along the third axis; inside: which cells are in
-    the area; parts: of a cell along the axes.
+    axes: positions [m]; sizes: lengths [m]; inside: cells in the area; parts: per cell and axis.
     """
 
     axes: tuple[FloatArray, FloatArray, FloatArray]
@@ -203,7 +198,6 @@ def _samples(exploration: UnexploredMap, parts: int) -> _Samples:
 
 @njit(cache=True)
 def _squares_of(samples, turn, low, widths, counts):  # type: ignore[no-untyped-def]
-    """Return the square that each part is in, (nx, ny, nz)."""
     x, y, z = samples.axes
     out = np.empty((len(x), len(y), len(z)), np.int32)
     for i in range(len(x)):
@@ -229,7 +223,7 @@ def _size(samples, i, j, k):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _middles(samples, squares, number):  # type: ignore[no-untyped-def]
-    """Return how much of the area squares hold, (n,), and the sum of that times place, (n, 3)."""
+    """Return the area in each cell, (n,), and its first moment, (n, 3)."""
     held, sums = np.zeros(number), np.zeros((number, 3))
     x, y, z = samples.axes
     for i in range(len(x)):
@@ -245,7 +239,6 @@ def _middles(samples, squares, number):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _cell_sizes(samples):  # type: ignore[no-untyped-def]
-    """Return how much of the area each cell of the map holds, (n,)."""
     out = np.zeros(samples.inside.shape)
     a, b, c = samples.parts
     for i in range(len(samples.axes[0])):
@@ -257,12 +250,12 @@ def _cell_sizes(samples):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _shares(squares, parts, number):  # type: ignore[no-untyped-def]
-    """Return the share of each cell in each square: data, cells, and where the squares begin."""
+    """Return the share of each map cell in each lattice cell, in the form of a CSR matrix."""
     a, b, c = parts
     shape = squares.shape[0] // a, squares.shape[1] // b, squares.shape[2] // c
     begin, last = np.zeros(number + 1, np.int64), np.zeros(number, np.int64)
     data, cells = np.zeros(0), np.zeros(0, np.int64)
-    # First how many cells each square has; cells come in order, so its last one is the same or not.
+    # Count first; map cells come in order, so comparing with the last one suffices.
     for fill in range(2):
         last[:] = -1
         used = begin[:-1].copy()
@@ -285,10 +278,7 @@ def _shares(squares, parts, number):  # type: ignore[no-untyped-def]
 
 
 def _joined(held: FloatArray, middles: FloatArray) -> IntArray:
-    """Return for each square itself, or for one that holds little the nearest other one, (n,).
-
-    held (n,): how much of the area squares hold; middles (n, d): the middle of that [m].
-    """
+    """Return for each cell itself or, for one with little area, its nearest large one, (n,)."""
     small = (held > 0.0) & (held < SMALL * held.max())
     large = np.flatnonzero(held >= SMALL * held.max())
     owner = np.arange(len(held))
@@ -298,7 +288,7 @@ def _joined(held: FloatArray, middles: FloatArray) -> IntArray:
 
 @njit(cache=True)
 def _seen(unseen, kernel, place, take):  # type: ignore[no-untyped-def]
-    """Return how much is seen from a place, and take it away if wanted."""
+    """Return how much is seen from a cell; `take` removes it."""
     nx, ny, nz = unseen.shape
     a, b, c = kernel.shape
     i, j, k = place // (ny * nz), place // nz % ny, place % nz
@@ -323,14 +313,14 @@ def _gains(unseen, kernel, chosen):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _choose(unseen, kernel, trust, overlap, least, enough):  # type: ignore[no-untyped-def]
-    """Take the place that sees most, as long as it is not mostly seen from those before."""
+    """Choose the cell that sees most, as long as earlier ones have not seen most of that."""
     alone = np.empty(unseen.size)
     for place in range(unseen.size):
         alone[place] = trust[place] * _seen(unseen, kernel, place, False)
     chosen, gains = np.empty(unseen.size, np.int64), np.empty(unseen.size)
     number, least = 0, least * alone.max()
-    # What a place adds only falls: it is computed again when it is the largest one. Of equal ones
-    # the first is taken.
+    # Gains only decrease: the largest one is computed again. Of equal ones
+    # the first is chosen.
     queue = [(-alone[place], place, -1) for place in range(unseen.size) if alone[place] > least]
     heapq.heapify(queue)
     while queue:

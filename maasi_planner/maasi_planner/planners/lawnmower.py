@@ -1,6 +1,6 @@
-"""Lawnmower: lanes that cover the environment evenly (000, sections 5 and 7).
+"""Lawnmower: lanes that cover the area evenly (000, sections 5 and 7).
 
-Two robots start from the two ends and meet between them; more robots divide the lanes into blocks,
+Two robots start from both ends and meet between them; more robots divide the lanes into blocks,
 two to a block.
 """
 
@@ -52,7 +52,7 @@ class LawnmowerSettings(PlannerSettings):
 def lanes(
     bounds: FloatArray, spacing: float, layer_spacing: float, margin: float
 ) -> list[FloatArray]:
-    """Return the lanes that cover an environment."""
+    """Return the lanes that cover an area."""
     d = len(bounds)
     low = bounds[:, 0] + margin
     high = bounds[:, 1] - margin
@@ -82,7 +82,7 @@ def lanes(
 class Lawnmower(Planner):
     """Lanes in order; the candidates are not used.
 
-    A robot takes its next lane when it has finished one, so that a faster robot takes more.
+    A robot takes its next lane when it has finished one, so that faster robots cover more lanes.
     """
 
     keys = LawnmowerSettings
@@ -90,7 +90,7 @@ class Lawnmower(Planner):
 
     def __init__(self, settings: LawnmowerSettings) -> None:
         super().__init__(settings)
-        # Lanes by block: all of them, and those that no robot has begun yet.
+        # Lanes by block: all, and those that no robot has begun.
         self._all: list[list[FloatArray]] = []
         self._blocks: list[list[FloatArray]] = []
         self._area: Area | None = None
@@ -98,7 +98,7 @@ class Lawnmower(Planner):
         self._pending: dict[str, list[FloatArray]] = {}
         # Lanes that some robots cannot afford with a full battery, and these robots.
         self._too_far: list[tuple[FloatArray, set[str]]] = []
-        # Of each robot the lane that it is on, and the robots that could not afford that.
+        # Lane of each robot, and the robots that could not afford it.
         self._lane: dict[str, FloatArray] = {}
         self._refused: dict[str, set[str]] = {}
         self._started = False
@@ -144,7 +144,7 @@ class Lawnmower(Planner):
         self._started = True
 
     def _open_again(self, team: TeamView) -> None:
-        """Put lanes back that have unexplored ground where zones were closed or opened."""
+        """Put back lanes with unexplored ground after a change of the area."""
         if not self._started or self._area is team.area:
             return
         self._area = team.area
@@ -176,7 +176,7 @@ class Lawnmower(Planner):
     def _begin(
         self, team: TeamView, name: str, lane: FloatArray, refused: set[str] | None = None
     ) -> FloatArray:
-        """Put a robot on a lane; return the nearer end. refused: by these robots."""
+        """Assign a lane that some robots `refused` to a robot; return its nearer end."""
         view = team.robots[name]
         here = view.state.pose.position
         ends = [lane[0].copy(), lane[1].copy()]
@@ -191,7 +191,7 @@ class Lawnmower(Planner):
         return ends[0]
 
     def _give_up(self, name: str) -> None:
-        """Leave the lane of a robot to others, as it cannot afford it with a full battery."""
+        """Return the lane of a robot, which cannot afford it with a full battery."""
         self._pending[name] = []
         self._too_far.append((self._lane[name], self._refused[name] | {name}))
 
@@ -207,7 +207,7 @@ class Lawnmower(Planner):
 
     def _decide_one(self, team: TeamView, name: str, decision: Decision) -> RobotDecision:
         view = team.robots[name]
-        here, out_of_reach = view.state.pose.position, 'stays: all lanes are done'
+        here, out_of_reach = view.state.pose.position, 'stays: all lanes are complete'
         while True:
             target = self._next(team, name)
             if target is None:
@@ -230,10 +230,10 @@ class Lawnmower(Planner):
                     continue
                 self._pending[name].insert(0, target)
                 return stay(view, held)
-            return single_choice(point[None, :], prediction, 0, 'next point of the lawnmower')
+            return single_choice(point[None, :], prediction, 0, 'goes to the next end of a lane')
 
     def finished(self, team: TeamView) -> str | None:
-        """See `Planner.finished`; also when every lane is done that some robot can afford."""
+        """See `Planner.finished`; also if every lane is complete that some robot can afford."""
         self._open_again(team)
         if self._started and not any(self._blocks) and not any(self._pending.values()):
             searching = set(self.searching(team))
@@ -248,16 +248,16 @@ class Lawnmower(Planner):
 
     def _reason(self, team: TeamView) -> str:
         if not self._too_far:
-            return 'all lanes of the lawnmower are done'
+            return 'all lanes of the lawnmower are complete'
         explored = 100.0 * team.exploration.explored_fraction()
         return (
-            f'all lanes of the lawnmower are done but {len(self._too_far)} that no robot can '
-            f'afford with a full battery ({explored:.1f} % of the environment is explored)'
+            f'all lanes of the lawnmower are complete but {len(self._too_far)}, for which a full '
+            f'battery does not suffice ({explored:.1f} % of the environment is explored)'
         )
 
 
 def _is_full(view: RobotView) -> bool:
-    """Return whether a robot is at its charger with all the charge that it gives."""
+    """Return whether a robot is at its charger with the highest charge that it gives."""
     endurance = view.endurance
     return (
         endurance is not None and endurance.topped and endurance.is_home(view.state.pose.position)
@@ -265,7 +265,7 @@ def _is_full(view: RobotView) -> bool:
 
 
 def _unseen(team: TeamView, lane: FloatArray) -> bool:
-    """Return whether something on a lane is open and mostly unexplored."""
+    """Return whether a part of a lane is open and mostly unexplored."""
     number = 2 + int(np.linalg.norm(lane[1] - lane[0]) / team.exploration.step.min())
     places = lane[0] + np.linspace(0.0, 1.0, number)[:, None] * (lane[1] - lane[0])
     places = places[team.area.inside(places)]

@@ -1,8 +1,8 @@
 """Mutual information with the event of an empty measurement set (Dames and Kumar, 2015).
 
-As 003, section 4, and the baseline of 000, section 5.1, use it. Targets are a Poisson random
-finite set with the filter's intensity D, and Lambda = 0 is the event that nothing is measured.
-With p(X) = prod (1 - pi(x)) the probability of that event given the targets,
+Used as in 003, section 4, and as the baseline of 000, section 5.1. Targets are a Poisson random
+finite set with the filter's intensity D, and Lambda = 0 is the event of no measurement. With
+p(X) = prod (1 - pi(x)) the probability of that event given the targets,
 
     I = h(E p) - E h(p),   h(p) = -p log p - (1 - p) log(1 - p),
 
@@ -22,7 +22,7 @@ from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.joint_choice import search_jointly
 from maasi_planner.planners.options import usable_options
 from maasi_planner.settings import JointSettings
-from maasi_planner.team import Decision, RobotView, TeamView, single_choice, stay
+from maasi_planner.team import ASSIGNED, Decision, RobotView, TeamView, single_choice, stay
 
 EXACT_TERMS = 48
 DOUBLINGS = 40
@@ -32,9 +32,9 @@ DOUBLINGS = 40
 def mutual_information(missed: FloatArray, weights: FloatArray) -> float:
     """Return the mutual information of targets and the empty measurement set, in nats.
 
-    missed (n,): probability 1 - pi that a target at each particle is missed, over several
-    measurements the product; weights (n,): expected number of targets at each. The series is summed
-    exactly for its first terms and then in blocks that double, whose error is far below 1e-3 of the
+    missed (n,): probability 1 - pi of missing a target at each particle, multiplied over several
+    measurements; weights (n,): expected number of targets at each. The first terms of the series
+    are summed exactly, further ones in blocks of doubling size, with an error far below 1e-3 of the
     result.
     """
     number = missed.shape[0]
@@ -66,7 +66,7 @@ def mutual_information(missed: FloatArray, weights: FloatArray) -> float:
         value = math.exp(-exponent)
         total -= (last - value) / n
         last = value
-    # power is missed^(N + 1) here; go on in blocks that double.
+    # power is missed^(N + 1) here; continue in blocks of doubling size.
     begin = EXACT_TERMS + 1
     for _ in range(DOUBLINGS):
         exponent = 0.0
@@ -85,7 +85,7 @@ def mutual_information(missed: FloatArray, weights: FloatArray) -> float:
 
 
 def lower_factor(covariance: FloatArray) -> FloatArray:
-    """Return Cholesky's factor, also of a covariance that is singular."""
+    """Return the Cholesky factor of a covariance, which may be singular."""
     lower = np.zeros_like(covariance)
     for i in range(len(lower)):
         for j in range(i + 1):
@@ -98,9 +98,9 @@ def lower_factor(covariance: FloatArray) -> FloatArray:
 
 
 def intensity(team: TeamView) -> tuple[FloatArray, FloatArray]:
-    """Return the points (n, d) and weights (n,) that stand for the intensity.
+    """Return points (n, d) and weights (n,) for the intensity.
 
-    Each cluster is 2 d + 1 points of equal weight with its mean and covariance.
+    Each cluster has 2 d + 1 points of equal weight with its mean and covariance.
     """
     d = team.dimension
     points, weights = [np.zeros((0, d))], [np.zeros(0)]
@@ -114,7 +114,7 @@ def intensity(team: TeamView) -> tuple[FloatArray, FloatArray]:
 
 
 def heading_to(view: RobotView, start: FloatArray, end: FloatArray) -> float:
-    """Return the heading of a robot that has gone from `start` to `end`, radians."""
+    """Return the heading of a robot after it went from `start` to `end`, radians."""
     settings = view.motion.settings
     turns = settings.model == 'unicycle' or settings.heading == 'travel'
     if turns and math.hypot(end[0] - start[0], end[1] - start[1]) > 1e-9:
@@ -125,7 +125,7 @@ def heading_to(view: RobotView, start: FloatArray, end: FloatArray) -> float:
 class MutualInformation(Planner):
     """The joint waypoints with the largest mutual information, and no exploration.
 
-    Each robot measures at its waypoint. Where no waypoint tells anything, robots go straight on.
+    Each robot measures at its waypoint, and continues straight on if no waypoint is informative.
     """
 
     measures_underway = False
@@ -156,7 +156,7 @@ class MutualInformation(Planner):
 
         indices = {}
         for name, option in options.items():
-            # Candidates that tell nothing are taken in the order of going straight on.
+            # Uninformative candidates are ordered by how straight on they are.
             ways = option.points - team.robots[name].state.pose.position
             lengths = np.sqrt((ways * ways).sum(axis=1))
             last = self._headings.get(name, np.zeros(3))
@@ -171,16 +171,17 @@ class MutualInformation(Planner):
         for name, option in options.items():
             view, row = team.robots[name], chosen[name]
             if row < 0:
-                decision.robots[name] = stay(view, 'stays: another robot takes its candidates')
+                decision.robots[name] = stay(view, f'stays: {ASSIGNED}')
                 continue
             values = np.array([value({**chosen, name: w}) for w in range(len(option.points))])
             way = option.points[row] - view.state.pose.position
             length = math.sqrt(float((way * way).sum()))
             if length > 1e-9:
                 self._headings[name] = way / length
-            reason = 'no waypoint tells anything: straight on'
+            reason = 'no waypoint promises information: continues straight on'
             if values[row] > 0.0:
-                reason = f'mutual information {values[row]:.4g} nats'
+                bits = values[row] / math.log(2.0)
+                reason = f'expects {bits:.3g} bits of information about targets'
             result = single_choice(option.points, option.prediction, row, reason)
             result.target_refinement = values
             result.objective = np.where(option.allowed, values, -np.inf)
@@ -190,7 +191,6 @@ class MutualInformation(Planner):
 
     @staticmethod
     def _missed(view: RobotView, places: FloatArray, points: FloatArray) -> FloatArray:
-        """Return 1 - pi of the points from each place."""
         here = np.array(view.state.pose.position)
         out = np.ones((len(places), len(points)))
         if len(points):

@@ -1,4 +1,4 @@
-"""Nearest cluster, widest cluster, in turn: Sung and Tokekar (2022) as 000, section 5.1, adapts it.
+"""Nearest and widest cluster in turn: Sung and Tokekar (2022) as adapted by 000, section 5.1.
 
 Without clusters a robot goes to the candidate with the largest e (ties: the nearest).
 """
@@ -14,7 +14,7 @@ from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice,
 
 
 class NearestWidest(Planner):
-    """Each robot plans alone and alternates: nearest, widest, nearest and so on."""
+    """Each robot plans alone and alternates between the nearest and the widest cluster."""
 
     def __init__(self, settings: PlannerSettings) -> None:
         super().__init__(settings)
@@ -56,7 +56,7 @@ class NearestWidest(Planner):
                     continue
                 self._turns[name] = (kind + 1) % 2
                 word = ('nearest', 'widest')[kind % 2]
-                return single_choice(point[None, :], prediction, 0, f'{word} cluster')
+                return single_choice(point[None, :], prediction, 0, f'goes to the {word} cluster')
         explored = team.exploration.at(found.points)
         gaps = ((found.points - here) ** 2).sum(axis=1)
         order = sorted(
@@ -68,7 +68,7 @@ class NearestWidest(Planner):
             found.points,
             found.prediction,
             best,
-            f'no cluster: least explored candidate, e = {explored[best]:.3g}',
+            f'no cluster: goes to the least explored candidate, e = {explored[best]:.3g}',
         )
         result.exploration = explored
         result.objective = np.where(found.allowed, explored, -np.inf)

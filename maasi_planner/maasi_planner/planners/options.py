@@ -1,4 +1,4 @@
-"""What robots may choose: waypoints that are usable, reached, apart from others, affordable."""
+"""Candidates of robots that are reachable, apart from others, and affordable."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -24,7 +24,7 @@ from maasi_planner.team import (
 def usable_candidates(
     team: TeamView, name: str, extra: FloatArray | None = None
 ) -> tuple[FloatArray, str]:
-    """Return a robot's candidates moved out of obstacles, and which were dropped."""
+    """Return a robot's candidates moved out of obstacles, and a text about dropped ones."""
     view = team.robots[name]
     points = np.asarray(view.candidates, dtype=float).reshape(-1, 3)
     dropped: list[str] = []
@@ -51,7 +51,7 @@ def usable_candidates(
 
 
 def waiting_places(team: TeamView) -> list[tuple[FloatArray, float]]:
-    """Return where robots that do not plan will stand, with their radii."""
+    """Return final positions (3,) [m] and radii of the robots that do not plan."""
     places = list(team.taken)
     for name in team.names():
         view = team.robots[name]
@@ -92,7 +92,7 @@ def options_of(
     if not free.any():
         return BLOCKED[1]
     if (prediction.lengths == 0).any():
-        return 'it is at its only candidate already'
+        return 'it is already at its only candidate'
     return 'no candidate can be reached'
 
 
@@ -102,9 +102,9 @@ def usable_options(
     extra: Callable[[str], FloatArray | None] = lambda _: None,
     kept: Callable[[str, Trajectories], Trajectories] = lambda _, exact: exact,
 ) -> dict[str, UsableCandidates]:
-    """Return the candidates of the robots that have some; the others stay in `decision`.
+    """Return the candidates of the robots that have some; `decision` lets the others stay.
 
-    extra: further waypoints (n, 3) of a robot; kept: what is kept of its predicted trajectories.
+    extra: further waypoints (n, 3) of a robot; kept: reduces its predicted trajectories.
     """
     places = waiting_places(team)
     options = {}
@@ -129,7 +129,7 @@ def centres_of(team: TeamView, view: RobotView, clusters: Sequence[Cluster]) -> 
 def affordable(
     team: TeamView, name: str, prediction: Trajectories, allowed: BoolArray
 ) -> BoolArray:
-    """Return which of the allowed ways leave a robot enough of its battery to come home, (W,)."""
+    """Return which of the allowed paths leave a robot enough battery to get home, (W,)."""
     endurance = team.robots[name].endurance
     if endurance is None:
         return allowed
@@ -137,7 +137,7 @@ def affordable(
 
 
 def held_back(team: TeamView, name: str, prediction: Trajectories, decision: Decision) -> str:
-    """Return why a robot must not go the only way of a prediction now, or an empty text."""
+    """Return why a robot must not follow the only path of a prediction now, or an empty text."""
     if crossed(team, name, prediction, decision):
         return CROSSED
     if not affordable(team, name, prediction, prediction.reached)[0]:

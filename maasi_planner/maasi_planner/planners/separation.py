@@ -1,4 +1,4 @@
-"""Distances between robots: of waypoints, and of whole predicted paths."""
+"""Distances between waypoints and between predicted paths of robots."""
 
 import math
 from collections.abc import Mapping
@@ -11,16 +11,16 @@ from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 from maasi_planner.team import CROSSED, Decision, RobotDecision, RobotView, TeamView, stay
 
-# Steps in which a robot brakes at most, and the speed below which it stands [m/s].
+# Most steps of braking, and the speed below which a robot stands [m/s].
 _BRAKING_STEPS, _STANDS = 400, 1e-3
-# Steps by which a robot is behind or before its predicted path at most.
+# Most steps by which a robot is behind or ahead of its predicted path.
 _LATEST = 10
 
 
 def free_of_robots(
     points: FloatArray, radius: float, places: list[tuple[FloatArray, float]]
 ) -> BoolArray:
-    """Return which waypoints (W, 3) keep the radii away from where others will stand."""
+    """Return which waypoints (W, 3) keep the radii away from other robots' final positions."""
     free = np.ones(len(points), dtype=bool)
     for place, other in places:
         reach = radius + other
@@ -31,15 +31,15 @@ def free_of_robots(
 
 
 def apart(point: FloatArray, radius: float, others: list[tuple[FloatArray, float]]) -> bool:
-    """Return whether a waypoint (3,) keeps the radii away from other places."""
+    """Return whether a waypoint (3,) keeps the radii away from other positions."""
     return bool(free_of_robots(point[None, :], radius, others)[0])
 
 
 @njit(cache=True)
 def _gaps(ways: FloatArray, other: FloatArray) -> FloatArray:
-    """Return how near each of the ways (W, K, 3) comes to another (n, 3), also between steps, (W,).
+    """Return the smallest distance of each path (W, K, 3) from another (n, 3), also between steps.
 
-    At their ends robots stand. A goal takes effect at once, or a step later.
+    Robots stand at the ends. A goal takes effect at once or one step later.
     """
     out = np.full(ways.shape[0], np.inf)
     for w in range(ways.shape[0]):
@@ -53,7 +53,7 @@ def _gaps(ways: FloatArray, other: FloatArray) -> FloatArray:
                 z = ways[w, here, 2] - other[there, 2]
                 square = x * x + y * y + z * z
                 if k > 0:
-                    # Between two steps both move evenly.
+                    # Both move uniformly between steps.
                     mx, my, mz = x - dx, y - dy, z - dz
                     moved = mx * mx + my * my + mz * mz
                     along = -(dx * mx + dy * my + dz * mz)
@@ -66,9 +66,9 @@ def _gaps(ways: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def from_here(path: FloatArray, position: FloatArray) -> FloatArray:
-    """Return the rest (n, 3) of a predicted path as a robot goes it from where it is now.
+    """Return the remaining predicted path (n, 3) from a robot's actual position.
 
-    It may be some steps late, as a goal takes effect after a while, or early.
+    The robot may be some steps late, as a goal takes effect after a while, or early.
     """
     first = path[:_LATEST]
     nearest = int(np.argmin(((first - position) ** 2).sum(axis=1)))
@@ -83,10 +83,7 @@ def from_here(path: FloatArray, position: FloatArray) -> FloatArray:
 
 
 def _drifting(path: FloatArray, view: RobotView, step: float) -> FloatArray | None:
-    """Return a path (n, 3) with what a robot drifts at its end; None: it stands there.
-
-    It is twice its tolerance at most.
-    """
+    """Return a path (n, 3) with the drift at its end, at most twice the tolerance, or None."""
     if len(path) < 2:
         return None
     settings, velocity = view.motion.settings, (path[-1] - path[-2]) / step
@@ -99,9 +96,9 @@ def _drifting(path: FloatArray, view: RobotView, step: float) -> FloatArray | No
 
 
 def braking_path(motion: MotionModel, state: RobotState, step: float) -> FloatArray:
-    """Return where a robot goes that is commanded to stand, (n, 3), from its present position on.
+    """Return the path of a robot that is commanded to stop, (n, 3), from its present position.
 
-    It is its position alone where it stands, or drifts by less than a tenth of its tolerance.
+    Drifts below a tenth of its tolerance are neglected.
     """
     path = [np.array(state.pose.position, dtype=float)]
     if np.linalg.norm(state.velocity) > _STANDS:
@@ -117,7 +114,7 @@ def braking_path(motion: MotionModel, state: RobotState, step: float) -> FloatAr
 
 
 def with_braking(motion: MotionModel, robot: RobotDecision, step: float) -> FloatArray:
-    """Return the predicted path (n, 3) of a robot, with what it drifts after it has arrived."""
+    """Return the predicted path (n, 3) of a robot with the drift after its arrival."""
     path = robot.positions
     if len(path) < 2:
         return path
@@ -128,10 +125,10 @@ def with_braking(motion: MotionModel, robot: RobotDecision, step: float) -> Floa
 def ways_apart(
     team: TeamView, name: str, ways: FloatArray, others: Mapping[str, FloatArray]
 ) -> BoolArray:
-    """Return which predicted ways (W, K, 3) of a robot keep the radii away from those of others.
+    """Return which predicted paths (W, K, 3) of a robot keep the radii away from those of others.
 
-    others: ways (n, 3) of robots that have just been decided, by name; the others are where they
-    stand, or on the rest of their ways. A robot that is too near already may not come nearer.
+    others: paths (n, 3) decided at this step, by name; other robots stand or are on their remaining
+    paths. Robots that are too near already must not come nearer.
     """
     view = team.robots[name]
     free = np.ones(len(ways), dtype=bool)
@@ -144,7 +141,7 @@ def ways_apart(
 
 
 def crossed(team: TeamView, name: str, prediction: Trajectories, decision: Decision) -> bool:
-    """Return whether others, also those just decided, are on the only way of a prediction."""
+    """Return whether other robots are in the only path of a prediction."""
     others = {key: robot.positions for key, robot in decision.robots.items()}
     return not ways_apart(team, name, prediction.positions, others)[0]
 
@@ -163,7 +160,7 @@ def all_apart(team: TeamView, waypoints: Mapping[str, FloatArray]) -> bool:
 def paths_of(
     team: TeamView, name: str, others: Mapping[str, FloatArray]
 ) -> list[tuple[FloatArray, float]]:
-    """Return where the others go or stand, (n, 3), and their radii."""
+    """Return paths or positions of the other robots, (n, 3), and their radii."""
     paths = [(place[None, :], radius) for place, radius in team.taken]
     for other in team.names():
         robot = team.robots[other]
@@ -172,11 +169,11 @@ def paths_of(
         elif other != name and not robot.planning:
             path = robot.remaining_path
             if path is None or len(path) < 2:
-                # Where it was commanded to stay it may have drifted on since.
+                # A robot that was commanded to stay may still drift.
                 path = braking_path(robot.motion, robot.state, team.step_time)
             else:
                 path = from_here(path, robot.state.pose.position)
-            # It may stand at once where it arrives, or drift.
+            # It stands at its end, or drifts.
             paths.append((path, robot.radius))
             drifting = _drifting(path, robot, team.step_time)
             if drifting is not None:
@@ -185,10 +182,10 @@ def paths_of(
 
 
 def keep_apart(team: TeamView, decision: Decision, left: Mapping[str, FloatArray]) -> None:
-    """Let robots wait whose ways would come too near to each other; the first by name has priority.
+    """Let robots wait whose paths come too close; the first by name has priority.
 
-    A robot that waits brakes, which may make others wait, too; left: or it is still on the rest
-    (n, 3) of its present path.
+    A waiting robot brakes, which may make others wait, too, or follows the rest `left` (n, 3) of
+    its present path.
     """
     ways, rest = {}, {}
     for name, robot in decision.robots.items():
@@ -219,7 +216,7 @@ def _both_apart(
     ways: Mapping[str, FloatArray],
     others: Mapping[str, FloatArray],
 ) -> bool:
-    """Return whether a robot keeps apart from others if it stands at its end, and if it drifts."""
+    """Return whether a robot keeps apart whether it stands or drifts at its end."""
     return all(
         ways_apart(team, name, way[None], others)[0] for way in (chosen.positions, ways[name])
     )

@@ -1,4 +1,4 @@
-"""Tour: the team visits places of a lattice in an order that finds targets early."""
+"""Tour: the team visits positions of a lattice in an order that finds targets early."""
 
 from __future__ import annotations
 
@@ -25,39 +25,38 @@ from maasi_planner.team import (
     stay,
 )
 
-# Tours are planned again when prizes on them have changed by this share in all.
+# Tours are planned again if the sum of their prizes changes by this share.
 CHANGE = 0.2
-# A place that keeps less than this share of its prize is passed over.
+# A cell with less than this share of its prize is skipped.
 STALE = 0.2
-# A cluster so near to one that was planned with is the same one [width of a square].
+# A cluster this close to a planned one is the same [width of a cell].
 SAME = 0.1
-# Places that are planned for each robot, even if they overlap.
+# Planned cells for each robot, even if they overlap.
 ENOUGH = 3
-# A leg has at most one square, or so many times the distance at which the robot turns.
+# Longest leg: one cell, or so many times the arrival radius.
 LEG = 5.0
-# Places of a tour that are published.
+# Published positions of a tour.
 MOST_DRAWN = 200
 
 
 class Tour(Planner):
-    """A tour for each robot over places of a lattice, and over clusters.
+    """A tour for each robot over cells of a lattice, and over clusters.
 
-    The prize of a place is the number of targets that is expected to be detected on passing it,
-    that of a cluster its mass. Tours are planned again for all robots when the prizes on them have
-    changed, when a cluster has appeared, or when a robot has nothing left. The candidates are not
-    used.
+    The prize of a cell is the expected number of targets detected in passing it, that of a cluster
+    its mass. All tours are planned again if the prizes on them have changed, a cluster has
+    appeared, or a robot has none left. The candidates are not used.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
         super().__init__(settings)
         self._lattice: Lattice | None = None
         self._area: Area | None = None
-        # What is planned with: places of the lattice, then clusters, and the prizes of both.
+        # Cells of the lattice, positions of cells and clusters, and planned prizes of both.
         self._chosen = np.zeros(0, np.int64)
         self._points = np.zeros((0, 0))
         self._planned = np.zeros(0)
         self._ways: dict[str, list[int]] = {}
-        # Where each robot was sent last, and which ones could not afford a place at this step.
+        # Last target of each robot, and robots that could not afford one at this step.
         self._target: dict[str, FloatArray] = {}
         self._refused: set[str] = set()
 
@@ -83,10 +82,7 @@ class Tour(Planner):
         return explain(decision)
 
     def finished(self, team: TeamView) -> str | None:
-        """See `Planner.finished`; also when too little is left that robots can reach.
-
-        That is the share of the expected targets that is unseen where places can be visited.
-        """
+        """See `Planner.finished`; also if few unseen targets are expected where robots can go."""
         reason = super().finished(team)
         if reason is not None:
             return reason
@@ -97,25 +93,25 @@ class Tour(Planner):
         explored = 100.0 * team.exploration.explored_fraction()
         return self._settled(
             team,
-            f'no place is worth a visit: {100.0 * left:.2g} % of the expected targets are within '
-            f'reach and unseen ({explored:.1f} % of the environment is explored)',
+            f'no position is worth a visit: {100.0 * left:.2g} % of the expected targets are '
+            f'unseen and reachable ({explored:.1f} % of the environment is explored)',
         )
 
     def _squares(self, team: TeamView) -> Lattice:
         if self._lattice is None or self._area is not team.area:
-            # Where zones were closed or opened, all is planned again.
+            # A change of the area makes all plans obsolete.
             self._lattice, self._area = Lattice(team.exploration, *lanes_of(team)[1:]), team.area
             self._ways = {}
         return self._lattice
 
     def _prizes(self, team: TeamView) -> FloatArray | None:
-        """Return what the places of the plan are worth now; None: it has to be made again."""
+        """Return the present prizes of the plan; None if it has to be made again."""
         lattice, number = self._squares(team), len(self._chosen)
         left = np.array([index for way in self._ways.values() for index in way], np.int64)
         if set(self.searching(team)) != set(self._ways):
             return None
         prizes = np.zeros(len(self._points))
-        # In the order of choice, as each sees what those before it leave.
+        # In the order of choice, as each gains what earlier ones leave.
         rows = np.sort(left[left < number])
         gains = lattice.gains(team.exploration, self._chosen[rows])
         prizes[rows] = team.area.expected_targets * gains
@@ -129,7 +125,7 @@ class Tour(Planner):
         return None if moved > CHANGE * self._planned[left].sum() else prizes
 
     def _plan(self, team: TeamView) -> FloatArray:
-        """Plan the tours of all robots from where they are, or will be; return the prizes."""
+        """Plan the tours of all robots from their present or final positions; return the prizes."""
         lattice, names, heavy = self._squares(team), self.searching(team), self.heavy(team)
         number = len(self._chosen)
         before = {
@@ -152,10 +148,10 @@ class Tour(Planner):
             if view.endurance is not None:
                 budget, home = view.endurance.range_from(end)
             budgets.append(budget)
-            # Without a limit it need not end at home.
+            # Unlimited tours need not end at home.
             ends.append(home[: team.dimension] + (0.0 if np.isfinite(budget) else np.nan))
             if name in self._target:
-                # It is on its way there.
+                # The robot is on its path there.
                 gaps = np.linalg.norm(self._points - self._target[name], axis=1)
                 prizes[gaps < SAME * lattice.pitch] = 0.0
         speeds = np.array([team.robots[name].motion.settings.speed for name in names])
@@ -180,7 +176,7 @@ class Tour(Planner):
         places: list[tuple[FloatArray, float]],
         decision: Decision,
     ) -> RobotDecision | None:
-        """Return the next leg of a robot's tour, past what has lost its prize; None: none left."""
+        """Return the next leg of a robot's tour, without cells that lost their prize, or None."""
         view, way, d = team.robots[name], self._ways.get(name, []), team.dimension
         here = view.state.pose.position
         while way:
@@ -227,8 +223,6 @@ class Tour(Planner):
         return None
 
     def _reason(self, name: str, here: FloatArray, index: int, prizes: FloatArray) -> str:
-        """Return what is expected of a robot's next place, what follows, and the alternative."""
-
         def told(place: int) -> str:
             numbers = ', '.join(f'{value:.4g}' for value in self._points[place])
             return f'({numbers}) m'
@@ -247,12 +241,12 @@ class Tour(Planner):
             gaps = np.linalg.norm(self._points[others] - here, axis=1)
             best = int(np.argmax(prizes[others] / np.maximum(gaps, 1e-9)))
             other, gap = int(others[best]), gaps[best]
-            when = 'later' if owners[other] == name else f'left to {owners[other]}'
+            when = 'later' if owners[other] == name else f'assigned to {owners[other]}'
             reason += f'; the alternative {told(other)}, {gain(other)}, {gap:.3g} m away, is {when}'
         return reason
 
     def _rest(self, view: RobotView, start: FloatArray, way: list[int]) -> FloatArray:
-        """Return a tour after a waypoint as it will be flown, around what is in the way, (n, 3)."""
+        """Return the path after a waypoint, around obstacles, (n, 3)."""
         corners: list[tuple[float, float, float]] = []
         here, keep_out = start, view.motion.keep_out
         for index in way[:MOST_DRAWN]:
@@ -265,15 +259,14 @@ class Tour(Planner):
         return np.array(corners).reshape(-1, 3)
 
     def _straight(self, here: FloatArray, index: int, following: int) -> bool:
-        """Return whether a place lies on the straight way to another one."""
         there, end = self._points[index], self._points[following]
         bent = np.linalg.norm(there - here) + np.linalg.norm(end - there)
         return bool(bent <= 1.001 * np.linalg.norm(end - here))
 
     def _leg(self, team: TeamView, view: RobotView, place: FloatArray) -> tuple[FloatArray, bool]:
-        """Return the waypoint of a leg towards a place, and whether it leads all the way.
+        """Return the waypoint of a leg, and whether it leads all the distance to a position.
 
-        It leads a quarter of the arrival radius too far: the robot cuts corners less.
+        It is a quarter of the arrival radius too far, so that the robot cuts corners less.
         """
         here, turning = view.state.pose.position, view.arrival_radius
         gap = max(float(np.linalg.norm(place - here)), 1e-9)

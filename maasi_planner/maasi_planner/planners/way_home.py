@@ -1,4 +1,4 @@
-"""The path of a robot to a charger, past others."""
+"""Path of a robot to a charger, past other robots."""
 
 import math
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from maasi_planner.team import (
     stay,
 )
 
-# Turn a way in the plane aside, by angles [rad], and halve it: (6, 3, 2).
+# Rotations of half a path to either side, by angles [rad]: (6, 3, 2).
 _ASIDE = np.array(
     [
         0.5 * np.array([[math.cos(t), -math.sin(t)], [math.sin(t), math.cos(t)], [0.0, 0.0]])
@@ -27,7 +27,7 @@ _ASIDE = np.array(
 
 
 def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> RobotDecision:
-    """Send a robot to a charger past others who are in the way; it waits where all are taken."""
+    """Send a robot to a charger past other robots; it waits if all are taken."""
     view, endurance = team.robots[name], team.robots[name].endurance
     assert endurance is not None
     here, keep_out = view.state.pose.position, view.motion.keep_out
@@ -41,7 +41,7 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
         return _wait_near(team, name, charger, others, f'{reason}; {TAKEN}')
     if ways_apart(team, name, prediction.positions, others)[0]:
         return single_choice(charger[None, :], prediction, 0, reason)
-    # Past where they will stand; else aside, until they have passed.
+    # Past their final positions, or to the side until they have passed.
     aside = here + _ASIDE @ (charger - here)[:2]
     moved = [keep_out.moved_out(here, point) for point in aside]
     inside = [place for place in moved if place is not None and team.area.inside(place[None, :])[0]]
@@ -52,7 +52,7 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
 
 
 def make_room(team: TeamView, name: str, decision: Decision, reason: str) -> RobotDecision:
-    """Send a robot away from the charger at which it is, so that another one can come."""
+    """Send a robot away from its charger for another one."""
     view, endurance = team.robots[name], team.robots[name].endurance
     assert endurance is not None
     others = {key: robot.positions for key, robot in decision.robots.items() if key != name}
@@ -68,7 +68,7 @@ def _wait_near(
     reason: str,
     leaves: bool = False,
 ) -> RobotDecision:
-    """Send a robot near a charger, where it waits; near it, it stays unless it `leaves`."""
+    """Send a robot near a charger, where it waits; if it is near, it stays unless it `leaves`."""
     view = team.robots[name]
     here, motion = view.state.pose.position, view.motion
     places = [(path[-1], radius) for path, radius in paths_of(team, name, others)]
