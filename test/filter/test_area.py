@@ -335,7 +335,7 @@ def test_a_keep_out_always_wins_over_the_prior():
         inner = shapely.contains_xy(left.buffer(-0.1), places[:, 0], places[:, 1])
         outer = ~shapely.contains_xy(left.buffer(0.1), places[:, 0], places[:, 1])
         assert not density[outer].any()
-        if any('is 0 everywhere' in doubt for doubt in area.doubts):
+        if any('is 0 everywhere' in warning for warning in area.warnings):
             even += 1
             assert (density[inner] == 1.0).all()
         elif values['prior']['floor'] > 0.0:
@@ -371,16 +371,16 @@ def test_zones_and_priors_far_from_the_area_are_doubted_by_name():
     prior = {'polygons': [{'polygon': RING, 'weight': 2.0}, {'polygon': far, 'weight': 2.0}]}
     zones = [SQUARE, far, {'centre': [50.0, 10.0], 'radius': 2.0}, square(-4e6, 2.5e6, 9.0)]
     area = Area(environment(area=RING, keep_outs=zones, prior=prior, obstacles=[far]))
-    assert [doubt.split(' outside')[0] for doubt in area.doubts] == [
+    assert [warning.split(' outside')[0] for warning in area.warnings] == [
         'environment.keep_outs[1]: lies 80 m',
         'environment.keep_outs[2]: lies 8 m',
         'environment.keep_outs[3]: lies 4,717 km',
         'environment.obstacles[0]: lies 80 m',
         'environment.prior.polygons[1]: lies 80 m',
-        area.doubts[-1],
+        area.warnings[-1],
     ]
-    assert area.doubts[-1].startswith('environment.prior: ')
-    assert Area(environment(area=RING, keep_outs=[SQUARE])).doubts == []
+    assert area.warnings[-1].startswith('environment.prior: ')
+    assert Area(environment(area=RING, keep_outs=[SQUARE])).warnings == []
 
 
 def test_rasters_of_any_size_and_weight_are_taken_or_refused_by_name(tmp_path):

@@ -223,7 +223,7 @@ def test_halves_at_180_degrees_are_one_area():
     shape = {'type': 'MultiPolygon', 'coordinates': rings}
     zone = polygon([[-179.999, -16.596], [-179.998, -16.596], [-179.998, -16.594]], role='keep_out')
     area = area_of(area=collection({'type': 'Feature', 'geometry': shape}, zone))
-    assert abs(area.settings.origin.longitude) == 180.0 and area.doubts == []
+    assert abs(area.settings.origin.longitude) == 180.0 and area.warnings == []
     assert area.border.geom_type == 'Polygon'
     assert area.border.area == pytest.approx(2.36e6, rel=1e-3)
 
@@ -242,7 +242,7 @@ def test_a_zone_with_exchanged_coordinates_is_named():
     exchanged = [corner[::-1] for corner in ZONE]
     far = [[x + 30.0, y] for x, y in ZONE]
     area = area_of(area=polygon(), keep_outs=[polygon(exchanged), polygon(ZONE), polygon(far)])
-    first, second = area.doubts
+    first, second = area.warnings
     assert first.startswith('environment.keep_outs[0]: lies 4,739 km') and 'swapped' in first
     assert second.startswith('environment.keep_outs[2]: lies ') and 'swapped' not in second
 
@@ -275,10 +275,10 @@ def test_images_of_16_bits_are_the_same_prior_and_others_need_a_band(tmp_path):
         assert area_of(bounds=bounds, prior=file).density(places) == pytest.approx(first)
 
 
-def test_a_prior_that_is_the_same_everywhere_is_doubted(tmp_path):
+def test_a_prior_that_is_the_same_everywhere_is_reported(tmp_path):
     Image.fromarray(np.full((9, 9), 70, np.uint8)).save(tmp_path / 'flat.png')
     area = area_of(bounds=[[0.0, 100.0]] * 2, prior=str(tmp_path / 'flat.png'))
-    (warning,) = area.doubts
+    (warning,) = area.warnings
     assert warning.startswith('environment.prior: ')
 
 
@@ -320,7 +320,7 @@ def test_polygons_across_180_degrees_that_are_not_cut_are_the_same_area():
     # Programs also count on beyond 180 degrees.
     beyond = polygon([[x % 360.0, y] for x, y in ring])
     assert area_of(area=beyond).border.area == pytest.approx(2.36e6, rel=1e-3)
-    assert abs(area.settings.origin.longitude) == pytest.approx(180.0) and area.doubts == []
+    assert abs(area.settings.origin.longitude) == pytest.approx(180.0) and area.warnings == []
     assert area.border.area == pytest.approx(2.36e6 - 11800.0, rel=1e-3)
     assert area.region.area == pytest.approx(area.border.area - 11800.0, rel=1e-3)
 
@@ -361,28 +361,28 @@ def test_what_is_another_format_or_encoding_is_refused_as_such(tmp_path):
 def test_each_polygon_of_a_zone_that_lies_elsewhere_is_counted_and_its_feature_named():
     exchanged = polygon([corner[::-1] for corner in ZONE], name='pond')
     file = collection(polygon(ZONE), exchanged)
-    (doubt,) = area_of(area=polygon(), keep_outs=[file]).doubts
-    assert doubt.startswith('environment.keep_outs[0]: 1 of its 2 polygons lie up to 4,739 km')
-    assert 'swapped' in doubt
+    (warning,) = area_of(area=polygon(), keep_outs=[file]).warnings
+    assert warning.startswith('environment.keep_outs[0]: 1 of its 2 polygons lie up to 4,739 km')
+    assert 'swapped' in warning
     pond = polygon(exchanged['geometry']['coordinates'][0][:-1], name='pond', role='keep_out')
     with pytest.warns(InputWarning, match=r'feature 2 \(pond\): .*keep_outs\[0\]'):
-        assert len(area_of(area=collection(polygon(), pond)).doubts) == 1
+        assert len(area_of(area=collection(polygon(), pond)).warnings) == 1
 
 
 def test_an_exchange_is_seen_where_latitude_and_longitude_are_nearly_the_same():
     ring = [[10.0, 10.1], [10.002, 10.1], [10.002, 10.102], [10.0, 10.102]]
     zone = polygon([[y, x] for x, y in ring[:3]])
-    (doubt,) = area_of(area=polygon(ring), keep_outs=[zone]).doubts
-    assert 'lies 15 km outside' in doubt and 'swapped' in doubt
+    (warning,) = area_of(area=polygon(ring), keep_outs=[zone]).warnings
+    assert 'lies 15 km outside' in warning and 'swapped' in warning
     away = polygon([[x + 0.1, y] for x, y in ring[:3]])
-    (doubt,) = area_of(area=polygon(ring), keep_outs=[away]).doubts
-    assert 'swapped' not in doubt
+    (warning,) = area_of(area=polygon(ring), keep_outs=[away]).warnings
+    assert 'swapped' not in warning
 
 
 def test_a_raster_over_other_ground_is_told_with_its_distance(tmp_path):
     Image.fromarray(np.array([[20, 200]], np.uint8)).save(tmp_path / 'heat.png')
     prior = {'raster': str(tmp_path / 'heat.png'), 'extent': [[1100, 1200], [0, 100]]}
-    first, second = area_of(bounds=[[0.0, 100.0]] * 2, prior=prior).doubts
+    first, second = area_of(bounds=[[0.0, 100.0]] * 2, prior=prior).warnings
     assert first.startswith('environment.prior.extent: lies 1000 m outside of the area')
     assert second.startswith('environment.prior: ')
 
@@ -398,7 +398,7 @@ def test_a_geotiff_of_other_ground_is_told_with_its_distance(tmp_path, exchanged
         file.write(np.array([[20, 200], [0, 7]], np.uint8), 1)
     origin = {'latitude': 46.6, 'longitude': 9.9}
     bounds, prior = [[0.0, 100.0]] * 2, str(tmp_path / 'heat.tif')
-    first, second = area_of(bounds=bounds, origin=origin, prior=prior).doubts
+    first, second = area_of(bounds=bounds, origin=origin, prior=prior).warnings
     gap = '4,739 km' if exchanged else '3731 m'
     assert first.startswith(f'environment.prior.raster: lies {gap} outside of the area')
     assert ('swapped' in first) == exchanged

@@ -72,7 +72,7 @@ class Area:
         Horizontal outline of the area without keep-outs; None: all of `bounds`.
     circles : (n, 5) array
         Round zones: x, y, z, radius [m, map], and 1 for a sphere or 0 for a cylinder.
-    doubts : list of str
+    warnings : list of str
         Warnings about valid input without effect, such as a keep-out far away: `key: text`.
 
     Raises
@@ -108,9 +108,9 @@ class Area:
         self._raster = read_raster(environment) if prior.raster else None
         #: Whether targets are equally likely in all of the bounds.
         self.uniform = self.region is None and not prior.polygons and self._raster is None
-        self.doubts = self._zones_outside()
+        self.warnings = self._zones_outside()
         if not self.uniform:
-            self.doubts += self._prior_doubts()
+            self.warnings += self._prior_warnings()
 
     @classmethod
     def of(cls, area: Area | EnvironmentSettings | ArrayLike) -> Area:
@@ -232,7 +232,7 @@ class Area:
         marked[x, y] = 1.0
         return marked
 
-    def _prior_doubts(self) -> list[str]:
+    def _prior_warnings(self) -> list[str]:
         likely, inside = self._cells(_CHECKED)
         given = bool(self.settings.prior.polygons) or self._raster is not None
         # All cells are slow: only if a few of them suggest it.
@@ -264,7 +264,7 @@ class Area:
             zones['prior.extent'] = box(west, south, east, north)
         if self._raster is not None and self._raster.corners is not None:
             zones['prior.raster'] = shapely.Polygon(self._raster.corners)
-        doubts = []
+        warnings = []
         for key, zone in zones.items():
             parts = shapely.get_parts(zone)
             gaps = shapely.distance(self.border, parts)
@@ -278,8 +278,8 @@ class Area:
             if away < len(parts):
                 lies = f'{away} of its {len(parts)} polygons lie up to {how_far(gaps.max())}'
                 where = 'where they have no effect'
-            doubts.append(f'environment.{key}: {lies} outside of the area, {where}{hint}')
-        return doubts
+            warnings.append(f'environment.{key}: {lies} outside of the area, {where}{hint}')
+        return warnings
 
     def exchanged(self, position: ArrayLike, gap: float) -> str:
         """Return a hint if swapping latitude and longitude would move a position into the area."""

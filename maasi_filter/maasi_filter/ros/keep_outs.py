@@ -58,8 +58,8 @@ class KeepOutTopic:
         message.zones = [str(zone) for zone in area.settings.keep_outs]
         self._latest = message
         self._node.get_logger().info(f'active keep-outs: {len(message.zones)}')
-        for doubt in area.doubts:
-            self._node.get_logger().warning(doubt)
+        for text in area.warnings:
+            self._node.get_logger().warning(text)
         if self._publisher is not None:
             self._publisher.publish(message)
         self._on_change(area)

@@ -267,7 +267,7 @@ def doubts_about(scenario: BaseScenario) -> Problems:
                 f'{robot.yaw:g} degrees are {math.radians(robot.yaw):.4g}'
             )
     area = Area(scenario.environment)
-    yield from area.doubts
+    yield from area.warnings
     if isinstance(scenario, Scenario):
         yield from _robot_doubts(scenario, area)
         return
