@@ -13,6 +13,7 @@ from maasi_planner.obstacles import (
     Vector,
     all_felt,
     beyond_walls,
+    clearance_at,
     crossed_walls,
     dot,
     felt_at,
@@ -23,7 +24,6 @@ from maasi_planner.obstacles import (
     minus,
     norm,
     plus,
-    room_at,
     segment_distance,
 )
 
@@ -71,7 +71,7 @@ def _same_vertex(
     away = math.hypot(vx - position[0], vy - position[1])
     if away < 0.5 * around.clearance:
         return -1, np.inf
-    if room_at(position, around) <= 0.0 and not is_visible(
+    if clearance_at(position, around) <= 0.0 and not is_visible(
         (position[0], position[1], 0.0), (vx, vy, 0.0), around, 0.0, True
     ):
         return -1, np.inf
@@ -260,16 +260,16 @@ def minded(position: Vector, manner: int, around: Surroundings) -> tuple[Felt, b
 
 
 @njit(cache=True, forceinline=True)
-def approach_limit(room: float, limits: tuple[float, float]) -> float:
-    """Return the highest speed towards an obstacle at a distance of `room` metres [m/s].
+def approach_limit(distance: float, limits: tuple[float, float]) -> float:
+    """Return the highest speed at a `distance` [m] towards an obstacle [m/s].
 
     Half of a limited acceleration stops the robot in time, except for the last half metre or so,
     which delays need.
     """
     rate, acceleration = limits
-    if acceleration == np.inf or room <= 0.0:
-        return rate * room
-    return max(rate * room, min(math.sqrt(0.5 * acceleration * room), _LAST * room))
+    if acceleration == np.inf or distance <= 0.0:
+        return rate * distance
+    return max(rate * distance, min(math.sqrt(0.5 * acceleration * distance), _LAST * distance))
 
 
 @njit(cache=True)

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from maasi_filter.arrays import FloatArray
 from maasi_planner.endurance import NOTHING_AFFORDABLE, SEARCH_ENDED, Endurance, Phase
 from maasi_planner.motion import RobotState
-from maasi_planner.planners.way_home import go_home, make_room
+from maasi_planner.planners.way_home import free_charger, go_home
 from maasi_planner.robot_plan import Errand, PlannedRobot, PresentRobot
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 
@@ -105,7 +105,7 @@ class Homing:
     def is_available(self, name: str, here: PresentRobot) -> bool:
         """Return whether the planner decides for a robot."""
         robot = self._robots[name]
-        if not here.searches or robot.plan.errand in (Errand.LEAVE, Errand.ROOM):
+        if not here.searches or robot.plan.errand in (Errand.LEAVE, Errand.FREE):
             return False
         endurance = robot.endurance
         return endurance is None or (endurance.phase is Phase.AVAILABLE and not endurance.cut_off)
@@ -147,7 +147,7 @@ class Homing:
         found = dict(sorted(found.items(), key=lambda item: (self._charge(item[0]), item[0])))
         for name in present:
             if self._is_wanted(name, present):
-                found.setdefault(name, Errand.ROOM)
+                found.setdefault(name, Errand.FREE)
         return found
 
     def waiting(
@@ -207,9 +207,9 @@ class Homing:
                 assert goal is not None
                 path = view.motion.predict(view.state, goal[None, :], team.step_time)
                 chosen = single_choice(goal[None, :], path, 0, Errand.LEAVE.value)
-            elif errand is Errand.ROOM:
+            elif errand is Errand.FREE:
                 self._phases[name] = Phase.RETURNING, ''
-                chosen = make_room(team, name, decision, Errand.ROOM.value)
+                chosen = free_charger(team, name, decision, Errand.FREE.value)
             else:
                 chosen = self._home(team, name, decision, finished)
             decision.robots[name] = chosen

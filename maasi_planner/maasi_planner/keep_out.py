@@ -73,21 +73,21 @@ class KeepOut:
         self.radius, self._reach = radius, reach
         self.clearance = float(clearance)
         apart = radius + clearance
-        room = self.area.room(apart)
+        region = self.area.free_space(apart)
         detail = _DETAIL * self.clearance
         inflation = radius + 0.1 * self.clearance
         # At the sides of bounds robots may be on the bounds.
-        held = self.area.room(inflation)
+        held = self.area.free_space(inflation)
         walls = None if held is None else _simplified(held, detail)
         self._round = len(self.area.circles)
         self.circles = self._inflated(self.area.circles, walls)
         # Region of waypoints; None: only round obstacles limit it.
-        self._places = None if room is None else room.buffer(-apart, join_style='mitre')
+        self._places = None if region is None else region.buffer(-apart, join_style='mitre')
         if self._places is not None:
             shapely.prepare(self._places)
         outline = self._places
-        if walls is not held and room is not None:
-            simple = _simplified(room, detail)
+        if walls is not held and region is not None:
+            simple = _simplified(region, detail)
             outline = simple.buffer(-apart, join_style='mitre')
         nearby = nearby_of(self.circles, reach, 0.5 * self.clearance)
         spheres = bool((self.circles[:, 4] > 0.5).any())
@@ -104,9 +104,9 @@ class KeepOut:
     def __len__(self) -> int:
         return len(self.circles)
 
-    def _inflated(self, round_ones: FloatArray, room: BaseGeometry | None) -> FloatArray:
+    def _inflated(self, round_ones: FloatArray, region: BaseGeometry | None) -> FloatArray:
         """Return round obstacles (n, 5) and the walls of a free space as circles, (m, 7)."""
-        walls = edges_of([] if room is None else [room])
+        walls = edges_of([] if region is None else [region])
         circles = np.zeros((len(round_ones) + len(walls), 7))
         circles[: len(round_ones), :5] = round_ones
         circles[len(round_ones) :, [0, 1, 5, 6]] = walls
@@ -116,8 +116,8 @@ class KeepOut:
     def _solid_circles(self) -> FloatArray:
         if not self.area.settings.keep_outs:
             return self.circles
-        room = self.area.room(self.radius + 0.1 * self.clearance, closed=False)
-        return self._inflated(self.area.solid, room)
+        region = self.area.free_space(self.radius + 0.1 * self.clearance, closed=False)
+        return self._inflated(self.area.solid, region)
 
     def _corners(self, outline: BaseGeometry | None) -> FloatArray:
         """Return corners around cylinders and convex walls for the visibility graph, (m, 2)."""
@@ -306,11 +306,11 @@ class KeepOut:
         return None
 
 
-def _simplified(room: BaseGeometry, detail: float) -> BaseGeometry:
+def _simplified(region: BaseGeometry, detail: float) -> BaseGeometry:
     """Return a region without finer detail than given [m], inside of the original."""
-    if shapely.get_num_coordinates(room.simplify(detail)) == shapely.get_num_coordinates(room):
-        return room
-    return room.buffer(-detail, join_style='mitre').simplify(detail)
+    if shapely.get_num_coordinates(region.simplify(detail)) == shapely.get_num_coordinates(region):
+        return region
+    return region.buffer(-detail, join_style='mitre').simplify(detail)
 
 
 #: Shared KeepOut of equal robots.

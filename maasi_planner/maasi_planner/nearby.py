@@ -49,7 +49,7 @@ def nearby_of(circles: FloatArray, reach: float, extra: float) -> Nearby:
     wall_starts, walls, _ = _listed(by_row, np.zeros(len(by_row)), int(counts[1]))
     offset = number + 1 + int(counts[1]) + 1
     lists = np.concatenate([starts + offset, wall_starts + offset + len(rows), rows, walls])
-    _mark_rooms(circles, head, cells, wall_starts, walls)
+    _mark_inside(circles, head, cells, wall_starts, walls)
     sorted_gaps = np.concatenate([np.zeros(offset), apart, np.zeros(len(walls))])
     return Nearby(head, cells, lists, sorted_gaps)
 
@@ -114,7 +114,7 @@ def _walls_by_row(circles: FloatArray, head: FloatArray, rows: int) -> IntArray:
 
 
 @njit(cache=True)
-def _mark_rooms(
+def _mark_inside(
     circles: FloatArray, head: FloatArray, cells: FloatArray, starts: IntArray, walls: IntArray
 ) -> None:
     """Mark cells without walls nearby: 0 inside of the walls, 1 outside; others 2."""

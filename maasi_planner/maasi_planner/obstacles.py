@@ -230,7 +230,7 @@ def is_clear(start: Vector, end: Vector, felt: Felt, extra: float, cylinders_onl
 
 
 @njit(cache=True, forceinline=True)
-def room_at(point: Vector, around: Surroundings) -> float:
+def clearance_at(point: Vector, around: Surroundings) -> float:
     """Return a lower bound of the distance from all circles [m]; minus infinity if unknown."""
     nearby = around.nearby
     size = nearby.head[2]
@@ -254,7 +254,7 @@ def is_visible(
     way = minus(end, start)
     length, done, here = norm(way), 0.0, start
     while True:
-        stride = room_at(here, around) - extra
+        stride = clearance_at(here, around) - extra
         free = stride > 0.1 * size
         stride = stride if stride > 0.1 * size else 0.5 * size
         done += stride

@@ -40,7 +40,7 @@ class Errand(Enum):
 
     LEAVE = 'leaves the closed zone'
     HOME = 'goes home'
-    ROOM = 'frees its charger for another robot'
+    FREE = 'frees its charger for another robot'
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from maasi_filter.ros.keep_outs import CORNERS, ZONES, with_keep_outs
 from maasi_planner import MotionSettings, RobotState, make_motion
 from maasi_planner.guidance import MANY
 from maasi_planner.keep_out import KeepOut
-from maasi_planner.obstacles import is_free_at, is_visible, room_at
+from maasi_planner.obstacles import clearance_at, is_free_at, is_visible
 
 DRONE = {'speed': 5.0, 'acceleration': 3.0, 'clearance': 1.0, 'tolerance': 0.5}
 ROVER = {
@@ -70,7 +70,7 @@ def test_a_grid_over_the_obstacles_changes_no_answer():
             square = np.maximum((along * along).sum(axis=1), 1e-12)
             part = np.clip((offsets * along).sum(axis=1) / square, 0.0, 1.0)
             true = np.linalg.norm(offsets - part[:, None] * along, axis=1) - gaps[:, 3]
-            assert room_at(start, listed.around) <= true.min() + 1e-9
+            assert clearance_at(start, listed.around) <= true.min() + 1e-9
     assert 200 < seen < 700
 
 

@@ -186,7 +186,7 @@ class Area:
         """Return the edges of solid polygons, (n, 4): x, y, and the vector to the other end [m]."""
         return edges_of(self._solid_polygons)
 
-    def room(self, reach: float, closed: bool = True) -> BaseGeometry | None:
+    def free_space(self, reach: float, closed: bool = True) -> BaseGeometry | None:
         """Return where robots that keep `reach` metres from the border may be; None: in a box.
 
         Round zones and the sides of bounds do not count; keep-outs count if `closed`.

@@ -15,7 +15,7 @@ TOLERANCE = 1e-7  # of the bounds of rows [m, m/s, N]
 DEPENDENT = 1e-10  # share of a row's length below which active rows span it
 
 
-class AxisRoom(NamedTuple):
+class AxisScratch(NamedTuple):
     """Scratch arrays of `solve_axis` for n forces: (n + 1,) twice, (n + 1, n + 1), (2, n + 1)."""
 
     active: IntArray
@@ -66,13 +66,13 @@ def solve_axis(
     most: int,
     cutoff: float,
     y: FloatArray,
-    room: AxisRoom,
+    axis_scratch: AxisScratch,
 ) -> float:
     """Minimise over the rows' values y = free + gram lambda in their bounds (Goldfarb, Idnani).
 
     Return the objective above that of the free minimum; inf without a solution, or above `cutoff`.
     """
-    active, multipliers, factor, work = room
+    active, multipliers, factor, work = axis_scratch
     m = free.shape[0]
     for i in range(m):
         y[i] = free[i]

@@ -89,7 +89,7 @@ def _solve(instance: Instance, tree: Tree, node: int, cutoff: float) -> bool:
             horizon,
             cutoff - total,
             tree.values[node, a],
-            tree.room,
+            tree.axis_scratch,
         )
         if cost == math.inf:
             return False

@@ -25,7 +25,7 @@ How = Literal['optimal', 'best_so_far', 'shifted', 'brake']
 
 GIVE = 1e-4  # relaxation of bounds if rounding leaves the state outside of them [m, m/s]
 TOUCH = 1e-6  # tolerance of the present position in a cuboid, whose faces plans touch [m]
-_SLICE, _ROOM = 500, 16384  # nodes between checks of the time limit; capacity of open nodes
+_SLICE, _CAPACITY = 500, 16384  # nodes between checks of the time limit; capacity of open nodes
 # Share of the smoothness weight on the flight home, which makes forces unique.
 _HOMING_SMOOTHNESS = 1e-2
 
@@ -77,7 +77,7 @@ class PlanSolver:
         self._homing = axis_rows(
             dynamics, horizon, pull, _HOMING_SMOOTHNESS * smoothness, self._rolling
         )
-        self._tree = make_tree(_ROOM, horizon, len(self._search.matrix))
+        self._tree = make_tree(_CAPACITY, horizon, len(self._search.matrix))
 
     def solve(self, problem: Problem) -> Plan | None:
         """Return the best plan or None; `GIVE` relaxes bounds that rounding violates."""

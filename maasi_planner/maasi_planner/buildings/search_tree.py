@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
-from maasi_planner.buildings.axis_problem import AxisRoom
+from maasi_planner.buildings.axis_problem import AxisScratch
 
 
 class Tree(NamedTuple):
@@ -27,7 +27,7 @@ class Tree(NamedTuple):
     counts: IntArray  # sizes of heap and spare, nodes solved, best node (or -1), out of nodes
     best: FloatArray  # (1,): objective of the best node
     scratch: FloatArray  # (3, m): bounds of an axis while it is solved
-    room: AxisRoom
+    axis_scratch: AxisScratch
 
 
 def make_tree(size: int, horizon: int, rows: int) -> Tree:
@@ -49,7 +49,9 @@ def make_tree(size: int, horizon: int, rows: int) -> Tree:
         counts=np.zeros(5, dtype=np.int64),
         best=np.full(1, np.inf),
         scratch=np.empty((3, rows)),
-        room=AxisRoom(np.empty(n, np.int64), np.empty(n), np.empty((n, n)), np.empty((2, n))),
+        axis_scratch=AxisScratch(
+            np.empty(n, np.int64), np.empty(n), np.empty((n, n)), np.empty((2, n))
+        ),
     )
 
 

@@ -62,7 +62,7 @@ def _stoppable(
 
     A circle that the robot is in, or walls that it is beyond, are left at full speed.
     """
-    room, circles = np.inf, felt.circles
+    free, circles = np.inf, felt.circles
     for n in range(felt.first, felt.last):
         i = felt.rows[n]
         offset = from_centre(position, circles, i)
@@ -71,11 +71,11 @@ def _stoppable(
             # Motion along a wall needs no stop.
             towards = -dot(offset, way) / max(gap * norm(way), 1e-9)
             if towards > 0.0 and not beyond:
-                room = min(room, (gap - circles[i, 3]) / towards)
+                free = min(free, (gap - circles[i, 3]) / towards)
         elif gap >= circles[i, 3] or dot(offset, way) < 0.0:
-            room = min(room, gap - circles[i, 3])
+            free = min(free, gap - circles[i, 3])
     speed = steering.speed
-    return min(speed, math.sqrt(steering.acceleration * max(room, 0.0)) + 0.05 * speed)
+    return min(speed, math.sqrt(steering.acceleration * max(free, 0.0)) + 0.05 * speed)
 
 
 @njit(cache=True, forceinline=True)

@@ -117,7 +117,7 @@ def _arc(
 ) -> tuple[float, float, float, float]:
     """Return the end of an arc and its clearance, -inf if the robot cannot stop in time."""
     px, py, heading = state[0], state[1], state[3]
-    room, circles = np.inf, felt.circles
+    margin, circles = np.inf, felt.circles
     dt = time / ARC_STEPS
     for k in range(ARC_STEPS):
         heading += 0.5 * w * dt
@@ -129,12 +129,12 @@ def _arc(
             c = felt.rows[n]
             ox, oy, _ = from_centre((px, py, 0.0), circles, c)
             gap = math.hypot(ox, oy) - circles[c, 3]
-            room = min(room, gap)
+            margin = min(margin, gap)
             if gap < 0.0 and v > 0.0 and travelled <= stopping + v * dt:
                 return px, py, heading, -np.inf
-        if room < 0.0 and v > 0.0:
+        if margin < 0.0 and v > 0.0:
             break
-    return px, py, heading, room
+    return px, py, heading, margin
 
 
 @njit(cache=True)
@@ -164,14 +164,14 @@ def window_command(
         stopping = 0.5 * v * v / deceleration + v * WINDOW
         for j in range(TURN_SAMPLES):
             w = turn_low + (turn_high - turn_low) * j / (TURN_SAMPLES - 1)
-            px, py, heading, room = _arc(state, v, w, time, stopping, felt)
-            if room == -np.inf:
+            px, py, heading, margin = _arc(state, v, w, time, stopping, felt)
+            if margin == -np.inf:
                 continue
             gap = math.hypot(target[0] - px, target[1] - py)
             off = wrapped(math.atan2(target[1] - py, target[0] - px) - heading)
             score = (away - gap) / (speed * time)
             score -= 0.3 * abs(off) / math.pi * min(1.0, gap / clearance)
-            score += 0.2 * min(max(room, -clearance), clearance) / clearance
+            score += 0.2 * min(max(margin, -clearance), clearance) / clearance
             score -= 0.01 * abs(w) / steering.yaw_rate
             if score > best:
                 best, best_forward, best_turn = score, v, w

@@ -237,7 +237,7 @@ def apply_misses(
     kind, parameters = measured.kind[robot], measured.parameters[robot]
     reach = measured.reach[robot]
     number, begin = left.shape[0], 0
-    room = np.empty((4, number))
+    scratch = np.empty((4, number))
     # The heading counts only for boxes and plugins.
     cosine, sine = 1.0, 0.0
     for e in range(first, last):
@@ -258,7 +258,12 @@ def apply_misses(
             continue
         # Slices, as possibly negative indices prevent vectorised loops.
         width = number - begin
-        x, y, z, chance = room[0, :width], room[1, :width], room[2, :width], room[3, :width]
+        x, y, z, chance = (
+            scratch[0, :width],
+            scratch[1, :width],
+            scratch[2, :width],
+            scratch[3, :width],
+        )
         px, py, pz, after = places[0][begin:], places[1][begin:], places[2][begin:], left[begin:]
         for i in range(width):
             x[i] = px[i] - x0

@@ -51,7 +51,7 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     return single_choice(goals, prediction, int(np.argmax(usable)), reason)
 
 
-def make_room(team: TeamView, name: str, decision: Decision, reason: str) -> RobotDecision:
+def free_charger(team: TeamView, name: str, decision: Decision, reason: str) -> RobotDecision:
     """Send a robot away from its charger for another one."""
     view, endurance = team.robots[name], team.robots[name].endurance
     assert endurance is not None

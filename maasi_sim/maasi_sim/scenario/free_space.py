@@ -54,10 +54,10 @@ class FreeSpace:
         """Return how far a robot at a position (3,) is from border, keep-outs and obstacles [m]."""
         x, y, z = np.asarray(position, dtype=float).tolist()
         point, reach = shapely.Point(x, y), self._reach
-        room = self.area.room(reach)
+        space = self.area.free_space(reach)
         gaps = [math.inf]
-        if room is not None:
-            gaps.append(room.boundary.distance(point) if room.covers(point) else 0.0)
+        if space is not None:
+            gaps.append(space.boundary.distance(point) if space.covers(point) else 0.0)
         for cx, cy, cz, radius, sphere in self.area.circles.tolist():
             gaps.append(math.hypot(cx - x, cy - y, (cz - z) * sphere) - radius)
         return max(min(gaps), 0.0)
@@ -99,10 +99,10 @@ class FreeSpace:
 # Robots of one size share it.
 @lru_cache(maxsize=16)
 def _parts(area: Area, apart: float, reach: float) -> list[BaseGeometry]:
-    """Return the parts where a centre is at least so far from everything; reach: as of `room`."""
-    room, region = area.room(reach), area.border
-    if room is not None:
-        region = room.buffer(-apart, join_style='mitre').intersection(region)
+    """Return the parts in which a centre keeps its distance from everything."""
+    space, region = area.free_space(reach), area.border
+    if space is not None:
+        region = space.buffer(-apart, join_style='mitre').intersection(region)
     circles: FloatArray = area.circles[area.circles[:, 4] < 0.5]
     discs = shapely.buffer(shapely.points(circles[:, :2]), circles[:, 3] + apart, quad_segs=32)
     return list(shapely.get_parts(region.difference(shapely.union_all(discs))))
