@@ -10,11 +10,13 @@ import contextlib
 import json
 import math
 import os
+import sys
 from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+import reference_quality
 from quality_conditions import CONDITIONS, DEGREES, RETURNS, SCENARIOS, changed, wanted
 from scipy.stats import binomtest, chi2
 
@@ -119,7 +121,12 @@ def rows(options, conditions, seeds):
 
 
 def main():
-    parser = argparse.ArgumentParser(prog='quality', description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog='quality',
+        description=__doc__,
+        epilog='`quality reference [NAME ...]` compares both filters with an exact one on small '
+        'scenes.',
+    )
     parser.add_argument('--filter', nargs='*', choices=METHODS, default=METHODS)
     parser.add_argument(
         '--json',
@@ -133,10 +140,17 @@ def main():
     parser.add_argument(
         '--stone-soup', action='store_true', help="GOSPA beside Stone Soup's JPDA tracker instead"
     )
-    options, conditions, seeds = wanted(parser, CONDITIONS, runs=20, jobs=1)
+    reference = sys.argv[1:2] == ['reference']
+    if reference:
+        del sys.argv[1]
+    known = reference_quality.CONDITIONS if reference else CONDITIONS
+    options, conditions, seeds = wanted(parser, known, runs=20, jobs=1)
     warm_up()
     head, table = HEAD, rows(options, conditions, seeds)
-    if options.stone_soup:
+    if reference:
+        head = reference_quality.HEAD
+        table = reference_quality.rows(conditions, seeds, options.jobs)
+    elif options.stone_soup:
         # Stone Soup takes seconds to import.
         import stone_soup_quality
 
