@@ -225,15 +225,15 @@ def _mark_seen(
 def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
     """Return thinned positions (n, 3) and headings (n,) on all paths between candidates."""
     points = np.vstack([viewer.start[None, :], viewer.candidates])
-    ways = viewer.candidates[None, :, :] - points[:, None, :]
-    lengths = np.sqrt((ways * ways).sum(axis=2))
+    paths = viewer.candidates[None, :, :] - points[:, None, :]
+    lengths = np.sqrt((paths * paths).sum(axis=2))
     number = max(1, math.ceil(float(lengths.max(initial=0.0)) / viewer.spacing))
     # Backwards, so that the view on arrival is included.
     along = np.arange(number + 1) * viewer.spacing
     share = np.maximum(0.0, 1.0 - along / np.maximum(lengths, 1e-12)[..., None])
-    places = points[:, None, None, :] + share[..., None] * ways[:, :, None, :]
+    places = points[:, None, None, :] + share[..., None] * paths[:, :, None, :]
     if viewer.yaw is None:
-        yaws = np.arctan2(ways[..., 1], ways[..., 0])
+        yaws = np.arctan2(paths[..., 1], paths[..., 0])
     else:
         yaws = np.full(lengths.shape, viewer.yaw)
     headings = np.broadcast_to(yaws[..., None], places.shape[:3]).ravel()

@@ -1,4 +1,4 @@
-"""Battery of a robot: charge, use in flight, and the way home."""
+"""Battery of a robot: charge, use in flight, and the path home."""
 
 import math
 from collections.abc import Callable
@@ -257,17 +257,17 @@ class Endurance:
         left = max(self.charge - settings.reserve - self.leg - self._margin(0.0), 0.0)
         return left / use, self.chargers[int(np.argmin(uses))]
 
-    def affords(self, ways: Trajectories, step: float) -> BoolArray:
+    def affords(self, paths: Trajectories, step: float) -> BoolArray:
         """Return which predicted paths leave enough charge to get home with the reserve, (W,)."""
-        allowed = np.ones(len(ways.lengths), dtype=bool)
+        allowed = np.ones(len(paths.lengths), dtype=bool)
         if math.isnan(self.charge):
             return allowed
-        seconds, settings = step * ways.lengths, self.settings
+        seconds, settings = step * paths.lengths, self.settings
         used = settings.per_second * seconds * self.time_ratio
-        used = (used + settings.per_metre * ways.distances()) * self.use_ratio
+        used = (used + settings.per_metre * paths.distances()) * self.use_ratio
         left = self.charge - settings.reserve - used
         for row in range(len(allowed)):
-            end = ways.positions[row, -1]
+            end = paths.positions[row, -1]
             # Bounds exclude most rows without a prediction.
             bounds = [self._least_use(charger, end) for charger in range(len(self.chargers))]
             allowed[row] = left[row] - self._margin(0.0) >= min(bounds)

@@ -101,17 +101,17 @@ def _beside_sphere(
     position: Vector, target: Vector, sphere: int, around: Surroundings
 ) -> tuple[Vector, float]:
     """Return a target next to a sphere where the line passes its centre, and the distance to it."""
-    way = minus(target, position)
-    length = norm(way)
-    way = (way[0] / length, way[1] / length, way[2] / length)
+    line = minus(target, position)
+    length = norm(line)
+    line = (line[0] / length, line[1] / length, line[2] / length)
     offset = from_centre(position, around.circles, sphere)
-    along = -dot(offset, way)
+    along = -dot(offset, line)
     # From the centre to the nearest point of the line.
-    side = plus(offset, along, way)
+    side = plus(offset, along, line)
     size = norm(side)
     if size < 1e-6:
         # Through the centre: choose a fixed side.
-        side = (-way[1], way[0], 0.0)
+        side = (-line[1], line[0], 0.0)
         size = math.hypot(side[0], side[1])
         if size < 1e-6:
             side, size = (1.0, 0.0, 0.0), 1.0
@@ -120,8 +120,8 @@ def _beside_sphere(
     # Head for the tangent cone: the point next to the centre, farther out when close.
     away = max(norm(offset), reach * 1.0000001)
     widen = min(reach * away / math.sqrt(away * away - radius**2), 5.0 * reach)
-    way = plus((-offset[0], -offset[1], -offset[2]), widen / size, side)
-    return plus(position, 1.0, way), norm(way)
+    line = plus((-offset[0], -offset[1], -offset[2]), widen / size, side)
+    return plus(position, 1.0, line), norm(line)
 
 
 @njit(cache=True)
@@ -170,15 +170,15 @@ def _leaves(position: Vector, goal: Vector, around: Surroundings, inside: int) -
 
     A robot that only touches the zone `inside` must not cross it: its exit is on the same side.
     """
-    way = minus(position, goal)
-    length = norm(way)
+    line = minus(position, goal)
+    length = norm(line)
     part = min(3.0 * around.clearance / length, 1.0) if length > 0.0 else 0.0
-    if is_free_at(plus(goal, part, way), around):
+    if is_free_at(plus(goal, part, line), around):
         return False
     if inside >= 0:
         offset = from_centre(position, around.circles, inside)
         touches = norm(offset) >= around.circles[inside, 3] - around.inflation
-        if touches and dot(offset, way) > 0.0:
+        if touches and dot(offset, line) > 0.0:
             return False
     return is_clear(position, goal, all_felt(around.solid), 0.0, False)
 
@@ -188,8 +188,8 @@ def head_for(
     position: Vector, goal: Vector, to_goal: FloatArray, around: Surroundings, before: int
 ) -> Heading:
     """Return the heading of a robot; before: vertex of the step before, or -1."""
-    way = minus(goal, position)
-    left, target, vertex = norm(way), goal, -1
+    line = minus(goal, position)
+    left, target, vertex = norm(line), goal, -1
     felt = felt_at(position, around)
     beyond = beyond_walls(position, around)
     inside, nearest = -1, np.inf
@@ -228,8 +228,8 @@ def head_for(
             vx, vy = around.vertices[index, 0], around.vertices[index, 1]
             near = math.sqrt((vx - position[0]) ** 2 + (vy - position[1]) ** 2)
             share = near / best if best > 0.0 else 1.0
-            target = (vx, vy, position[2] + share * way[2])
-            left = math.sqrt(best * best + way[2] * way[2])
+            target = (vx, vy, position[2] + share * line[2])
+            left = math.sqrt(best * best + line[2] * line[2])
             if closely:
                 left = min(left, 2.0 * near)
             elif around.vertices.shape[0] > MANY:

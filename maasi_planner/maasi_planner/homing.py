@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from maasi_filter.arrays import FloatArray
 from maasi_planner.endurance import NOTHING_AFFORDABLE, SEARCH_ENDED, Endurance, Phase
 from maasi_planner.motion import RobotState
-from maasi_planner.planners.way_home import free_charger, go_home
+from maasi_planner.planners.home_path import free_charger, go_home
 from maasi_planner.robot_plan import Errand, PlannedRobot, PresentRobot
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 

@@ -187,13 +187,13 @@ def segment_distance(start: Vector, end: Vector, circles: FloatArray, i: int) ->
     """Return the distance of a circle's centre, or of a wall, from a segment."""
     if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
         return _wall_distance(start, end, circles, i)
-    way = minus(end, start)
+    line = minus(end, start)
     if circles[i, 4] <= 0.5:
-        way = (way[0], way[1], 0.0)
+        line = (line[0], line[1], 0.0)
     offset = from_centre(start, circles, i)
-    square = dot(way, way)
-    part = min(max(-dot(offset, way) / square, 0.0), 1.0) if square > 0.0 else 0.0
-    return norm(plus(offset, part, way))
+    square = dot(line, line)
+    part = min(max(-dot(offset, line) / square, 0.0), 1.0) if square > 0.0 else 0.0
+    return norm(plus(offset, part, line))
 
 
 @njit(cache=True, forceinline=True)
@@ -251,14 +251,14 @@ def is_visible(
     if nearby.cells.shape[0] * nearby.cells.shape[1] == 1:
         return is_clear(start, end, felt_at(start, around), extra, cylinders_only)
     size = nearby.head[2]
-    way = minus(end, start)
-    length, done, here = norm(way), 0.0, start
+    line = minus(end, start)
+    length, done, here = norm(line), 0.0, start
     while True:
         stride = clearance_at(here, around) - extra
         free = stride > 0.1 * size
         stride = stride if stride > 0.1 * size else 0.5 * size
         done += stride
-        there = plus(start, done / length, way) if done < length else end
+        there = plus(start, done / length, line) if done < length else end
         if not free and not is_clear(here, there, felt_at(here, around), extra, cylinders_only):
             return False
         if done >= length:

@@ -179,7 +179,7 @@ class MotionSettings(Settings):
     )
 
     @model_validator(mode='after')
-    def _one_way_around(self) -> MotionSettings:
+    def _one_avoidance(self) -> MotionSettings:
         if self.obstacle_term != 'none' and self.avoidance != 'steer':
             raise ValueError(
                 f'avoidance: got {self.avoidance} with obstacle_term {self.obstacle_term}, which '

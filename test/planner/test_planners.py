@@ -22,10 +22,10 @@ from maasi_planner import (
     planner_settings,
 )
 from maasi_planner.endurance import Endurance, EnduranceSettings
+from maasi_planner.planners.home_path import go_home
 from maasi_planner.planners.lawnmower import lanes
 from maasi_planner.planners.mutual_information import intensity, mutual_information
 from maasi_planner.planners.separation import keep_apart
-from maasi_planner.planners.way_home import go_home
 from maasi_planner.team import TAKEN, Decision, single_choice, stay
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search

@@ -100,11 +100,11 @@ def test_a_wide_view_visits_few_places_and_then_those_between():
 def test_others_keep_their_tours_until_a_cluster_appears():
     team, planner = field(starts=((1.0, 1.0, 0.0), (11.0, 11.0, 0.0))), make_planner('tour')
     planner.decide(team)
-    ways = {name: list(way) for name, way in planner._ways.items()}
+    ways = {name: list(way) for name, way in planner.routes.items()}
     other = team.robots['robot1']
     other.planning, other.remaining_path = False, np.array([[11.0, 9.0, 0.0]])
     fly(planner, team)
-    assert planner._ways['robot1'] == ways['robot1']
+    assert planner.routes['robot1'] == ways['robot1']
     team.clusters = [Cluster(np.array([4.2, 6.3]), 0.01 * np.eye(2), 0.1, 0.9)]
     seen = [fly(planner, team) for _ in range(30)]
     assert min(np.linalg.norm(place[:2] - [4.2, 6.3]) for place in seen if place is not None) < 1e-6
@@ -199,14 +199,14 @@ def test_each_robot_has_its_own_path_home(charge):
     if charge is not None:
         other.endurance = Endurance(settings, other.motion, other.state.pose.position)
         other.endurance.update_charge(charge)
-    planner._plan(team)
-    way = planner._ways['robot0']
+    planner.plan(team)
+    way = planner.routes['robot0']
     budget, home = view.endurance.range_from(view.state.pose.position)
-    places = [view.state.pose.position[:2], *planner._points[way], home[:2]]
+    places = [view.state.pose.position[:2], *planner.points[way], home[:2]]
     length = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
     assert len(way) > 4 and length <= budget + 1e-9 and length > 0.7 * budget
     # The other one takes what is left.
-    assert sorted([*way, *planner._ways['robot1']]) == list(range(36))
+    assert sorted([*way, *planner.routes['robot1']]) == list(range(36))
 
 
 def test_places_of_a_robot_that_is_done_go_to_the_others():
@@ -214,9 +214,9 @@ def test_places_of_a_robot_that_is_done_go_to_the_others():
     view = team.robots['robot0']
     view.endurance = Endurance(EnduranceSettings(), view.motion, view.state.pose.position)
     planner.decide(team)
-    assert planner._ways['robot0']
+    assert planner.routes['robot0']
     view.endurance.begin(Phase.DONE, NOTHING_AFFORDABLE)
     view.planning = False
     while planner.finished(team) is None:
         assert fly(planner, team, 'robot1') is not None
-    assert team.exploration.explored_fraction() > 0.99 and 'robot0' not in planner._ways
+    assert team.exploration.explored_fraction() > 0.99 and 'robot0' not in planner.routes

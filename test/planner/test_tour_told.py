@@ -60,7 +60,7 @@ def test_the_rest_of_a_tour_leads_around_keep_outs(seed):
     for name, robot in decision.robots.items():
         drawn = shapely.LineString(np.vstack([robot.waypoint, robot.tour])[:, :2])
         assert drawn.intersection(closed).length < 1e-6
-        bent += len(robot.tour) > len(planner._ways[name])
+        bent += len(robot.tour) > len(planner.routes[name])
     assert bent
 
 
@@ -86,6 +86,6 @@ def test_each_waypoint_has_a_reason_with_numbers_also_in_nodes(name, seed):
         place = re.match(r'next on its tour is \((.*?), (.*?)\) m, where it expects ', text)
         # Straight runs are one leg, whose end may be moved out of a zone.
         assert np.linalg.norm([float(word) for word in place.groups()] - item.waypoint[:2]) < 3.0
-        first = tour._points[tour._ways[robot][0]]
+        first = tour.points[tour.routes[robot][0]]
         assert f'; then ({first[0]:.4g}, {first[1]:.4g}) m' in text
         assert re.search(r'; the alternative \(.*\) m, .* m away, is (later|left to \w+)$', text)

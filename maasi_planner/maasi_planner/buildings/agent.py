@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.buildings.dynamics import Dynamics
-from maasi_planner.buildings.preplanning import CoveragePlan, WayFinder, detection_probability
+from maasi_planner.buildings.preplanning import CoveragePlan, PathFinder, detection_probability
 from maasi_planner.buildings.problem import Plan, PlanSolver, Problem
 from maasi_planner.buildings.settings import (
     CuboidMethodSettings,
@@ -135,7 +135,7 @@ class SearchAgent:
         self._cuboids = inflated(mission.boxes, -settings.visit_depth)
         speed = self.dynamics.speed
         climb = float(self.dynamics.deceleration[1, 2]) / max(1.0 - self.dynamics.retained, 1e-9)
-        self._ways = WayFinder(self._solids, mission.area, speed, min(climb, speed))
+        self._paths = PathFinder(self._solids, mission.area, speed, min(climb, speed))
         self._check_home()
         self.visited = np.zeros(len(mission.cells), dtype=bool)
         self.snapshots: list[Snapshot] = []
@@ -156,7 +156,7 @@ class SearchAgent:
             problem = f', allowed is what lies inside the area, {area.tolist()} [m]'
         elif self.mission.hits(self.home):
             problem = ', which is inside an object or obstacle, allowed is a position outside'
-        elif not any(self._ways.reaches(self.home, centre) for centre in self.mission.centres):
+        elif not any(self._paths.reaches(self.home, centre) for centre in self.mission.centres):
             problem = ', from which no cuboid can be reached: obstacles enclose it'
         if problem:
             raise ValueError(f'{self.name}: start: read {self.home.tolist()}{problem}')
@@ -236,7 +236,7 @@ class SearchAgent:
         homing = self.activity is not Activity.SEARCHING
         self.target = self.home if homing else self._aim(heard)
         if self.settings.around_corners and (self.target != self.position).any():
-            self.target = self._ways.first_corner(self.position, self.target)
+            self.target = self._paths.first_corner(self.position, self.target)
         return Problem(
             position=self.position,
             velocity=self.velocity,

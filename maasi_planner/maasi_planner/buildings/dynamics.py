@@ -69,15 +69,15 @@ class Dynamics:
             steps += 1
         return steps
 
-    def rolling_ways(self, steps: int) -> FloatArray:
+    def rolling_distances(self, steps: int) -> FloatArray:
         """Return the distance [m] after each step of braking from 1 m/s by air resistance."""
         return self.step * np.cumsum(self.retained ** np.arange(steps))
 
-    def shorter_ways(self, steps: int) -> FloatArray:
+    def distance_reductions(self, steps: int) -> FloatArray:
         """Return the reduction of these distances by full force, up and down, (2, 3, steps)."""
         lost = np.zeros((2, 3))
-        ways = np.zeros((2, 3, steps))
+        distances = np.zeros((2, 3, steps))
         for j in range(1, steps):
             lost = self.retained * lost + self.deceleration
-            ways[:, :, j] = ways[:, :, j - 1] + self.step * lost
-        return ways
+            distances[:, :, j] = distances[:, :, j - 1] + self.step * lost
+        return distances

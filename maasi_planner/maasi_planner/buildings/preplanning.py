@@ -89,7 +89,7 @@ class CoveragePlan:
         """Return whether a position (3,) is inside an object or obstacle."""
         return bool(_inside(np.asarray(position, dtype=float), self.solids).all(axis=1).any())
 
-    def way_hits(self, begin: ArrayLike, end: ArrayLike) -> bool:
+    def path_hits(self, begin: ArrayLike, end: ArrayLike) -> bool:
         """Return whether the segment between two positions (3,) cuts an object or obstacle."""
         ends = np.asarray(begin, dtype=float), np.asarray(end, dtype=float)
         return bool(segment_cuts(*ends, self.solids).any())
@@ -102,11 +102,11 @@ def _inside(position: FloatArray, boxes: FloatArray) -> BoolArray:
 
 def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolArray:
     """Return which boxes (n, 3, 2) have interiors that segments (..., 3) cut, (..., n)."""
-    way = end - begin
+    offset = end - begin
     with np.errstate(divide='ignore', invalid='ignore'):
-        first = (boxes[:, :, 0] - begin[..., None, :]) / way[..., None, :]
-        second = (boxes[:, :, 1] - begin[..., None, :]) / way[..., None, :]
-    still = np.broadcast_to(way[..., None, :] == 0.0, first.shape)
+        first = (boxes[:, :, 0] - begin[..., None, :]) / offset[..., None, :]
+        second = (boxes[:, :, 1] - begin[..., None, :]) / offset[..., None, :]
+    still = np.broadcast_to(offset[..., None, :] == 0.0, first.shape)
     within = _inside(begin, boxes)
     enter = np.where(still, np.where(within, -np.inf, np.inf), np.minimum(first, second))
     leave = np.where(still, np.where(within, np.inf, -np.inf), np.maximum(first, second))
@@ -235,7 +235,7 @@ def _usable(
 _BERTH = 3.0  # distance of intermediate targets from the corners of obstacles [m]
 
 
-class WayFinder:
+class PathFinder:
     """Fastest paths around boxes (n, 3, 2) [m] by a visibility graph of their corners."""
 
     def __init__(self, solids: FloatArray, area: FloatArray, speed: float, climb: float) -> None:
@@ -249,10 +249,12 @@ class WayFinder:
             return target
         points = np.vstack([place, target, self._corners(place, target)])
         number = len(points)
-        way = points[None, :, :] - points[:, None, :]
-        times = np.abs(way) / self._speeds
-        times[:, :, 2] = np.where(way[:, :, 2] > 0.0, times[:, :, 2], -way[:, :, 2] / self._down)
-        times = times.max(axis=2) + 1e-3 * np.sqrt((way * way).sum(axis=2))
+        offset = points[None, :, :] - points[:, None, :]
+        times = np.abs(offset) / self._speeds
+        times[:, :, 2] = np.where(
+            offset[:, :, 2] > 0.0, times[:, :, 2], -offset[:, :, 2] / self._down
+        )
+        times = times.max(axis=2) + 1e-3 * np.sqrt((offset * offset).sum(axis=2))
         for i in range(number):
             blocked = segment_cuts(
                 np.broadcast_to(points[i], points.shape), points, self.solids

@@ -69,8 +69,8 @@ class PlanSolver:
         pull[settings.guided] = settings.guidance_weight
         # As printed, the path after the horizon is unconstrained.
         steps = dynamics.braking_steps() if settings.brake_at_end else 0
-        self._rolling = dynamics.rolling_ways(steps)
-        self._rise, self._sink = dynamics.shorter_ways(steps)
+        self._rolling = dynamics.rolling_distances(steps)
+        self._rise, self._sink = dynamics.distance_reductions(steps)
         self._search = axis_rows(dynamics, horizon, pull, smoothness, self._rolling)
         pull = np.full(horizon + 1, settings.guidance_weight)
         pull[0] = 0.0

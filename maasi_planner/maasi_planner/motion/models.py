@@ -217,12 +217,12 @@ def _roll_out(
             seconds = _SLOWEST * path / steering.speed + _AT_LEAST
             last = int(min(seconds / (kernel.periods * kernel.h), last)) if path < np.inf else 1
         if straight:
-            way = _go_straight(kernel, start, goal, positions[w], yaws[w])
+            result = _go_straight(kernel, start, goal, positions[w], yaws[w])
         else:
             state = start.copy()
             row, headings = positions[w, :last], yaws[w, :last]
-            way = _close_loop(kernel, state, goal, tables[w], row, headings)
-        lengths[w], control_cost[w] = way
+            result = _close_loop(kernel, state, goal, tables[w], row, headings)
+        lengths[w], control_cost[w] = result
         if lengths[w] >= last and last < yaws.shape[1]:
             lengths[w] = -last
         for axis in range(3):

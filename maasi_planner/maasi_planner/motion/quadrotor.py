@@ -71,12 +71,12 @@ def _inputs(state: FloatArray, force: Vector, turn: float) -> tuple[float, Vecto
     strength = norm(force)
     thrust = MASS * max(0.0, dot(force, up))
     # Rotation from the thrust to the force.
-    way = _cross(up, (force[0] / strength, force[1] / strength, force[2] / strength))
+    turn_axis = _cross(up, (force[0] / strength, force[1] / strength, force[2] / strength))
     p, q, r = state[11], state[12], state[13]
     jx, jy, jz = INERTIA
     return thrust, (
-        jx * C4 * (C3 * dot(forward, way) - p) + (jz - jy) * q * r,
-        jy * C4 * (C3 * dot(left, way) - q) + (jx - jz) * r * p,
+        jx * C4 * (C3 * dot(forward, turn_axis) - p) + (jz - jy) * q * r,
+        jy * C4 * (C3 * dot(left, turn_axis) - q) + (jx - jz) * r * p,
         jz * C4 * (turn - r) + (jy - jx) * p * q,
     )
 

@@ -56,7 +56,7 @@ def turned(x: float, y: float, yaw: float) -> tuple[float, float]:
 
 @njit(cache=True, forceinline=True)
 def _stoppable(
-    position: Vector, way: Vector, steering: Steering, felt: Felt, beyond: bool
+    position: Vector, line: Vector, steering: Steering, felt: Felt, beyond: bool
 ) -> float:
     """Return the speed, at most the limit, that can be stopped before the nearest circle.
 
@@ -69,20 +69,20 @@ def _stoppable(
         gap = norm(offset)
         if circles[i, 5] != 0.0 or circles[i, 6] != 0.0:
             # Motion along a wall needs no stop.
-            towards = -dot(offset, way) / max(gap * norm(way), 1e-9)
+            towards = -dot(offset, line) / max(gap * norm(line), 1e-9)
             if towards > 0.0 and not beyond:
                 free = min(free, (gap - circles[i, 3]) / towards)
-        elif gap >= circles[i, 3] or dot(offset, way) < 0.0:
+        elif gap >= circles[i, 3] or dot(offset, line) < 0.0:
             free = min(free, gap - circles[i, 3])
     speed = steering.speed
     return min(speed, math.sqrt(steering.acceleration * max(free, 0.0)) + 0.05 * speed)
 
 
 @njit(cache=True, forceinline=True)
-def _towards(way: Vector, velocity: Vector, yaw: float, steering: Steering) -> Command:
+def _towards(line: Vector, velocity: Vector, yaw: float, steering: Steering) -> Command:
     turn = 0.0
-    if steering.face_travel and way[0] * way[0] + way[1] * way[1] > 1e-6:
-        turn = 2.0 * wrapped(math.atan2(way[1], way[0]) - yaw)
+    if steering.face_travel and line[0] * line[0] + line[1] * line[1] > 1e-6:
+        turn = 2.0 * wrapped(math.atan2(line[1], line[0]) - yaw)
         turn = min(max(turn, -steering.yaw_rate), steering.yaw_rate)
     forward, side = turned(velocity[0], velocity[1], -yaw)
     return forward, side, velocity[2], turn
@@ -91,11 +91,11 @@ def _towards(way: Vector, velocity: Vector, yaw: float, steering: Steering) -> C
 @njit(cache=True, forceinline=True)
 def fly_freely(position: Vector, yaw: float, goal: Vector, steering: Steering) -> Command:
     """Return the command towards a waypoint: `rate` times the distance, at most `speed`."""
-    way = minus(goal, position)
-    size, scale = norm(way), steering.rate
+    line = minus(goal, position)
+    size, scale = norm(line), steering.rate
     if scale * size > steering.speed:
         scale = steering.speed / size
-    return _towards(way, (scale * way[0], scale * way[1], scale * way[2]), yaw, steering)
+    return _towards(line, (scale * line[0], scale * line[1], scale * line[2]), yaw, steering)
 
 
 @njit(cache=True)
@@ -114,18 +114,18 @@ def fly_among(
     """
     target, left, manner, vertex = head_for(position, goal, to_goal, around, vertex)
     felt, beyond = minded(position, manner, around)
-    way, speed = minus(target, position), steering.speed
-    size = norm(way)
+    line, speed = minus(target, position), steering.speed
+    size = norm(line)
     if steering.acceleration < np.inf:
-        speed = _stoppable(position, way, steering, felt, beyond)
+        speed = _stoppable(position, line, steering, felt, beyond)
     scale = min(steering.rate * left, speed) / size if size > 0.0 else 0.0
-    velocity = (scale * way[0], scale * way[1], scale * way[2])
+    velocity = (scale * line[0], scale * line[1], scale * line[2])
     limits = steering.barrier, steering.acceleration
     velocity = hold_back(position, felt, beyond, limits, velocity)
     fastest = norm(velocity)
     share = speed / fastest if fastest > speed else 1.0
     velocity = (velocity[0] * share, velocity[1] * share, velocity[2] * share)
-    return _towards(way, velocity, yaw, steering), vertex
+    return _towards(line, velocity, yaw, steering), vertex
 
 
 TERMS = ('none', 'printed', 'away')
@@ -151,20 +151,20 @@ def with_obstacle_term(
     position: Vector, yaw: float, command: Command, term: ObstacleTerm
 ) -> Command:
     """Return a command with the obstacle term."""
-    nearest, way = np.inf, (0.0, 0.0, 0.0)
+    nearest, line = np.inf, (0.0, 0.0, 0.0)
     for i in range(term.circles.shape[0]):
         offset = from_centre(position, term.circles, i)
         size = norm(offset)
         if size - term.circles[i, 3] < nearest:
             nearest, size = size - term.circles[i, 3], max(size, 1e-9)
-            way = (offset[0] / size, offset[1] / size, offset[2] / size)
+            line = (offset[0] / size, offset[1] / size, offset[2] / size)
     if nearest >= term.distance:
         return command
     x, y, z, turn = command
     by_x, by_y, by_z, by_turn = term.push
     if term.kind == PRINTED:
         return x - by_x, y - by_y, z - by_z, turn - by_turn
-    forward, left = turned(way[0], way[1], -yaw)
+    forward, left = turned(line[0], line[1], -yaw)
     # A robot that cannot move sideways turns to that side.
     turn += by_turn * left if by_y == 0.0 else 0.0
-    return x + abs(by_x) * forward, y + abs(by_y) * left, z + by_z * way[2], turn
+    return x + abs(by_x) * forward, y + abs(by_y) * left, z + by_z * line[2], turn

@@ -45,7 +45,7 @@ def _before_disc(along: float, across: float, radius: float) -> float:
 
 
 @njit(cache=True, forceinline=True)
-def way_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: bool) -> float:
+def distance_ahead(x: float, y: float, yaw: float, reach: float, felt: Felt, beyond: bool) -> float:
     """Return the distance straight ahead that is free of circles, at most `reach` metres.
 
     beyond: whether the robot is beyond the walls, so that they do not count.
@@ -93,21 +93,21 @@ def _speed_ahead(
 ) -> float:
     # Farther obstacles allow full speed.
     reach = 1.001 * steering.speed / steering.barrier
-    free = way_ahead(position[0], position[1], yaw, reach, felt, beyond)
+    free = distance_ahead(position[0], position[1], yaw, reach, felt, beyond)
     return approach_limit(free, (steering.barrier, steering.acceleration))
 
 
 @njit(cache=True, forceinline=True)
 def _along(
-    here: Vector, way: tuple[float, float], steering: Steering, felt: Felt
+    here: Vector, line: tuple[float, float], steering: Steering, felt: Felt
 ) -> tuple[float, float]:
     """Return the direction along what the robot touches, and slightly away from it."""
-    share = steering.speed / max(math.hypot(way[0], way[1]), 1e-9)
+    share = steering.speed / max(math.hypot(line[0], line[1]), 1e-9)
     limits = steering.barrier, steering.acceleration
-    x, y, _ = hold_back(here, felt, False, limits, (share * way[0], share * way[1], 0.0))
+    x, y, _ = hold_back(here, felt, False, limits, (share * line[0], share * line[1], 0.0))
     if math.hypot(x, y) < _STANDS * steering.speed:
-        return way
-    away = math.copysign(_AWAY, x * way[1] - y * way[0])
+        return line
+    away = math.copysign(_AWAY, x * line[1] - y * line[0])
     return x + away * y, y - away * x
 
 

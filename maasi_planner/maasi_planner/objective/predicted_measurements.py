@@ -49,7 +49,7 @@ class Measurements(NamedTuple):
     reach: FloatArray
 
 
-class Ways(NamedTuple):
+class Paths(NamedTuple):
     """Trajectories (W, K + 1) of `lengths` steps of a robot, and its measurements on them.
 
     The first is after `phase` steps, others follow in every period and, with `arrival`, at the end.
@@ -92,13 +92,15 @@ class CoarseTrajectories(Trajectories):
         return self.metres
 
 
-def planned_way(view: RobotView, prediction: Trajectories, arrival: bool) -> Ways:
+def planned_paths(view: RobotView, prediction: Trajectories, arrival: bool) -> Paths:
     """Return the trajectories of a planning robot, which measures now."""
     stride = prediction.stride if isinstance(prediction, CoarseTrajectories) else 1
-    return Ways(view, prediction.positions, prediction.yaws, prediction.lengths, 0, arrival, stride)
+    return Paths(
+        view, prediction.positions, prediction.yaws, prediction.lengths, 0, arrival, stride
+    )
 
 
-def remaining_way(view: RobotView) -> Ways:
+def path_ahead(view: RobotView) -> Paths:
     """Return the trajectory of a robot that does not plan."""
     path, yaws = view.remaining_path, view.remaining_yaws
     if view.planning or path is None or len(path) == 0:
@@ -107,7 +109,7 @@ def remaining_way(view: RobotView) -> Ways:
         yaws = np.full(len(path), view.state.pose.yaw)
     # The robot plans, and therefore measures, at the end of its path.
     lengths, arrival = np.array([len(path) - 1]), view.planning or len(path) > 1
-    return Ways(view, path[None], yaws[None], lengths, max(0, view.phase), arrival)
+    return Paths(view, path[None], yaws[None], lengths, max(0, view.phase), arrival)
 
 
 @njit(cache=True)
@@ -141,18 +143,18 @@ def _fill(
                 out.places[g, i, axis] = path[k, axis]
 
 
-def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurements:
+def predicted(robots: Sequence[Paths], horizon: int, extend: bool) -> Measurements:
     """Return the measurements of robots on their trajectories.
 
     With `extend` robots continue to measure at their ends until `horizon` (000, section 6: appended
     constant states), which counts only for others.
     """
-    counts = [len(ways.lengths) for ways in robots]
+    counts = [len(paths.lengths) for paths in robots]
     total, most = sum(counts), 1
-    for ways in robots:
-        longest = max(horizon, int(ways.lengths.max(initial=0)))
-        most = max(most, max(0, longest - ways.phase) // ways.view.period_steps + 2)
-    detections = [ways.view.sensor.detection for ways in robots]
+    for paths in robots:
+        longest = max(horizon, int(paths.lengths.max(initial=0)))
+        most = max(most, max(0, longest - paths.phase) // paths.view.period_steps + 2)
+    detections = [paths.view.sensor.detection for paths in robots]
     out = Measurements(
         np.repeat(np.arange(len(robots)), counts),
         number=np.empty(total, np.int64),
@@ -165,11 +167,11 @@ def predicted(robots: Sequence[Ways], horizon: int, extend: bool) -> Measurement
         reach=np.array([reach_of(item) for item in detections], float),
     )
     row = 0
-    for ways, count in zip(robots, counts):
-        until, period = horizon if extend else -1, ways.view.period_steps
-        timing = ways.phase, period, until, ways.arrival, ways.stride
-        dimension = ways.view.sensor.dimension
-        _fill(out, row, ways.positions, ways.yaws, ways.lengths, timing, dimension)
+    for paths, count in zip(robots, counts):
+        until, period = horizon if extend else -1, paths.view.period_steps
+        timing = paths.phase, period, until, paths.arrival, paths.stride
+        dimension = paths.view.sensor.dimension
+        _fill(out, row, paths.positions, paths.yaws, paths.lengths, timing, dimension)
         row += count
     return out
 

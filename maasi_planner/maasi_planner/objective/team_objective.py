@@ -9,7 +9,7 @@ from maasi_planner.objective.candidate_table import CandidateTable, part_of_tabl
 from maasi_planner.objective.information_terms import InformationTerms, joined, reduced
 from maasi_planner.objective.joint_search import PAIRS_LIMIT
 from maasi_planner.objective.paper_terms import paper_terms
-from maasi_planner.objective.predicted_measurements import planned_way, predicted, remaining_way
+from maasi_planner.objective.predicted_measurements import path_ahead, planned_paths, predicted
 from maasi_planner.objective.settings import InformationSettings
 from maasi_planner.objective.terms import Terms
 from maasi_planner.team import RobotView, TeamView, UsableCandidates
@@ -40,20 +40,20 @@ class TeamObjective:
         choices = [options[name] for name in self.names]
         self.start = np.array([0, *(len(option.points) for option in choices)]).cumsum()
         views = [team.robots[name] for name in self.names]
-        ways = [
-            planned_way(view, option.prediction, settings.measure_at_arrival)
+        paths = [
+            planned_paths(view, option.prediction, settings.measure_at_arrival)
             for view, option in zip(views, choices)
         ]
-        rest = [remaining_way(team.robots[name]) for name in team.names() if name not in self.names]
+        rest = [path_ahead(team.robots[name]) for name in team.names() if name not in self.names]
         # First counted measurement: the present one does not depend on the choice.
         first = 0 if settings.count_present else 1
         if first and informed:
-            rest += map(remaining_way, views)
-        lengths = np.concatenate([way.lengths for way in ways])
+            rest += map(path_ahead, views)
+        lengths = np.concatenate([path.lengths for path in paths])
         cost = np.concatenate([option.prediction.control_cost for option in choices])
         # By information, later measurements at a robot's end do not count.
         extend = settings.extension == 'measuring' and not informed
-        planned = predicted(ways, int(lengths.max()), extend)
+        planned = predicted(paths, int(lengths.max()), extend)
         settled = predicted(rest, int(lengths.max()), extend)
         norm = lengths.astype(float)
         if settings.normalisation == 'distance':
@@ -71,7 +71,7 @@ class TeamObjective:
             terms=Terms(informed, np.zeros(0), np.zeros(1, np.int64)),
         )
         if informed:
-            others = [way.view for way in rest], settled
+            others = [path.view for path in rest], settled
             build = InformationTerms(team, settings, others, planned.kind)
             self.table, self.alone = self._by_robot(table, build, views, first)
             return

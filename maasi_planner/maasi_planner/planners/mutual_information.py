@@ -157,10 +157,10 @@ class MutualInformation(Planner):
         indices = {}
         for name, option in options.items():
             # Uninformative candidates are ordered by how straight on they are.
-            ways = option.points - team.robots[name].state.pose.position
-            lengths = np.sqrt((ways * ways).sum(axis=1))
+            offsets = option.points - team.robots[name].state.pose.position
+            lengths = np.sqrt((offsets * offsets).sum(axis=1))
             last = self._headings.get(name, np.zeros(3))
-            order = (ways * last).sum(axis=1) / np.maximum(lengths, 1e-12)
+            order = (offsets * last).sum(axis=1) / np.maximum(lengths, 1e-12)
             rows = np.flatnonzero(option.allowed)
             indices[name] = rows[np.argsort(-order[rows], kind='stable')].tolist()
         points = {name: option.points for name, option in options.items()}
@@ -174,10 +174,10 @@ class MutualInformation(Planner):
                 decision.robots[name] = stay(view, f'stays: {ASSIGNED}')
                 continue
             values = np.array([value({**chosen, name: w}) for w in range(len(option.points))])
-            way = option.points[row] - view.state.pose.position
-            length = math.sqrt(float((way * way).sum()))
+            offset = option.points[row] - view.state.pose.position
+            length = math.sqrt(float((offset * offset).sum()))
             if length > 1e-9:
-                self._headings[name] = way / length
+                self._headings[name] = offset / length
             reason = 'no waypoint promises information: continues straight on'
             if values[row] > 0.0:
                 bits = values[row] / math.log(2.0)

@@ -8,7 +8,7 @@ import numpy as np
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.records import Cluster
 from maasi_planner.motion.base import Trajectories
-from maasi_planner.planners.separation import crossed, free_of_robots, ways_apart
+from maasi_planner.planners.separation import crossed, free_of_robots, paths_apart
 from maasi_planner.team import (
     BLOCKED,
     CROSSED,
@@ -82,7 +82,7 @@ def options_of(
     free = free_of_robots(points, view.radius, places)
     allowed = prediction.reached & free & (prediction.lengths > 0)
     if allowed.any():
-        allowed &= ways_apart(team, name, prediction.positions, {})
+        allowed &= paths_apart(team, name, prediction.positions, {})
         if not allowed.any():
             return BLOCKED[0]
         allowed = affordable(team, name, prediction, allowed)

@@ -36,21 +36,21 @@ def apart(point: FloatArray, radius: float, others: list[tuple[FloatArray, float
 
 
 @njit(cache=True)
-def _gaps(ways: FloatArray, other: FloatArray) -> FloatArray:
+def _gaps(paths: FloatArray, other: FloatArray) -> FloatArray:
     """Return the smallest distance of each path (W, K, 3) from another (n, 3), also between steps.
 
     Robots stand at the ends. A goal takes effect at once or one step later.
     """
-    out = np.full(ways.shape[0], np.inf)
-    for w in range(ways.shape[0]):
+    out = np.full(paths.shape[0], np.inf)
+    for w in range(paths.shape[0]):
         for late in range(2):
             dx = dy = dz = 0.0
-            for k in range(max(ways.shape[1] + late, other.shape[0])):
-                here = min(max(k - late, 0), ways.shape[1] - 1)
+            for k in range(max(paths.shape[1] + late, other.shape[0])):
+                here = min(max(k - late, 0), paths.shape[1] - 1)
                 there = min(k, other.shape[0] - 1)
-                x = ways[w, here, 0] - other[there, 0]
-                y = ways[w, here, 1] - other[there, 1]
-                z = ways[w, here, 2] - other[there, 2]
+                x = paths[w, here, 0] - other[there, 0]
+                y = paths[w, here, 1] - other[there, 1]
+                z = paths[w, here, 2] - other[there, 2]
                 square = x * x + y * y + z * z
                 if k > 0:
                     # Both move uniformly between steps.
@@ -122,8 +122,8 @@ def with_braking(motion: MotionModel, robot: RobotDecision, step: float) -> Floa
     return np.vstack([path, braking_path(motion, state, step)[1:]])
 
 
-def ways_apart(
-    team: TeamView, name: str, ways: FloatArray, others: Mapping[str, FloatArray]
+def paths_apart(
+    team: TeamView, name: str, paths: FloatArray, others: Mapping[str, FloatArray]
 ) -> BoolArray:
     """Return which predicted paths (W, K, 3) of a robot keep the radii away from those of others.
 
@@ -131,19 +131,19 @@ def ways_apart(
     paths. Robots that are too near already must not come nearer.
     """
     view = team.robots[name]
-    free = np.ones(len(ways), dtype=bool)
+    free = np.ones(len(paths), dtype=bool)
     for path, radius in paths_of(team, name, others):
         if view.radius + radius > 0.0:
             now = float(np.linalg.norm(view.state.pose.position - path[0]))
             reach = min(view.radius + radius, now)
-            free &= _gaps(ways, np.ascontiguousarray(path, dtype=float)) >= reach - 1e-9
+            free &= _gaps(paths, np.ascontiguousarray(path, dtype=float)) >= reach - 1e-9
     return free
 
 
 def crossed(team: TeamView, name: str, prediction: Trajectories, decision: Decision) -> bool:
     """Return whether other robots are in the only path of a prediction."""
     others = {key: robot.positions for key, robot in decision.robots.items()}
-    return not ways_apart(team, name, prediction.positions, others)[0]
+    return not paths_apart(team, name, prediction.positions, others)[0]
 
 
 def all_apart(team: TeamView, waypoints: Mapping[str, FloatArray]) -> bool:
@@ -187,7 +187,7 @@ def keep_apart(team: TeamView, decision: Decision, left: Mapping[str, FloatArray
     A waiting robot brakes, which may make others wait, too, or follows the rest `left` (n, 3) of
     its present path.
     """
-    ways, rest = {}, {}
+    paths, rest = {}, {}
     for name, robot in decision.robots.items():
         view = team.robots[name]
         if name in left:
@@ -195,17 +195,17 @@ def keep_apart(team: TeamView, decision: Decision, left: Mapping[str, FloatArray
         else:
             rest[name] = braking_path(view.motion, view.state, team.step_time)
         going = rest[name] if robot.stays else with_braking(view.motion, robot, team.step_time)
-        ways[name] = going
+        paths[name] = going
     changed = True
     while changed:
         changed = False
-        for name in sorted(ways, reverse=True):
-            others = {key: way for key, way in ways.items() if key != name}
+        for name in sorted(paths, reverse=True):
+            others = {key: path for key, path in paths.items() if key != name}
             chosen = decision.robots[name]
-            if chosen.stays or _both_apart(team, name, chosen, ways, others):
+            if chosen.stays or _both_apart(team, name, chosen, paths, others):
                 continue
             decision.robots[name] = stay(team.robots[name], CROSSED)
-            ways[name] = rest[name]
+            paths[name] = rest[name]
             changed = True
 
 
@@ -213,10 +213,10 @@ def _both_apart(
     team: TeamView,
     name: str,
     chosen: RobotDecision,
-    ways: Mapping[str, FloatArray],
+    paths: Mapping[str, FloatArray],
     others: Mapping[str, FloatArray],
 ) -> bool:
     """Return whether a robot keeps apart whether it stands or drifts at its end."""
     return all(
-        ways_apart(team, name, way[None], others)[0] for way in (chosen.positions, ways[name])
+        paths_apart(team, name, path[None], others)[0] for path in (chosen.positions, paths[name])
     )

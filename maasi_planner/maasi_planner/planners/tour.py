@@ -53,9 +53,9 @@ class Tour(Planner):
         self._area: Area | None = None
         # Cells of the lattice, positions of cells and clusters, and planned prizes of both.
         self._chosen = np.zeros(0, np.int64)
-        self._points = np.zeros((0, 0))
+        self.points = np.zeros((0, 0))
         self._planned = np.zeros(0)
-        self._ways: dict[str, list[int]] = {}
+        self.routes: dict[str, list[int]] = {}
         # Last target of each robot, and robots that could not afford one at this step.
         self._target: dict[str, FloatArray] = {}
         self._refused: set[str] = set()
@@ -67,11 +67,11 @@ class Tour(Planner):
         prizes = self._prizes(team)
         again = prizes is None
         if prizes is None:
-            prizes = self._plan(team)
+            prizes = self.plan(team)
         for name in team.planning():
             chosen = self._next(team, name, prizes, places, decision)
             if chosen is None and not again:
-                prizes, again = self._plan(team), True
+                prizes, again = self.plan(team), True
                 chosen = self._next(team, name, prizes, places, decision)
             if chosen is None:
                 self._target.pop(name, None)
@@ -101,22 +101,22 @@ class Tour(Planner):
         if self._lattice is None or self._area is not team.area:
             # A change of the area makes all plans obsolete.
             self._lattice, self._area = Lattice(team.exploration, *lanes_of(team)[1:]), team.area
-            self._ways = {}
+            self.routes = {}
         return self._lattice
 
     def _prizes(self, team: TeamView) -> FloatArray | None:
         """Return the present prizes of the plan; None if it has to be made again."""
         lattice, number = self._squares(team), len(self._chosen)
-        left = np.array([index for way in self._ways.values() for index in way], np.int64)
-        if set(self.searching(team)) != set(self._ways):
+        left = np.array([index for route in self.routes.values() for index in route], np.int64)
+        if set(self.searching(team)) != set(self.routes):
             return None
-        prizes = np.zeros(len(self._points))
+        prizes = np.zeros(len(self.points))
         # In the order of choice, as each gains what earlier ones leave.
         rows = np.sort(left[left < number])
         gains = lattice.gains(team.exploration, self._chosen[rows])
         prizes[rows] = team.area.expected_targets * gains
         for cluster in self.heavy(team):
-            gaps = np.linalg.norm(self._points[number:] - cluster.position, axis=1)
+            gaps = np.linalg.norm(self.points[number:] - cluster.position, axis=1)
             same = gaps < SAME * lattice.pitch
             if not same.any():
                 return None
@@ -124,17 +124,17 @@ class Tour(Planner):
         moved = np.abs(prizes - self._planned)[left].sum()
         return None if moved > CHANGE * self._planned[left].sum() else prizes
 
-    def _plan(self, team: TeamView) -> FloatArray:
+    def plan(self, team: TeamView) -> FloatArray:
         """Plan the tours of all robots from their present or final positions; return the prizes."""
         lattice, names, heavy = self._squares(team), self.searching(team), self.heavy(team)
         number = len(self._chosen)
         before = {
-            name: self._chosen[[i for i in way if i < number]].tolist()
-            for name, way in self._ways.items()
+            name: self._chosen[[i for i in route if i < number]].tolist()
+            for name, route in self.routes.items()
         }
         self._chosen, gains = lattice.choose(team.exploration, ENOUGH * len(names))
         centres = np.array([item.position for item in heavy]).reshape(-1, team.dimension)
-        self._points = np.vstack([lattice.points(team.exploration, self._chosen), centres])
+        self.points = np.vstack([lattice.points(team.exploration, self._chosen), centres])
         masses = [item.mass for item in heavy]
         self._planned = np.concatenate([team.area.expected_targets * gains, masses])
         prizes = self._planned.copy()
@@ -152,20 +152,20 @@ class Tour(Planner):
             ends.append(home[: team.dimension] + (0.0 if np.isfinite(budget) else np.nan))
             if name in self._target:
                 # The robot is on its path there.
-                gaps = np.linalg.norm(self._points - self._target[name], axis=1)
+                gaps = np.linalg.norm(self.points - self._target[name], axis=1)
                 prizes[gaps < SAME * lattice.pitch] = 0.0
         speeds = np.array([team.robots[name].motion.settings.speed for name in names])
         homes = np.array(ends) if np.isfinite(budgets).any() else None
         # Lanes are those of the lattice.
-        points, places = self._points @ lattice.turn, np.array(starts) @ lattice.turn
+        points, places = self.points @ lattice.turn, np.array(starts) @ lattice.turn
         homes = None if homes is None else homes @ lattice.turn
         rows = {square: row for row, square in enumerate(self._chosen.tolist())}
         known = [
             np.array([rows[i] for i in before.get(name, []) if i in rows], np.int64)
             for name in names
         ]
-        ways = plan_ways(points, prizes, places, np.array(budgets), homes, speeds, known)
-        self._ways = {name: way.tolist() for name, way in zip(names, ways)}
+        routes = plan_ways(points, prizes, places, np.array(budgets), homes, speeds, known)
+        self.routes = {name: route.tolist() for name, route in zip(names, routes)}
         return self._planned
 
     def _next(
@@ -177,20 +177,20 @@ class Tour(Planner):
         decision: Decision,
     ) -> RobotDecision | None:
         """Return the next leg of a robot's tour, without cells that lost their prize, or None."""
-        view, way, d = team.robots[name], self._ways.get(name, []), team.dimension
+        view, route, d = team.robots[name], self.routes.get(name, []), team.dimension
         here = view.state.pose.position
-        while way:
-            index = way.pop(0)
+        while route:
+            index = route.pop(0)
             if prizes[index] < STALE * self._planned[index]:
                 continue
             passed = [index]
-            while way and self._straight(here[:d], passed[-1], way[0]):
-                passed.append(way.pop(0))
+            while route and self._straight(here[:d], passed[-1], route[0]):
+                passed.append(route.pop(0))
             index = passed[-1]
             place = np.array(here)
             if d == 2:
                 place[2] = view.height
-            place[:d] = self._points[index]
+            place[:d] = self.points[index]
             waypoint, whole = self._leg(team, view, place)
             moved = view.motion.keep_out.moved_out(here, waypoint)
             point = np.array([here if moved is None else moved])
@@ -202,10 +202,10 @@ class Tour(Planner):
                 continue
             if usable and crossed(team, name, prediction, decision):
                 if others_move(team, name, decision):
-                    way.insert(0, index)
+                    route.insert(0, index)
                     return stay(view, CROSSED)
                 if detour := past_standing(team, name, point[0], decision):
-                    way.insert(0, index)
+                    route.insert(0, index)
                     self._target[name] = detour[0][0, :d]
                     return single_choice(*detour, 0, PASSES)
                 usable = False
@@ -213,45 +213,45 @@ class Tour(Planner):
                 squares = [self._chosen[i] for i in passed if i < len(self._chosen)]
                 self._squares(team).trust[squares] *= 0.5
             elif not whole:
-                way.insert(0, index)
+                route.insert(0, index)
             if usable:
                 self._target[name] = (place if whole else waypoint)[:d]
                 reason = self._reason(name, here[:d], index, prizes)
                 chosen = single_choice(point, prediction, 0, reason)
-                chosen.tour = self._rest(view, point[0], way)
+                chosen.tour = self._rest(view, point[0], route)
                 return chosen
         return None
 
     def _reason(self, name: str, here: FloatArray, index: int, prizes: FloatArray) -> str:
         def told(place: int) -> str:
-            numbers = ', '.join(f'{value:.4g}' for value in self._points[place])
+            numbers = ', '.join(f'{value:.4g}' for value in self.points[place])
             return f'({numbers}) m'
 
         def gain(place: int) -> str:
             potential = 'a potential target of mass ' if place >= len(self._chosen) else ''
             return f'{potential}{prizes[place]:.2g}' + ('' if potential else ' targets')
 
-        rest = [place for place in self._ways[name] if place != index]
+        rest = [place for place in self.routes[name] if place != index]
         reason = f'next on its tour is {told(index)}, where it expects {gain(index)}'
         if rest:
             reason += f'; then {told(rest[0])}' + (f' and {len(rest) - 1} more' * (len(rest) > 1))
-        owners = {place: owner for owner, way in self._ways.items() for place in way}
+        owners = {place: owner for owner, route in self.routes.items() for place in route}
         others = np.array([place for place in owners if place != index], np.int64)
         if len(others):
-            gaps = np.linalg.norm(self._points[others] - here, axis=1)
+            gaps = np.linalg.norm(self.points[others] - here, axis=1)
             best = int(np.argmax(prizes[others] / np.maximum(gaps, 1e-9)))
             other, gap = int(others[best]), gaps[best]
             when = 'later' if owners[other] == name else f'assigned to {owners[other]}'
             reason += f'; the alternative {told(other)}, {gain(other)}, {gap:.3g} m away, is {when}'
         return reason
 
-    def _rest(self, view: RobotView, start: FloatArray, way: list[int]) -> FloatArray:
+    def _rest(self, view: RobotView, start: FloatArray, route: list[int]) -> FloatArray:
         """Return the path after a waypoint, around obstacles, (n, 3)."""
         corners: list[tuple[float, float, float]] = []
         here, keep_out = start, view.motion.keep_out
-        for index in way[:MOST_DRAWN]:
+        for index in route[:MOST_DRAWN]:
             place = np.array(start)
-            place[: self._points.shape[1]] = self._points[index]
+            place[: self.points.shape[1]] = self.points[index]
             moved = keep_out.moved_out(here, place)
             if moved is not None:
                 corners += keep_out.route(here, moved)
@@ -259,7 +259,7 @@ class Tour(Planner):
         return np.array(corners).reshape(-1, 3)
 
     def _straight(self, here: FloatArray, index: int, following: int) -> bool:
-        there, end = self._points[index], self._points[following]
+        there, end = self.points[index], self.points[following]
         bent = np.linalg.norm(there - here) + np.linalg.norm(end - there)
         return bool(bent <= 1.001 * np.linalg.norm(end - here))
 

@@ -119,7 +119,7 @@ class CuboidMission:
                 place, speed = agent.dynamics.next(
                     self.positions[name], self.velocities[name], choice.controls[0]
                 )
-                collisions += self.mission.way_hits(self.positions[name], place)
+                collisions += self.mission.path_hits(self.positions[name], place)
                 beyond = (place < area[:, 0] - 1e-2) | (place > area[:, 1] + 1e-2)
                 outside += bool(beyond.any())
                 self.positions[name], self.velocities[name] = place, speed

@@ -154,7 +154,7 @@ def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
     visited = {shot['cuboid'] for shot in shots}
     total = len(mission.cells)
     cuts = sum(
-        mission.way_hits(begin, end)
+        mission.path_hits(begin, end)
         for path in record.trajectories.values()
         for begin, end in zip(path[:-1, 1:], path[1:, 1:])
     )

@@ -47,7 +47,7 @@ class SearchingRobot:
         self._command = np.zeros(4)
         place, velocity = self._dynamics.next(pose.position, self.state.velocity, control)
         self.state = RobotState(Pose(place, pose.orientation), velocity)
-        self.collisions += self._mission.way_hits(pose.position, place)
+        self.collisions += self._mission.path_hits(pose.position, place)
         self.battery.drain(float(np.linalg.norm(velocity)), dt)
         self.odometry = self._odometry.step(self.state, step)
 

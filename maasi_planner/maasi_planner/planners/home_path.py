@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.planners.separation import apart, paths_of, ways_apart
+from maasi_planner.planners.separation import apart, paths_apart, paths_of
 from maasi_planner.team import (
     CROSSED,
     TAKEN,
@@ -39,7 +39,7 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     prediction = view.motion.predict(view.state, charger[None, :], team.step_time)
     if not free:
         return _wait_near(team, name, charger, others, f'{reason}; {TAKEN}')
-    if ways_apart(team, name, prediction.positions, others)[0]:
+    if paths_apart(team, name, prediction.positions, others)[0]:
         return single_choice(charger[None, :], prediction, 0, reason)
     # Past their final positions, or to the side until they have passed.
     aside = here + _ASIDE @ (charger - here)[:2]
@@ -47,7 +47,7 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     inside = [place for place in moved if place is not None and team.area.inside(place[None, :])[0]]
     goals = np.array([keep_out.past(here, charger, places), *inside])
     prediction = view.motion.predict(view.state, goals, team.step_time)
-    usable = ways_apart(team, name, prediction.positions, others) & prediction.reached
+    usable = paths_apart(team, name, prediction.positions, others) & prediction.reached
     return single_choice(goals, prediction, int(np.argmax(usable)), reason)
 
 
@@ -89,7 +89,7 @@ def _wait_near(
         return stay(view, f'waits: {TAKEN}')
     goals = ring[free]
     prediction = motion.predict(view.state, goals, team.step_time)
-    usable = ways_apart(team, name, prediction.positions, others) & prediction.reached
+    usable = paths_apart(team, name, prediction.positions, others) & prediction.reached
     if not usable.any():
         return stay(view, CROSSED)
     return single_choice(goals, prediction, int(np.argmax(usable)), reason)
