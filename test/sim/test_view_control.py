@@ -95,10 +95,10 @@ def test_buttons_that_change_nothing_are_off_and_states_and_answers_are_whole(ch
     words = ('start', 'pause', 'resume', 'home', 'stop', 'release')
     steps = [
         ('Waiting for start', 0, '', 'waiting for start', {'start', 'home', 'stop'}),
-        ('Searching', 1, '', 'on the way', {'pause', 'home', 'stop'}),
+        ('Searching', 1, '', 'moving', {'pause', 'home', 'stop'}),
         ('Paused', 3, '', 'paused', {'resume', 'home', 'stop'}),
-        ('Sent home', 1, '', 'sent home, on the way', {'pause', 'resume', 'stop'}),
-        ('Stopped', 5, stopped, 'until it is released', {'start', 'home', 'stop', 'release'}),
+        ('Sent home', 1, '', 'sent home, moving', {'pause', 'resume', 'stop'}),
+        ('Stopped', 5, stopped, 'until released', {'start', 'home', 'stop', 'release'}),
         ('Stopped', 0, '', 'search stopped', {'start', 'home', 'stop'}),
     ]
     with closing(made) as server, chromium() as shown:

@@ -74,7 +74,7 @@ def test_what_is_drawn_and_saved_is_what_the_next_run_reads(chromium, tmp_path, 
         assert origin or same(own.shapes['area'][0], OLD['area'])
         area = draw(shown, 'area', AREA, twice=True)
         drawn = [draw(shown, 'keep_out', ring, bool(n)) for n, ring in enumerate(KEEP_OUTS)]
-        assert 'Area drawn, keep-outs: 3' in shown.page.inner_text('#drawing')
+        assert 'New area, 3 keep-out zones' in shown.page.inner_text('#drawing')
         file = saved(shown, tmp_path)
     # Without an origin in the scenario the map is where it was.
     read = Area(EnvironmentSettings(area=str(file)))
@@ -97,11 +97,11 @@ def test_a_ring_that_is_wrong_is_said_and_nothing_is_lost(chromium, tmp_path):
         assert page.is_hidden('#drawing')
         # Two corners, then sides that cross.
         crossed = draw(shown, 'keep_out', [[50, 50], [300, 200]], twice=True)
-        assert 'it has 2 of at least 3 corners' in page.inner_text('#drawing')
+        assert 'at least 3 corners' in page.inner_text('#drawing')
         crossed += [click(shown, [300, 50]), click(shown, [50, 200], twice=True)]
         assert 'crosses another' in page.inner_text('#drawing')
         page.click('button[data-draw=save]')
-        assert 'Not saved, as a shape is open' in page.inner_text('#drawing')
+        assert 'Not saved' in page.inner_text('#drawing')
         assert page.evaluate('maasi.drawing.corners') == [
             pytest.approx(corner, abs=1e-4) for corner in crossed
         ]

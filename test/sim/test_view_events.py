@@ -74,7 +74,7 @@ def test_states_are_one_per_period_except_where_the_robot_says_something_else(ta
     lost = state(0.5, goal_status=msg.AgentState.UNAVAILABLE, reason='its link is lost')
     taken.take('/rover/state', lost)
     assert taken.of('robot')[-1][5:] == [msg.AgentState.UNAVAILABLE, 'its link is lost']
-    assert [event[5] for event in taken.of('log')] == ['cannot go on: its link is lost']
+    assert [event[5] for event in taken.of('log')] == ['unavailable: its link is lost']
     assert all(json.loads(line(event)) for event in taken.events)
 
 
@@ -98,10 +98,10 @@ def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_en
         for name in ('crawler', 'rover', 'walker')
     }
     assert statuses['walker'] == [(0.0, 1, ''), (1.0, 1, ''), (2.0, LEFT, '')]
-    assert statuses['crawler'][1:] == [(1.0, 1, ''), (6.0, SILENT, 'not heard for 3 s')]
+    assert statuses['crawler'][1:] == [(1.0, 1, ''), (6.0, SILENT, 'no state for 3 s')]
     assert statuses['rover'][-1] == (6.0, ENDED, '')
     said = [event[4:] for event in taken.of('log')]
-    assert said == [['walker', 'left'], ['crawler', 'not heard for 3 s']]
+    assert said == [['walker', 'left'], ['crawler', 'no state for 3 s']]
 
 
 def test_what_comes_before_the_first_step_is_taken_at_its_time():

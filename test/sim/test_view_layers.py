@@ -77,12 +77,12 @@ def test_the_belief_is_a_heat_map_that_can_be_switched_on_from_above_and_in_spac
                 red, _, blue = colour_at(shown, *places[0])
                 assert red > blue + 40
                 assert colour_at(shown, *places[1]) == before[1]
-                assert 'belief' in shown.page.inner_text('#legend')
+                assert 'potential targets per area' in shown.page.inner_text('#legend')
                 shown.page.click('button[data-layer=belief]')
                 shown.page.click('button[data-layer=clusters]')
                 shown.settle()
                 assert [colour_at(shown, *item) for item in places] == before
-                assert 'belief' not in shown.page.inner_text('#legend')
+                assert 'potential targets per area' not in shown.page.inner_text('#legend')
         density = shown.page.evaluate('maasi.map.belief.words([3, 1])')
         assert float(density.split()[1]) == pytest.approx(0.6 / (2 * math.pi * 0.25), rel=0.02)
 
@@ -120,7 +120,7 @@ def test_the_dark_goes_as_the_field_of_view_moves_and_stays_away_where_it_was_me
         # What it measured since the map stays; what it only passed is as the planner has it.
         assert shares[1.5][3] == pytest.approx(0.12, abs=0.01)
         assert shares[2.0] == pytest.approx([1.0, 1.0, 0.2, 0.2, 1.0], abs=0.01)
-        assert tip(shown, *place(shown, 2.0, 2.0)).startswith('searched 80 %')
+        assert tip(shown, *place(shown, 2.0, 2.0)).startswith('explored 80 %')
         # As dark as what is left.
         here, beside = (colour_at(shown, *place(shown, 1.87, y)) for y in (2.17, 2.87))
         assert sum(here) > sum(beside) + 30
@@ -142,7 +142,7 @@ def test_the_rest_of_a_tour_is_a_thin_line_in_the_colour_of_its_robot(chromium, 
             near = np.abs(strip - BLUE).max(axis=2) < 150
             blue[bool(tour)] = near.any(axis=1).mean()
             assert near.all(axis=1).sum() == 0
-            assert ('rest of its tour' in shown.page.inner_text('#legend')) == bool(tour)
+            assert ('rest of the tour' in shown.page.inner_text('#legend')) == bool(tour)
     assert blue[False] == 0.0 and 0.2 < blue[True] < 0.8
 
 
@@ -167,14 +167,14 @@ def test_cells_say_how_unexplored_they_are_in_perspective(chromium, opened):
     with chromium() as shown:
         opened(shown, SPACE, grid)
         assert shown.page.evaluate('maasi.camera.spatial')
-        assert tip(shown, *place(shown, 2, 2, 2)).startswith('searched 34 %')
+        assert tip(shown, *place(shown, 2, 2, 2)).startswith('explored 34 %')
         assert tip(shown, *place(shown, 0, 2, 2)) == ''
         opened(shown, PLANE, floor)
         shown.page.click('#space')
         shown.settle()
-        assert tip(shown, *place(shown, 2, 2, 0)).startswith('searched 0 %')
+        assert tip(shown, *place(shown, 2, 2, 0)).startswith('explored 0 %')
         where = tip(shown, *place(shown, 3.3, 0.7, 0))
-        assert where.startswith('searched 100 %')
+        assert where.startswith('explored 100 %')
         numbers = [float(item) for item in where[where.index('(') + 1 : -3].split(', ')]
         assert numbers == pytest.approx([3.3, 0.7], abs=0.02)
 
@@ -211,7 +211,7 @@ def test_faces_of_buildings_fill_and_what_the_log_offers_is_there(chromium, open
             centre[face // 2] = middle[face // 2]
             assert f'photographed ({share} %)' in tip(shown, *place(shown, *centre))
         legend = shown.page.inner_text('#legend')
-        assert 'share photographed' in legend and 'belief' not in legend
+        assert 'share photographed' in legend and 'potential targets' not in legend
         for words, time in (('6', 1.0), ('5, 6', 0.0)):
             shown.seek(2.0)
             shown.page.click(f'#log li.decision:has-text("visit: {words}") >> nth=0')
@@ -228,7 +228,7 @@ def test_faces_of_buildings_fill_and_what_the_log_offers_is_there(chromium, open
 
 @pytest.mark.parametrize('width', [1280, 390])
 def test_a_strip_for_each_robot_has_the_scale_of_the_time_line(chromium, opened, width):
-    # On the way to 4 s, waits to 6 s, cannot go on to 8 s, and has left.
+    # Moves to 4 s, waits to 6 s, is unavailable to 8 s, and has left.
     statuses = [(0.0, 1), (4.0, 2), (6.0, 5), (8.0, 6)]
     events = [
         [time, 'robot', 'rover', [1.0, 1.0, 0.0, 0.0], 1.0, status, ''] for time, status in statuses
@@ -242,7 +242,7 @@ def test_a_strip_for_each_robot_has_the_scale_of_the_time_line(chromium, opened,
         box, line = strip.bounding_box(), page.locator('#time').bounding_box()
         assert (box['x'], box['width']) == (line['x'], line['width'])
         words = strip.get_attribute('aria-label')
-        shares = 'on the way 40 %, waiting 20 %, cannot go on 20 %, left 20 %'
+        shares = 'moving 40 %, waiting 20 %, unavailable 20 %, left 20 %'
         assert words == f'rover: {shares}, 2 measurements'
 
         def at(time):

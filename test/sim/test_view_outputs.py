@@ -149,7 +149,7 @@ def test_a_robot_that_left_goes_nowhere_on_the_page(chromium, departing, tmp_pat
     with chromium() as shown:
         shown.open((tmp_path / 'page.html').as_uri())
         pixels = []
-        for seconds, text in ((1.5, 'on the way'), (2.5, 'left')):
+        for seconds, text in ((1.5, 'moving'), (2.5, 'left')):
             shown.seek(seconds)
             assert shown.page.is_hidden('#card')
             assert shown.page.inner_text('#robots tr[data-robot=mambo] td.text') == text
@@ -228,11 +228,11 @@ def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chrom
 
         assert tip(waypoint).startswith(f'candidate {chosen} at (')
         assert tip(page.evaluate('maasi.log.at("robot", "mambo", 0)[3]')).startswith(
-            'mambo: on the'
+            'mambo: moving'
         )
         page.keyboard.press('Escape')
         assert tip((-0.25, 2.35)) == (
-            'searched 0 %, still 1.65 expected targets per m², at (-0.25, 2.35) m'
+            'explored 0 %, 1.65 expected targets per m² left, at (-0.25, 2.35) m'
         )
         found = next(event for event in log.events if event[1] == 'found' and event[3])
         shown.seek(found[0])
@@ -250,7 +250,7 @@ def test_on_a_phone_in_the_dark_the_legend_is_whole_and_it_plays_by_the_space_ba
         page.evaluate('maasi.select("turtlebot")')
         shown.settle()
         text = page.inner_text('#legend')
-        for entry in ('searched', 'planned way', 'way so far', 'waypoint', 'found', 'candidate'):
+        for entry in ('explored', 'planned path', 'path so far', 'waypoint', 'found', 'candidate'):
             assert entry in text
         map_, legend = (page.locator(part).bounding_box() for part in ('#map', '#legend'))
         assert legend['y'] >= map_['y'] + map_['height'] and legend['height'] > 20

@@ -142,10 +142,10 @@ def test_other_machines_need_the_whole_link(public, capsys):
     assert link.hostname not in ('0.0.0.0', '127.0.0.1') and link.query == f'token={server.token}'
     public.announce(print)
     said = capsys.readouterr().out
-    assert f'view: {server.address}\n' in said and 'other machines see it' in said
+    assert f'view: {server.address}\n' in said and 'other machines' in said
     for path in ('/', '/events', '/?token=', '/?token=wrong'):
         status, text = ask(server, 'GET', path)
-        assert status == 403 and 'whole link' in text
+        assert status == 403 and 'wrong token' in text
     # By a number or by its own name, but by no name that somebody made point here.
     own = socket.gethostname()
     for host, status in (('127.0.0.1', 200), ('192.0.2.7', 200), (own, 200), ('evil.example', 403)):
@@ -159,7 +159,7 @@ def test_where_a_port_is_in_use_the_next_one_is_taken_and_said(server, capsys):
     view.close()
     assert server.port < view.server.port <= server.port + 20
     said = capsys.readouterr().out
-    assert f'port {server.port} is in use: the page is at {view.server.port}' in said
+    assert f'port {server.port} is in use: using port {view.server.port}' in said
 
 
 STAYING = """

@@ -34,7 +34,7 @@ def watch(run, address):
         shown.open(address)
         strips = "[...document.querySelectorAll('#strips canvas')].map((strip) => strip.ariaLabel)"
         # Strips are drawn now and then: until both robots have moved on them.
-        shown.until(f"{strips}.filter((text) => text.includes('on the way')).length === 2")
+        shown.until(f"{strips}.filter((text) => text.includes('moving')).length === 2")
         run.strips = shown.page.evaluate(strips)
         shown.page.click('#robots tr[data-robot=turtlebot]')
         shown.page.click('button[data-command=pause]')
@@ -85,10 +85,11 @@ def test_a_browser_saw_the_run_while_it_went_on(run):
     assert run.answer == 'pause: turtlebot'
     # What robots have done so far is below the time line of a live run, too.
     assert [strip.partition(':')[0] for strip in run.strips] == ['mambo', 'turtlebot']
-    assert all('on the way' in strip and ' measurements' in strip for strip in run.strips)
+    assert all('moving' in strip and ' measurements' in strip for strip in run.strips)
     # Nobody follows after the end.
     assert not run.controls
-    assert run.headline == f'Ended: time limit; {run.found} of 12 found after 30 s'
+    assert 'limits.time' in run.headline
+    assert run.headline.endswith(f'; {run.found} of 12 found after 30 s')
     assert './scripts/run_scenario mambo_turtlebot --seed 1 --lockstep' in run.card
     # Where it is, as the terminal says it.
     assert f'Replay: {run.folder / REPLAY}' in run.card and (run.folder / REPLAY).is_file()

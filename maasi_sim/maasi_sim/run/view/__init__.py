@@ -1,1 +1,1 @@
-"""The view of a search: events of a run, the page that shows them, live or as a replay."""
+"""The page of a search: its events, live or as a replay."""

@@ -1,4 +1,4 @@
-"""Calls the services that pause, resume, send home and stop, for a page."""
+"""Calls the services that pause, resume, send home and stop robots, for a page."""
 
 import argparse
 import threading
@@ -13,7 +13,7 @@ _PATIENCE = 5.0  # longest wait for the answers of all services [s]
 
 
 class Control:
-    """Calls the services of planners and drivers of a team; no command waits for another one."""
+    """Calls the services of planners and drivers of a team; commands do not wait for each other."""
 
     def __init__(self, domain: int | None, namespace: str = '') -> None:
         self._namespace = namespace
@@ -25,7 +25,7 @@ class Control:
         )
 
     def __call__(self, command: str, robot: str | None) -> tuple[bool, str]:
-        """Carry out a command for a robot (None: all); return whether all followed, and answers."""
+        """Execute a command for a robot (None: all); return whether all succeeded, and answers."""
         options = argparse.Namespace(
             command=command,
             robots=[robot] if robot else [],
@@ -36,7 +36,7 @@ class Control:
             if not self._context.ok():
                 return False, 'the run has ended'
             self._running += 1
-        # A node of its own for each command, as a node is spun by one thread only.
+        # Each command has its own node, as only one thread may spin a node.
         node = rclpy.create_node(
             'view_control',
             context=self._context,
@@ -58,7 +58,7 @@ class Control:
         return done, '; '.join(sorted(words))
 
     def close(self) -> None:
-        """Leave the graph, after the last command."""
+        """Destroy the context after the last command."""
         with self._changed:
             self._changed.wait_for(lambda: self._running == 0)
             rclpy.try_shutdown(context=self._context)

@@ -1,4 +1,4 @@
-"""Makes the events of a page from the facts of a run."""
+"""Makes the events of a page from facts."""
 
 import math
 from collections.abc import Sequence
@@ -9,22 +9,23 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
+from maasi_filter.wording import point
 from maasi_sim.run import facts
 from maasi_sim.run.scores import Scoreboard
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning, shades
 from maasi_sim.run.view.pictures import picture
 from maasi_sim.run.view.scene import zones_as
 
-_NOT_ALLOWED = -1e29  # objectives below this stand for candidates that are not allowed
-# Status of a robot: of AgentState, and what only those who watch know.
+_NOT_ALLOWED = -1e29  # candidates with an objective below this are not allowed
+# Status of a robot: constants of AgentState, and further ones of observers.
 MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
-_SILENCE = 3.0  # a robot is silent when others say where they are for so long without it [s]
-_MOST_POINTS = 40  # points of a planned path that are shown
-_MOST_PLACES = 400  # of a tour
+_SILENCE = 3.0  # a robot is silent after this long without a state, if others send theirs [s]
+_MOST_POINTS = 40  # shown points of a planned path
+_MOST_PLACES = 400  # shown points of a tour
 
 
 def padded(values: ArrayLike) -> FloatArray:
-    """Return a place, or a covariance, of three axes; the third is 0 in a planar search."""
+    """Return a position or covariance with three axes; the third is 0 in 2D."""
     given = np.asarray(values, dtype=float)
     whole = np.zeros((3,) * given.ndim)
     whole[tuple(map(slice, given.shape))] = given
@@ -32,7 +33,7 @@ def padded(values: ArrayLike) -> FloatArray:
 
 
 def significant(value: float) -> float:
-    """Return a number with five significant digits; one that is not finite becomes 0."""
+    """Return a number with five significant digits, or 0 if it is not finite."""
     return float(f'{value:.5g}') if math.isfinite(value) else 0.0
 
 
@@ -40,18 +41,14 @@ def _upper(covariance: ArrayLike) -> list[float]:
     return [significant(value) for value in padded(covariance)[np.triu_indices(3)]]
 
 
-def _words(place: Sequence[float]) -> str:
-    return f'({", ".join(f"{value:.3g}" for value in place)})'
-
-
 class EventMaker:
-    """Makes the events of a run with a scene, see `scene_of`, and hands each to a listener."""
+    """Makes the events of a run with a scene (`scene_of`) and passes each to a listener."""
 
     def __init__(self, scene: Scene, listener: Listener) -> None:
         self.scene, self._listener = scene, listener
         bounds = np.asarray(scene.get('bounds') or [[0.0, 1.0]], dtype=float)
         extent = float((bounds[:, 1] - bounds[:, 0]).max())
-        # A ten-thousandth of the environment is not seen.
+        # Changes below a ten-thousandth of the environment are invisible.
         self._digits = max(0, 4 - math.floor(math.log10(max(extent, 1e-6))))
         self._thinning = Thinning(STATE_PERIOD)
         self._last: dict[tuple[str, str], float] = {}
@@ -100,7 +97,7 @@ class EventMaker:
             case facts.Truth():
                 self._add_truth(time, np.asarray(fact.targets, dtype=float))
             case facts.SceneFound():
-                # What a scenario says is better.
+                # The scenario's values are better.
                 self._add_to_scene({k: v for k, v in fact.parts.items() if k not in self.scene})
             case facts.Said():
                 self._say(time, fact.source, fact.level, fact.text)
@@ -114,7 +111,7 @@ class EventMaker:
 
     def _put(self, time: float, kind: str, owner: str, *content: Any) -> None:
         key = kind, owner
-        # Times of a kind and owner rise, so that the last one before a time can be searched.
+        # Times of a kind and owner increase, for binary search.
         rising = max(round(time, 3), self._last.get(key, 0.0))
         self._last[key] = rising
         self.latest = max(self.latest, rising)
@@ -127,7 +124,7 @@ class EventMaker:
         return [*(round(value, self._digits) for value in place), 0.0, 0.0][:3]
 
     def _plain(self, content: Any) -> Any:
-        """Return content with positions, which are arrays, as they are shown."""
+        """Return content with positions as they are shown."""
         if isinstance(content, np.ndarray):
             return self._place(content)
         if isinstance(content, (list, tuple)):
@@ -135,11 +132,11 @@ class EventMaker:
         return content
 
     def starting(self, ready: int, total: int) -> None:
-        """Add how many nodes are ready before the first step."""
+        """Add the number of ready nodes before the first step."""
         self._put(0.0, 'start', '', ready, total)
 
     def end(self, reason: str = '', text: str = '') -> None:
-        """Add that the run has ended, and why: no robot is on its way any more."""
+        """Add the end of the run and its reason."""
         if reason:
             self._put(self.latest, 'end', '', reason, text)
         for name in self._states:
@@ -153,13 +150,13 @@ class EventMaker:
             return
         time, name = max(fact.time, 0.0), fact.robot
         place = [*self._place(fact.pose[:3]), round(float(fact.pose[3]), 3)]
-        # Its last time: after a jump of the clock the others have their turn first.
+        # After a jump of the clock, other robots may not have sent yet.
         until = self._states[name][0] if name in self._states else time
         self._states[name] = time, place, round(float(fact.battery), 3)
         self._set_status(time, name, fact.status, fact.reason)
         for other, (last, *_) in self._states.items():
             if until - last > _SILENCE and self._status[other] < LEFT:
-                self._set_status(time, other, SILENT, f'not heard for {_SILENCE:g} s')
+                self._set_status(time, other, SILENT, f'no state for {_SILENCE:g} s')
 
     def _add_left(self, fact: facts.Left) -> None:
         if self._team is not None:
@@ -172,11 +169,11 @@ class EventMaker:
         _, place, battery = self._states[name]
         self._put(time, 'robot', name, place, battery, status, reason)
         before, self._status[name] = self._status.get(name), status
-        words = {UNAVAILABLE: 'cannot go on: ', SILENT: ''}
+        words = {UNAVAILABLE: 'unavailable: ', SILENT: ''}
         if status in words and status != before:
-            self._say(time, name, 'fault', words[status] + (reason or 'no reason given'))
+            self._say(time, name, 'fault', words[status] + (reason or 'unknown reason'))
         elif before in words and status < UNAVAILABLE:
-            self._say(time, name, 'team', 'takes part again')
+            self._say(time, name, 'team', 'available again')
 
     def _add_measurement(self, fact: facts.Measured) -> None:
         rows = []
@@ -196,7 +193,7 @@ class EventMaker:
         try:
             content = picture(fact.image, self._robot(item.robot), item.pose, item.values)
         except ValueError:
-            # One that cannot be decoded is not shown.
+            # Images that cannot be decoded are not shown.
             return
         self._put(fact.time, 'picture', item.robot, *content)
 
@@ -222,7 +219,7 @@ class EventMaker:
             place, when = self._place(item.position), round(max(item.time, 0.0), 3)
             rows.append([item.id, *place, _upper(item.covariance), item.robot, when])
             if item.id not in before:
-                self._say(time, item.robot, 'found', f'target {item.id} at {_words(place)} m')
+                self._say(time, item.robot, 'found', f'target {item.id} at {point(place)} m')
         self._board.found[team] = targets
         self._put(time, 'found', team, rows)
         self._score(time)
@@ -246,7 +243,7 @@ class EventMaker:
             waypoint, number = self._place(robot.waypoint), fact.indices[name]
             row = [name, number, robot.chosen, waypoint, candidates, robot.reason]
             rows.append([*row, list(map(self._place, robot.tour[:_MOST_PLACES]))])
-            words = f'to {_words(waypoint)}'
+            words = f'to {point(waypoint)}'
             if robot.stays:
                 words = f'stays: {robot.reason or decision.reason or "no candidate"}'
             self._say(time, name, 'decision', f'decision {number}: {words}')
@@ -275,7 +272,7 @@ class EventMaker:
             bounds = np.round(np.stack([lower, lower + step * (shape - 1)], axis=1), 4)
             self._add_to_scene({'bounds': bounds.tolist()})
         if fact.rounded:
-            # Nodes of the map are on all bounds.
+            # Nodes of the map lie on all bounds.
             low, high = np.array(self.scene['bounds'])[:2].T
             exact = (high - low) / np.maximum(shape - 1, 1)
             if np.allclose(exact, step, rtol=0.05):

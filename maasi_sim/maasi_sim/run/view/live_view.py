@@ -1,4 +1,4 @@
-"""The page of a running run, of its messages."""
+"""The page of a running run, from its messages."""
 
 import contextlib
 import os
@@ -21,16 +21,16 @@ from maasi_sim.run.view.pictures import IMAGES
 from maasi_sim.run.view.recording import facts_for
 from maasi_sim.run.view.server import Commander, Hub, ViewServer
 
-_FAREWELL = 2.0  # for browsers to take the last events [s]
-# Calls that wait at most, and wait for more before they are made, so that the run has the
-# processor [s].
+_FAREWELL = 2.0  # time for browsers to receive the last events [s]
+# Most waiting calls, and the time that calls are collected, which leaves the processor to the run
+# [s].
 MOST_WAITING = 50_000
 _PERIOD = 0.05
-_PATIENCE = 5.0  # patience at the end for calls that wait [s]
+_PATIENCE = 5.0  # longest wait at the end for waiting calls [s]
 
 
 class LiveView:
-    """Serve the page of a run in progress, its events made in a thread for which nothing waits."""
+    """Serves the page of a run in progress; a thread makes its events without blocking the run."""
 
     def __init__(
         self,
@@ -49,18 +49,18 @@ class LiveView:
         self._feed.start()
 
     def announce(self, say: Callable[[str], object], browser: bool = True) -> None:
-        """Say where the page is, and open it where there is a browser."""
+        """Print the address of the page and open it in a browser."""
         server = self.server
         if server.wanted_port not in (0, server.port):
-            say(f'warning: port {server.wanted_port} is in use: the page is at {server.port}')
+            say(f'warning: port {server.wanted_port} is in use: using port {server.port}')
         say(f'view: {server.address}')
         if not server.is_private:
-            say('view: other machines see it, by this whole link only')
+            say('view: other machines need this full link including its token')
         if browser:
             open_browser(server.address)
 
     def put(self, function: Callable[..., object], *arguments: Any) -> None:
-        """Have a function called with the event maker and arguments; drop it if too many wait."""
+        """Queue a function of the event maker with arguments; drop it if too many wait."""
         if len(self._waiting) < MOST_WAITING:
             self._waiting.append((function, arguments))
 
@@ -77,12 +77,12 @@ class LiveView:
                     function(self.maker, *arguments)
 
     def restart(self) -> None:
-        """Forget all events: another run begins."""
+        """Drop all events: another run begins."""
         self.hub.restart(self._scene)
         self.maker = EventMaker(dict(self._scene), self.hub.put)
 
     def finish(self, text: str) -> None:
-        """Show what waits, and say how the run ended; browsers that come now get all of it."""
+        """Show the queued events and how the run ended."""
         if self._ended.is_set():
             return
         self._ended.set()
@@ -91,14 +91,14 @@ class LiveView:
         self.hub.close()
 
     def wait_for_reader(self, say: Callable[[str], object]) -> None:
-        """Keep the page, in a terminal, until Enter is pressed; it is finished."""
+        """Keep serving in a terminal until Enter is pressed."""
         with contextlib.suppress(OSError, ValueError):
             if os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp():
-                say(f'the page stays at {self.server.address} (Enter or Ctrl-C ends it)')
+                say(f'the page stays at {self.server.address} until Enter or Ctrl-C is pressed')
                 sys.stdin.readline()
 
     def close(self) -> None:
-        """Finish, let browsers take the rest, and stop serving."""
+        """Finish, let browsers receive the rest, and stop serving."""
         self.finish('closed')
         deadline = time.monotonic() + _FAREWELL
         while self.server.browsers and time.monotonic() < deadline:
@@ -107,9 +107,9 @@ class LiveView:
 
 
 class RunPage(LiveView):
-    """Serves the page of a scene with serialised messages; OSError if it cannot be served.
+    """Serves the page of a scene from serialised messages; raises OSError if it cannot.
 
-    `waits`: the run begins with a `LockstepStep`, and what comes before is shown at its time.
+    `waits`: the run begins with a `LockstepStep`; earlier messages are shown at its time.
     """
 
     def __init__(
@@ -129,10 +129,10 @@ class RunPage(LiveView):
         self._facts = facts_for(scene, waits, None if waits else self.restart)
 
     def put_message(self, topic: str, type_name: str, data: bytes) -> None:
-        """Take a message of a topic that is shown; never waits."""
+        """Queue a message of a shown topic without waiting."""
         decode = self._types.deserialize_cdr
         if type_name in IMAGES:
-            # Not in the queue: most are never decoded.
+            # Not in the queue: most images are never decoded.
             stamp = time_at(data, 4) / 1e9
             self._facts.pictures.keep(topic, stamp, lambda: decode(data, type_name))
         elif not (self._known and type_name == MARKERS):
@@ -143,13 +143,13 @@ class RunPage(LiveView):
             self.maker.add(fact)
 
     def starting(self, ready: int, total: int) -> None:
-        """Show how many nodes are ready."""
+        """Show the number of ready nodes."""
         if self._ready != ready:
             self._ready = ready
             self.put(EventMaker.starting, ready, total)
 
     def end(self) -> None:
-        """Show the queued messages; no command is carried out any more."""
+        """Show the queued messages and refuse further commands."""
         if self._waits:
             self.put(EventMaker.end)
         self.finish('the run has ended' if self._waits else 'the view was closed')

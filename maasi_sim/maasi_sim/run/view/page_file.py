@@ -1,4 +1,4 @@
-"""The page that shows a run, as one HTML file: alone for a live run, or with a run inside."""
+"""The page of a run as one HTML file: without a run for live views, or with a run inside."""
 
 import contextlib
 import os
@@ -13,7 +13,7 @@ from maasi_sim.run.view.event_log import LARGEST, EventLog
 
 FOLDER = Path(__file__).with_name('page')
 REPLAY = 'replay.html'
-# Each uses only what is before it.
+# Each file uses only earlier ones.
 _MODULES = (
     'run_log camera colours text icons words shapes labels floor_grid unexplored belief robots '
     'buildings map_frame map why panels pictures legend marks strips earth tips curve live drawing '
@@ -22,7 +22,7 @@ _MODULES = (
 
 
 def empty_page() -> str:
-    """Return the page without a run: it asks the server that it came from."""
+    """Return the page without a run, which loads it from its server."""
     return _with('RUN', _page(), '')
 
 
@@ -35,7 +35,7 @@ def write_replay(log: EventLog, path: Path, largest: int = LARGEST) -> None:
 def _page() -> str:
     names = ('index.html', 'page.css', *(f'{name}.js' for name in _MODULES.split()))
     text, style, *modules = ((FOLDER / name).read_text(encoding='utf-8') for name in names)
-    # In one scope nothing is imported.
+    # In one scope, without imports.
     script = re.sub(r'^(import .*;\n|export )', '', '\n'.join(modules), flags=re.MULTILINE)
     return _with('SCRIPT', _with('STYLE', text, style), script)
 

@@ -1,4 +1,4 @@
-"""What cameras saw as their robots measured: small pictures of the part that counts."""
+"""Camera pictures of measurements: small cut-outs of what the sensor model covers."""
 
 import base64
 from collections import defaultdict, deque
@@ -15,20 +15,20 @@ from maasi_sim.run.bag import COMPRESSED_TYPE, IMAGE_TYPE
 if TYPE_CHECKING:
     from maasi_drivers.vision.camera_model import Camera
 
-# Types of images, and the last parts of their topics' names.
+# Types of images, and last parts of their topics.
 IMAGES = {IMAGE_TYPE: 'camera/image_raw', COMPRESSED_TYPE: 'camera/image_raw/compressed'}
-# Largest width [px], quality as JPEG, and time from one of a robot to the next [s].
+# Largest width [px], JPEG quality, and time between pictures of a robot [s].
 _WIDTH, _QUALITY, _PERIOD = 240, 60, 0.5
-_KEPT = 16  # images of a camera that are kept until the detections in them come
-# Points along an axis of a sensor's box, and the part of its size that is shown around it.
+_KEPT = 16  # images of a camera that wait for their detections
+# Points per side of a sensor's box, and the margin around it relative to its size.
 _POINTS, _AROUND = 25, 0.06
 
 
 class Pictures:
-    """Keeps the last images of cameras, of which most are never decoded."""
+    """Keeps the last images of cameras; most are never decoded."""
 
     def __init__(self) -> None:
-        # By namespace of the robot: stamps, and what reads the images.
+        # Stamps and readers of images, by namespace of the robot.
         self._images: dict[str, deque[Any]] = defaultdict(lambda: deque(maxlen=_KEPT))
         self._last: dict[str, float] = {}
 
@@ -37,8 +37,8 @@ class Pictures:
         self._images[topic.partition('/camera/')[0]].append((stamp, read))
 
     def at(self, space: str, stamp: float) -> Any:
-        """Return the message of a robot's image with a stamp [s], if a picture is due, or None."""
-        # A copy: another thread may keep images meanwhile.
+        """Return the message of a robot's image with a stamp [s] if a picture is due, else None."""
+        # A copy, as another thread may add images.
         images = dict(self._images[space].copy())
         if stamp not in images or abs(stamp - self._last.get(space, -_PERIOD)) < _PERIOD:
             return None
@@ -47,14 +47,14 @@ class Pictures:
 
 
 def picture(message: Any, robot: dict[str, Any], pose: Pose, values: ArrayLike) -> list[Any]:
-    """Return the part of an image that counts, as JPEG in base64, and what is in it.
+    """Return the relevant part of an image as JPEG in base64, and its annotations.
 
-    Its size [px], detections in it (column, row, radius), and the corners of what the sensor sees,
-    the box of its model on the floor; none where all of the image counts. The robot is one of a
-    scene: without its camera, the positions of the detections are not known. Values are range,
-    bearing and elevation of detections, which are on the floor.
+    Annotations: size [px], detections (column, row, radius), and corners of the box of the
+    sensor model on the floor, empty if it covers the image. The robot is one of a scene;
+    without its camera the detections have no pixels. Values: range, bearing and elevation of
+    detections on the floor.
     """
-    # Deferred: they take long to import, and most runs show no picture.
+    # Deferred: slow imports that most runs do not need.
     import cv2
 
     from maasi_drivers.settings.camera import CameraSettings
@@ -86,7 +86,7 @@ def picture(message: Any, robot: dict[str, Any], pose: Pose, values: ArrayLike) 
 
 
 def _marks(model: 'Camera', radius: float, pose: Pose, values: ArrayLike) -> FloatArray:
-    """Return column, row and radius [px] of detections on the floor that are in front."""
+    """Return column, row and radius [px] of detections on the floor in front of the camera."""
     reach, bearing, elevation = np.reshape(np.asarray(values, dtype=float), (-1, 3)).T
     level, (x, y, _) = reach * np.cos(elevation), pose.position
     floor = x + level * np.cos(bearing), y + level * np.sin(bearing), 0.0 * level
@@ -100,7 +100,7 @@ def _marks(model: 'Camera', radius: float, pose: Pose, values: ArrayLike) -> Flo
 def _outline(
     model: 'Camera', view: dict[str, Any], pose: Pose, shape: tuple[int, ...]
 ) -> FloatArray:
-    """Return the corners of a sensor's box on the floor in an image, (n, 2) [px]; none: all."""
+    """Return the corners of a sensor's box on the floor in an image, (n, 2) [px]; empty if all."""
     if view.get('kind') != 'box':
         return np.zeros((0, 2))
     import cv2
@@ -113,13 +113,13 @@ def _outline(
     floor = np.column_stack([grid + pose.position[:2], np.zeros(len(grid))])
     pixels = model.project(floor, pose)
     height, width = shape[:2]
-    # What is far outside tells nothing of the part that is seen.
+    # Points far outside say nothing about the visible part.
     near = (np.abs(pixels - (width / 2, height / 2)) < (width, height)).all(axis=1)
     if near.sum() < 3:
         return np.zeros((0, 2))
     hull = cv2.convexHull(pixels[near].astype(np.float32)).reshape(-1, 2)
     image = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
-    # Pixel centres are at whole numbers.
+    # Pixel centres have integer coordinates.
     area, common = cv2.intersectConvexConvex(hull + 0.5, image)
     if common is None or area < 4.0 or area > 0.98 * width * height:
         return np.zeros((0, 2))

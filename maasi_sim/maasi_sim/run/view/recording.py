@@ -1,4 +1,4 @@
-"""The events of a recording: what a page shows of it."""
+"""The page events of a recording."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,23 +9,23 @@ from maasi_sim.run.view.event_log import Event, EventLog, Scene
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.scene import empty_scene, scene_of_facts
 
-_PROGRESS = 1000  # messages between two words on the progress
+_PROGRESS = 1000  # messages between two progress reports
 
 
 def facts_for(
     scene: Scene, waits: bool, on_restart: Callable[[], object] | None = None
 ) -> MessageFacts:
-    """Return what makes facts of the messages of a run with a scene."""
+    """Return the converter from messages to facts for a run with a scene."""
     dimension = len(scene.get('bounds') or (0, 0, 0))
     return MessageFacts(waits, scene.get('robots', {}).keys(), dimension, on_restart)
 
 
 def read_events(path: Path, progress: Callable[[float], None] | None = None) -> EventLog:
-    """Return the event log of a recording or a run's folder; `progress` takes the share read."""
+    """Return the event log of a recording or run folder; `progress` receives the share read."""
     with Bag(path) as bag:
         shown = {topic: kind for topic, kind in bag.types.items() if is_read(topic, kind)}
         if not any(kind.startswith('maasi_msgs/') for kind in shown.values()):
-            raise BagError(f'{path}: holds no topic of a search')
+            raise BagError(f'{path}: contains no topics of a search')
         try:
             scene = scene_of_facts(bag.scenario())
         except (BagError, ValueError, KeyError):
@@ -33,7 +33,7 @@ def read_events(path: Path, progress: Callable[[float], None] | None = None) -> 
         events: list[Event] = []
         maker = EventMaker(scene, events.append)
         facts = facts_for(scene, STEP in {shown[topic] for topic in shown if bag.counts[topic]})
-        # Markers hold what a scenario says better.
+        # The scenario's values are better than markers.
         known = 'bounds' in scene
         topics = [topic for topic, kind in shown.items() if not (known and kind == MARKERS)]
         total = sum(bag.counts[topic] for topic in topics)

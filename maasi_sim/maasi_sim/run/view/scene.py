@@ -1,4 +1,4 @@
-"""The scene of a run: what does not change, from its scenario or from its messages."""
+"""The scene of a run: its constant parts, from its scenario or messages."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,12 +26,12 @@ from maasi_sim.scenario.schema import RobotSettings, Scenario
 
 
 def empty_scene(name: str = '') -> Scene:
-    """Return the scene of a run of which nothing is known yet."""
+    """Return the scene of a run before anything is known."""
     return {'name': name, 'robots': {}}
 
 
 def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scene:
-    """Return the scene of a scenario; the seed of a run is that of the scenario if not given."""
+    """Return the scene of a scenario; seed: that of the run, default the scenario's."""
     seed = scenario.seed if seed is None else seed
     scene: Scene = {
         'name': name,
@@ -56,7 +56,7 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
                 if obstacle.centre
             ],
             'zones': zones_of(area),
-            # What may be searched, seen from above [m^2].
+            # Searchable area seen from above [m^2].
             'ground': round(area.volume / float(np.prod(np.ptp(area.bounds[2:], axis=1))), 3),
             'origin': scenario.environment.origin and scenario.environment.origin.model_dump(),
             'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},
@@ -70,24 +70,21 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
 
 
 def _background(scenario: BaseScenario) -> Scene:
-    """Return the picture under the map; of a recording its file may be missing."""
+    """Return the background picture; a recording's file may be missing."""
     try:
         picture = background_of(scenario.environment)
     except ValueError as error:
-        return {'missing': f'no background: {error}'}
+        return {'missing': f'cannot show the background: {error}'}
     return {} if picture is None else {'background': [*picture]}
 
 
 def _prior(scenario: Scenario) -> Scene:
-    """Return how likely targets are where no zone is closed: a grid's corner, step, shape, values.
-
-    Nothing where they are equally likely.
-    """
+    """Return the prior on a grid (corner, step, shape, values), or nothing if it is uniform."""
     if not (scenario.environment.prior.polygons or scenario.environment.prior.raster):
         return {}
     area = Area(scenario.environment.without_keep_outs())
     unseen = UnexploredMap(area, scenario.filter.exploration_spacing)
-    # As coarse as what is unexplored is shown.
+    # At the resolution of the unexplored area.
     corner, step, likely = unseen.shown(prior=True)
     level = likely.reshape(*likely.shape[:2], -1)[:, :, 0]
     values = [float(f'{value:.3g}') for value in level.ravel()]
@@ -95,12 +92,12 @@ def _prior(scenario: Scenario) -> Scene:
 
 
 def zones_of(area: Area) -> list[dict[str, Any]]:
-    """Return the shapes of an area: what each is, and its rings [m, map], the first the outer."""
+    """Return the shapes of an area: kind and rings [m, map], the outer ring first."""
     return [zone for kind, shapes in area.shapes.items() for zone in zones_as(kind, shapes)]
 
 
 def zones_as(kind: str, shapes: Sequence[BaseGeometry]) -> list[dict[str, Any]]:
-    """Return shapes of one kind, see `zones_of`."""
+    """Return shapes of one kind, as `zones_of`."""
     return [
         {'kind': kind, 'rings': [rounded(shapely.get_coordinates(ring)) for ring in rings]}
         for rings in map(shapely.get_rings, shapely.get_parts(shapes))
@@ -108,7 +105,7 @@ def zones_as(kind: str, shapes: Sequence[BaseGeometry]) -> list[dict[str, Any]]:
 
 
 def scene_of_facts(facts: Mapping[str, Any]) -> Scene:
-    """Return the scene of what a recording says of its run; of another version, what is known."""
+    """Return the scene from a recording's own description of its run."""
     content = facts['scenario']
     buildings = content.get('planner', {}).get('name') == BUILDINGS
     model: type[BaseScenario] = CuboidScenario if buildings else Scenario
@@ -118,13 +115,13 @@ def scene_of_facts(facts: Mapping[str, Any]) -> Scene:
 
 
 def rounded(values: ArrayLike) -> list[Any]:
-    """Return an array as nested lists, to a tenth of a millimetre."""
+    """Return an array as nested lists, rounded to 0.1 mm."""
     return list(np.round(np.asarray(values, dtype=float), 4).tolist())
 
 
 def _objective(settings: PlannerSettings) -> Scene:
-    """Return what J is made of, for planners whose J is that of `PlannerSettings`."""
-    # Planners that choose by (17).
+    """Return the terms of J, for planners whose objective is that of `PlannerSettings`."""
+    # Planners that choose by equation (17).
     if settings.name == 'auto' or not isinstance(settings, InformationSettings):
         return {}
     weights = {
@@ -151,7 +148,7 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
     deviations = [float(value) for value in robot.sensor.noise.deviations(scenario.dimension)]
     fence = {}
     if robot.link != 'topics':
-        # As its driver makes it.
+        # As its driver creates it.
         flies = robot.link == 'mambo_wifi'
         limits = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
         volume = flight_volume(Area(scenario.environment.bounds), robot, limits)
@@ -175,7 +172,7 @@ def _buildings(scenario: CuboidScenario) -> Scene:
         'objects': rounded(mission.objects),
         'blocks': rounded(mission.obstacles),
         'cuboids': rounded(mission.boxes),
-        # The part of a face that each is for: object, number of the face, sides.
+        # Part of a face for each cuboid: object, face number, sides.
         'cells': [
             [cell.target, FACES.index(cell.face), rounded(cell.sides())] for cell in mission.cells
         ],

@@ -1,4 +1,4 @@
-"""The page of a search in one process, while it runs and afterwards."""
+"""The page of a search in one process, during the search and afterwards."""
 
 from maasi_sim.run.log import RunLog
 from maasi_sim.run.view.event_log import Event, EventLog
@@ -8,7 +8,7 @@ from maasi_sim.run.view.scene import scene_of
 
 
 def event_log(log: RunLog, name: str = 'search') -> EventLog:
-    """Return what a page shows of a search."""
+    """Return the page events of a search."""
     events: list[Event] = []
     maker = EventMaker(scene_of(name, log.scenario, log.seed), events.append)
     for fact in log.facts:
@@ -18,7 +18,7 @@ def event_log(log: RunLog, name: str = 'search') -> EventLog:
 
 
 class SearchPage:
-    """Serves the page of a search that runs."""
+    """Serves the page of a running search."""
 
     def __init__(self, log: RunLog) -> None:
         self._log = log
@@ -29,7 +29,7 @@ class SearchPage:
         log.listeners.append(lambda fact: self._live.put(EventMaker.add, fact))
 
     def end(self) -> None:
-        """Show how the search ended, and stop serving."""
+        """Show how the search ended and stop serving."""
         reason = self._log.end_reason
         self._live.put(EventMaker.end, reason)
         self._live.finish(f'ended: {reason}')

@@ -1,8 +1,8 @@
-"""Serves the page of a live run, its events, and its controls where they are allowed.
+"""Serves the page of a live run, its events, and its controls if enabled.
 
 GET / is the page, GET /events a stream of Server-Sent Events, POST /control a command. Commands
-need a token, and so does all else unless the server listens on this machine only. A browser has a
-thread of its own: neither the run nor another browser waits for it.
+always need a token, the rest unless the server listens on this machine only. Each browser has its
+own thread, so that it delays neither the run nor other browsers.
 """
 
 import contextlib
@@ -24,26 +24,26 @@ from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Scene, line, thin
 from maasi_sim.run.view.page_file import empty_page
 
 PORT = 8420
-_MORE_PORTS = 20  # further ports that are tried where one is in use
-# Takes a command and a robot (None: all); returns whether it was followed, and an answer.
+_MORE_PORTS = 20  # further ports to try if one is in use
+# Executes a command for a robot (None: all); returns success and answer.
 Commander = Callable[[str, 'str | None'], 'tuple[bool, str]']
 COMMANDS = ('start', 'pause', 'resume', 'home', 'stop', 'release')
-MOST_BROWSERS = 32  # browsers at once; further ones are refused
-MOST_IDLE = 64  # other connections at once; beyond them the oldest is closed
-# Longest body of a request [bytes], and longest wait for a browser that reads or writes [s].
+MOST_BROWSERS = 32  # most browsers at a time
+MOST_IDLE = 64  # most other connections at a time; beyond that the oldest is closed
+# Largest request body [bytes], and longest wait for a browser to read or write [s].
 LARGEST_BODY = 4096
 PATIENCE = 10.0
 _EVERYWHERE = ('0.0.0.0', '::')
-# Period of portions, which bounds the load of a browser, and of signs of life [s].
+# Period of event portions, which limits a browser's load, and of keep-alive comments [s].
 _PORTION_PERIOD = 0.1
 _BEAT = 5.0
-# Events that are kept; beyond them those that change gradually are thinned. And events at once.
+# Most events kept, above which gradual changes are thinned, and most events per portion.
 MOST_EVENTS = 200_000
 _MOST_AT_ONCE = 2000
 
 
 class Hub:
-    """Keeps the events of a run, about `most`; nothing that puts one waits for a browser."""
+    """Keeps the events of a run, about `most`, without waiting for browsers."""
 
     def __init__(self, scene: Scene, most: int = MOST_EVENTS) -> None:
         self._scene = dict(scene)
@@ -65,14 +65,14 @@ class Hub:
             self._changed.notify_all()
 
     def restart(self, scene: Scene) -> None:
-        """Forget all events: another run begins."""
+        """Drop all events: another run begins."""
         with self._changed:
             self._scene = dict(scene)
             self._events.clear()
             self._generation += 1
 
     def close(self) -> None:
-        """Say that no event follows."""
+        """Mark the end of the events."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -80,10 +80,10 @@ class Hub:
     def next(
         self, generation: int, position: int, patience: float
     ) -> tuple[str, tuple[int, int], bool]:
-        """Return Server-Sent Events after a position, the next one, and whether nothing follows.
+        """Return Server-Sent Events after a position, the next position, and whether it is the end.
 
-        A browser begins with generation -1; in another one than its own it gets the scene again.
-        Nothing new within the patience [s] is a comment.
+        A browser begins with generation -1 and receives the scene again when the generation
+        changes. Without new events within `patience` [s] it receives a comment.
         """
         with self._changed:
             self._changed.wait_for(
@@ -99,7 +99,7 @@ class Hub:
             position += len(events)
             closed = self._closed and position == len(self._events)
             generation = self._generation
-        # Outside of the lock: a large portion takes a while.
+        # Outside of the lock, as a large portion takes a while.
         if events:
             text += f'event: events\ndata: [{",".join(map(line, events))}]\n\n'
         if closed:
@@ -110,16 +110,16 @@ class Hub:
         while len(self._events) > 0.9 * self._most and self._period < 1e5:
             self._period *= 2.0
             self._events = thin(self._events, self._period)
-        # Where nothing can be thinned, the oldest go.
+        # If nothing can be thinned, drop the oldest events.
         del self._events[: max(0, len(self._events) - self._most)]
         self._scene['thinned'] = self._period
         self._generation += 1
 
 
 class ViewServer(ThreadingHTTPServer):
-    """Serve a hub to browsers until it is closed; without `commander` read only.
+    """Serves a hub to browsers until it is closed; read only without a `commander`.
 
-    The next free port is taken (0: any); OSError if the address cannot be listened on.
+    Takes the next free port (0: any); raises OSError if it cannot listen on the address.
     """
 
     daemon_threads = True
@@ -134,13 +134,13 @@ class ViewServer(ThreadingHTTPServer):
     ) -> None:
         self.hub, self.host, self.commander = hub, host, commander
         number = _number(host)
-        # Whether only this machine reaches it.
+        # Whether only this machine can connect.
         self.is_private = host == 'localhost' or (number is not None and number.is_loopback)
         self.token = '' if self.is_private and commander is None else secrets.token_urlsafe(16)
         self.wanted_port = PORT if port is None else port
         self.browsers = 0
         self._lock = threading.Lock()
-        # Connections without a stream or a command, the oldest first.
+        # Connections without a stream or command, the oldest first.
         self._idle: dict[socket.socket, None] = {}
         last = min(self.wanted_port + _MORE_PORTS, 65535)
         for wanted in range(self.wanted_port, last + 1):
@@ -150,32 +150,32 @@ class ViewServer(ThreadingHTTPServer):
             except OSError as error:
                 if error.errno != errno.EADDRINUSE or wanted == last:
                     raise
-        self.port = int(self.server_address[1])  # that it listens on
+        self.port = int(self.server_address[1])  # listening port
         threading.Thread(target=self.serve_forever, name='view server', daemon=True).start()
 
     @property
     def address(self) -> str:
-        """Address of the page, with the token where one is needed."""
+        """Address of the page, with its token if one is needed."""
         host = _own_address() if self.host in _EVERYWHERE else self.host
         host = f'[{host}]' if ':' in host else host
         place = f'http://{host}:{self.port}/'
         return f'{place}?token={self.token}' if self.token else place
 
     def close(self) -> None:
-        """Stop serving; browsers get what is left for a moment."""
+        """Stop serving after a short time for browsers to receive the rest."""
         self.hub.close()
         self.shutdown()
         self.server_close()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection in a thread of its own; close the oldest where there are too many."""
+        """Serve a connection in its own thread; close the oldest if there are too many."""
         with self._lock:
             self._idle[request] = None
             oldest = next(iter(self._idle)) if len(self._idle) > MOST_IDLE else None
             if oldest is not None:
                 del self._idle[oldest]
         if oldest is not None:
-            # Its thread wakes, and ends.
+            # Its thread wakes and ends.
             with contextlib.suppress(OSError):
                 oldest.shutdown(socket.SHUT_RDWR)
         super().process_request(request, client_address)
@@ -186,7 +186,7 @@ class ViewServer(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def keep(self, connection: Any, browsers: int = 0) -> bool:
-        """Keep a command, or streams of so many browsers, open; return whether there is room."""
+        """Keep a command or the streams of some browsers open; return whether there is capacity."""
         with self._lock:
             self._idle.pop(connection, None)
             if self.browsers + browsers > MOST_BROWSERS:
@@ -195,7 +195,7 @@ class ViewServer(ThreadingHTTPServer):
             return True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Do nothing: a browser that breaks a connection is no error of the run."""
+        """Ignore errors of browsers."""
 
 
 def _number(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
@@ -207,7 +207,7 @@ def _number(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 def _own_address() -> str:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            # Of a documentation network: only the route to it is looked up, nothing is sent.
+            # Address of a documentation network: only its route is looked up, nothing is sent.
             probe.connect(('192.0.2.1', 9))
             return str(probe.getsockname()[0])
         except OSError:
@@ -228,7 +228,7 @@ class _Handler(BaseHTTPRequestHandler):
         path = urlsplit(self.path).path
         given = parse_qs(urlsplit(self.path).query).get('token', [''])[-1]
         if not (self.server.is_private or self._has_token(given)):
-            self._refuse(HTTPStatus.FORBIDDEN, 'wrong token: use the whole link that was printed')
+            self._refuse(HTTPStatus.FORBIDDEN, 'wrong token: use the full link that was printed')
         elif path == '/':
             self._answer(HTTPStatus.OK, empty_page().encode(), 'text/html; charset=utf-8')
         elif path == '/events':
@@ -238,7 +238,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """Carry out a command."""
-        # What is left of a refused request is not read.
+        # The rest of a refused request is not read.
         self.close_connection = True
         if not self._is_for_this_host():
             return
@@ -247,7 +247,9 @@ class _Handler(BaseHTTPRequestHandler):
             return
         commander = self.server.commander
         if commander is None:
-            self._refuse(HTTPStatus.FORBIDDEN, 'read only: started without --control')
+            self._refuse(
+                HTTPStatus.FORBIDDEN, 'read only: start the run with --control to send commands'
+            )
         elif not self._has_token(self.headers.get('X-Maasi-Token', '')):
             self._refuse(HTTPStatus.FORBIDDEN, 'wrong token')
         else:
@@ -274,7 +276,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif command not in COMMANDS:
             problem = f'command: allowed are {", ".join(COMMANDS)}'
         elif robot is not None and not (isinstance(robot, str) and robot.isidentifier()):
-            problem = 'robot: allowed is the name of one, or null'
+            problem = 'robot: allowed is a robot name or null'
         else:
             return str(command), robot
         self._refuse(HTTPStatus.BAD_REQUEST, problem)
@@ -285,21 +287,23 @@ class _Handler(BaseHTTPRequestHandler):
         return hmac.compare_digest(given.encode('utf-8', 'replace'), token.encode())
 
     def _is_for_this_host(self) -> bool:
-        """Refuse what another page asks by a name that it made point here."""
+        """Refuse requests with another host name (DNS rebinding)."""
         host, own = self.server.host, socket.gethostname()
         name = urlsplit(f'//{self.headers.get("Host", "")}').hostname or ''
         allowed = name in (host, 'localhost', '127.0.0.1', '::1')
-        # Where it listens on all addresses, each of them: another page has a name, no number.
+        # A server on all addresses accepts each address as a number.
         if host in _EVERYWHERE:
             allowed = allowed or name in (own, f'{own}.local') or _number(name) is not None
         if not allowed:
-            self._refuse(HTTPStatus.FORBIDDEN, 'Host: allowed is the address that was printed')
+            self._refuse(HTTPStatus.FORBIDDEN, 'Host: allowed is the printed address')
         return allowed
 
     def _stream(self) -> None:
         self.close_connection = True
         if not self.server.keep(self.connection, 1):
-            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_BROWSERS} browsers are here')
+            self._refuse(
+                HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_BROWSERS} browsers are already connected'
+            )
             return
         try:
             self._begin(HTTPStatus.OK, 'text/event-stream', {})
@@ -310,7 +314,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(text.encode())
                 time.sleep(0.0 if closed else _PORTION_PERIOD)
         except OSError:
-            pass  # the client has disconnected, or does not read
+            pass  # the client disconnected or does not read
         finally:
             self.server.keep(self.connection, -1)
 
@@ -336,4 +340,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Say nothing of requests."""
+        """Log no requests."""

@@ -25,23 +25,23 @@ from maasi_sim.run.run_folder import write_whole
 from maasi_sim.run.view.event_log import Event, EventLog, Scene, shares
 from maasi_sim.run.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
-Progress = Callable[[float], object]  # called with the share that is done
-# Pictures per second; GIFs would be large. Size [in] at a resolution [px/in].
+Progress = Callable[[float], object]  # receives the completed share
+# Pictures per second, low for GIFs. Size [in] at a resolution [px/in].
 RATE, GIF_RATE = 30, 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80
-_HOLD = 2.0  # the last picture is shown for so long [s]
-_FADE = 1.0  # detections are shown for so long [s]
-# Points of a way that are drawn, and those of a circle.
+_HOLD = 2.0  # duration of the last picture [s]
+_FADE = 1.0  # display time of detections [s]
+# Most points of a path, and points of a circle.
 _MOST_POINTS = 600
 _CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 40)) for f in (np.cos, np.sin)], axis=1)
 _SOLID = '#59636E'
-# Where they are shown, texts, marks and colours.
+# Legend: layer, text, mark and colour.
 _LEGEND = (
-    ('', 'left or cannot go on', '>', AWAY),
-    ('', 'planned way', '--', PALE),
+    ('', 'left or unavailable', '>', AWAY),
+    ('', 'planned path', '--', PALE),
     ('targets', 'waypoint', 's', PALE),
     ('floor', 'field of view', ':', PALE),
-    ('floor', 'not searched', 's', UNSEEN),
+    ('floor', 'not explored', 's', UNSEEN),
     ('targets', 'found, 3 sigma', 'o', FOUND),
     ('targets', 'potential, 2 sigma', 'o', POTENTIAL),
     ('targets', 'detection', '+', SEEN),
@@ -57,7 +57,7 @@ _LEGEND = (
 
 
 class Moments:
-    """What holds at a time, which only rises: the last event of each kind and owner, and ways."""
+    """State of the run at a time that only increases: last event of each kind and owner, paths."""
 
     def __init__(self, log: EventLog) -> None:
         self.scene: Scene = log.scene
@@ -65,7 +65,7 @@ class Moments:
         #: Last event by kind, then by owner; detections of the last moments.
         self.last: dict[str, dict[str, Event]] = defaultdict(dict)
         self.seen: list[Event] = []
-        #: By robot: its way so far, its tour, and where it is sent, None: it stays.
+        # : By robot: path so far, tour, and waypoint (None: it stays).
         self.ways: dict[str, list[list[float]]] = defaultdict(list)
         self.tours: dict[str, list[list[float]]] = {}
         self.waypoints: dict[str, list[float] | None] = {}
@@ -73,11 +73,11 @@ class Moments:
         self.visited: set[int] = set()
         moving = {event[2] for event in log.events if event[1] == 'robot'}
         self.robots = sorted(moving | set(self.scene.get('robots', {})))
-        # The next one is the last of the list.
+        # The next event is the last of the list.
         self._coming = sorted(log.events, key=lambda event: float(event[0]))[::-1]
 
     def advance(self, time: float) -> None:
-        """Take the events until a time."""
+        """Apply the events up to a time."""
         self.time = time
         while self._coming and self._coming[-1][0] <= time:
             event = self._coming.pop()
@@ -107,10 +107,10 @@ class Moments:
 
 
 def write_video(log: EventLog, path: Path, speed: float = 5.0, progress: Progress = float) -> None:
-    """Write a run as FILE.mp4 or FILE.gif, `speed` times as fast."""
+    """Write a run as FILE.mp4 or FILE.gif, at `speed` times real time."""
     write, rate = (_write_gif, GIF_RATE) if path.suffix == '.gif' else (_write_mp4, RATE)
     pictures = _pictures(log, speed, rate, progress)
-    # Keep the suffix: it tells the type of the file.
+    # Keep the suffix, which determines the file type.
     write_whole(path, lambda part: write(part, pictures))
 
 
@@ -119,8 +119,8 @@ def _write_mp4(path: Path, pictures: Iterator[ImageArray]) -> None:
     writer: Any = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'mp4v'), RATE, size)
     try:
         if not writer.isOpened():
-            raise OSError(f'{path}: cannot be written as a video')
-        # Encoded beside drawing.
+            raise OSError(f'{path}: cannot write a video')
+        # Encode in parallel to drawing.
         with ThreadPoolExecutor(1) as encoder:
             done: Future[Any] = encoder.submit(int)
             for picture in pictures:
@@ -158,7 +158,7 @@ def _pictures(log: EventLog, speed: float, rate: int, progress: Progress) -> Ite
 
 
 class Sheet:
-    """Axes on which a run is drawn: what moves, on a ground that is kept while it holds."""
+    """Axes on which a run is drawn: moving parts on a cached ground."""
 
     def __init__(self, bounds: FloatArray, now: Moments) -> None:
         self.bounds = bounds
@@ -171,24 +171,24 @@ class Sheet:
         for name, limits in zip('xyz', bounds):
             axes.set(**{f'{name}lim': limits, f'{name}label': f'{name} [m]'})
         if size == 3:
-            # Labels of the axes need room.
+            # Space for the axis labels.
             axes.set_box_aspect(np.ptp(bounds, axis=1), zoom=0.9)
         else:
             axes.set_aspect('equal')
         self._axes = axes
         self._add_legend(now.scene)
         self._title = axes.set_title(now.title(), animated=True)
-        # Artists by kind, which are used again; how many of a kind are in use; what is to be drawn.
+        # Reusable artists by kind; number in use by kind; artists to draw.
         self._pool: dict[str, list[Any]] = defaultdict(list)
         self._used: Counter[str] = Counter()
         self._drawn: list[Any] = []
-        # Drawn once: the axes and the legend. On them is the ground, and what that shows.
+        # Drawn once: axes and legend. On top the ground and what it shows.
         self._canvas.draw()
         self._axes_alone = self._ground = self._canvas.copy_from_bbox(figure.bbox)
         self._shown: list[Any] = []
 
     def draw(self, now: Moments) -> ImageArray:
-        """Return a picture of what holds now, (height, width, 3), until the next."""
+        """Return the picture (height, width, 3), valid until the next call."""
         kinds = (now.last[kind].values() for kind in ('map', 'truth', 'found'))
         shown = [len(now.visited), *chain.from_iterable(kinds)]
         if shown != self._shown:
@@ -207,7 +207,7 @@ class Sheet:
         return np.asarray(self._canvas.buffer_rgba())[:, :, :3]
 
     def _flush(self, ground: Any) -> None:
-        """Draw what waits on a ground; what is solid in space from the back."""
+        """Draw the queued artists on a ground; in 3D solid parts from back to front."""
         self._canvas.restore_region(ground)
         self._drawn.sort(key=lambda item: -getattr(item, 'do_3d_projection', lambda: -math.inf)())
         for artist in self._drawn:
@@ -239,7 +239,7 @@ class Sheet:
         x, y, z, xx, xy, _, yy, *_ = row
         self._line([x, y, z], 'o', ms=4, **style)
         if self.size == 2:
-            # The root of the covariance by Cholesky.
+            # Square root of the covariance by Cholesky.
             first = math.sqrt(max(xx, 1e-12))
             other = math.sqrt(max(yy - (xy / first) ** 2, 0.0))
             ring = _CIRCLE @ np.array([[first, xy / first], [0.0, other]])
@@ -251,7 +251,7 @@ class Sheet:
             values = np.maximum(shares(digits), 0.0).reshape(nx, ny).T
             extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
             shades: Any = {'origin': 'lower', 'cmap': 'Greys', 'vmin': 0, 'vmax': 2.7}
-            # The frame again, which the map covers.
+            # Draw the frame again over the map.
             image = self._axes.imshow(values, extent=extent, **shades)
             self._drawn += [image, *self._axes.spines.values()]
         changed = now.last['zones'].get('')
@@ -319,14 +319,14 @@ class Sheet:
             self._line(now.waypoints.get(name) or [], 's', color=colour, ms=8, mfc='none')
             self._line(now.tours.get(name, []), '--', color=colour, lw=0.6)
         if size == 3 and not away:
-            # How high it is.
+            # Height.
             foot = [*place[:2], self.bounds[2, 0]]
             self._line([foot, place], ':', color=colour, lw=0.8)
         elif 'view' in robot and not away:
             outline = _view(robot['view'], place, yaw)
             view = self._next('view', lambda: self._axes.fill(*outline.T, ls=':')[0])
             view.set(xy=outline, ec=colour, fc=(*to_rgb(colour), 0.12))
-        # From above it points ahead.
+        # Seen from above it points ahead.
         arrow = [[1.4, 0.0], [-0.9, 0.8], [-0.5, 0.0], [-0.9, -0.8], [1.4, 0.0]]
         marker: Any = 'D' if size == 3 else Outline(arrow @ _turn(yaw))
         self._line(place, '', marker=marker, color=colour, ms=8 if size == 3 else 16)

@@ -1,4 +1,4 @@
-"""A node that shows any search: beside real robots, or beside a bag that is played."""
+"""A node that shows any search, of real robots or a played bag."""
 
 import argparse
 import sys
@@ -23,17 +23,15 @@ from maasi_sim.run.view.scene import empty_scene, scene_of
 from maasi_sim.scenario.layering import ScenarioError
 
 DONE, WRONG_INPUT = 0, 2
-_DISCOVERY = 0.5  # period of looks for new topics [s]
+_DISCOVERY = 0.5  # period of checks for new topics [s]
 
 
 class ViewNode(Node):
-    """Hands messages of topics that show a search to a function that never waits.
-
-    It takes topic, type and serialised message.
+    """Passes messages of shown topics to a function that never waits: topic, type, message.
 
     Subscribes
     ----------
-    every topic of a type in `maasi_sim.run.message_facts.READERS`, as its publishers offer it
+    every topic of a type in `maasi_sim.run.message_facts.READERS`, with its publishers' QoS
     """
 
     def __init__(self, put: Callable[[str, str, bytes], None]) -> None:
@@ -54,7 +52,7 @@ class ViewNode(Node):
                 continue
             self._known.add(topic)
             qos = reader_of(offers)
-            # A bounded history: no publisher waits for the page.
+            # A bounded history: publishers never wait for the page.
             qos.history = HistoryPolicy.KEEP_LAST
             self.create_subscription(
                 message_class(types[0]), topic, partial(self._put, topic, types[0]), qos, raw=True
@@ -64,14 +62,16 @@ class ViewNode(Node):
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog='view_node', description='Shows a search in a browser, from its topics.'
+        prog='view_node', description='Show a search in a browser, from its topics.'
     )
     parser.add_argument(
         '--scenario',
         metavar='FILE',
-        help='what is searched, where it is known: fields of view, obstacles, scores',
+        help='scenario of the search; shows fields of view, obstacles and scores, too',
     )
-    parser.add_argument('--namespace', default='', metavar='NS', help='of the team to control')
+    parser.add_argument(
+        '--namespace', default='', metavar='NS', help='namespace of the team to control'
+    )
     add_view_options(parser)
     return parser
 

@@ -1,4 +1,4 @@
-"""Make the page, or a video, that shows a recorded run."""
+"""Make the page or a video of a recorded run."""
 
 import argparse
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def send_replay(folder: Path, send: Callable[[Any], None]) -> None:
-    """Write the page of a run beside its report; send the shares that are done, then any error."""
+    """Write the page of a run next to its report; send the completed shares, then any error."""
     try:
         write_replay(read_events(folder, send), folder / REPLAY)
         send('')
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--speed: read '{options.speed:g}', allowed are numbers above 0, below 1e4")
     bags = sorted(Path('runs').glob('*/bag/metadata.yaml'), key=lambda item: item.stat().st_mtime)
     if options.recording is None and not bags:
-        parser.error('there is no run in runs: name a recording')
+        parser.error('runs contains no run: name a recording')
     recording = options.recording or bags[-1].parents[1]
     display = ProgressDisplay()
     try:
@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
             display.close()
             print(file)
             return DONE
-        # In the folder of its run, or beside the recording.
+        # In the folder of its run, or next to the recording.
         folder = recording if (recording / 'bag').is_dir() else recording.resolve().parent
         file = options.out or folder / REPLAY
         write_replay(log, file)

@@ -1,10 +1,10 @@
-// The belief as a heat map: how many potential targets are expected where, of their Gaussians.
+// Potential targets as a heat map: density from their Gaussians.
 
 import { themed } from './colours.js';
 import { FloorGrid } from './floor_grid.js';
 import { number } from './text.js';
 
-// Cells along the longer side; colours; and where a Gaussian ends [deviations].
+// Cells along the longer side; colours; cut-off of a Gaussian [deviations].
 const BELIEF_CELLS = 90;
 const LEVELS = 24;
 const REACH = 3.5;
@@ -15,7 +15,7 @@ export class Belief {
     this.events = [];
   }
 
-  // Reckon the density [targets/m^2] of the filters' last updates; of several filters the largest.
+  // Compute the density [targets/m^2] from the filters' last updates; the largest of several filters.
   update(log, time) {
     const events = log.owners('filter').map((space) => log.at('filter', space, time)).filter(Boolean);
     if (this.bounds === log.bounds && events.length === this.events.length && events.every((event, index) => event === this.events[index])) return;
@@ -32,7 +32,7 @@ export class Belief {
       for (const cluster of event[4]) highest = Math.max(highest, this.add(own, cluster));
       for (let index = 0; index < own.length; index += 1) this.density[index] = Math.max(this.density[index], own[index]);
     }
-    // As dark as can be where a whole target is as certain as the most certain one.
+    // Darkest for a whole target as certain as the most certain one.
     this.levels = new Uint8Array(this.density.length);
     this.isEmpty = highest === 0;
     for (let index = 0; index < this.levels.length && !this.isEmpty; index += 1) {
@@ -40,10 +40,10 @@ export class Belief {
     }
   }
 
-  // Add a potential target, seen from above; return the density that a whole one would have at most.
+  // Add a potential target, seen from above; return the peak density of a whole one.
   add(density, [px, py, , mass, xx, xy, , yy]) {
     const { corner, step, shape } = this.cells;
-    // No narrower than a cell, so that none is missed.
+    // At least one cell wide, so that none is missed.
     const [a, b, c] = [xx + step[0] ** 2 / 4, xy, yy + step[1] ** 2 / 4];
     const determinant = Math.max(a * c - b * b, 1e-12);
     const top = 1 / (2 * Math.PI * Math.sqrt(determinant));
@@ -76,10 +76,10 @@ export class Belief {
     this.floor.draw(view, this.cells, this.levels, this.colours);
   }
 
-  // Return in words what is expected at a place.
+  // Return the density at a position as text.
   words(place) {
     const { corner, step, shape } = this.cells;
     const [i, j] = [0, 1].map((axis) => Math.round((place[axis] - corner[axis]) / step[axis]));
-    return `belief ${number(this.density[i * shape[1] + j] || 0)} targets per m²`;
+    return `potential ${number(this.density[i * shape[1] + j] || 0)} targets per m²`;
   }
 }

@@ -7,7 +7,7 @@ import { box, path, side } from './shapes.js';
 const FACES = ['west', 'east', 'south', 'north', 'bottom', 'top'];
 export const PHOTOGRAPHED = '#2f8fd0';
 
-// Return the colour of a face of which a share was photographed.
+// Return the colour of a face by its photographed share.
 export function faceColour(share) {
   return `rgba(${140 - 93 * share}, 140, ${160 + 48 * share}, .75)`;
 }
@@ -21,7 +21,7 @@ export function drawBuildings(view, log, time) {
   for (const name of log.owners('cuboid')) {
     const event = log.at('cuboid', name, time);
     const here = log.at('robot', name, time);
-    // Who is not on the way carries out no plan.
+    // Only moving robots execute their plan.
     if (event && here && here[5] === MOVING) for (const cuboid of event[7]) planned.set(cuboid, name);
   }
   const boxes = [
@@ -62,8 +62,7 @@ export function drawBuildings(view, log, time) {
   drawLinks(view, log, time);
 }
 
-// The faces of an object by the share that was photographed, and the photographed parts; from above
-// the walls are lines.
+// The faces of an object by photographed share, and photographed parts; from above walls are lines.
 function drawFaces(view, log, visited, { object, sides }) {
   const { context, camera } = view;
   const cells = (log.scene.cells || []).map(([owner, number, part], cuboid) => ({ owner, number, part, cuboid }));
@@ -92,7 +91,7 @@ function drawFaces(view, log, visited, { object, sides }) {
   });
 }
 
-// Lines between robots of which one hears the other.
+// Lines between robots that receive from each other.
 function drawLinks(view, log, time) {
   const { context, camera } = view;
   context.strokeStyle = themed('--text');

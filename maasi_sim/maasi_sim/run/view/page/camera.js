@@ -1,4 +1,4 @@
-// From places on the map [m] to the canvas [px]: seen from above, or in space with an orbit.
+// Projection from the map [m] to the canvas [px]: from above, or in 3D with an orbit camera.
 
 export class Camera {
   constructor() {
@@ -63,7 +63,7 @@ export class Camera {
     ];
   }
 
-  // Return how a small step on each axis moves the picture: two rows of three [px/m].
+  // Return the derivative of the picture by each axis: two rows of three [px/m].
   jacobian(place) {
     const step = 1e-3 * (this.distance || 1);
     const [x, y] = this.project(place);
@@ -78,7 +78,7 @@ export class Camera {
     return rows;
   }
 
-  // Return the place on the plane z = 0 below a point of the canvas; seen from above only.
+  // Return the position on the plane z = 0 at a point of the canvas, from above only.
   place(x, y) {
     return [
       this.centre[0] + (x - this.width / 2) / this.scale,
@@ -86,7 +86,7 @@ export class Camera {
     ];
   }
 
-  // Return the place at a height below a point of the canvas.
+  // Return the position at a height at a point of the canvas.
   ground(x, y, height) {
     if (!this.spatial) return this.place(x, y);
     // A point of the ray at a depth d is right = a (D + d), up = b (D + d), with D the distance of the eye.

@@ -1,4 +1,4 @@
-// Colours that colour-blind readers can tell apart (Okabe and Ito; candidates: cividis).
+// Colours for colour-blind readers (Okabe and Ito; candidates: cividis).
 
 export const FOUND = '#009e73';
 export const POTENTIAL = '#e69f00';
@@ -6,7 +6,7 @@ export const SEEN = '#cc79a7';
 export const VISITED = '#56b4e9';
 export const OPEN = '#d55e00';
 export const KEEP_OUT = '#8f9900';
-// Of robots, also on what is unexplored; brighter in the dark.
+// Robot colours, brighter in the dark theme.
 const ROBOTS = ['#0072b2', '#b54800', '#6a3d9a', '#7a4a00', '#00707f', '#a02c6d'];
 const NAMED = { purple: '#7b3294', red: '#d62728', green: '#1f7a1f', blue: '#0072b2' };
 const BRIGHT = ['#6cc0f5', '#ff9a5c', '#c9a6f0', '#d0ad7a', '#5fd3dd', '#f29ac8'];
@@ -33,7 +33,7 @@ export function scaleColour(share) {
 
 const known = new Map();
 
-// Return a colour of the theme; asked for often, so it is read once.
+// Return a colour of the theme, cached.
 export function themed(name) {
   const key = `${document.documentElement.dataset.theme} ${name}`;
   if (!known.has(key)) known.set(key, getComputedStyle(document.documentElement).getPropertyValue(name).trim());

@@ -1,4 +1,4 @@
-// The curve of what was found, and of the expected number left, over time.
+// The curves of finds and of the expected number left over time.
 
 import { FOUND, POTENTIAL, themed } from './colours.js';
 
@@ -9,7 +9,7 @@ export class Curve {
     this.key = '';
   }
 
-  // Where the axis of time begins and how long it is [px].
+  // Begin and length of the time axis [px].
   get axis() {
     return [28, this.canvas.clientWidth - 36];
   }
@@ -42,7 +42,7 @@ export class Curve {
     const found = log.isOfBuildings
       ? { times: log.visits.times, events: log.visits.times.map((_, index) => index + 1) }
       : log.totals;
-    // Without the number expected before the search only potential targets are known.
+    // Without an expected number only potential targets are known.
     const [other, title] = log.knowsExpected ? [log.left, 'expected left'] : [log.potential, 'potential'];
     const most = Math.max(1, log.total || 0, ...found.events.slice(-1), ...sampled(other, 500).map((item) => item[1]));
     const [left, wide] = this.axis;
@@ -61,7 +61,7 @@ export class Curve {
     context.fillText('0', left - 3, top + high);
     context.fillText(`${log.duration.toFixed(0)} s`, left + wide, height - 6);
     context.textAlign = 'left';
-    // A piece of the line, then its name: orange letters on white cannot be read.
+    // A line sample, then its name: orange letters on white are illegible.
     const entry = (colour, dash, text, from) => {
       context.strokeStyle = colour;
       context.lineWidth = 2;
@@ -98,7 +98,7 @@ export class Curve {
   }
 }
 
-// Return at most so many pairs of time and value, the last one always.
+// Return at most `most` pairs of time and value, including the last one.
 function sampled({ times, events }, most) {
   const stride = Math.max(1, Math.ceil(times.length / most));
   const points = [];

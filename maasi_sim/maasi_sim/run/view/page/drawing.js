@@ -1,27 +1,27 @@
-// Drawing an area and keep-outs on the map, and saving them for the next run.
+// Draws an area and keep-out zones on the map and saves them for the next run.
 
 import { KEEP_OUT, themed } from './colours.js';
 import { onEarth } from './earth.js';
 import { path } from './shapes.js';
-import { element } from './text.js';
+import { counted, element } from './text.js';
 
 const SHAPES = { area: 'area', keep_out: 'keep-out' };
 const FILE = 'area.geojson';
-// A click so near to the first or last corner closes a ring [px].
+// A click this close to the first or last corner closes a ring [px].
 const CLOSING = 9;
 
 export class Drawing {
   constructor(tools, status, page) {
     this.status = status;
     this.page = page;
-    // What clicks on the map draw; null: nothing.
+    // Kind that clicks draw, or null.
     this.kind = null;
-    // What would be saved, first that of the run; null: nothing was drawn yet.
+    // Shapes to save, beginning with those of the run; null before the first drawing.
     this.shapes = null;
     this.corners = [];
     const actions = [
       ['area', 'Draw area', () => this.start('area')],
-      ['keep_out', 'Draw keep-out', () => this.start('keep_out')],
+      ['keep_out', 'Draw keep-out zone', () => this.start('keep_out')],
       ['undo', 'Undo', () => this.undo()],
       ['save', 'Save', () => this.save()],
     ];
@@ -37,7 +37,7 @@ export class Drawing {
     tools.append(...this.buttons);
   }
 
-  // Let clicks draw; a second time, or without a kind, they do what they did before.
+  // Toggle drawing by clicks.
   start(kind) {
     this.kind = this.kind === kind ? null : kind;
     this.tell();
@@ -64,7 +64,7 @@ export class Drawing {
     this.tell();
   }
 
-  // Take back the last corner, or the last shape; the area of the run stays.
+  // Undo the last corner or shape; the area of the run stays.
   undo() {
     const last = this.shapes.at(-1);
     if (this.corners.length) this.corners.pop();
@@ -72,7 +72,7 @@ export class Drawing {
     this.tell();
   }
 
-  // What would be saved: of areas the last that was drawn, in place of that of the run.
+  // Shapes to save: the last drawn area replaces that of the run.
   get kept() {
     const area = this.shapes.filter(({ kind, drawn }) => kind === 'area' && drawn).at(-1);
     return this.shapes.filter((item) => item.kind !== 'area' || !area || item === area);
@@ -80,7 +80,7 @@ export class Drawing {
 
   save() {
     if (this.corners.length) {
-      this.tell('Not saved, as a shape is open: close it, or undo its corners.');
+      this.tell('Not saved: close the open shape or undo its corners first.');
       return;
     }
     const { bounds, scene: { origin } } = this.page.log;
@@ -96,15 +96,15 @@ export class Drawing {
     link.download = FILE;
     link.click();
     const altitude = bounds[2] ? `, altitude: [${bounds[2].join(', ')}]` : '';
-    this.tell(`Saved; for the next scenario: environment: {area: ${FILE}${altitude}}.`);
+    this.tell(`Saved. Use it in a scenario: environment: {area: ${FILE}${altitude}}.`);
   }
 
-  // Say what is drawn, after what there is to say of the last click.
+  // Show a message, the drawn shapes and the next step.
   tell(news = '') {
-    const area = this.kept.some(({ drawn, kind }) => drawn && kind === 'area') ? 'Area drawn' : 'Area of the run';
+    const area = this.kept.some(({ drawn, kind }) => drawn && kind === 'area') ? 'New area' : 'Area of the run';
     const closed = this.kept.filter(({ kind }) => kind === 'keep_out').length;
-    const hint = `Corners of the ${SHAPES[this.kind]}: ${this.corners.length}. Click to add one; double-click, or click the first, to close.`;
-    this.status.textContent = `${news} ${area}, keep-outs: ${closed}. ${this.kind ? hint : ''}`;
+    const hint = `Corners of the ${SHAPES[this.kind]}: ${this.corners.length}. Click to add a corner; double-click or click the first corner to close.`;
+    this.status.textContent = `${news} ${area}, ${counted(closed, 'keep-out zone')}. ${this.kind ? hint : ''}`;
     this.status.hidden = false;
     for (const button of this.buttons.slice(0, 2)) button.setAttribute('aria-pressed', String(this.kind === button.dataset.draw));
     this.page.request();
@@ -129,7 +129,7 @@ export class Drawing {
   }
 }
 
-// Return area and keep-outs of a run; its bounds where it has no border.
+// Return area and keep-out zones of a run; its bounds if it has no polygon.
 function shapesOf(log, time) {
   const zones = log.zones(time).filter(({ kind }) => kind in SHAPES);
   if (zones.some(({ kind }) => kind === 'area')) return zones;
@@ -137,10 +137,10 @@ function shapesOf(log, time) {
   return [{ kind: 'area', rings: [[[left, low], [right, low], [right, high], [left, high], [left, low]]] }, ...zones];
 }
 
-// Return what is wrong with the corners of a ring; empty if nothing is.
+// Return the problem of a ring's corners, or an empty text.
 function problemOf(corners) {
   const count = corners.length;
-  if (count < 3) return `it has ${count} of at least 3 corners`;
+  if (count < 3) return `it needs at least 3 corners and has ${count}`;
   const side = ([ax, ay], [bx, by], [cx, cy]) => Math.sign((bx - ax) * (cy - ay) - (by - ay) * (cx - ax));
   const turnsBack = (a, b, c) => side(a, b, c) === 0 && (a[0] - b[0]) * (c[0] - b[0]) + (a[1] - b[1]) * (c[1] - b[1]) > 0;
   for (let i = 0; i < count; i += 1) {
@@ -150,7 +150,7 @@ function problemOf(corners) {
       const [c, d] = [corners[j], corners[(j + 1) % count]];
       isCrossed ||= side(a, b, c) !== side(a, b, d) && side(c, d, a) !== side(c, d, b);
     }
-    if (isCrossed) return `its side ${i + 1} crosses another; undo corners`;
+    if (isCrossed) return `side ${i + 1} crosses another side; undo corners`;
   }
   return '';
 }

@@ -1,22 +1,22 @@
-// Where places of the map are on the earth (WGS 84).
+// Geodetic coordinates of map positions (WGS 84).
 
 const RADIUS = 6378137;
 const SQUARED_ECCENTRICITY = 0.00669437999014;
 const RADIANS = Math.PI / 180;
 
-// Return a place in axes that turn with the earth [m].
+// Return earth-centred, earth-fixed coordinates [m].
 function inSpace(longitude, latitude, altitude) {
   const normal = RADIUS / Math.sqrt(1 - SQUARED_ECCENTRICITY * Math.sin(latitude) ** 2);
   const level = (normal + altitude) * Math.cos(latitude);
   return [level * Math.cos(longitude), level * Math.sin(longitude), (normal * (1 - SQUARED_ECCENTRICITY) + altitude) * Math.sin(latitude)];
 }
 
-// Return longitude and latitude [degrees] of a place [m] on the map with an origin.
+// Return longitude and latitude [degrees] of a map position [m].
 export function onEarth([x, y], { latitude, longitude, altitude }) {
   const [east, north] = [longitude * RADIANS, latitude * RADIANS];
   const centre = inSpace(east, north, altitude);
   let found = [east, north];
-  // Each round leaves a hundredth of the error.
+  // Each iteration reduces the error by 100.
   for (let round = 0; round < 8; round += 1) {
     const [a, b, c] = inSpace(...found, altitude).map((value, axis) => value - centre[axis]);
     const out = a * Math.cos(east) + b * Math.sin(east);

@@ -1,4 +1,4 @@
-// A grid on the floor whose cells have colours, from above as an image, else cell by cell.
+// A grid of coloured floor cells, from above as an image, else cell by cell.
 
 export class FloorGrid {
   constructor(isSmooth = false) {
@@ -6,7 +6,7 @@ export class FloorGrid {
     this.canvas = document.createElement('canvas');
   }
 
-  // Draw levels (nx, ny); `colours` has red, green, blue and opacity, up to 255, of each level.
+  // Draw levels (nx, ny); `colours`: red, green, blue and opacity (to 255) of each level.
   draw({ context, camera, floor }, { corner, step, shape }, levels, colours) {
     const [nx, ny] = shape;
     const [left, low] = [0, 1].map((axis) => corner[axis] - step[axis] / 2);

@@ -1,7 +1,7 @@
-// Drawn icons: fonts would show some of them as emoji, or not at all.
+// Icons as outlines, as fonts may lack them or show emoji.
 
 export const SVG = 'http://www.w3.org/2000/svg';
-// Outlines in a square of 16 by 16; those of a line have no inside.
+// Outlines of 16 by 16; lines are not filled.
 const OUTLINES = {
   play: 'M4 2 L14 8 L4 14 Z',
   pause: 'M3 2 H7 V14 H3 Z M9 2 H13 V14 H9 Z',

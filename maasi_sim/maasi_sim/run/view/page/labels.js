@@ -2,7 +2,7 @@
 
 import { themed } from './colours.js';
 
-// Where a text is tried beside its point, in this order: to the right and upwards.
+// Offsets of a text from its point, in the order in which they are tried.
 const PLACES = [[1, -1], [1, 1], [-1, -1], [-1, 1], [1, 0], [-1, 0], [0, -1], [0, 1]];
 const HEIGHT = 13;
 
@@ -11,7 +11,7 @@ export class Labels {
     this.wanted = [];
   }
 
-  // Have a text drawn near a point; one that is needed is drawn before others, and in any case.
+  // Add a text near a point; needed ones are always drawn, before others.
   add(text, x, y, { font = '11px system-ui, sans-serif', away = 6, needed = false } = {}) {
     this.wanted.push({ text, x, y, font, away, needed });
   }

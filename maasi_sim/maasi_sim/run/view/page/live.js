@@ -1,4 +1,4 @@
-// A run that goes on: its events as they come, and its controls where they are allowed.
+// A live run: its events as they arrive, and its controls if enabled.
 
 import { isStopped, RunLog } from './run_log.js';
 import { element } from './text.js';
@@ -20,10 +20,10 @@ export function follow(onLog, onEvents, onState) {
 
 const COMMANDS = [['start', 'Start'], ['pause', 'Pause'], ['resume', 'Resume'], ['home', 'Send home'], ['stop', 'Stop'], ['release', 'Release']];
 const HINTS = {
-  stop: 'The selected robot, or all where none is selected, until they are released',
-  release: 'The selected robot, or all where none is selected, take goals again after a stop',
+  stop: 'Stop the selected robot, or all robots if none is selected, until released',
+  release: 'Let the selected robot, or all robots, accept goals again after a stop',
 };
-// Modes of a robot in which a command changes something; of the others it always may.
+// Modes of a robot in which a command has an effect; other commands always may.
 const USEFUL = {
   start: ['waiting for start', 'stopped'],
   pause: ['searching', 'sent home'],
@@ -31,7 +31,7 @@ const USEFUL = {
   home: ['waiting for start', 'searching', 'paused', 'stopped'],
 };
 
-// Switch off the buttons that cannot work; where no mode is known, none.
+// Disable buttons without effect, if the modes are known.
 export function updateControls(parent, log, selected) {
   const names = selected ? [selected] : log.robots();
   for (const button of parent.querySelectorAll('[data-command]')) {
@@ -46,7 +46,7 @@ export function updateControls(parent, log, selected) {
   }
 }
 
-// Show the controls; the token is in the address.
+// Show the controls; the address contains the token.
 export function showControls(parent, selectedRobot) {
   const token = new URLSearchParams(window.location.search).get('token') || '';
   const answer = element('span', 'quiet', '');
@@ -57,11 +57,11 @@ export function showControls(parent, selectedRobot) {
   for (const [command, title] of COMMANDS) {
     const button = element('button', '', title);
     button.dataset.command = command;
-    button.title = HINTS[command] || 'The selected robot, or the whole search where none is selected';
+    button.title = HINTS[command] || 'For the selected robot, or for the whole search if none is selected';
     button.onclick = async () => {
       const robot = selectedRobot();
       answer.textContent = `${command} ${robot || 'all'} ...`;
-      // A browser queues requests beyond six connections: what a stop supersedes makes room for it.
+      // A browser queues requests beyond six connections: a stop aborts those that it supersedes.
       for (const other of waiting) {
         if (command === 'stop' && (robot === null || other.command !== 'stop')) other.abort.abort();
       }

@@ -1,4 +1,4 @@
-// The page: what is shown at which time, and what the reader does.
+// The page: shown time, layers, and input of the user.
 
 import { Camera } from './camera.js';
 import { Curve } from './curve.js';
@@ -18,7 +18,7 @@ import { showWhy } from './why.js';
 import { hasEnded, headline, showCard, showHeadline } from './words.js';
 
 const $ = (id) => document.getElementById(id);
-// Pictures of a live run per second: the search needs the processor more.
+// Frames per second of a live run, low to leave the processor to the search.
 const LIVE_RATE = 3;
 const reducedMotion = window.matchMedia('(prefers-reduced-motion: reduce)');
 
@@ -53,12 +53,12 @@ class Page {
         document.body.dataset.ready = 'yes';
         this.playByItself();
       }).catch((error) => {
-        $('source').textContent = `the run in this file cannot be read: ${error.message}`;
+        $('source').textContent = `cannot read the run in this file: ${error.message}`;
       });
     } else this.followRun();
   }
 
-  // Play a replay once it is seen, unless its reader has begun to look around.
+  // Play a replay when it becomes visible, unless the user has already interacted.
   playByItself() {
     if (reducedMotion.matches || this.time > 0) return;
     if (document.visibilityState === 'visible') this.setPlaying(true);
@@ -84,7 +84,7 @@ class Page {
         this.connection = state;
         this.request();
         if (state !== 'ended') return;
-        // Nobody is left who would follow: it is a replay from now on.
+        // The run has ended: from now on this is a replay.
         if (this.following) this.time = this.log.duration;
         this.setFollowing(false);
         this.isLive = false;
@@ -100,7 +100,7 @@ class Page {
     const { seed, planner } = log.scene;
     if (!this.isLive) {
       const facts = [seed === undefined ? '' : `seed ${seed}`, planner ? `planner ${planner}` : ''];
-      facts.push(log.scene.missing || '', `replay, ${log.size} events`, log.scene.thinned ? `thinned to ${log.scene.thinned} s` : '');
+      facts.push(log.scene.missing || '', `replay, ${log.size} events`, log.scene.thinned ? `reduced to one state per ${log.scene.thinned} s` : '');
       $('source').textContent = facts.filter(Boolean).join(', ');
     }
     if (log.scene.control && !$('controls').childElementCount) showControls($('controls'), () => this.selected);
@@ -117,7 +117,7 @@ class Page {
   }
 
   addLayers() {
-    const layers = [['background', 'Background'], ['truth', 'Truth'], ['unseen', 'Searched'], ['left', 'Where targets may still be'], ['belief', 'Belief'], ['view', 'Field of view'], ['ways', 'Ways'], ['clusters', 'Potential'], ['detections', 'Detections']];
+    const layers = [['background', 'Background'], ['truth', 'Truth'], ['unseen', 'Explored'], ['left', 'Undetected targets'], ['belief', 'Potential per area'], ['view', 'Field of view'], ['ways', 'Paths'], ['clusters', 'Potential'], ['detections', 'Detections']];
     for (const [name, title] of layers) {
       const button = element('button', '', title);
       button.dataset.layer = name;
@@ -226,7 +226,7 @@ class Page {
     };
     canvas.addEventListener('pointerup', release);
     canvas.addEventListener('pointercancel', release);
-    // A finger leaves when it is lifted: what it tapped stays.
+    // On touch screens the tip stays after the finger is lifted.
     canvas.addEventListener('pointerleave', (event) => event.pointerType === 'mouse' && showTip($('tip'), ''));
     canvas.addEventListener('wheel', (event) => {
       event.preventDefault();
@@ -247,7 +247,7 @@ class Page {
     this.point(x, y);
   }
 
-  // Say what is at a point of the map.
+  // Show the tip for a point of the map.
   point(x, y) {
     showTip($('tip'), tipAt(this.map, this.log, this.time, this.selected, x, y), x, y);
   }
@@ -318,7 +318,7 @@ class Page {
     if (this.playing) this.request();
   }
 
-  // The headline, the card at the end, and which buttons work.
+  // The headline, the card at the end, and enabled buttons.
   tell() {
     const { log, time } = this;
     const wait = showHeadline($('headline'), headline(log, time, this.connection), performance.now());
@@ -358,7 +358,7 @@ class Page {
       this.fitted = Boolean(log.scene.bounds) || !this.isLive;
     }
     this.map.marked = this.marked;
-    // Above a second of a fast replay, too.
+    // Also above one second of a fast replay.
     this.map.pulse = reducedMotion.matches ? 0 : Math.max(4, 1.2 * Number($('speed').value));
     this.map.draw(log, time, this.selected);
     showLegend($('legend'), log, time, this.selected, this.map);
@@ -382,7 +382,7 @@ class Page {
 }
 
 const page = new Page();
-// For tests and for readers who look behind the page.
+// For tests and the browser's console.
 window.maasi = page;
 page.start();
 setInterval(() => {

@@ -1,4 +1,4 @@
-// Draws a search for targets at a time.
+// Draws the map at a time.
 
 import { Belief } from './belief.js';
 import { FOUND, KEEP_OUT, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colours.js';
@@ -11,9 +11,9 @@ import { number } from './text.js';
 import { Unexplored } from './unexplored.js';
 import { drawBuildings } from './buildings.js';
 
-// Detections are shown for this time [s].
+// Display time of detections [s].
 const FADE = 1.5;
-// How far the ring runs out from what was found [px].
+// Largest radius of the ring around a new find [px].
 const PULSE_REACH = 40;
 
 export class MapView {
@@ -23,12 +23,12 @@ export class MapView {
     this.camera = camera;
     this.layers = { background: true, truth: true, unseen: true, left: false, belief: false, view: true, ways: true, clusters: true, detections: true };
     this.marked = null;
-    // How long a ring runs out from what was found [s of the run].
+    // Display time of the ring around a new find [s of the run].
     this.pulse = 0;
     this.unexplored = new Unexplored();
     this.belief = new Belief();
     this.background = new Background(onReady);
-    // Where robots and candidates were drawn, for clicks.
+    // Screen positions of robots and candidates, for clicks.
     this.targets = [];
   }
 
@@ -108,7 +108,7 @@ export class MapView {
     this.gridStep = step;
   }
 
-  // The border of the area, keep-outs and solid polygons.
+  // The border of the area, keep-out zones and solid polygons.
   drawZones(log, time) {
     const { context, camera } = this;
     for (const { kind, rings } of log.zones(time)) {
@@ -165,7 +165,7 @@ export class MapView {
     }
   }
 
-  // Geofences that robots keep to, in their colours.
+  // Geofences of robots, in their colours.
   drawFences(log) {
     const { context, camera } = this;
     context.setLineDash([8, 3, 2, 3]);
@@ -317,7 +317,7 @@ export class MapView {
     context.lineWidth = 1;
   }
 
-  // Return what is at a point of the canvas: robots before what is nearer, true targets last.
+  // Return the item at a point of the canvas: robots first, true targets last.
   hit(x, y) {
     const near = this.targets
       .map((item) => ({ ...item, distance: Math.hypot(item.x - x, item.y - y) }))

@@ -1,14 +1,14 @@
-// What lies under the map and around it: the background picture, north arrow and scale bar.
+// Background picture, north arrow and scale bar.
 
 import { themed } from './colours.js';
 
-// Parts of the picture along a side where it is drawn in perspective.
+// Tiles per side of a picture in perspective.
 const TILES = 12;
 // Longest scale bar [px].
 const LONGEST = 130;
 
 export class Background {
-  // The picture is there a little later: `onReady` is called then.
+  // The picture loads asynchronously; then `onReady` is called.
   constructor(onReady) {
     this.onReady = onReady;
     this.given = null;
@@ -34,7 +34,7 @@ export class Background {
         const [[x, y], [ax, ay], [bx, by]] = [at(i / count, j / count), at((i + 1) / count, j / count), at(i / count, (j + 1) / count)];
         context.save();
         context.transform((ax - x) / wide, (ay - y) / wide, (bx - x) / tall, (by - y) / tall, x, y);
-        // Half a pixel wider, so that no gaps are seen.
+        // Half a pixel wider, to avoid gaps.
         const more = camera.spatial ? 0.5 : 0;
         context.drawImage(image, i * wide, j * tall, wide, tall, 0, 0, wide + more, tall + more);
         context.restore();
@@ -91,7 +91,7 @@ function lengthWords(length) {
   return `${Number(value.toPrecision(2))} ${unit}`;
 }
 
-// Letters that can be read on any picture.
+// Letters that are legible on any picture.
 function write(context, text, x, y, align) {
   context.font = '600 11px system-ui, sans-serif';
   context.textAlign = align;

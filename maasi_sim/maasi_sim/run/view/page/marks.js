@@ -1,8 +1,8 @@
-// Marks above the time line: where something was found, and where robots left or failed.
+// Marks above the time line: finds, and robots that left or failed.
 
 import { FOUND, themed } from './colours.js';
 
-// Of the line of the input, from the middle of its knob at the left [px].
+// Offset of the input's track from the centre of its knob at the left [px].
 export const KNOB = 8;
 
 export function drawMarks(canvas, log) {

@@ -1,4 +1,4 @@
-// The panels beside the map: numbers, robots, log.
+// The panels next to the map: numbers, robots, log.
 
 import { robotColour, themed } from './colours.js';
 import { icon } from './icons.js';
@@ -7,14 +7,14 @@ import { element, number, pressable } from './text.js';
 import { harvest, hasEnded, stateOf } from './words.js';
 
 const SIGNS = ['found', 'decision', 'team', 'warning', 'fault'];
-// Lines of the log that are shown.
+// Shown lines of the log.
 const MOST_LINES = 60;
 
-// Show what a search is about first; scores and counts are in a fold.
+// Show the main numbers first; scores and counts are in a fold.
 export function showNumbers(parent, fold, log, time, unexplored) {
   const first = [[log.isOfBuildings ? 'visited' : 'found', harvest(log, time), 'found_count']];
   const { searched } = unexplored;
-  if (searched !== undefined) first.push(['searched area', `${Math.round(100 * searched)} % of ${area(log.scene.ground || unexplored.ground)}`]);
+  if (searched !== undefined) first.push(['explored area', `${Math.round(100 * searched)} % of ${area(log.scene.ground || unexplored.ground)}`]);
   first.push(['time', `${Math.round(time)} s`]);
   const charges = log.robots().map((name) => [name, log.at('robot', name, time)]).filter(([, event]) => event && event[4] >= 0);
   if (charges.length) {
@@ -77,7 +77,7 @@ export function showRobots(body, log, time, selected, onSelect) {
     const event = log.at('robot', name, time);
     return [name, stateOf(log, name, time), event && event[4]];
   });
-  // Rows that are made again lose the focus of the keyboard.
+  // New rows lose the keyboard focus.
   const key = JSON.stringify([shown, selected, document.documentElement.dataset.theme]);
   if (body.dataset.key === key) return;
   body.dataset.key = key;

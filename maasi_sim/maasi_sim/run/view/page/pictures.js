@@ -1,4 +1,4 @@
-// What the cameras saw when their robots last measured, with the detections in it.
+// Camera pictures of the last measurements, with their detections.
 
 import { SEEN, robotColour } from './colours.js';
 import { SVG } from './icons.js';
@@ -15,7 +15,7 @@ function detectionMark([width, height], [column, row, radius]) {
   return mark;
 }
 
-// What the sensor counts is outlined; the rest is dim.
+// The area of the sensor model is outlined; the rest is dimmed.
 function outlineOf([width, height], corners) {
   if (!corners.length) return [];
   const ring = `M${corners.map((corner) => corner.join(' ')).join(' L')} Z`;

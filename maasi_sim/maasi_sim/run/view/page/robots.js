@@ -1,10 +1,10 @@
-// Draws robots: where they are, what they see, their ways so far and planned.
+// Draws robots: positions, fields of view, past and planned paths.
 
 import { robotColour, themed } from './colours.js';
 import { isAway, LEFT, MOVING } from './run_log.js';
 import { dropLine, ellipse, matrix, path } from './shapes.js';
 
-// Half the length of a robot [px], and outlines of one that points along x.
+// Half length of a robot [px], and outlines for a heading along x.
 const SIZE = 9;
 const ROVER = new Path2D('M1.4 0 L-0.9 0.8 L-0.5 0 L-0.9 -0.8 Z');
 const MULTIROTOR = new Path2D('M1.5 0 L0.9 0.35 L-0.5 0.35 L-0.5 -0.35 L0.9 -0.35 Z');
@@ -12,10 +12,10 @@ for (const [ahead, side] of [[0.8, 0.8], [0.8, -0.8], [-0.8, 0.8], [-0.8, -0.8]]
   MULTIROTOR.moveTo(ahead + 0.55, side);
   MULTIROTOR.arc(ahead, side, 0.55, 0, 2 * Math.PI);
 }
-// Points of a way that are drawn.
+// Drawn points of a path.
 const MOST_POINTS = 600;
 
-// Return a planned way from where its robot is now.
+// Return a planned path from its robot's current position.
 function rest(way, here) {
   let nearest = 0;
   const distance = (place) => Math.hypot(...[0, 1, 2].map((axis) => place[axis] - here[axis]));
@@ -47,7 +47,7 @@ export function drawWays(view, log, time) {
   context.lineWidth = 1;
 }
 
-// The planned way (dashed), its waypoint (square), and the rest of its tour (thin).
+// The planned path (dashed), its waypoint (box), and the rest of its tour (thin).
 function drawPlan(view, log, time, name, here) {
   const { context, camera } = view;
   const way = log.at('way', name, time);
@@ -86,7 +86,7 @@ export function drawRobot(view, log, time, name, selected) {
   if (view.layers.view && robot.view && !isPale) drawFieldOfView(view, robot.view, [x, y, z, yaw], log.isSpatial);
   if (log.isSpatial || z > 0) dropLine(context, camera, [x, y, z], view.floor);
   const [px, py] = camera.project([x, y, z]);
-  // Of one size in each search, and turned as it is seen.
+  // Constant size on the screen, rotated with the view.
   const [ahead, side] = [[Math.cos(yaw), Math.sin(yaw)], [-Math.sin(yaw), Math.cos(yaw)]].map(([dx, dy]) => {
     const step = 1 / camera.scale;
     const [ex, ey] = camera.project([x + step * dx, y + step * dy, z]);

@@ -1,14 +1,14 @@
-// The events of a run, by kind and owner, so that what holds at a time is found by binary search.
+// The events of a run by kind and owner, for binary search by time.
 
-// Statuses of a robot: on the way, left, the run has ended; and those in which it takes no part
-// (cannot go on, left, silent).
+// Statuses of a robot: moving, left, run ended; and those of absent robots (unavailable, left,
+// silent).
 export const MOVING = 1;
 export const LEFT = 6;
 export const SILENT = 7;
 export const ENDED = 8;
 const AWAY = [5, LEFT, SILENT];
 
-// Return the share that a letter of a map stands for; NaN where no target may be.
+// Return the share of a map's letter; NaN where no target can be.
 export function shareOf(letter) {
   return parseInt(letter, 36) / 35;
 }
@@ -29,7 +29,7 @@ export class Slot {
   }
 
   add(time, event) {
-    // Almost always at the end; messages of different filters may be a little out of order.
+    // Almost always at the end; messages of different filters may be slightly out of order.
     let index = this.times.length;
     while (index > 0 && this.times[index - 1] > time) index -= 1;
     if (index === this.times.length) {
@@ -53,7 +53,7 @@ export class Slot {
     return low;
   }
 
-  // The event that holds at a time.
+  // The last event at a time.
   at(time) {
     const count = this.count(time);
     return count ? this.events[count - 1] : undefined;
@@ -95,13 +95,13 @@ export class RunLog {
     return slot && slot.at(time);
   }
 
-  // Border, keep-outs and solid polygons: keep-outs may have changed since the start.
+  // Border, keep-out zones (which may change) and solid polygons.
   zones(time) {
     const event = this.at('zones', '', time);
     return event ? event[3] : this.scene.zones || [];
   }
 
-  // Where a robot is and points to; on the way also between two of its states.
+  // Pose of a robot, interpolated between its states.
   pose(name, time) {
     const slot = this.slot('robot', name);
     const count = slot.count(time);
@@ -160,7 +160,7 @@ export class RunLog {
       const decision = { time, cuboid: event, name: owner };
       const before = this.slot('decision', owner).at(time);
       this.slot('decision', owner).add(time, decision);
-      // One at each step; those that count have another plan.
+      // One per step; only a changed plan counts.
       if (!before || String(before.cuboid[7]) !== String(event[7])) this.decisions.add(time, decision);
       for (const shot of event[8]) {
         if (this.visited.has(shot[0])) continue;
@@ -186,7 +186,7 @@ export class RunLog {
     return this.scene.expected_targets !== undefined;
   }
 
-  // What was found by a time: targets, or cuboids in a search of buildings.
+  // Number of found targets, or visited cuboids, at a time.
   found(time) {
     return this.isOfBuildings ? this.visits.count(time) : this.totals.at(time) || 0;
   }
@@ -199,7 +199,7 @@ export class RunLog {
     return this.isOfBuildings ? this.scene.cuboids.length : this.scene.targets;
   }
 
-  // The unexplored share at a place, from above the mean of its column; undefined outside.
+  // The unexplored share at a position, in 2D views the mean of its column; undefined outside.
   unexplored(time, place) {
     const [space] = this.owners('map');
     const event = space !== undefined && this.at('map', space, time);
@@ -221,7 +221,7 @@ export class RunLog {
     return sum;
   }
 
-  // Bounds of the environment, or of what is known of it.
+  // Bounds of the environment, or of its known part.
   get bounds() {
     if (this.scene.bounds) return this.scene.bounds;
     const low = [Infinity, Infinity, Infinity];
@@ -243,7 +243,7 @@ export class RunLog {
   }
 }
 
-// Return the log that a replay has inside: JSON lines, compressed, in base64.
+// Return the log inside a replay: JSON lines, compressed, in base64.
 export async function unpack(text) {
   const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));

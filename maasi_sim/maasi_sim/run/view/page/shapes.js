@@ -20,7 +20,7 @@ export function matrix([xx, xy, xz, yy, yz, zz]) {
   return [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
 }
 
-// Trace the outline of the ellipsoid of some deviations; at least so many pixels large.
+// Trace the outline of the ellipsoid of some deviations, with a least size in pixels.
 export function ellipse(context, camera, place, covariance, deviations, smallest = 0) {
   const [across, down] = camera.jacobian(place);
   const product = (a, b) => {
@@ -48,12 +48,12 @@ export function circle([x, y, z = 0], radius, count = 48) {
 
 const SIDES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
 
-// Draw the sides of a box that face the reader.
+// Draw the visible sides of a box.
 export function box(context, camera, sides, fill, stroke) {
   for (let number = 0; number < SIDES.length; number += 1) side(context, camera, sides, number, fill, stroke);
 }
 
-// Draw one side of a box, west, east, south, north, bottom or top, and return whether it faces the reader.
+// Draw one side of a box (west, east, south, north, bottom, top); return whether it is visible.
 export function side(context, camera, sides, number, fill, stroke) {
   const points = SIDES[number].map((corner) => camera.project(sides.map((range, axis) => range[(corner >> (2 - axis)) & 1])));
   let area = 0;
@@ -81,7 +81,7 @@ export function cross(context, x, y, size) {
   context.stroke();
 }
 
-// A line from a place to the ground, and its foot.
+// A line from a position to the ground, and its foot.
 export function dropLine(context, camera, place, floor) {
   if (!camera.spatial) return;
   const foot = [place[0], place[1], floor];

@@ -1,18 +1,18 @@
-// Strips below the time line: what each robot did when.
+// Strips below the time line: the activity of each robot over time.
 
 import { robotColour, SEEN, themed } from './colours.js';
 import { KNOB } from './marks.js';
 import { isAway, ENDED, LEFT, MOVING, SILENT } from './run_log.js';
-import { element } from './text.js';
+import { counted, element } from './text.js';
 import { stateOf } from './words.js';
 
-// Height of a strip; of more robots than these it is less, and they have no names [px].
+// Height of a strip [px]; lower and without names for more robots than this.
 const STRIP = 12;
 const NAMED_ROBOTS = 8;
 // The log whose strips are shown.
 let stripLog = null;
 
-const KINDS = ['on the way', 'waiting', 'cannot go on', 'left'];
+const KINDS = ['moving', 'waiting', 'unavailable', 'left'];
 
 function kindOf(event) {
   if (event[5] === MOVING) return 0;
@@ -20,7 +20,7 @@ function kindOf(event) {
   return isAway(event) ? 2 : 1;
 }
 
-// Return stretches of a robot: kind, begin and end; and the times at which it measured.
+// Return the intervals of a robot (kind, begin, end) and the times of its measurements.
 function historyOf(log, name) {
   const stretches = [];
   for (const event of log.slot('robot', name).events) {
@@ -38,7 +38,7 @@ function summary(stretches, measured) {
   for (const [kind, from, to] of stretches) sums[kind] += to - from;
   const total = sums.reduce((sum, item) => sum + item, 0) || 1;
   const parts = KINDS.map((kind, index) => [kind, Math.round((100 * sums[index]) / total)]).filter(([, share]) => share);
-  return [...parts.map(([kind, share]) => `${kind} ${share} %`), `${measured.length} measurements`].join(', ');
+  return [...parts.map(([kind, share]) => `${kind} ${share} %`), counted(measured.length, 'measurement')].join(', ');
 }
 
 function drawStrip(canvas, log, names, name, height) {
@@ -70,7 +70,7 @@ function drawStrip(canvas, log, names, name, height) {
   canvas.setAttribute('aria-label', `${name}: ${summary(stretches, measured)}`);
 }
 
-// Show the strips, and where the time is; return whether they take another room than before.
+// Show the strips and the time; return whether their height has changed.
 export function showStrips(parent, log, time, onChoose) {
   const names = log.robots();
   const isNew = stripLog !== log || parent.dataset.names !== names.join();

@@ -1,4 +1,4 @@
-// Elements and numbers as text. Nothing of a run is ever read as HTML.
+// Elements and numbers as text. Texts of a run are never parsed as HTML.
 
 export function element(tag, className, text) {
   const made = document.createElement(tag);
@@ -7,7 +7,7 @@ export function element(tag, className, text) {
   return made;
 }
 
-// Return a number with three significant digits; padded, also where the last ones are 0.
+// Return a number with three significant digits; padded: keep trailing zeros.
 export function number(value, padded = false) {
   if (value === null || value === undefined || Number.isNaN(value)) return '-';
   if (Number.isInteger(value)) return String(value);
@@ -17,11 +17,16 @@ export function number(value, padded = false) {
   return padded && !digits.includes('e') ? digits : String(Number(digits));
 }
 
-// Have something done by a click, or by Enter.
+// Return a count with its noun, which has an s unless it is 1.
+export function counted(count, noun) {
+  return `${count} ${noun}${count === 1 ? '' : 's'}`;
+}
+
+// Run an action on a click or Enter.
 export function pressable(part, action) {
   part.tabIndex = 0;
   part.onclick = action;
-  // A handler that returns false, as a comparison may, would hold the focus.
+  // A handler that returns false would keep the focus.
   part.addEventListener('keydown', (event) => {
     if (event.key === 'Enter') action();
   });

@@ -1,7 +1,7 @@
-// What is at a point of the map, in numbers.
+// Numbers at a point of the map.
 
 import { onEarth } from './earth.js';
-import { number } from './text.js';
+import { counted, number } from './text.js';
 import { stateOf } from './words.js';
 
 function at(place, size) {
@@ -26,9 +26,9 @@ function tell(log, time, selected, hit) {
     if (!item) return '';
     const [, , , , refinement, exploration, objective, length, measurements] = item;
     const value = objective === null ? 'not allowed' : `J ${number(objective)}, T ${number(refinement)}, E ${number(exploration)}`;
-    return `candidate ${hit.candidate} ${at(item, size)}: ${value}, ${length} steps, ${measurements} measurements on the way`;
+    return `candidate ${hit.candidate} ${at(item, size)}: ${value}, ${counted(length, 'step')}, ${counted(measurements, 'measurement')} on the path`;
   }
-  if (hit.cluster) return `potential target: mass ${number(hit.cluster[3])}, ${at(hit.cluster, size)}`;
+  if (hit.cluster) return `potential target: ${number(hit.cluster[3])} expected, ${at(hit.cluster, size)}`;
   if (hit.cuboid !== undefined) {
     const index = log.visits.events.findIndex((visit) => visit.cuboid === hit.cuboid);
     const isVisited = index >= 0 && log.visits.times[index] <= time;
@@ -43,25 +43,25 @@ function tell(log, time, selected, hit) {
   return hit.truth ? `true target ${at(hit.truth, size)}` : '';
 }
 
-// Return the text for a point of the canvas; there is one for each cell as well.
+// Return the text for a point of the canvas.
 export function tipAt(view, log, time, selected, x, y) {
   const hit = view.hit(x, y);
   const text = hit && tell(log, time, selected, hit);
   if (text) return text;
   const cell = view.unexplored.pick(view, x, y);
-  // Of a search in space only cells have a place; else the floor has one everywhere.
+  // In 3D only cells have a position; in 2D the whole floor.
   if (!cell && (log.isSpatial || log.isOfBuildings)) return '';
   const { scene: { origin }, knowsExpected } = log;
   const place = cell ? cell.place : view.camera.ground(x, y, view.floor);
   const earth = origin ? `, latitude ${onEarth(place, origin).reverse().map((angle) => angle.toFixed(6)).join(', longitude ')}` : '';
   const where = `${at(place, 3)}${earth}`;
-  if (!cell) return view.unexplored.cells ? `no target is expected here, ${where}` : where;
+  if (!cell) return view.unexplored.cells ? `no target expected here, ${where}` : where;
   const belief = view.layers.belief ? `, ${view.belief.words(place)}` : '';
-  const left = knowsExpected ? `still ${view.unexplored.amount(cell.left)}` : `${Math.round((100 * cell.left) / view.unexplored.most)} % of the targets of unsearched ground`;
-  return `searched ${Math.round(100 - 100 * cell.share)} %, ${left}, ${where}${belief}`;
+  const left = knowsExpected ? `${view.unexplored.amount(cell.left)} left` : `${Math.round((100 * cell.left) / view.unexplored.most)} % of the targets of unexplored ground left`;
+  return `explored ${Math.round(100 - 100 * cell.share)} %, ${left}, ${where}${belief}`;
 }
 
-// Show a text beside a point of its parent; none hides it.
+// Show a text next to a point of its parent; an empty one hides it.
 export function showTip(tip, text, x, y) {
   tip.hidden = !text;
   if (!text) return;

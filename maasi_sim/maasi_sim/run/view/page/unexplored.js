@@ -1,26 +1,26 @@
-// What is not searched: the map as it was last published, less what robots have seen since, as the
-// planner reckons it: each look at a cell multiplies its e by 1 - pi. So the dark goes as the field
-// of view moves, not once a second. Where targets may still be is that times how likely they are.
+// The unexplored area: the last published map, updated with the measurements since, as in the
+// planner: each measurement multiplies the e of a cell by 1 - pi. Multiplied by the prior it gives
+// the expected undetected targets.
 
 import { themed } from './colours.js';
 import { FloorGrid } from './floor_grid.js';
 import { isAway, shareOf } from './run_log.js';
 import { number } from './text.js';
 
-// Where the chance to see something ends, in sizes of a sensor.
+// Range of the detection probability, in sizes of a sensor.
 const SIGHT = { exponential: 7, gaussian: 3 };
 // Largest opacity of a cell, up to 255; cells below this e are not drawn in space.
 const DARKEST = 135;
 const FAINTEST = 0.06;
-// Of where targets may still be: shades, and the largest opacity.
+// Undetected targets: number of shades and largest opacity.
 const LEFT_SHADES = 40;
 const DARKEST_LEFT = 165;
-// Most cells that are drawn in space.
+// Most drawn cells in 3D.
 const MOST_CELLS = 3000;
 
-// Return from where robots looked since a time, and where each is now: sensor, and place with yaw.
+// Return the poses of measurements since a time and the current poses, with their sensors.
 function looks(log, time, space, since) {
-  // The map of a robot that plans for itself has only its own.
+  // The map of a robot with its own planner contains only its own measurements.
   const own = space.split('/').pop();
   const list = [];
   for (const name of log.robots()) {
@@ -37,7 +37,7 @@ function looks(log, time, space, since) {
   return list;
 }
 
-// Return the chance to see a target at an offset; the edge of a box is as soft as a cell.
+// Return the detection probability at an offset; the edge of a box is one cell wide.
 function chance(view, x, y, z, turn, soft) {
   if (view.kind === 'box') {
     const place = [turn[0] * x + turn[1] * y, turn[0] * y - turn[1] * x, z];
@@ -52,7 +52,7 @@ function chance(view, x, y, z, turn, soft) {
   return Math.exp(-0.5 * (view.kind === 'gaussian' ? square : Math.sqrt(square)));
 }
 
-// Multiply what is unexplored by the chance that a look misses it.
+// Multiply e by the probability of a missed detection.
 function wipe({ corner, step, shape, values }, { view, place }) {
   const isBox = view.kind === 'box';
   if (!isBox && !SIGHT[view.kind]) return;
@@ -68,7 +68,7 @@ function wipe({ corner, step, shape, values }, { view, place }) {
     for (let j = first[1]; j <= last[1]; j += 1) {
       for (let k = first[2]; k <= last[2]; k += 1) {
         const [x, y] = [corner[0] + i * step[0] - place[0], corner[1] + j * step[1] - place[1]];
-        // On a floor heights play no part.
+        // In 2D heights are ignored.
         const z = shape[2] > 1 ? corner[2] + k * step[2] - place[2] : 0;
         values[(i * shape[1] + j) * shape[2] + k] *= 1 - gain * chance(view, x, y, z, turn, soft);
       }
@@ -80,7 +80,7 @@ export class Unexplored {
   constructor() {
     this.floor = new FloorGrid();
     this.leftFloor = new FloorGrid();
-    // Corner and spacing [m], number of cells on each axis, and e of each at the time that is shown.
+    // Corner and spacing [m], number of cells on each axis, and e at the shown time.
     this.cells = null;
   }
 
@@ -101,7 +101,7 @@ export class Unexplored {
     for (const look of seen) wipe(this.cells, look);
   }
 
-  // Reckon how many targets were expected in each column before the search [1/m^2 of ground].
+  // Compute the expected targets in each column before the search [1/m^2 of ground].
   expect({ prior, expected_targets: targets }, corner, step, shape) {
     const [nx, ny, nz] = shape;
     this.before = new Float32Array(nx * ny);
@@ -127,12 +127,12 @@ export class Unexplored {
     this.unit = [[1, 'm²', 1e3], [1e4, 'ha', 1e8], [1e6, 'km²', Infinity]].find(([, , limit]) => ground < limit);
   }
 
-  // Return in words how many targets there are of a density [1/m^2].
+  // Return a target density [1/m^2] as text.
   amount(density) {
     return `${number(density * this.unit[0])} expected targets per ${this.unit[1]}`;
   }
 
-  // Return the share of the open ground that is searched: the chance to have found a target there.
+  // Return the explored share of the open ground.
   get searched() {
     if (!this.cells) return undefined;
     const { shape: [nx, ny, nz], values } = this.cells;
@@ -146,7 +146,7 @@ export class Unexplored {
     return whole ? sum / whole : undefined;
   }
 
-  // Return the ground that may be searched [m^2].
+  // Return the searchable ground [m^2].
   get ground() {
     const { shape: [nx, ny, nz], step } = this.cells;
     let whole = 0;
@@ -164,7 +164,7 @@ export class Unexplored {
     return sum / nz;
   }
 
-  // Draw where targets may still be, on the floor.
+  // Draw the expected undetected targets on the floor.
   drawLeft(view) {
     if (!this.cells || !this.most) return;
     const { shape: [, ny], values } = this.cells;
@@ -195,7 +195,7 @@ export class Unexplored {
       context.globalAlpha = 1;
       return;
     }
-    // From above a search in space has the mean of each column.
+    // From above a 3D search shows the mean of each column.
     const { shape: [nx, ny], values } = this.cells;
     if (this.colour !== colour) {
       const colours = Array.from({ length: DARKEST + 1 }, (_, level) => [...colour.split(',').map(Number), level]);
@@ -212,7 +212,7 @@ export class Unexplored {
     return camera.spatial && this.cells.shape[2] > 1;
   }
 
-  // Call a function with place and e of each cell that is drawn in space.
+  // Call a function with position and e of each drawn cell in 3D.
   each(visit) {
     const { corner, step, shape: [nx, ny, nz], values } = this.cells;
     const skip = Math.max(1, Math.round(Math.cbrt((nx * ny * nz) / MOST_CELLS)));
@@ -226,8 +226,8 @@ export class Unexplored {
     }
   }
 
-  // Return place, e and expected targets left of the cell at a point of the canvas; in space of the
-  // first that is drawn. Where no target may be there is no cell.
+  // Return position, e and expected undetected targets of the (in 3D frontmost) cell at a point of
+  // the canvas, or nothing where no target can be.
   pick({ camera, floor }, x, y) {
     if (!this.cells) return null;
     const { corner, step, shape } = this.cells;

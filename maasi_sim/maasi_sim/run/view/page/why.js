@@ -1,15 +1,15 @@
-// The panel that says why a robot goes where it goes.
+// The panel that explains the waypoint of a robot.
 
 import { scaleColour } from './colours.js';
 import { icon } from './icons.js';
 import { LEFT } from './run_log.js';
-import { element, number, pressable } from './text.js';
+import { counted, element, number, pressable } from './text.js';
 
 const COLUMNS = [
   ['x', 0, 'm'], ['y', 1, 'm'], ['z', 2, 'm'], ['J', 6, ''], ['C', 3, ''], ['T', 4, ''], ['E', 5, ''], ['K', 7, 'steps'], ['M', 8, ''],
 ];
 const TITLES = {
-  J: 'objective', C: 'control cost', T: 'target refinement', E: 'exploration', K: 'steps to reach it', M: 'measurements on the way',
+  J: 'objective', C: 'control cost', T: 'target refinement', E: 'exploration', K: 'steps to reach it', M: 'measurements on the path',
 };
 let order = 6;
 
@@ -20,23 +20,23 @@ function units(log) {
   return { C: '', ...terms, J: weights ? `per ${weights.per_distance ? 'metre' : 'step'}` : '' };
 }
 
-// Return the sentence on the choice that the node gives, or what follows from the numbers.
+// Return the planner's sentence on its choice, or one derived from the numbers.
 export function reasonOf(decision) {
   const { robot, event } = decision;
   const [, , chosen, , candidates, own] = robot;
-  // The planner's words on all robots, where it has none on this one.
+  // The planner's sentence on all robots, if it gives none for this one.
   const given = own || (event[7].length > 1 ? '' : event[6]);
-  // The planner's own words have its own digits.
+  // Round the numbers in the planner's sentence.
   if (given) return given.replace(/\d*\.\d+(e[-+]?\d+)?/g, (digits) => number(Number(digits)));
-  if (chosen < 0) return 'stays: no candidate is worth going to';
+  if (chosen < 0) return 'stays: no candidate has a positive objective';
   const values = candidates.map((item) => item[6]).filter((value) => value !== null);
   const best = candidates[chosen] && candidates[chosen][6];
-  if (values.every((value) => value === 0)) return `chosen by the planner ${event[3]}, which does not use J`;
-  if (best >= Math.max(...values)) return `largest J of ${values.length} admissible candidates`;
-  return `part of the best joint choice of ${event[7].length} robots; alone, another candidate has a larger J`;
+  if (values.every((value) => value === 0)) return `planner ${event[3]} chose this candidate without using J`;
+  if (best >= Math.max(...values)) return `this candidate has the largest J of ${values.length}`;
+  return `this candidate is part of the best joint choice for ${event[7].length} robots; for this robot alone another has a larger J`;
 }
 
-// Return what the chosen candidate has more than the best of the others.
+// Return the differences between the chosen candidate and the best other one.
 export function gains(candidates, chosen) {
   let next = -1;
   candidates.forEach((item, index) => {
@@ -48,7 +48,7 @@ export function gains(candidates, chosen) {
   return { next, C: a[3] - b[3], T: a[4] - b[4], E: a[5] - b[5], J: a[6] - b[6], K: a[7] - b[7] };
 }
 
-// Return what the planner expects of the chosen way, and of the next best, in a sentence.
+// Return what the planner expects from the chosen path and the next best one, as a sentence.
 export function expectation(log, candidates, chosen) {
   const gain = gains(candidates, chosen);
   if (!gain || gain.J === 0) return '';
@@ -57,12 +57,12 @@ export function expectation(log, candidates, chosen) {
   if (objective !== 'information' || !weights) {
     return `has the ${gain.J > 0 ? 'larger' : 'smaller'} objective: J ${number(own[6])}, next best ${number(other[6])}`;
   }
-  // What it is mostly chosen for.
+  // The term with the larger part.
   const explores = weights.beta * own[5] >= weights.alpha * own[4];
-  const [term, what] = explores ? [5, 'new targets'] : [4, 'nat of information on potential targets'];
-  // J is per step: a larger number on a longer way may be worth less.
-  const [here, there] = own[7] === other[7] ? ['', ''] : [` of ${own[7]} steps`, ` on ${other[7]} steps`];
-  return `expects ${number(own[term])} ${what} on this way${here}, next best ${number(other[term])}${there}`;
+  const [term, what] = explores ? [5, 'new targets'] : [4, 'nats of information on potential targets'];
+  // J is per step: a longer path needs more.
+  const [here, there] = own[7] === other[7] ? ['', ''] : [` of ${counted(own[7], 'step')}`, ` on ${counted(other[7], 'step')}`];
+  return `expects ${number(own[term])} ${what} on this path${here}, next best ${number(other[term])}${there}`;
 }
 
 export function showWhy(parent, log, time, selected, marked, onMark) {
@@ -72,7 +72,7 @@ export function showWhy(parent, log, time, selected, marked, onMark) {
   const key = hasLeft ? `left ${selected}` : decision ? `${selected} ${decision.time} ${order} ${marked} ${log.scene.name}` : `none ${selected}`;
   if (parent.dataset.key === key) return;
   parent.dataset.key = key;
-  // A fold that is open stays open.
+  // Keep an open fold open.
   const isOpen = Boolean(parent.querySelector('details[open]'));
   parent.replaceChildren();
   if (hasLeft) {
@@ -93,10 +93,10 @@ function showCuboid(parent, { time, cuboid, name }) {
   parent.append(
     element('p', 'expects', planned.length
       ? `${name} plans to visit ${planned.length === 1 ? 'cuboid' : 'cuboids'} ${planned.join(', ')} within its horizon.`
-      : `${name} reaches no new cuboid within its horizon: it is drawn to the nearest one left.`),
+      : `${name} reaches no new cuboid within its horizon: it heads for the nearest unvisited one.`),
     element('p', 'quiet', `${name} at ${time.toFixed(1)} s: ${activity}; plan: ${how.replace('_', ' ')}`),
-    element('p', '', `drawn to (${place}) m`),
-    element('p', '', `hears ${heard.join(', ') || 'nobody'}`),
+    element('p', '', `heads for (${place}) m`),
+    element('p', '', `receives from ${heard.join(', ') || 'no robot'}`),
     element('p', '', shots.length ? `takes snapshots of ${shots.map((shot) => shot[0]).join(', ')}` : 'no snapshot now'),
   );
 }
@@ -111,7 +111,7 @@ function showCandidates(parent, log, decision, marked, onMark, isOpen) {
     element('p', 'reason', reasonOf(decision)),
     element('p', 'quiet', `${name}, decision ${index} at ${decision.time.toFixed(2)} s: ${chosen < 0 ? 'stays at' : 'goes to'} (${place}) m`),
   );
-  // Of a single one all is told.
+  // A single candidate is fully described above.
   if (candidates.length < 2) return;
   const fold = element('details', '');
   fold.open = isOpen;
@@ -120,14 +120,14 @@ function showCandidates(parent, log, decision, marked, onMark, isOpen) {
   const gain = gains(candidates, chosen);
   if (gain && gain.J !== 0) {
     const part = (term) => `${term} ${gain[term] >= 0 ? '+' : ''}${number(gain[term])} ${unit[term]}`.trim();
-    const steps = `K ${gain.K >= 0 ? '+' : ''}${gain.K} steps`;
-    fold.append(element('p', 'gain', `Over the next best (candidate ${gain.next}): ${['J', 'C', 'T', 'E'].map(part).join(', ')}, ${steps}`));
+    const steps = `K ${gain.K >= 0 ? '+' : ''}${counted(gain.K, 'step')}`;
+    fold.append(element('p', 'gain', `Difference to the next best (candidate ${gain.next}): ${['J', 'C', 'T', 'E'].map(part).join(', ')}, ${steps}`));
   }
   const { weights } = log.scene;
   if (weights) {
     const { control, alpha, beta } = weights;
     const terms = `-${number(control)} C + ${number(alpha)} T + ${number(beta)} E`;
-    fold.append(element('p', 'formula quiet', `J = (${terms}) / ${weights.per_distance ? 'metres of the way' : 'K'}`));
+    fold.append(element('p', 'formula quiet', `J = (${terms}) / ${weights.per_distance ? 'path length' : 'K'}`));
   }
   const table = element('table', '');
   const head = table.createTHead().insertRow();

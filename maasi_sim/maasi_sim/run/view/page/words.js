@@ -1,17 +1,18 @@
-// What a run says in words: its headline, what robots do, and where places are.
+// Texts of a run: its headline, what robots do, and map regions.
 
 import { isAway, isStopped, ENDED, MOVING } from './run_log.js';
-import { element } from './text.js';
+import { counted, element } from './text.js';
 
-const STATES = ['no goal', 'on the way', 'goal reached', 'goal cancelled', 'goal given up', 'cannot go on', 'left', 'silent', 'run ended'];
+const STATES = ['no goal', 'moving', 'goal reached', 'goal cancelled', 'goal aborted', 'unavailable', 'left', 'silent', 'run ended'];
 const MODES = ['waiting for start', 'searching', 'paused', 'sent home', 'stopped'];
-// A place is near a potential target within this share of the environment, and unexplored above this.
+// A position is near a potential target within this share of the environment's size, and unexplored
+// above this share.
 const NEAR = 0.08;
 const UNEXPLORED = 0.5;
 // Shortest time between two headlines [ms]: they are read aloud.
 const HEADLINE_PERIOD = 1000;
 
-// Return the mode of a robot in the search, as its planner says; undefined where none does.
+// Return the mode of a robot in the search, as its planner reports it, or undefined.
 export function modeOf(log, name, time) {
   const names = log.robots();
   for (const node of log.owners('mode')) {
@@ -27,22 +28,22 @@ export function modeOf(log, name, time) {
 
 export function stateOf(log, name, time) {
   const event = log.at('robot', name, time);
-  if (!event) return 'not heard';
+  if (!event) return 'no state received';
   const [status, reason] = [event[5], event[6]];
-  // Its reason may say what it was about to do.
-  if (status === 5 && hasEnded(log, time)) return 'run ended; it could not go on';
-  if (isStopped(event)) return 'stopped, until it is released';
+  // Its reason may describe its last plan.
+  if (status === 5 && hasEnded(log, time)) return 'run ended while unavailable';
+  if (isStopped(event)) return 'stopped until released';
   const cuboid = log.at('cuboid', name, time);
   const mode = modeOf(log, name, time);
   let state = STATES[status] || 'unknown';
   if (isAway(event) || status === ENDED) return reason ? `${state}: ${reason}` : state;
-  if (mode === 'stopped') state = 'search stopped, until it is started';
-  else if (mode && mode !== 'searching') state = status === MOVING ? `${mode}, on the way` : mode;
+  if (mode === 'stopped') state = 'search stopped until started';
+  else if (mode && mode !== 'searching') state = status === MOVING ? `${mode}, moving` : mode;
   else if (cuboid) [, , , state] = cuboid;
   return reason && reason !== mode ? `${state}: ${reason}` : state;
 }
 
-// Return where a place is on the map, whose north is +y.
+// Return the map region of a position; north is +y.
 export function regionOf(bounds, place) {
   const part = (axis, low, high) => {
     const share = (place[axis] - bounds[axis][0]) / (bounds[axis][1] - bounds[axis][0]);
@@ -66,7 +67,7 @@ function destination(log, time, place) {
   return `the ${shape}${where}`;
 }
 
-// Return what the robot that decided last, of those on the way, is about to do.
+// Return what the moving robot that decided last is about to do.
 function intention(log, time) {
   const { events } = log.decisions;
   const count = log.decisions.count(time);
@@ -81,7 +82,7 @@ function intention(log, time) {
   return '';
 }
 
-// Return what was found by a time, of how many: where the truth is known, what of it is true.
+// Return the number of finds by a time, with the true and false ones if the truth is known.
 export function harvest(log, time) {
   const score = log.at('score', '', time);
   const [count, wrong] = score ? [score[3], score[5]] : [log.found(time), 0];
@@ -98,7 +99,7 @@ function endWords(log, time) {
   const complete = reason === 'all_found' || (score ? score[4] === 0 : log.found(time) >= log.total);
   const after = `after ${Math.round(Math.min(ended, time))} s`;
   if (log.total && complete) {
-    // A planner may search on after the last one.
+    // A planner may continue after the last find.
     const { totals, visits } = log;
     const last = log.isOfBuildings ? visits.times[log.total - 1] : totals.times[totals.events.findIndex((count) => count >= log.total)];
     const when = reason === 'all_found' ? time : Math.min(last ?? time, time);
@@ -111,7 +112,7 @@ function endWords(log, time) {
 export function hasEnded(log, time) {
   if (log.at('end', '', time)) return true;
   const events = log.robots().map((name) => log.at('robot', name, time)).filter(Boolean);
-  // Recordings of earlier versions do not say why.
+  // Recordings of earlier versions have no end event.
   return events.some((event) => event[5] === ENDED) && events.every((event) => event[5] === ENDED || isAway(event));
 }
 
@@ -131,7 +132,7 @@ export function headline(log, time, connection = '') {
   return [`${prefix}: ${harvested(log, time)}`, intention(log, time)].filter(Boolean).join(', ');
 }
 
-// Show a headline, and no other one within a second; return the time until it may change [ms].
+// Show a headline for at least a second; return the time until it may change [ms].
 export function showHeadline(parent, text, now) {
   if (parent.textContent === text) return 0;
   const wait = Number(parent.dataset.since || -HEADLINE_PERIOD) + HEADLINE_PERIOD - now;
@@ -141,16 +142,16 @@ export function showHeadline(parent, text, now) {
   return 0;
 }
 
-// Show how a run ended, where its replay is, and how to run it again.
+// Show how a run ended, its replay file, and the command to repeat it.
 export function showCard(parent, log, time, onClose) {
   const { command, replay } = log.scene;
   const measured = log.measurements(time);
-  const title = endWords(log, time) + (measured ? `, with ${measured} measurements` : '');
+  const title = endWords(log, time) + (measured ? `, with ${counted(measured, 'measurement')}` : '');
   if (parent.dataset.key === title) return;
   parent.dataset.key = title;
   const close = element('button', '', 'Close');
   close.onclick = onClose;
-  const rows = [['Replay', replay], ['Run it again', command]].filter(([, text]) => text);
+  const rows = [['Replay', replay], ['Repeat it', command]].filter(([, text]) => text);
   parent.replaceChildren(
     element('strong', '', title),
     ...rows.map(([name, text]) => {
