@@ -168,10 +168,10 @@ def unseen_parts(
     values, lower, step = grid.kernel()
     seen = np.ascontiguousarray(area.density(grid.nodes()).reshape(values.shape) <= 0.0)
     for viewer in viewers:
-        places, yaws = _poses(viewer, size)
+        positions, yaws = _poses(viewer, size)
         detection = viewer.sensor.detection
         kernel, reach = detection.kernel(), reach_of(detection)
-        _mark_seen(seen, (lower, step), places, yaws, grid.dimension, kernel, reach, probability)
+        _mark_seen(seen, (lower, step), positions, yaws, grid.dimension, kernel, reach, probability)
     return _parts(grid, seen)
 
 
@@ -179,7 +179,7 @@ def unseen_parts(
 def _mark_seen(
     seen: BoolArray,
     grid: tuple[FloatArray, FloatArray],
-    places: FloatArray,
+    positions: FloatArray,
     yaws: FloatArray,
     dimension: int,
     kernel: tuple[int, FloatArray],
@@ -191,14 +191,14 @@ def _mark_seen(
     kind, parameters = kernel
     low, high = np.zeros(3, np.int64), np.array(seen.shape)
     left = seen.size - np.sum(seen)
-    for m in range(places.shape[0]):
+    for m in range(positions.shape[0]):
         if left == 0:
             break
         cosine = math.cos(yaws[m])
         sine = math.sin(yaws[m])
         for axis in range(3):
             if reach < np.inf and step[axis] > 0.0:
-                centre = (places[m, axis] - lower[axis]) / step[axis]
+                centre = (positions[m, axis] - lower[axis]) / step[axis]
                 width = reach / step[axis]
                 low[axis] = max(math.floor(centre - width), 0)
                 high[axis] = min(math.ceil(centre + width) + 1, seen.shape[axis])
@@ -207,12 +207,12 @@ def _mark_seen(
                 for k in range(low[2], high[2]):
                     if seen[i, j, k]:
                         continue
-                    dz = lower[2] + k * step[2] - places[m, 2] if dimension == 3 else 0.0
+                    dz = lower[2] + k * step[2] - positions[m, 2] if dimension == 3 else 0.0
                     found = detection_probability_at(
                         kind,
                         parameters,
-                        lower[0] + i * step[0] - places[m, 0],
-                        lower[1] + j * step[1] - places[m, 1],
+                        lower[0] + i * step[0] - positions[m, 0],
+                        lower[1] + j * step[1] - positions[m, 1],
                         dz,
                         cosine,
                         sine,
@@ -231,13 +231,13 @@ def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
     # Backwards, so that the view on arrival is included.
     along = np.arange(number + 1) * viewer.spacing
     share = np.maximum(0.0, 1.0 - along / np.maximum(lengths, 1e-12)[..., None])
-    places = points[:, None, None, :] + share[..., None] * paths[:, :, None, :]
+    positions = points[:, None, None, :] + share[..., None] * paths[:, :, None, :]
     if viewer.yaw is None:
         yaws = np.arctan2(paths[..., 1], paths[..., 0])
     else:
         yaws = np.full(lengths.shape, viewer.yaw)
-    headings = np.broadcast_to(yaws[..., None], places.shape[:3]).ravel()
-    flat = places.reshape(-1, 3)
+    headings = np.broadcast_to(yaws[..., None], positions.shape[:3]).ravel()
+    flat = positions.reshape(-1, 3)
     sectors = np.zeros(len(flat), np.int64)
     kind, parameters = viewer.sensor.detection.kernel()
     # Whether the view depends on the heading.

@@ -135,18 +135,18 @@ def planner_markers(
     for number, name in enumerate(sorted(robots)):
         position, waypoint, path, tour = robots[name]
         tint = colour_of(tints[name])
-        for namespace, place, shape in (
+        for namespace, centre, shape in (
             ('robots', position, Marker.SPHERE),
             ('waypoints', waypoint, Marker.CUBE),
         ):
             marker = Marker(header=header, ns=namespace, id=number, type=shape)
-            marker.pose.position = point_to_ros(place)
+            marker.pose.position = point_to_ros(centre)
             marker.pose.orientation.w = 1.0
             marker.scale.x = marker.scale.y = marker.scale.z = size
             marker.color = tint
             markers.append(marker)
         thinned = path[:: max(1, len(path) // 50)]
-        for namespace, places, width in (
+        for namespace, line, width in (
             ('ways', thinned, 0.2 * size),
             ('tours', [waypoint, *tour], 0.07 * size),
         ):
@@ -154,7 +154,7 @@ def planner_markers(
             line.pose.orientation.w = 1.0
             line.scale.x = width
             line.color = tint
-            line.points = [point_to_ros(point) for point in places]
+            line.points = [point_to_ros(point) for point in line]
             line.action = Marker.ADD if len(line.points) > 1 else Marker.DELETE
             markers.append(line)
     return MarkerArray(markers=markers)

@@ -82,10 +82,10 @@ class KeepOut:
         self._round = len(self.area.circles)
         self.circles = self._inflated(self.area.circles, walls)
         # Region of waypoints; None: only round obstacles limit it.
-        self._places = None if region is None else region.buffer(-apart, join_style='mitre')
-        if self._places is not None:
-            shapely.prepare(self._places)
-        outline = self._places
+        self._allowed = None if region is None else region.buffer(-apart, join_style='mitre')
+        if self._allowed is not None:
+            shapely.prepare(self._allowed)
+        outline = self._allowed
         if walls is not held and region is not None:
             simple = _simplified(region, detail)
             outline = simple.buffer(-apart, join_style='mitre')
@@ -184,7 +184,7 @@ class KeepOut:
         """Return the next point, (3,), of the path to a goal past others (positions, radii)."""
         area = copy(self.area)
         # A quarter wider, for robots that cut corners.
-        discs = [[*place, 1.25 * radius + 0.25 * self.radius, 0.0] for place, radius in others]
+        discs = [[*point, 1.25 * radius + 0.25 * self.radius, 0.0] for point, radius in others]
         area.circles = np.vstack([area.circles, discs])
         wide = KeepOut(area, self.radius, self.clearance, self._reach)
         x, y, z = robot.tolist()
@@ -247,7 +247,7 @@ class KeepOut:
         reach = self.circles[: self._round, 3] + 0.95 * self.clearance
         centres = shapely.points(self.circles[: self._round, :2])
         discs = shapely.buffer(centres, reach / math.cos(math.pi / 64), quad_segs=16)
-        whole = self.area.border if self._places is None else self._places
+        whole = self.area.border if self._allowed is None else self._allowed
         return whole.difference(shapely.union_all(discs))
 
     @cached_property
@@ -269,12 +269,12 @@ class KeepOut:
         """
         start = np.asarray(robot, dtype=float)
         point = np.array(waypoint, dtype=float)
-        if self._places is not None:
-            if self._places.is_empty:
+        if self._allowed is not None:
+            if self._allowed.is_empty:
                 return None
             level = shapely.Point(point[:2])
-            if not self._places.covers(level):
-                near = nearest_points(self._places, level)[0]
+            if not self._allowed.covers(level):
+                near = nearest_points(self._allowed, level)[0]
                 if near.distance(level) > 1e-9:
                     point[:2] = near.x, near.y
         line = point - start

@@ -40,13 +40,13 @@ class Broadcast:
     predicted: FloatArray  # (3,): position at t + tau* + 1 in the previous plan [m]
 
 
-def assigned(places: FloatArray, row: int, centres: FloatArray, unvisited: IntArray) -> int | None:
+def assigned(points: FloatArray, row: int, centres: FloatArray, unvisited: IntArray) -> int | None:
     """Return the cuboid assigned to robot `row` of robots at positions (m, 3): (10), or None."""
     if not len(unvisited):
         return None
     from scipy.optimize import linear_sum_assignment
 
-    cost = np.sqrt(((places[:, None, :] - centres[unvisited][None, :, :]) ** 2).sum(axis=2))
+    cost = np.sqrt(((points[:, None, :] - centres[unvisited][None, :, :]) ** 2).sum(axis=2))
     rows, columns = linear_sum_assignment(cost)
     chosen = np.flatnonzero(rows == row)
     return int(unvisited[columns[chosen[0]]]) if len(chosen) else None
@@ -168,17 +168,17 @@ class SearchAgent:
 
     def observe(self, step: int, position: ArrayLike, velocity: ArrayLike) -> Broadcast | None:
         """Update the robot's state; return its message to the others, None while it recharges."""
-        place = np.array(position, dtype=float)
+        point = np.array(position, dtype=float)
         speed = np.array(velocity, dtype=float)
-        if not (np.isfinite(place).all() and np.isfinite(speed).all()):
+        if not (np.isfinite(point).all() and np.isfinite(speed).all()):
             raise ValueError(
-                f'{self.name}: state: got {place}, {speed}, allowed are finite numbers'
+                f'{self.name}: state: got {point}, {speed}, allowed are finite numbers'
             )
         if self.plan is not None and step != self.step + 1:
             # After a recharge or a missed step there is no previous plan.
             self.plan = None
         self.step = step
-        self.position, self.velocity = place, speed
+        self.position, self.velocity = point, speed
         plan = {}
         if self.activity is Activity.SEARCHING:
             self._photograph()
@@ -186,7 +186,7 @@ class SearchAgent:
                 plan = {n: k - 1 for k, n in self.plan.visits}
         elif self.activity is Activity.RETURNING:
             slow = float(np.abs(speed).max()) <= _ARRIVED_SPEED
-            if slow and float(np.linalg.norm(place - self.home)) <= _ARRIVED:
+            if slow and float(np.linalg.norm(point - self.home)) <= _ARRIVED:
                 self.activity = Activity.RECHARGING
                 self._recharge_left = -1
         if self.activity is Activity.RECHARGING:
@@ -194,7 +194,7 @@ class SearchAgent:
         return Broadcast(
             robot=self.name,
             step=step,
-            position=place,
+            position=point,
             velocity=speed,
             searching=self.activity is Activity.SEARCHING,
             visited=self.visited.copy(),
@@ -256,10 +256,10 @@ class SearchAgent:
             offset = centres[unvisited] - self._predicted()
             return centres[unvisited[np.argmin((offset * offset).sum(axis=1))]]
         predicted = self.settings.assignment == 'predicted'
-        places = {m.robot: m.predicted if predicted else m.position for m in heard}
-        places[self.name] = self._predicted() if predicted else self.position
-        order = sorted(places)
-        stacked = np.stack([places[name] for name in order])
+        points = {m.robot: m.predicted if predicted else m.position for m in heard}
+        points[self.name] = self._predicted() if predicted else self.position
+        order = sorted(points)
+        stacked = np.stack([points[name] for name in order])
         chosen = assigned(stacked, order.index(self.name), centres, unvisited)
         return self.position if chosen is None else centres[chosen]
 

@@ -207,8 +207,8 @@ def _visit(instance: Instance, tree: Tree, node: int, q: int) -> None:
         low, high = instance.visit_lower[q, a], instance.visit_upper[q, a]
         tree.low[node, a, k] = max(tree.low[node, a, k], low)
         tree.high[node, a, k] = min(tree.high[node, a, k], high)
-        place = tree.values[node, a, k - 2]
-        if place < low or place > high:
+        coordinate = tree.values[node, a, k - 2]
+        if coordinate < low or coordinate > high:
             tree.dirty[node] |= 1 << a  # unless it is inside already
     tree.visits[node, tree.number[node]] = q
     tree.number[node] += 1

@@ -51,8 +51,8 @@ class Dynamics:
         for k in range(steps):
             brakes = k >= len(controls)
             used.append(self.control_for(velocities[-1], np.zeros(3)) if brakes else controls[k])
-            place, speed = self.next(positions[-1], velocities[-1], used[-1])
-            positions.append(place)
+            point, speed = self.next(positions[-1], velocities[-1], used[-1])
+            positions.append(point)
             velocities.append(speed)
         return np.array(positions), np.array(velocities), np.array(used)
 

@@ -80,9 +80,9 @@ class CoveragePlan:
 
     def inside(self, position: ArrayLike) -> BoolArray:
         """Return which cuboids contain a position (3,), (N,)."""
-        place = np.asarray(position, dtype=float)
+        point = np.asarray(position, dtype=float)
         return np.asarray(
-            ((self.boxes[:, :, 0] <= place) & (place <= self.boxes[:, :, 1])).all(axis=1)
+            ((self.boxes[:, :, 0] <= point) & (point <= self.boxes[:, :, 1])).all(axis=1)
         )
 
     def hits(self, position: ArrayLike) -> bool:
@@ -96,8 +96,8 @@ class CoveragePlan:
 
 
 def _inside(position: FloatArray, boxes: FloatArray) -> BoolArray:
-    place = position[..., None, :]
-    return np.asarray((boxes[:, :, 0] < place) & (place < boxes[:, :, 1]))
+    point = position[..., None, :]
+    return np.asarray((boxes[:, :, 0] < point) & (point < boxes[:, :, 1]))
 
 
 def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolArray:
@@ -243,11 +243,11 @@ class PathFinder:
         self._speeds = np.array([speed, speed, max(climb, 1e-3)])
         self._down = speed
 
-    def first_corner(self, place: FloatArray, target: FloatArray) -> FloatArray:
+    def first_corner(self, point: FloatArray, target: FloatArray) -> FloatArray:
         """Return the next corner (3,) of the path to a target, or the target."""
-        if not segment_cuts(place, target, self.solids).any():
+        if not segment_cuts(point, target, self.solids).any():
             return target
-        points = np.vstack([place, target, self._corners(place, target)])
+        points = np.vstack([point, target, self._corners(point, target)])
         number = len(points)
         offset = points[None, :, :] - points[:, None, :]
         times = np.abs(offset) / self._speeds
@@ -281,18 +281,18 @@ class PathFinder:
             node = int(before[node])
         return np.asarray(points[node])
 
-    def reaches(self, place: FloatArray, target: FloatArray) -> bool:
+    def reaches(self, point: FloatArray, target: FloatArray) -> bool:
         """Return whether a path leads from a position to a target."""
-        if not segment_cuts(place, target, self.solids).any():
+        if not segment_cuts(point, target, self.solids).any():
             return True
-        return bool((self.first_corner(place, target) != target).any())
+        return bool((self.first_corner(point, target) != target).any())
 
-    def _corners(self, place: FloatArray, target: FloatArray) -> FloatArray:
+    def _corners(self, point: FloatArray, target: FloatArray) -> FloatArray:
         points = np.array(
             [
                 (x, y, height)
                 for box in self.solids
-                for height in (place[2], target[2], box[2, 1] + _BERTH)
+                for height in (point[2], target[2], box[2, 1] + _BERTH)
                 for x in (box[0, 0] - _BERTH, box[0, 1] + _BERTH)
                 for y in (box[1, 0] - _BERTH, box[1, 1] + _BERTH)
             ]

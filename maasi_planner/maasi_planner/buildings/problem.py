@@ -209,12 +209,12 @@ class PlanSolver:
         return steps.copy(), number[which], low[steps, which], high[steps, which], fall, climb
 
 
-def _due(problem: Problem, place: FloatArray) -> tuple[list[int], BoolArray]:
+def _due(problem: Problem, point: FloatArray) -> tuple[list[int], BoolArray]:
     wanted = np.asarray(problem.wanted, dtype=bool).copy()
     if problem.homing:
         return [], np.zeros_like(wanted)
     low, high = problem.cuboids[:, :, 0] - TOUCH, problem.cuboids[:, :, 1] + TOUCH
-    due = np.flatnonzero(((low <= place) & (place <= high)).all(axis=1) & wanted)
+    due = np.flatnonzero(((low <= point) & (point <= high)).all(axis=1) & wanted)
     wanted[due] = False
     return due.tolist(), wanted
 

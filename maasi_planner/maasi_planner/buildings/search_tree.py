@@ -58,15 +58,15 @@ def make_tree(size: int, horizon: int, rows: int) -> Tree:
 @njit(cache=True)
 def push(tree: Tree, node: int) -> None:
     """Put a node into the heap of bounds."""
-    place = tree.counts[0]
+    slot = tree.counts[0]
     tree.counts[0] += 1
-    while place > 0:
-        parent = (place - 1) // 2
+    while slot > 0:
+        parent = (slot - 1) // 2
         if tree.bound[tree.heap[parent]] <= tree.bound[node]:
             break
-        tree.heap[place] = tree.heap[parent]
-        place = parent
-    tree.heap[place] = node
+        tree.heap[slot] = tree.heap[parent]
+        slot = parent
+    tree.heap[slot] = node
 
 
 @njit(cache=True)
@@ -77,18 +77,18 @@ def pop(tree: Tree) -> int:
     size = tree.counts[0]
     if size:
         node = tree.heap[size]
-        place = 0
+        slot = 0
         while True:
-            child = 2 * place + 1
+            child = 2 * slot + 1
             if child >= size:
                 break
             if child + 1 < size and tree.bound[tree.heap[child + 1]] < tree.bound[tree.heap[child]]:
                 child += 1
             if tree.bound[tree.heap[child]] >= tree.bound[node]:
                 break
-            tree.heap[place] = tree.heap[child]
-            place = child
-        tree.heap[place] = node
+            tree.heap[slot] = tree.heap[child]
+            slot = child
+        tree.heap[slot] = node
     return top
 
 

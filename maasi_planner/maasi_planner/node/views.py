@@ -58,9 +58,9 @@ class PlannerViews:
         shown = {}
         for name, robot in robots.items():
             plan = coordinator.robots[name].plan
-            place = np.asarray(robot.state.pose.position)
-            waypoint = plan.positions[-1] if len(plan.positions) else place
-            shown[name] = (place, waypoint, plan.positions, plan.tour)
+            here = np.asarray(robot.state.pose.position)
+            waypoint = plan.positions[-1] if len(plan.positions) else here
+            shown[name] = (here, waypoint, plan.positions, plan.tour)
         # Colours are those of the whole team, also for a robot with its own planner.
         tints = robot_colours([*coordinator.names, *self._node.settings.others])
         markers = planner_markers(shown, tints, header, self._size)

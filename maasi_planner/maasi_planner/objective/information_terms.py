@@ -31,14 +31,14 @@ LEAST_GAIN = 1e-7
 class Nodes(NamedTuple):
     """L nodes with unseen targets.
 
-    numbers (nx, ny, nz): index of each cell or -1; lower (3,) and step (3,) of the grid [m]; places
-    (3, L) [m]; unseen (L,): expected targets.
+    numbers (nx, ny, nz): index of each cell or -1; lower (3,) and step (3,) of the grid [m];
+    positions (3, L) [m]; unseen (L,): expected targets.
     """
 
     numbers: IndexArray
     lower: FloatArray
     step: FloatArray
-    places: FloatArray
+    positions: FloatArray
     unseen: FloatArray
 
 
@@ -76,7 +76,7 @@ def _information(
     for where, part in parts_of(measured, len(centres)):
         chance = chances(part, first, centres)
         owner, index, cluster = np.nonzero(chance)
-        offsets = (centres[cluster] - part.places[owner, index])[:, :d]
+        offsets = (centres[cluster] - part.positions[owner, index])[:, :d]
         # Nearer than the noise of the range, the linear model would be too optimistic.
         distance = np.sqrt((offsets * offsets).sum(axis=1))
         offsets *= np.maximum(1.0, lower[0, 0] / np.maximum(distance, 1e-12))[:, None]
@@ -99,10 +99,10 @@ def _nodes(team: TeamView, settings: InformationSettings, every_node: bool) -> N
     block = (x * shape[1] + y) * shape[2] + z
     left = np.bincount(block.ravel(), (values * volumes).ravel()).astype(float)
     start, distance = lower + 0.5 * (stride - 1) * step, stride * step
-    places = start[:, None] + distance[:, None] * np.indices(shape).reshape(3, -1)
+    positions = start[:, None] + distance[:, None] * np.indices(shape).reshape(3, -1)
     unseen = left * (team.area.expected_targets / float(volumes.sum()))
     index = np.arange(len(left), dtype=np.int32).reshape(shape)
-    return Nodes(index, start, distance, places, unseen)
+    return Nodes(index, start, distance, positions, unseen)
 
 
 def _without(nodes: Nodes, settled: Measurements) -> Nodes:
@@ -114,8 +114,10 @@ def _without(nodes: Nodes, settled: Measurements) -> Nodes:
     kept = np.flatnonzero(unseen > 0.0)
     index = np.full(nodes.numbers.size, -1, np.int32)
     index[kept] = np.arange(len(kept))
-    places = np.ascontiguousarray(nodes.places[:, kept])
-    return Nodes(index.reshape(nodes.numbers.shape), nodes.lower, nodes.step, places, unseen[kept])
+    positions = np.ascontiguousarray(nodes.positions[:, kept])
+    return Nodes(
+        index.reshape(nodes.numbers.shape), nodes.lower, nodes.step, positions, unseen[kept]
+    )
 
 
 @njit(cache=True)
@@ -128,11 +130,11 @@ def _miss_near(
     low, high = np.zeros(2, np.int64), np.zeros(2, np.int64)
     for e in range(first, measured.own[g]):
         for axis in range(2):
-            begin = measured.places[g, e, axis] - nodes.lower[axis]
+            begin = measured.positions[g, e, axis] - nodes.lower[axis]
             low[axis] = max(0, np.int64((begin - reach) / nodes.step[axis]) - 1)
             last = np.int64(max(-1.0, (begin + reach) / nodes.step[axis])) + 2
             high[axis] = min(shape[axis], last)
-        x, y, z = measured.places[g, e]
+        x, y, z = measured.positions[g, e]
         cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
         kind, parameters = measured.kind[robot], measured.parameters[robot]
         for i in range(low[0], high[0]):
@@ -140,11 +142,11 @@ def _miss_near(
                 for n in nodes.numbers[i, j]:
                     if n < 0 or miss[n] == 0.0:
                         continue
-                    dx, dy = nodes.places[0, n] - x, nodes.places[1, n] - y
+                    dx, dy = nodes.positions[0, n] - x, nodes.positions[1, n] - y
                     if abs(dx) > reach or abs(dy) > reach:
                         continue
                     chance = detection_probability_at(
-                        kind, parameters, dx, dy, nodes.places[2, n] - z, cosine, sine
+                        kind, parameters, dx, dy, nodes.positions[2, n] - z, cosine, sine
                     )
                     if 1.0 - chance < 1.0:
                         if miss[n] == 1.0:
@@ -168,7 +170,7 @@ def rows_of(
     node, row = np.empty(number, np.int32), np.empty(number)
     miss, seen = np.ones(number), np.empty(number, np.int32)
     until = np.full(number, NEVER)
-    at = nodes.places[0], nodes.places[1], nodes.places[2]
+    at = nodes.positions[0], nodes.positions[1], nodes.positions[2]
     for g in range(total):
         if measured.reach[measured.robot[g]] < np.inf:
             count = _miss_near(measured, g, first, nodes, miss, seen)

@@ -25,20 +25,20 @@ class Others(NamedTuple):
     """Choices of the k other robots in the order in which they count, by information.
 
     candidate (k,), and its norm (k,). Rows begin[n] to begin[n + 1] - 1 are of the robots that see
-    node n: place (E,) in that order, before (E,) what earlier ones leave of the node, and after
-    (E,) what it and later ones see, each over its norm; the last row has no place. Rows of cluster
-    c begin at cluster_begin[c]: place (F,), known (F, d, d) before it, and content (F,), its log
+    node n: rank (E,) in that order, before (E,) what earlier ones leave of the node, and after
+    (E,) what it and later ones see, each over its norm; the last row has no rank. Rows of cluster
+    c begin at cluster_begin[c]: rank (F,), known (F, d, d) before it, and content (F,), its log
     determinant.
     """
 
     candidate: IntArray
     norm: FloatArray
     begin: IntArray
-    place: IntArray
+    rank: IntArray
     before: FloatArray
     after: FloatArray
     cluster_begin: IntArray
-    cluster_place: IntArray
+    cluster_rank: IntArray
     known: FloatArray
     content: FloatArray
 
@@ -90,14 +90,14 @@ def _others(table: CandidateTable, chosen: IntArray, r: int) -> Others:
         begin[n + 1] += begin[n] + (begin[n + 1] > 0)
     for c in range(clusters):
         cluster_begin[c + 1] += cluster_begin[c] + 1
-    place, filled = np.full(begin[-1], number), begin[:-1].copy()
+    rank, filled = np.full(begin[-1], number), begin[:-1].copy()
     before, after = np.ones(begin[-1]), np.zeros(begin[-1])
     for i in range(number):
         g = candidate[i]
         for row in range(terms.first[g], terms.first[g + 1]):
             n = terms.node[row]
             at = filled[n]
-            place[at], filled[n] = i, at + 1
+            rank[at], filled[n] = i, at + 1
             before[at + 1] = before[at] * terms.miss[row]
     for i in range(number - 1, -1, -1):
         g = candidate[i]
@@ -107,7 +107,7 @@ def _others(table: CandidateTable, chosen: IntArray, r: int) -> Others:
             filled[n] = at
             after[at] = after[at + 1] + before[at] * (1.0 - terms.miss[row]) / norm[i]
     d = terms.covariance.shape[1]
-    cluster_place, nothing = np.full(cluster_begin[-1], number), np.zeros((d, d))
+    cluster_rank, nothing = np.full(cluster_begin[-1], number), np.zeros((d, d))
     known, content = np.zeros((cluster_begin[-1], d, d)), np.zeros(cluster_begin[-1])
     filled = cluster_begin[:-1].copy()
     for c in range(clusters):
@@ -118,11 +118,11 @@ def _others(table: CandidateTable, chosen: IntArray, r: int) -> Others:
         for row in range(terms.gain_first[g], terms.gain_first[g + 1]):
             c = terms.cluster[row]
             at = filled[c]
-            cluster_place[at], filled[c] = i, at + 1
+            cluster_rank[at], filled[c] = i, at + 1
             known[at + 1] = known[at] + terms.gain[row]
             content[at + 1] = _content(terms, c, known[at + 1], nothing)
     return Others(
-        candidate, norm, begin, place, before, after, cluster_begin, cluster_place, known, content
+        candidate, norm, begin, rank, before, after, cluster_begin, cluster_rank, known, content
     )
 
 
@@ -137,16 +137,16 @@ def _value_of_others(table: CandidateTable, others: Others) -> float:
     for c in range(len(terms.mass)):
         for at in range(others.cluster_begin[c], others.cluster_begin[c + 1] - 1):
             gained = max(0.0, others.content[at + 1] - others.content[at])
-            norm = others.norm[others.cluster_place[at]]
+            norm = others.norm[others.cluster_rank[at]]
             total += table.alpha * 0.5 * terms.mass[c] * gained / norm
     return total
 
 
 @njit(cache=True)
-def _explored(table: CandidateTable, others: Others, g: int, place: int) -> tuple[float, float]:
+def _explored(table: CandidateTable, others: Others, g: int, rank: int) -> tuple[float, float]:
     """Return what E of candidate g adds to the sum of J without the others, and with them.
 
-    It counts before the others from `place` on.
+    It counts before the others from `rank` on.
     """
     terms, norm, alone, total = table.terms, table.norm[g], 0.0, 0.0
     for row in range(terms.first[g], terms.first[g + 1]):
@@ -155,9 +155,9 @@ def _explored(table: CandidateTable, others: Others, g: int, place: int) -> tupl
         share = 1.0 / norm
         if end >= at:
             if end - at == len(others.candidate):
-                at += place
+                at += rank
             else:
-                while others.place[at] < place:
+                while others.rank[at] < rank:
                     at += 1
             share = others.before[at] / norm - others.after[at]
         seen = terms.unseen[n] * (1.0 - terms.miss[row])
@@ -167,13 +167,13 @@ def _explored(table: CandidateTable, others: Others, g: int, place: int) -> tupl
 
 
 @njit(cache=True)
-def _refined(table: CandidateTable, others: Others, g: int, place: int) -> float:
-    """Return what T of candidate g, which counts from `place` on, adds to the sum of J."""
+def _refined(table: CandidateTable, others: Others, g: int, rank: int) -> float:
+    """Return what T of candidate g, which counts from `rank` on, adds to the sum of J."""
     terms, norm, total = table.terms, table.norm[g], 0.0
     for row in range(terms.gain_first[g], terms.gain_first[g + 1]):
         c = terms.cluster[row]
         at, end = others.cluster_begin[c], others.cluster_begin[c + 1] - 1
-        while at < end and others.cluster_place[at] < place:
+        while at < end and others.cluster_rank[at] < rank:
             at += 1
         gain = terms.gain[row]
         last = _content(terms, c, others.known[at], gain)
@@ -181,7 +181,7 @@ def _refined(table: CandidateTable, others: Others, g: int, place: int) -> float
         for later in range(at, end):
             now = _content(terms, c, others.known[later + 1], gain)
             change = now - last - (others.content[later + 1] - others.content[later])
-            value += change / others.norm[others.cluster_place[later]]
+            value += change / others.norm[others.cluster_rank[later]]
             last = now
         total += 0.5 * terms.mass[c] * value
     return total
@@ -199,20 +199,20 @@ def _best_by_information(ranking: Ranking, r: int, chosen: IntArray) -> tuple[in
         if collides(table, g, chosen):
             continue
         evaluated += 1
-        place = 0
-        while place < len(others.candidate) and (
-            others.norm[place],
-            table.planned.robot[others.candidate[place]],
+        rank = 0
+        while rank < len(others.candidate) and (
+            others.norm[rank],
+            table.planned.robot[others.candidate[rank]],
         ) < (table.norm[g], r):
-            place += 1
+            rank += 1
         total = value - table.cost[g] / table.norm[g]
         if table.beta > 0.0:
-            without, explored = _explored(table, others, g, place)
+            without, explored = _explored(table, others, g, rank)
             # T without the others is an upper bound.
             if value + alone[g] + table.beta * (explored - without) <= best_value:
                 continue
             total += table.beta * explored
-        total += table.alpha * _refined(table, others, g, place)
+        total += table.alpha * _refined(table, others, g, rank)
         if total > best_value:
             best, best_value = g, total
     return best, best_value, evaluated

@@ -19,7 +19,7 @@ Grid = tuple[FloatArray, FloatArray, FloatArray]
 def _unseen_nodes(
     planned: Measurements, settled: Measurements, first: int, own_counts: bool, grid: Grid
 ) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
-    """Return count, value, place and time of `Terms`, without the other planning robots.
+    """Return count, value, position and time of `Terms`, without the other planning robots.
 
     (22) interpolates e between grid nodes: each has its weight times its unseen share. With
     `own_counts` a measurement itself is in its product (21).
@@ -29,13 +29,13 @@ def _unseen_nodes(
     most = corners * max(1, planned.own.max() - first)
     count = np.zeros(total, np.int64)
     value, time = np.empty((total, most)), np.empty((total, most), np.int64)
-    place = np.empty((3, total, most))
+    position = np.empty((3, total, most))
     low, share = np.zeros(3, np.int64), np.zeros(3)
     for g in range(total):
         number = 0
         for e in range(first, planned.own[g]):
             for axis in range(3 if corners == 8 else 2):
-                u = (planned.places[g, e, axis] - lower[axis]) / step[axis]
+                u = (planned.positions[g, e, axis] - lower[axis]) / step[axis]
                 u = min(max(u, 0.0), values.shape[axis] - 1.0)
                 low[axis] = min(np.int64(u), values.shape[axis] - 2)
                 share[axis] = u - low[axis]
@@ -47,18 +47,18 @@ def _unseen_nodes(
                 weight *= values[i, j, k]
                 if weight > 0.0:
                     value[g, number], time[g, number] = weight, planned.times[g, e]
-                    place[0, g, number] = lower[0] + i * step[0]
-                    place[1, g, number] = lower[1] + j * step[1]
-                    place[2, g, number] = lower[2] + k * step[2]
+                    position[0, g, number] = lower[0] + i * step[0]
+                    position[1, g, number] = lower[1] + j * step[1]
+                    position[2, g, number] = lower[2] + k * step[2]
                     number += 1
         count[g], worth, when, left = number, value[g, :number], time[g, :number], np.ones(number)
-        at = place[0, g, :number], place[1, g, :number], place[2, g, :number]
+        at = position[0, g, :number], position[1, g, :number], position[2, g, :number]
         until = when if own_counts else when - 1
         apply_misses(at, until, left, planned, g, np.int64(0), planned.own[g])
         worth *= left
         for s in range(settled.own.shape[0]):
             apply_misses(at, when, worth, settled, s, np.int64(0), settled.number[s])
-    return count, value, place, time
+    return count, value, position, time
 
 
 def paper_terms(
@@ -74,7 +74,7 @@ def paper_terms(
     T is the sum of pi at cluster centres (000, (19), (31)). `settled` are the measurements of
     robots that do not plan; `grid` has the values, first node and distances of e.
     """
-    count, value, place, time = _unseen_nodes(planned, settled, first, own_counts, grid)
+    count, value, position, time = _unseen_nodes(planned, settled, first, own_counts, grid)
     total = len(planned.own)
     seen = [
         chances(part, first, centres).sum(axis=(1, 2))
@@ -87,7 +87,7 @@ def paper_terms(
         first=np.zeros(total + 1, np.int64),
         filled=count,
         value=value,
-        place=place,
+        position=position,
         time=time,
         keys=np.full(CACHE_KEYS, -1),
         slots=np.zeros(CACHE_KEYS, np.int32),

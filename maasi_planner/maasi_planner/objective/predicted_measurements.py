@@ -26,23 +26,23 @@ from maasi_planner.team import RobotView
 NEVER = 1 << 60  # after every measurement [steps]
 MOST_CHANCES = 500_000  # largest part of `chances`
 # x, y and z (n,) [m] in separate arrays, so that loops are vectorised.
-Places = tuple[FloatArray, FloatArray, FloatArray]
+Axes = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class Measurements(NamedTuple):
     """Predicted measurements on G trajectories of R robots, in order of time.
 
     Trajectory g of robot[g] has number[g] measurements: own[g] planned ones, and others that only
-    other robots expect. times (G, n) [steps from now], places (G, n, 3) [m], in 2D with z = 0, yaws
-    (G, n) [rad]. For each robot kind (R,) and parameters (R, PARAMETERS) of pi, and its reach (R,)
-    [m].
+    other robots expect. times (G, n) [steps from now], positions (G, n, 3) [m], in 2D with z = 0,
+    yaws (G, n) [rad]. For each robot kind (R,) and parameters (R, PARAMETERS) of pi, and its reach
+    (R,) [m].
     """
 
     robot: IntArray
     number: IntArray
     own: IntArray
     times: IntArray
-    places: FloatArray
+    positions: FloatArray
     yaws: FloatArray
     kind: IntArray
     parameters: FloatArray
@@ -140,7 +140,7 @@ def _fill(
             k = (min(times[i], last) + stride - 1) // stride
             out.yaws[g, i] = heading[k]
             for axis in range(dimension):
-                out.places[g, i, axis] = path[k, axis]
+                out.positions[g, i, axis] = path[k, axis]
 
 
 def predicted(robots: Sequence[Paths], horizon: int, extend: bool) -> Measurements:
@@ -160,7 +160,7 @@ def predicted(robots: Sequence[Paths], horizon: int, extend: bool) -> Measuremen
         number=np.empty(total, np.int64),
         own=np.empty(total, np.int64),
         times=np.full((total, most), NEVER),
-        places=np.zeros((total, most, 3)),
+        positions=np.zeros((total, most, 3)),
         yaws=np.zeros((total, most)),
         kind=np.array([item.kernel()[0] for item in detections], np.int64),
         parameters=np.array([item.kernel()[1] for item in detections]).reshape(-1, PARAMETERS),
@@ -189,7 +189,7 @@ def reach_of(detection: DetectionModel) -> float:
 
 def part_of(measured: Measurements, begin: int, end: int) -> Measurements:
     """Return the measurements on the trajectories from `begin` to before `end`."""
-    own = ('robot', 'number', 'own', 'times', 'places', 'yaws')
+    own = ('robot', 'number', 'own', 'times', 'positions', 'yaws')
     return measured._replace(**{name: getattr(measured, name)[begin:end] for name in own})
 
 
@@ -212,9 +212,9 @@ def chances(measured: Measurements, first: int, points: FloatArray) -> FloatArra
         kind, parameters = measured.kind[robot], measured.parameters[robot]
         for e in range(first, measured.own[g]):
             for c in range(number):
-                x[c] = points[c, 0] - measured.places[g, e, 0]
-                y[c] = points[c, 1] - measured.places[g, e, 1]
-                z[c] = points[c, 2] - measured.places[g, e, 2]
+                x[c] = points[c, 0] - measured.positions[g, e, 0]
+                y[c] = points[c, 1] - measured.positions[g, e, 1]
+                z[c] = points[c, 2] - measured.positions[g, e, 2]
             cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
             fill_probabilities(kind, parameters, x, y, z, cosine, sine, out[g, e])
     return out
@@ -222,7 +222,7 @@ def chances(measured: Measurements, first: int, points: FloatArray) -> FloatArra
 
 @njit(cache=True)
 def apply_misses(
-    places: Places,
+    positions: Axes,
     until: IntArray,
     left: FloatArray,
     measured: Measurements,
@@ -230,9 +230,9 @@ def apply_misses(
     first: int,
     last: int,
 ) -> None:
-    """Multiply left (n,) at places by 1 - pi of measurements of trajectory g.
+    """Multiply left (n,) at positions by 1 - pi of measurements of trajectory g.
 
-    At a place those from `first` to before `last` count that are taken by its time in `until` (n,),
+    At a position, measurements from `first` to before `last` count until its time in `until` (n,),
     which does not decrease.
     """
     robot = measured.robot[g]
@@ -247,15 +247,15 @@ def apply_misses(
             begin += 1
         if begin == number:
             return
-        x0, y0, z0 = measured.places[g, e]
+        x0, y0, z0 = measured.positions[g, e]
         if kind >= BOX:
             cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
         if reach < np.inf:
             for i in range(begin, number):
-                dx, dy = places[0][i] - x0, places[1][i] - y0
+                dx, dy = positions[0][i] - x0, positions[1][i] - y0
                 if left[i] > 0.0 and abs(dx) <= reach and abs(dy) <= reach:
                     left[i] *= 1.0 - detection_probability_at(
-                        kind, parameters, dx, dy, places[2][i] - z0, cosine, sine
+                        kind, parameters, dx, dy, positions[2][i] - z0, cosine, sine
                     )
             continue
         # Slices, as possibly negative indices prevent vectorised loops.
@@ -266,7 +266,12 @@ def apply_misses(
             scratch[2, :width],
             scratch[3, :width],
         )
-        px, py, pz, after = places[0][begin:], places[1][begin:], places[2][begin:], left[begin:]
+        px, py, pz, after = (
+            positions[0][begin:],
+            positions[1][begin:],
+            positions[2][begin:],
+            left[begin:],
+        )
         for i in range(width):
             x[i] = px[i] - x0
             y[i] = py[i] - y0

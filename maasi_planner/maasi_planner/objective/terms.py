@@ -23,8 +23,8 @@ class Terms(NamedTuple):
 
     As printed, E is what others leave of value (G, n), of which filled[g] numbers are used: their
     product with what each other candidate leaves by its measurements until time (G, n) [steps from
-    now] at place (3, G, n) [m]. Rows (S, n) cache it by pair of candidates, in a hash table of keys
-    and slots; used (1,) counts rows.
+    now] at position (3, G, n) [m]. Rows (S, n) cache it by pair of candidates, in a hash table of
+    keys and slots; used (1,) counts rows.
 
     T is refinement (G,), and for C clusters with mass (C,) and covariance (C, d, d) the information
     that a candidate adds to base (C, d, d), both sums of pi H' R^-1 H. Rows gain_first[g] to
@@ -39,7 +39,7 @@ class Terms(NamedTuple):
     unseen: FloatArray = np.zeros(0)
     filled: IntArray = np.zeros(0, np.int64)
     value: FloatArray = np.zeros((0, 0))
-    place: FloatArray = np.zeros((3, 0, 0))
+    position: FloatArray = np.zeros((3, 0, 0))
     time: IntArray = np.zeros((0, 0), np.int64)
     keys: IntArray = np.zeros(0, np.int64)
     slots: IndexArray = np.zeros(0, np.int32)
@@ -64,8 +64,8 @@ def left_by(terms: Terms, planned: Measurements, g: int, other: int) -> FloatArr
             return terms.rows[terms.slots[index], :count]
         index = (index + 1) & mask
     out = np.ones(count)
-    until, number, place = terms.time[g, :count], planned.number[other], terms.place
-    at = place[0, g, :count], place[1, g, :count], place[2, g, :count]
+    until, number, position = terms.time[g, :count], planned.number[other], terms.position
+    at = position[0, g, :count], position[1, g, :count], position[2, g, :count]
     # A literal would be compiled separately.
     apply_misses(at, until, out, planned, other, np.int64(0), number)
     if terms.used[0] < terms.rows.shape[0]:

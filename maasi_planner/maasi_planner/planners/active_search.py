@@ -70,20 +70,20 @@ class Sequences:
         ]
         for _ in range(horizon - 1):
             longer = []
-            for index, places in kept:
-                following = places[-1] + steps
+            for index, visited in kept:
+                following = visited[-1] + steps
                 free = [
-                    place
-                    for place, inside in zip(following, team.area.inside(following))
-                    if inside and view.motion.keep_out.is_free(place)
+                    point
+                    for point, inside in zip(following, team.area.inside(following))
+                    if inside and view.motion.keep_out.is_free(point)
                 ]
                 # Extend a dead end by staying.
-                for place in free or [places[-1]]:
-                    longer.append((index, [*places, place]))
+                for point in free or [visited[-1]]:
+                    longer.append((index, [*visited, point]))
             kept = longer
         self.first = np.array([index for index, _ in kept], np.int64)
         positions = np.array([sequence for _, sequence in kept]).reshape(len(kept), horizon, 3)
-        self.places = positions
+        self.positions = positions
         flat = positions.reshape(-1, 3)
         exploration = team.exploration if view.exploration is None else view.exploration
         self.explored = exploration.at(flat).reshape(len(kept), horizon)
@@ -96,11 +96,11 @@ class Sequences:
         self,
         team: TeamView,
         view: RobotView,
-        places: FloatArray,
+        positions: FloatArray,
         before: FloatArray,
         informed: bool,
     ) -> FloatArray:
-        number, horizon, _ = places.shape
+        number, horizon, _ = positions.shape
         if informed:
             points, weights = intensity(team)
         else:
@@ -112,10 +112,10 @@ class Sequences:
         for row in range(number):
             missed = np.ones(len(points))
             for j in range(horizon):
-                yaw = heading_to(view, before[row, j], places[row, j])
-                key = places[row, j].tobytes() + np.float64(yaw).tobytes()
+                yaw = heading_to(view, before[row, j], positions[row, j])
+                key = positions[row, j].tobytes() + np.float64(yaw).tobytes()
                 if key not in known:
-                    pose = Pose.from_yaw(places[row, j], yaw)
+                    pose = Pose.from_yaw(positions[row, j], yaw)
                     known[key] = view.sensor.detection.probability(points, pose)
                 if informed:
                     missed *= 1.0 - known[key]

@@ -29,14 +29,14 @@ def past_standing(
     """
     view = team.robots[name]
     here, motion = view.state.pose.position, view.motion
-    places = list(team.taken) + [
+    positions = list(team.taken) + [
         (np.array(other.state.pose.position), other.radius)
         for key, other in team.robots.items()
         if key != name
     ]
-    if not free_of_robots(waypoint[None], view.radius, places)[0]:
+    if not free_of_robots(waypoint[None], view.radius, positions)[0]:
         return None
-    point = motion.keep_out.past(here, waypoint, places)[None]
+    point = motion.keep_out.past(here, waypoint, positions)[None]
     prediction = motion.predict(view.state, point, team.step_time)
     usable = prediction.reached & (prediction.lengths > 0) & team.area.inside(point)
     if not usable[0] or crossed(team, name, prediction, decision):

@@ -32,9 +32,9 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     assert endurance is not None
     here, keep_out = view.state.pose.position, view.motion.keep_out
     others = {key: robot.positions for key, robot in decision.robots.items() if key != name}
-    places = [(path[-1], radius) for path, radius in paths_of(team, name, others)]
+    standing = [(path[-1], radius) for path, radius in paths_of(team, name, others)]
     chargers = endurance.chargers_within(here)
-    free = [charger for charger in chargers if apart(charger, view.radius, places)]
+    free = [charger for charger in chargers if apart(charger, view.radius, standing)]
     charger = (free or chargers)[0]
     prediction = view.motion.predict(view.state, charger[None, :], team.step_time)
     if not free:
@@ -44,8 +44,8 @@ def go_home(team: TeamView, name: str, decision: Decision, reason: str) -> Robot
     # Past their final positions, or to the side until they have passed.
     aside = here + _ASIDE @ (charger - here)[:2]
     moved = [keep_out.moved_out(here, point) for point in aside]
-    inside = [place for place in moved if place is not None and team.area.inside(place[None, :])[0]]
-    goals = np.array([keep_out.past(here, charger, places), *inside])
+    inside = [point for point in moved if point is not None and team.area.inside(point[None, :])[0]]
+    goals = np.array([keep_out.past(here, charger, standing), *inside])
     prediction = view.motion.predict(view.state, goals, team.step_time)
     usable = paths_apart(team, name, prediction.positions, others) & prediction.reached
     return single_choice(goals, prediction, int(np.argmax(usable)), reason)
@@ -71,9 +71,9 @@ def _wait_near(
     """Send a robot near a charger, where it waits; if it is near, it stays unless it `leaves`."""
     view = team.robots[name]
     here, motion = view.state.pose.position, view.motion
-    places = [(path[-1], radius) for path, radius in paths_of(team, name, others)]
+    standing = [(path[-1], radius) for path, radius in paths_of(team, name, others)]
     # Far enough that the robot at the charger can leave it.
-    reach = 3.0 * (view.radius + max(radius for _, radius in places))
+    reach = 3.0 * (view.radius + max(radius for _, radius in standing))
     reach += 2.0 * motion.settings.tolerance
     if math.dist(here, charger) <= 1.25 * reach and not leaves:
         return stay(view, f'waits: {TAKEN}')
@@ -82,7 +82,7 @@ def _wait_near(
     ring = charger + reach * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
     free = [
         bool(team.area.inside(point[None, :])[0] and motion.keep_out.is_free(point))
-        and apart(point, view.radius, places)
+        and apart(point, view.radius, standing)
         for point in ring
     ]
     if not any(free):

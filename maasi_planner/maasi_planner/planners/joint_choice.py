@@ -27,8 +27,8 @@ def search_jointly(
     best_value, evaluated = -math.inf, 0
 
     def fits(joint: dict[str, int]) -> bool:
-        places = {name: points[name][row] for name, row in joint.items() if row >= 0}
-        return all_apart(team, places)
+        waypoints = {name: points[name][row] for name, row in joint.items() if row >= 0}
+        return all_apart(team, waypoints)
 
     if math.prod(map(len, indices.values())) <= settings.enumeration_limit:
         for rows in itertools.product(*indices.values()):

@@ -47,15 +47,15 @@ def passing(
     # All measurements within `far` along the path, for targets at four positions between two.
     far = min(8.0 * half, reach)
     beside = np.linspace(-far, far, 641)
-    places = np.zeros((4, len(beside), 2))
-    places[..., 0] = spacing * np.arange(4)[:, None] / 4.0
-    places[..., 1] = beside
-    places = places @ turned(heading, 2).T
-    missed = np.ones(places.shape[:2])
+    points = np.zeros((4, len(beside), 2))
+    points[..., 0] = spacing * np.arange(4)[:, None] / 4.0
+    points[..., 1] = beside
+    points = points @ turned(heading, 2).T
+    missed = np.ones(points.shape[:2])
     for number in range(-math.ceil(far / spacing), math.ceil(far / spacing) + 2):
         along = number * spacing
         pose = Pose.from_yaw([along * math.cos(heading), along * math.sin(heading), 0.0], heading)
-        found = view.sensor.detection.probability(places.reshape(-1, 2), pose)
+        found = view.sensor.detection.probability(points.reshape(-1, 2), pose)
         missed *= 1.0 - found.reshape(missed.shape)
     detected = 1.0 - missed.mean(axis=0)
     return beside[320:], 0.5 * (detected[320:] + detected[320::-1])
@@ -123,16 +123,16 @@ class Lattice:
         counts = np.maximum(1, np.ceil((high - low) / size - 0.1)).astype(int)
         widths = (high - low) / counts
         number = int(counts.prod())
-        squares = _squares_of(samples, self.turn, low, widths, counts)
-        held, sums = _middles(samples, squares, number)
-        squares = _joined(held, sums[:, :d] / np.maximum(held, 1e-12)[:, None])[squares]
+        cells = _cells_of(samples, self.turn, low, widths, counts)
+        held, sums = _middles(samples, cells, number)
+        cells = _joined(held, sums[:, :d] / np.maximum(held, 1e-12)[:, None])[cells]
         self.shape = (*counts.tolist(), 1)[:3]
         self.trust = np.ones(number)
         # Share of each map cell in each lattice cell.
-        table = _shares(squares, samples.parts, number)
+        table = _shares(cells, samples.parts, number)
         self._parts = csr_array(table, (number, nodes))
-        self._cells = _cell_sizes(samples)
-        self._held, sums = _middles(samples, squares, number)
+        self._sizes = _cell_sizes(samples)
+        self._held, sums = _middles(samples, cells, number)
         self._centres = sums[:, :d] / np.maximum(self._held, 1e-12)[:, None]
         centres = (low + (np.indices(tuple(counts)).reshape(d, -1).T + 0.5) * widths) @ self.turn.T
         whole = np.abs(self._held / widths.prod() - 1.0) < 1.0 - WHOLE
@@ -141,8 +141,8 @@ class Lattice:
         reach = [min(int(far / width), size) for width, size in zip(widths, self.shape)]
         reach += [0] * (3 - d)
         offsets = np.meshgrid(*(np.arange(-count, count + 1) for count in reach), indexing='ij')
-        square = sum((offset * width) ** 2 for offset, width in zip(offsets, widths))
-        self.kernel = np.interp(np.sqrt(square), beside, detected, right=0.0)
+        squared = sum((offset * width) ** 2 for offset, width in zip(offsets, widths))
+        self.kernel = np.interp(np.sqrt(squared), beside, detected, right=0.0)
 
     def unseen(self, exploration: UnexploredMap) -> FloatArray:
         """Return the share of all targets that is unseen in each cell, (nx, ny, nz)."""
@@ -152,7 +152,7 @@ class Lattice:
 
     def points(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
         """Return where to pass cells, (m, d) [m]: their centres, or those of the unseen part."""
-        unseen = exploration.values.ravel() * self._cells
+        unseen = exploration.values.ravel() * self._sizes
         parts, nodes = self._parts[chosen], np.meshgrid(*exploration.axes(), indexing='ij')
         held = np.maximum(parts @ unseen, 1e-12)
         middles = np.stack([parts @ (unseen * axis.ravel()) / held for axis in nodes], axis=1)
@@ -197,20 +197,20 @@ def _samples(exploration: UnexploredMap, parts: int) -> _Samples:
 
 
 @njit(cache=True)
-def _squares_of(samples, turn, low, widths, counts):  # type: ignore[no-untyped-def]
+def _cells_of(samples, turn, low, widths, counts):  # type: ignore[no-untyped-def]
     x, y, z = samples.axes
     out = np.empty((len(x), len(y), len(z)), np.int32)
     for i in range(len(x)):
         for j in range(len(y)):
             for k in range(len(z)):
-                square = 0
+                cell = 0
                 for axis in range(len(low)):
                     along = x[i] * turn[0, axis] + y[j] * turn[1, axis]
                     if len(low) == 3:
                         along += z[k] * turn[2, axis]
                     row = int((along - low[axis]) / widths[axis])
-                    square = square * counts[axis] + min(max(row, 0), counts[axis] - 1)
-                out[i, j, k] = square
+                    cell = cell * counts[axis] + min(max(row, 0), counts[axis] - 1)
+                out[i, j, k] = cell
     return out
 
 
@@ -222,18 +222,18 @@ def _size(samples, i, j, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _middles(samples, squares, number):  # type: ignore[no-untyped-def]
+def _middles(samples, cells, number):  # type: ignore[no-untyped-def]
     """Return the area in each cell, (n,), and its first moment, (n, 3)."""
     held, sums = np.zeros(number), np.zeros((number, 3))
     x, y, z = samples.axes
     for i in range(len(x)):
         for j in range(len(y)):
             for k in range(len(z)):
-                square, size = squares[i, j, k], _size(samples, i, j, k)
-                held[square] += size
-                sums[square, 0] += size * x[i]
-                sums[square, 1] += size * y[j]
-                sums[square, 2] += size * z[k]
+                cell, size = cells[i, j, k], _size(samples, i, j, k)
+                held[cell] += size
+                sums[cell, 0] += size * x[i]
+                sums[cell, 1] += size * y[j]
+                sums[cell, 2] += size * z[k]
     return held, sums
 
 
@@ -249,32 +249,30 @@ def _cell_sizes(samples):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _shares(squares, parts, number):  # type: ignore[no-untyped-def]
+def _shares(cells, parts, number):  # type: ignore[no-untyped-def]
     """Return the share of each map cell in each lattice cell, in the form of a CSR matrix."""
     a, b, c = parts
-    shape = squares.shape[0] // a, squares.shape[1] // b, squares.shape[2] // c
+    shape = cells.shape[0] // a, cells.shape[1] // b, cells.shape[2] // c
     begin, last = np.zeros(number + 1, np.int64), np.zeros(number, np.int64)
-    data, cells = np.zeros(0), np.zeros(0, np.int64)
+    data, columns = np.zeros(0), np.zeros(0, np.int64)
     # Count first; map cells come in order, so comparing with the last one suffices.
     for fill in range(2):
         last[:] = -1
         used = begin[:-1].copy()
-        for cell in range(shape[0] * shape[1] * shape[2]):
-            i, j = cell // (shape[1] * shape[2]), cell // shape[2] % shape[1]
-            k = cell % shape[2]
-            for square in squares[
-                i * a : (i + 1) * a, j * b : (j + 1) * b, k * c : (k + 1) * c
-            ].flat:
-                if last[square] != cell:
-                    last[square] = cell
-                    used[square] += 1
+        for column in range(shape[0] * shape[1] * shape[2]):
+            i, j = column // (shape[1] * shape[2]), column // shape[2] % shape[1]
+            k = column % shape[2]
+            for cell in cells[i * a : (i + 1) * a, j * b : (j + 1) * b, k * c : (k + 1) * c].flat:
+                if last[cell] != column:
+                    last[cell] = column
+                    used[cell] += 1
                 if fill:
-                    cells[used[square] - 1] = cell
-                    data[used[square] - 1] += 1.0 / (a * b * c)
+                    columns[used[cell] - 1] = column
+                    data[used[cell] - 1] += 1.0 / (a * b * c)
         if not fill:
             begin[1:] = np.cumsum(used)
-            data, cells = np.zeros(begin[-1]), np.zeros(begin[-1], np.int64)
-    return data, cells, begin
+            data, columns = np.zeros(begin[-1]), np.zeros(begin[-1], np.int64)
+    return data, columns, begin
 
 
 def _joined(held: FloatArray, middles: FloatArray) -> IntArray:
@@ -287,11 +285,11 @@ def _joined(held: FloatArray, middles: FloatArray) -> IntArray:
 
 
 @njit(cache=True)
-def _seen(unseen, kernel, place, take):  # type: ignore[no-untyped-def]
+def _seen(unseen, kernel, cell, take):  # type: ignore[no-untyped-def]
     """Return how much is seen from a cell; `take` removes it."""
     nx, ny, nz = unseen.shape
     a, b, c = kernel.shape
-    i, j, k = place // (ny * nz), place // nz % ny, place % nz
+    i, j, k = cell // (ny * nz), cell // nz % ny, cell % nz
     total = 0.0
     for u in range(max(i - a // 2, 0), min(i + a // 2 + 1, nx)):
         for v in range(max(j - b // 2, 0), min(j + b // 2 + 1, ny)):
@@ -306,8 +304,8 @@ def _seen(unseen, kernel, place, take):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _gains(unseen, kernel, chosen):  # type: ignore[no-untyped-def]
     gains = np.empty(len(chosen))
-    for number, place in enumerate(chosen):
-        gains[number] = _seen(unseen, kernel, place, True)
+    for number, cell in enumerate(chosen):
+        gains[number] = _seen(unseen, kernel, cell, True)
     return gains
 
 
@@ -315,23 +313,23 @@ def _gains(unseen, kernel, chosen):  # type: ignore[no-untyped-def]
 def _choose(unseen, kernel, trust, overlap, least, enough):  # type: ignore[no-untyped-def]
     """Choose the cell that sees most, as long as earlier ones have not seen most of that."""
     alone = np.empty(unseen.size)
-    for place in range(unseen.size):
-        alone[place] = trust[place] * _seen(unseen, kernel, place, False)
+    for cell in range(unseen.size):
+        alone[cell] = trust[cell] * _seen(unseen, kernel, cell, False)
     chosen, gains = np.empty(unseen.size, np.int64), np.empty(unseen.size)
     number, least = 0, least * alone.max()
     # Gains only decrease: the largest one is computed again. Of equal ones
     # the first is chosen.
-    queue = [(-alone[place], place, -1) for place in range(unseen.size) if alone[place] > least]
+    queue = [(-alone[cell], cell, -1) for cell in range(unseen.size) if alone[cell] > least]
     heapq.heapify(queue)
     while queue:
-        bound, place, fresh = heapq.heappop(queue)
+        bound, cell, fresh = heapq.heappop(queue)
         if -bound <= least:
             break
         if fresh < number:
-            left = trust[place] * _seen(unseen, kernel, place, False)
-            if number < enough or left >= overlap * alone[place]:
-                heapq.heappush(queue, (-left, place, number))
+            left = trust[cell] * _seen(unseen, kernel, cell, False)
+            if number < enough or left >= overlap * alone[cell]:
+                heapq.heappush(queue, (-left, cell, number))
             continue
-        chosen[number], gains[number] = place, trust[place] * _seen(unseen, kernel, place, True)
+        chosen[number], gains[number] = cell, trust[cell] * _seen(unseen, kernel, cell, True)
         number += 1
     return chosen[:number], gains[:number]

@@ -60,7 +60,7 @@ def lanes(
     low = np.minimum(low, middle)
     high = np.maximum(high, middle)
 
-    def places(axis: int, distance: float) -> list[float]:
+    def levels(axis: int, distance: float) -> list[float]:
         length = float(high[axis] - low[axis])
         number = math.ceil(length / distance - 1e-9) + 1 if length > 1e-12 else 1
         if number == 1:
@@ -69,8 +69,8 @@ def lanes(
 
     out = []
     backwards_x = backwards_y = False
-    for z in places(2, layer_spacing) if d == 3 else [0.0]:
-        rows = places(1, spacing)
+    for z in levels(2, layer_spacing) if d == 3 else [0.0]:
+        rows = levels(1, spacing)
         for y in reversed(rows) if backwards_y else rows:
             ends = [(float(low[0]), y, z), (float(high[0]), y, z)]
             out.append(np.array(ends[::-1] if backwards_x else ends))
@@ -267,6 +267,6 @@ def _is_full(view: RobotView) -> bool:
 def _unseen(team: TeamView, lane: FloatArray) -> bool:
     """Return whether a part of a lane is open and mostly unexplored."""
     number = 2 + int(np.linalg.norm(lane[1] - lane[0]) / team.exploration.step.min())
-    places = lane[0] + np.linspace(0.0, 1.0, number)[:, None] * (lane[1] - lane[0])
-    places = places[team.area.inside(places)]
-    return len(places) > 0 and bool((team.exploration.at(places) > 0.5).any())
+    levels = lane[0] + np.linspace(0.0, 1.0, number)[:, None] * (lane[1] - lane[0])
+    levels = levels[team.area.inside(levels)]
+    return len(levels) > 0 and bool((team.exploration.at(levels) > 0.5).any())

@@ -190,11 +190,11 @@ class MutualInformation(Planner):
         return explain(decision)
 
     @staticmethod
-    def _missed(view: RobotView, places: FloatArray, points: FloatArray) -> FloatArray:
+    def _missed(view: RobotView, positions: FloatArray, points: FloatArray) -> FloatArray:
         here = np.array(view.state.pose.position)
-        out = np.ones((len(places), len(points)))
+        out = np.ones((len(positions), len(points)))
         if len(points):
-            for row, place in zip(out, places):
-                pose = Pose.from_yaw(place, heading_to(view, here, place))
+            for row, point in zip(out, positions):
+                pose = Pose.from_yaw(point, heading_to(view, here, point))
                 row[:] = 1.0 - view.sensor.detection.probability(points, pose)
         return out

@@ -52,23 +52,23 @@ def usable_candidates(
 
 def waiting_places(team: TeamView) -> list[tuple[FloatArray, float]]:
     """Return final positions (3,) [m] and radii of the robots that do not plan."""
-    places = list(team.taken)
+    standing = list(team.taken)
     for name in team.names():
         view = team.robots[name]
         if view.planning:
             continue
         if view.remaining_path is not None and len(view.remaining_path):
-            place = np.asarray(view.remaining_path[-1], dtype=float)
+            point = np.asarray(view.remaining_path[-1], dtype=float)
         else:
-            place = np.array(view.state.pose.position)
-        places.append((place, view.radius))
-    return places
+            point = np.array(view.state.pose.position)
+        standing.append((point, view.radius))
+    return standing
 
 
 def options_of(
     team: TeamView,
     name: str,
-    places: list[tuple[FloatArray, float]],
+    standing: list[tuple[FloatArray, float]],
     extra: FloatArray | None = None,
 ) -> UsableCandidates | str:
     """Return the candidates of a robot, or why it has to stay."""
@@ -79,7 +79,7 @@ def options_of(
     if not len(points):
         return f'no candidate is usable ({dropped})'
     prediction = view.motion.predict(view.state, points, team.step_time)
-    free = free_of_robots(points, view.radius, places)
+    free = free_of_robots(points, view.radius, standing)
     allowed = prediction.reached & free & (prediction.lengths > 0)
     if allowed.any():
         allowed &= paths_apart(team, name, prediction.positions, {})
@@ -106,10 +106,10 @@ def usable_options(
 
     extra: further waypoints (n, 3) of a robot; kept: reduces its predicted trajectories.
     """
-    places = waiting_places(team)
+    standing = waiting_places(team)
     options = {}
     for name in team.planning():
-        found = options_of(team, name, places, extra(name))
+        found = options_of(team, name, standing, extra(name))
         if isinstance(found, str):
             decision.robots[name] = stay(team.robots[name], f'stays: {found}')
         else:

@@ -18,14 +18,14 @@ _LATEST = 10
 
 
 def free_of_robots(
-    points: FloatArray, radius: float, places: list[tuple[FloatArray, float]]
+    points: FloatArray, radius: float, standing: list[tuple[FloatArray, float]]
 ) -> BoolArray:
     """Return which waypoints (W, 3) keep the radii away from other robots' final positions."""
     free = np.ones(len(points), dtype=bool)
-    for place, other in places:
+    for point, other in standing:
         reach = radius + other
         if reach > 0.0:
-            offset = points - place
+            offset = points - point
             free &= (offset * offset).sum(axis=1) >= reach * reach
     return free
 
@@ -161,7 +161,7 @@ def paths_of(
     team: TeamView, name: str, others: Mapping[str, FloatArray]
 ) -> list[tuple[FloatArray, float]]:
     """Return paths or positions of the other robots, (n, 3), and their radii."""
-    paths = [(place[None, :], radius) for place, radius in team.taken]
+    paths = [(point[None, :], radius) for point, radius in team.taken]
     for other in team.names():
         robot = team.robots[other]
         if other in others:

@@ -62,23 +62,23 @@ class Tour(Planner):
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
-        decision, places = Decision(step=team.step), waiting_places(team)
+        decision, standing = Decision(step=team.step), waiting_places(team)
         self._refused.clear()
         prizes = self._prizes(team)
         again = prizes is None
         if prizes is None:
             prizes = self.plan(team)
         for name in team.planning():
-            chosen = self._next(team, name, prizes, places, decision)
+            chosen = self._next(team, name, prizes, standing, decision)
             if chosen is None and not again:
                 prizes, again = self.plan(team), True
-                chosen = self._next(team, name, prizes, places, decision)
+                chosen = self._next(team, name, prizes, standing, decision)
             if chosen is None:
                 self._target.pop(name, None)
                 why = SAVES_BATTERY if name in self._refused else NOTHING_LEFT
                 chosen = stay(team.robots[name], f'stays: {why}')
             decision.robots[name] = chosen
-            places.append((chosen.waypoint, team.robots[name].radius))
+            standing.append((chosen.waypoint, team.robots[name].radius))
         return explain(decision)
 
     def finished(self, team: TeamView) -> str | None:
@@ -86,7 +86,7 @@ class Tour(Planner):
         reason = super().finished(team)
         if reason is not None:
             return reason
-        lattice = self._squares(team)
+        lattice = self._lattice_of(team)
         left = float((lattice.trust * lattice.unseen(team.exploration).ravel()).sum())
         if left > self.settings.gain_threshold:
             return None
@@ -97,7 +97,7 @@ class Tour(Planner):
             f'unseen and reachable ({explored:.1f} % of the environment is explored)',
         )
 
-    def _squares(self, team: TeamView) -> Lattice:
+    def _lattice_of(self, team: TeamView) -> Lattice:
         if self._lattice is None or self._area is not team.area:
             # A change of the area makes all plans obsolete.
             self._lattice, self._area = Lattice(team.exploration, *lanes_of(team)[1:]), team.area
@@ -106,7 +106,7 @@ class Tour(Planner):
 
     def _prizes(self, team: TeamView) -> FloatArray | None:
         """Return the present prizes of the plan; None if it has to be made again."""
-        lattice, number = self._squares(team), len(self._chosen)
+        lattice, number = self._lattice_of(team), len(self._chosen)
         left = np.array([index for route in self.routes.values() for index in route], np.int64)
         if set(self.searching(team)) != set(self.routes):
             return None
@@ -126,7 +126,7 @@ class Tour(Planner):
 
     def plan(self, team: TeamView) -> FloatArray:
         """Plan the tours of all robots from their present or final positions; return the prizes."""
-        lattice, names, heavy = self._squares(team), self.searching(team), self.heavy(team)
+        lattice, names, heavy = self._lattice_of(team), self.searching(team), self.heavy(team)
         number = len(self._chosen)
         before = {
             name: self._chosen[[i for i in route if i < number]].tolist()
@@ -157,14 +157,14 @@ class Tour(Planner):
         speeds = np.array([team.robots[name].motion.settings.speed for name in names])
         homes = np.array(ends) if np.isfinite(budgets).any() else None
         # Lanes are those of the lattice.
-        points, places = self.points @ lattice.turn, np.array(starts) @ lattice.turn
+        points, origins = self.points @ lattice.turn, np.array(starts) @ lattice.turn
         homes = None if homes is None else homes @ lattice.turn
-        rows = {square: row for row, square in enumerate(self._chosen.tolist())}
+        rows = {cell: row for row, cell in enumerate(self._chosen.tolist())}
         known = [
             np.array([rows[i] for i in before.get(name, []) if i in rows], np.int64)
             for name in names
         ]
-        routes = plan_ways(points, prizes, places, np.array(budgets), homes, speeds, known)
+        routes = plan_ways(points, prizes, origins, np.array(budgets), homes, speeds, known)
         self.routes = {name: route.tolist() for name, route in zip(names, routes)}
         return self._planned
 
@@ -173,7 +173,7 @@ class Tour(Planner):
         team: TeamView,
         name: str,
         prizes: FloatArray,
-        places: list[tuple[FloatArray, float]],
+        standing: list[tuple[FloatArray, float]],
         decision: Decision,
     ) -> RobotDecision | None:
         """Return the next leg of a robot's tour, without cells that lost their prize, or None."""
@@ -187,16 +187,16 @@ class Tour(Planner):
             while route and self._straight(here[:d], passed[-1], route[0]):
                 passed.append(route.pop(0))
             index = passed[-1]
-            place = np.array(here)
+            position = np.array(here)
             if d == 2:
-                place[2] = view.height
-            place[:d] = self.points[index]
-            waypoint, whole = self._leg(team, view, place)
+                position[2] = view.height
+            position[:d] = self.points[index]
+            waypoint, whole = self._leg(team, view, position)
             moved = view.motion.keep_out.moved_out(here, waypoint)
             point = np.array([here if moved is None else moved])
             prediction = view.motion.predict(view.state, point, team.step_time)
             usable = prediction.reached[0] and prediction.lengths[0] > 0
-            usable = usable and free_of_robots(point, view.radius, places)[0]
+            usable = usable and free_of_robots(point, view.radius, standing)[0]
             if usable and not affordable(team, name, prediction, prediction.reached)[0]:
                 self._refused.add(name)
                 continue
@@ -210,12 +210,12 @@ class Tour(Planner):
                     return single_choice(*detour, 0, PASSES)
                 usable = False
             if not usable or not np.array_equal(point[0], waypoint):
-                squares = [self._chosen[i] for i in passed if i < len(self._chosen)]
-                self._squares(team).trust[squares] *= 0.5
+                cells = [self._chosen[i] for i in passed if i < len(self._chosen)]
+                self._lattice_of(team).trust[cells] *= 0.5
             elif not whole:
                 route.insert(0, index)
             if usable:
-                self._target[name] = (place if whole else waypoint)[:d]
+                self._target[name] = (position if whole else waypoint)[:d]
                 reason = self._reason(name, here[:d], index, prizes)
                 chosen = single_choice(point, prediction, 0, reason)
                 chosen.tour = self._rest(view, point[0], route)
@@ -223,26 +223,28 @@ class Tour(Planner):
         return None
 
     def _reason(self, name: str, here: FloatArray, index: int, prizes: FloatArray) -> str:
-        def told(place: int) -> str:
-            numbers = ', '.join(f'{value:.4g}' for value in self.points[place])
+        def named(stop: int) -> str:
+            numbers = ', '.join(f'{value:.4g}' for value in self.points[stop])
             return f'({numbers}) m'
 
-        def gain(place: int) -> str:
-            potential = 'a potential target of mass ' if place >= len(self._chosen) else ''
-            return f'{potential}{prizes[place]:.2g}' + ('' if potential else ' targets')
+        def gain(stop: int) -> str:
+            potential = 'a potential target of mass ' if stop >= len(self._chosen) else ''
+            return f'{potential}{prizes[stop]:.2g}' + ('' if potential else ' targets')
 
-        rest = [place for place in self.routes[name] if place != index]
-        reason = f'next on its tour is {told(index)}, where it expects {gain(index)}'
+        rest = [stop for stop in self.routes[name] if stop != index]
+        reason = f'next on its tour is {named(index)}, where it expects {gain(index)}'
         if rest:
-            reason += f'; then {told(rest[0])}' + (f' and {len(rest) - 1} more' * (len(rest) > 1))
-        owners = {place: owner for owner, route in self.routes.items() for place in route}
-        others = np.array([place for place in owners if place != index], np.int64)
+            reason += f'; then {named(rest[0])}' + (f' and {len(rest) - 1} more' * (len(rest) > 1))
+        owners = {stop: owner for owner, route in self.routes.items() for stop in route}
+        others = np.array([stop for stop in owners if stop != index], np.int64)
         if len(others):
             gaps = np.linalg.norm(self.points[others] - here, axis=1)
             best = int(np.argmax(prizes[others] / np.maximum(gaps, 1e-9)))
             other, gap = int(others[best]), gaps[best]
             when = 'later' if owners[other] == name else f'assigned to {owners[other]}'
-            reason += f'; the alternative {told(other)}, {gain(other)}, {gap:.3g} m away, is {when}'
+            reason += (
+                f'; the alternative {named(other)}, {gain(other)}, {gap:.3g} m away, is {when}'
+            )
         return reason
 
     def _rest(self, view: RobotView, start: FloatArray, route: list[int]) -> FloatArray:
@@ -250,9 +252,9 @@ class Tour(Planner):
         corners: list[tuple[float, float, float]] = []
         here, keep_out = start, view.motion.keep_out
         for index in route[:MOST_DRAWN]:
-            place = np.array(start)
-            place[: self.points.shape[1]] = self.points[index]
-            moved = keep_out.moved_out(here, place)
+            position = np.array(start)
+            position[: self.points.shape[1]] = self.points[index]
+            moved = keep_out.moved_out(here, position)
             if moved is not None:
                 corners += keep_out.route(here, moved)
                 here = moved
@@ -263,18 +265,20 @@ class Tour(Planner):
         bent = np.linalg.norm(there - here) + np.linalg.norm(end - there)
         return bool(bent <= 1.001 * np.linalg.norm(end - here))
 
-    def _leg(self, team: TeamView, view: RobotView, place: FloatArray) -> tuple[FloatArray, bool]:
+    def _leg(
+        self, team: TeamView, view: RobotView, position: FloatArray
+    ) -> tuple[FloatArray, bool]:
         """Return the waypoint of a leg, and whether it leads all the distance to a position.
 
         It is a quarter of the arrival radius too far, so that the robot cuts corners less.
         """
         here, turning = view.state.pose.position, view.arrival_radius
-        gap = max(float(np.linalg.norm(place - here)), 1e-9)
-        longest = max(self._squares(team).pitch, LEG * turning)
+        gap = max(float(np.linalg.norm(position - here)), 1e-9)
+        longest = max(self._lattice_of(team).pitch, LEG * turning)
         whole = turning == 0.0 or gap <= 1.5 * longest
-        end = place + (place - here) * 0.25 * turning / gap
+        end = position + (position - here) * 0.25 * turning / gap
         if not whole:
-            end = here + (place - here) * longest / gap
+            end = here + (position - here) * longest / gap
         low, high = team.bounds.T
         end[: team.dimension] = np.clip(end[: team.dimension], low, high)
         return end, whole
