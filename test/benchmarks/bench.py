@@ -11,8 +11,10 @@ AREAS = ('filter', 'planner', 'scale', 'cuboid', 'drivers', 'system', 'view')
 
 def show(row):
     text = f'{row["name"]:<36} {row["value"]:>12.4g} {row["unit"]:<6}'
-    if row['baseline'] is not None:
+    if row['ratio'] is not None:
         text += f' {row["ratio"]:>10.4g} x faster than {row["baseline"]}'
+    elif row['baseline'] is not None:
+        text += f' {"":>10} {row["baseline"]}'
     return text
 
 

@@ -1,10 +1,11 @@
-"""Speed of the filter: medians of repeated steps, those of `ic_phd` from the same state."""
+"""Speed of the filters next to Stone Soup: medians of steps, those of `ic_phd` from one state."""
 
 import time
+from functools import partial
 
 import numpy as np
 from quality_conditions import NOISES
-from timing import entry, few, median_time, times_of
+from timing import against, entry, few, median_time, times_of
 
 from maasi_filter import (
     AgentMeasurement,
@@ -18,7 +19,7 @@ from maasi_filter import (
 from maasi_filter.ic_phd.corrector import phd_correct, phd_scan
 
 BOUNDS = np.array([[0.0, 260.0]] * 3)
-TARGETS, DETECTED = 12, 3
+TARGETS, DETECTED, CLUTTER = 12, 3, 1e-6
 # The papers' 3D sensor; the wide clouds of angles in radians cost most.
 RADIANS, DEGREES = (
     SensorSettings(noise=NOISES[name]).build('bench', 3) for name in ('radians', 'degrees')
@@ -70,21 +71,65 @@ def phd_update_time():
 
     def update():
         scan = phd_scan(member.values, member.sensor, member.pose)
-        return weights * phd_correct(particles, weights, scan, np.full(DETECTED, 1e-6))[0]
+        return weights * phd_correct(particles, weights, scan, np.full(DETECTED, CLUTTER))[0]
 
     return median_time(update, 200)
 
 
-def pmb_step_time(device, number, robots, steps):
+def smc_phd_update_time(repeats):
+    """Return the time of Stone Soup's update of the same particles by the same detections [s]."""
+    from stone_soup_quality import START, detections_of
+    from stonesoup.types.array import StateVectors
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.multihypothesis import MultipleHypothesis
+    from stonesoup.types.numeric import Probability
+    from stonesoup.types.prediction import ParticleStatePrediction
+    from stonesoup.updater.particle import SMCPHDUpdater
+
+    particles, weights, (member,) = middle_of_search(10_000, 1)
+    state = ParticleStatePrediction(StateVectors(particles.T), weight=weights, timestamp=START)
+    seen = detections_of(member, START)
+    hypotheses = MultipleHypothesis([SingleHypothesis(state, detection) for detection in seen])
+    updater = SMCPHDUpdater(
+        seen[0].measurement_model,
+        # Constant, as it only takes one; ours is pi at each particle.
+        prob_detect=Probability(0.9),
+        clutter_intensity=CLUTTER,
+        num_samples=len(particles),
+        resampler=None,
+    )
+    return median_time(lambda: updater.update(hypotheses), repeats)
+
+
+def step_time(search, device, number, robots, steps):
     """Return the time of a search's steps [s]; the first ten are not counted."""
     generator = np.random.default_rng(3)
     targets = 20.0 + 220.0 * generator.random((number, 3))
-    search = PmbFilter(FilterSettings(method='pmb'), BOUNDS, np.random.default_rng(1))
     times = []
     for step in range(steps):
         members = batch(generator, device, targets, robots, device.covariance, step * robots)
-        times += times_of(lambda: search.step(members, 1, float(step)), 1)  # noqa: B023
+        times += times_of(lambda: search(members, float(step)), 1)  # noqa: B023
     return float(np.median(times[10:]))
+
+
+def pmb_step_time(*case):
+    search = PmbFilter(FilterSettings(method='pmb'), BOUNDS, np.random.default_rng(1))
+    return step_time(lambda members, now: search.step(members, 1, now), *case)
+
+
+def jpda_step_time(*case):
+    """Return the time of steps of Stone Soup's JPDA tracker with the same detections [s]."""
+    from stone_soup_quality import StoneSoup
+
+    trackers = []
+
+    def step(members, now):
+        if not trackers:
+            trackers.append(StoneSoup(members[0], BOUNDS, 0.0))
+        for member in members:
+            trackers[0].step(member, now)
+
+    return step_time(step, *case)
 
 
 def run(share=1.0):
@@ -97,10 +142,19 @@ def run(share=1.0):
         ('ic_phd_step_100k', phd_step_time, 100_000, 1, few(share, 30), None),
         ('ic_phd_step_1m', phd_step_time, 1_000_000, 1, few(share, 9), None),
         ('ic_phd_step_ten_robots', phd_step_time, 10_000, 10, few(share, 100), 1),
-        ('ic_phd_update', phd_update_time),
-        ('pmb_step_degrees', pmb_step_time, DEGREES, TARGETS, 1, steps),
-        ('pmb_step_radians', pmb_step_time, RADIANS, TARGETS, 1, steps),
-        ('pmb_step_100_targets', pmb_step_time, DEGREES, 100, 1, max(12, few(share, 200))),
         ('pmb_step_ten_robots', pmb_step_time, DEGREES, TARGETS, 10, steps),
     ):
         yield entry(name, 1e3 * function(*arguments))
+    yield against(
+        'ic_phd_update',
+        1e3 * phd_update_time(),
+        'Stone Soup, SMCPHDUpdater',
+        lambda: 1e3 * smc_phd_update_time(few(share, 3)),
+    )
+    for name, *case in (
+        ('pmb_step_degrees', DEGREES, TARGETS, 1, steps),
+        ('pmb_step_radians', RADIANS, TARGETS, 1, steps),
+        ('pmb_step_100_targets', DEGREES, 100, 1, max(12, few(share, 200))),
+    ):
+        ours, theirs = 1e3 * pmb_step_time(*case), partial(jpda_step_time, *case)
+        yield against(name, ours, 'Stone Soup, JPDA', lambda: 1e3 * theirs())  # noqa: B023

@@ -33,6 +33,7 @@ from maasi_sim.search import search
 
 HEAD = 'condition', 'runs', '', 'mean GOSPA [m]', 'at the end [m]', 'step [ms]'
 CUTOFF = 10.0
+ORDER = [2, 1, 0]  # elevation, bearing, range
 START = datetime.datetime(2026, 1, 1)
 # Setting of Stone Soup: the least clutter in a scan, as of `pmb`.
 LEAST_CLUTTER = 0.05
@@ -46,6 +47,20 @@ def probability(scan, state):
     """Return pi at a track, by the sensor and its pose at the scan that is processed."""
     place = np.asarray(state.mean, float).reshape(1, 3)
     return min(float(scan.sensor.detection.probability(place, scan.pose)[0]), 0.999)
+
+
+def detections_of(scan, now):
+    """Return the detections of a scan, with the model of its sensor and pose."""
+    model = CartesianToElevationBearingRange(
+        ndim_state=3,
+        mapping=(0, 1, 2),
+        noise_covar=CovarianceMatrix(scan.sensor.covariance[np.ix_(ORDER, ORDER)]),
+        translation_offset=scan.pose.position.reshape(3, 1),
+    )
+    return [
+        Detection(row[ORDER].reshape(3, 1), timestamp=now, measurement_model=model)
+        for row in np.asarray(scan.values)
+    ]
 
 
 class ViewedHypothesiser(PDAHypothesiser):
@@ -101,18 +116,7 @@ class StoneSoup:
     def step(self, scan, seconds):
         self.hypothesiser.scan = self.deleter.scan = scan
         now = START + datetime.timedelta(seconds=seconds)
-        # Stone Soup's order is elevation, bearing, range.
-        order = [2, 1, 0]
-        model = CartesianToElevationBearingRange(
-            ndim_state=3,
-            mapping=(0, 1, 2),
-            noise_covar=CovarianceMatrix(scan.sensor.covariance[np.ix_(order, order)]),
-            translation_offset=scan.pose.position.reshape(3, 1),
-        )
-        detections = {
-            Detection(row[order].reshape(3, 1), timestamp=now, measurement_model=model)
-            for row in np.asarray(scan.values)
-        }
+        detections = set(detections_of(scan, now))
         self.tracker.detector_iter = iter([(now, detections)])
         next(self.tracker)
 

@@ -48,3 +48,15 @@ def real_time_factor(name, folder, seconds, *options, watch=None):
 def entry(name, value, unit='ms', baseline=None, ratio=None):
     """Return a result; baseline is what it was compared with, and ratio its time over ours."""
     return {'name': name, 'value': value, 'unit': unit, 'baseline': baseline, 'ratio': ratio}
+
+
+def against(name, value, peer, measure):
+    """Return the entry of a time [ms] with its ratio to a peer's, which `measure` returns [ms].
+
+    A peer that is not installed is named as not measured.
+    """
+    try:
+        theirs = measure()
+    except ImportError as error:
+        return entry(name, value, 'ms', f'{peer}: not measured, {error}')
+    return entry(name, value, 'ms', f'{peer}, {theirs:.3g} ms', theirs / value)
