@@ -29,7 +29,7 @@ from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
 from maasi_planner.node.search_action import SearchAction, offer_services
 from maasi_planner.node.search_modes import Mode, SearchModes
-from maasi_planner.node.team_goals import HeardState
+from maasi_planner.node.team_goals import ReceivedState
 from maasi_planner.node.views import PlannerViews
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.robot_plan import PresentRobot
@@ -97,7 +97,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._begin_anew()
 
     def _begin_anew(self) -> None:
-        self._heard: dict[str, HeardState] = {}
+        self.states: dict[str, ReceivedState] = {}
         self._gates: dict[str, StampGate] = {}
         self._away: set[str] = set(self.coordinator.names)
         self._taken_step = -1
@@ -226,8 +226,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         answer = f'{word}: {", ".join(follow)}'
         for name in follow:
             if name in self._away:
-                heard = self._heard.get(name)
-                why = heard.reason if heard is not None else f'no {name}/state yet'
+                received = self.states.get(name)
+                why = received.reason if received is not None else f'no {name}/state yet'
                 answer += f'; {name} is unavailable: {why or "no state received"}'
         for text in self._orders.warnings(follow):
             answer += f'; {text}, which continues'
@@ -303,7 +303,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 'the next state follows it',
             )
             return
-        before = self._heard.get(name)
+        before = self.states.get(name)
         if before is not None and message.step < before.step:
             back = before.step - message.step
             if not self.settings.lockstep and back <= 1.0 / self.settings.step:
@@ -314,7 +314,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 return
             self._restart(f'{name}/state.step went back from {before.step} to {message.step}')
         goal = message.goal_id, message.goal_status, message.reason
-        self._heard[name] = HeardState(
+        self.states[name] = ReceivedState(
             message.step, state, *goal, Silence(self), float(message.battery)
         )
         if self.settings.lockstep:
@@ -344,8 +344,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             return
         now = time.monotonic()
         if not self.settings.lockstep:
-            for name in sorted(self._heard):
-                silent = self._heard[name].silence.length
+            for name in sorted(self.states):
+                silent = self.states[name].silence.length
                 if silent > self.settings.state_timeout:
                     self._leave(name, f'no {name}/state for {silent:.1f} s')
             problem = self._guard.problem(now)
@@ -371,7 +371,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 explored=self.coordinator.exploration.explored_fraction(),
             ),
             self.coordinator.ended or '',
-            not self._heard or len(self._away) < len(self.coordinator.names),
+            not self.states or len(self._away) < len(self.coordinator.names),
         )
 
     # ---- a step ------------------------------------------------------------------------------
@@ -382,7 +382,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             return
         step = int(expected.step)
         names = [name for name in expected.robots if name in self.coordinator.names]
-        if any(name not in self._heard or self._heard[name].step != step for name in names):
+        if any(name not in self.states or self.states[name].step != step for name in names):
             return
         if names and self._others.missing(step, expected.robots):
             return
@@ -391,7 +391,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             if name not in names:
                 self._leave(name, 'not in this step')
         for name in names:
-            self._join_or_leave(name, self._heard[name].status, self._heard[name].reason)
+            self._join_or_leave(name, self.states[name].status, self.states[name].reason)
         self._plan_step(
             step,
             stamp_from_ros(expected.stamp),
@@ -405,7 +405,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         present = [name for name in self.coordinator.names if name not in self._away]
         if not present:
             return
-        step = min(self._heard[name].step for name in present)
+        step = min(self.states[name].step for name in present)
         if step > self._taken_step:
             self._plan_step(
                 step, stamp_of_step(step, self.settings.step), None, self._others.taken(step, None)
@@ -421,15 +421,15 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         for name in self.coordinator.names:
             if name in self._away:
                 continue
-            heard = self._heard[name]
-            free = self._orders.is_free(name, heard, step)
-            if free and self._orders.send_home(name, heard.state, header):
+            received = self.states[name]
+            free = self._orders.is_free(name, received, step)
+            if free and self._orders.send_home(name, received.state, header):
                 free = False
             mode = self.modes.of[name]
             robots[name] = PresentRobot(
-                heard.state,
+                received.state,
                 free,
-                heard.charge,
+                received.charge,
                 searches=mode is Mode.SEARCHING and not self._held,
                 returns=mode not in (Mode.WAITING, Mode.STOPPED),
             )

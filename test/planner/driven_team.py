@@ -166,7 +166,7 @@ class World(Player):
                 and all(robot.go_to.server_is_ready() for robot in self.robots.values())
                 and self.search.server_is_ready()
                 and self.node.count_publishers('decisions') == 1
-                and set(self.planner._heard) == set(ROBOTS)
+                and set(self.planner.states) == set(ROBOTS)
             ),
             'not connected',
         )
@@ -206,9 +206,9 @@ class World(Player):
 
     def pass_steps(self, steps):
         """Let the robots do some steps, each heard by the planner."""
-        heard = self.planner._heard
+        heard = self.planner.states
         last = min(item.step for item in heard.values()) + steps
-        self.until(lambda: min(item.step for item in self.planner._heard.values()) >= last)
+        self.until(lambda: min(item.step for item in self.planner.states.values()) >= last)
 
     def logged(self, text):
         return [item.msg for item in self._logs if text in item.msg]

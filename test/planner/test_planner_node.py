@@ -131,7 +131,7 @@ class Team(Player):
     def tell(self, step):
         for name in ROBOTS:
             self.states[name].publish(state_of(name, step))
-        self.until(lambda: [item.step for item in self.tested._heard.values()] == [step, step])
+        self.until(lambda: [item.step for item in self.tested.states.values()] == [step, step])
 
     def begin(self):
         """Return once both robots are sent on their way."""

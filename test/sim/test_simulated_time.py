@@ -71,7 +71,7 @@ def test_a_silent_robot_is_left_out_in_simulated_time(world):
     state.pose.pose.position.x, state.pose.pose.position.y = 0.4, 0.3
     state.pose.pose.orientation.w = 1.0
     world.publisher(AgentState, '/rover/state').publish(state)
-    world.until(lambda: 'rover' in node._heard and 'rover' not in node._away)
+    world.until(lambda: 'rover' in node.states and 'rover' not in node._away)
     world.wait_in_vain()
     assert 'rover' not in node._away
     world.tell(2 * SECOND)

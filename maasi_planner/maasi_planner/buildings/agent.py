@@ -56,7 +56,7 @@ def rewards(
     settings: CuboidMethodSettings,
     hazard: HazardSettings,
     flight_steps: int,
-    heard: Sequence[Broadcast],
+    received: Sequence[Broadcast],
     draws: FloatArray,
 ) -> BoolArray:
     """Return r(n) for all cuboids, (N,): (11) to (14), for random numbers `draws` in [0, 1]."""
@@ -64,9 +64,9 @@ def rewards(
     failing = hazard.failure(flight_steps + settings.horizon)
     low = failing <= 0.5
     holds = low if settings.condition == 'low_hazard' else not low
-    for n in {n for message in heard for n in message.plan}:
+    for n in {n for message in received for n in message.plan}:
         product, expected = 1.0, 0.0
-        for message in heard:
+        for message in received:
             if n in message.plan:
                 fails = message.hazard.failure(message.flight_steps + message.plan[n] - 1)  # (11)
                 product *= fails
@@ -217,24 +217,27 @@ class SearchAgent:
             )
 
     def decide(
-        self, heard: Sequence[Broadcast], rng: np.random.Generator, wanted: BoolArray | None = None
+        self,
+        received: Sequence[Broadcast],
+        rng: np.random.Generator,
+        wanted: BoolArray | None = None,
     ) -> Plan:
         """Decide for the last observed step; `wanted` (N,) replaces the drawn rewards."""
         fails, minutes = rng.random(2)
         if self.activity is not Activity.RECHARGING:
-            for message in heard:
+            for message in received:
                 self.visited |= message.visited  # (15i)
         self._battery(float(fails), float(minutes))
-        heard = [message for message in heard if message.searching]
+        received = [message for message in received if message.searching]
         if wanted is None:
             draws = rng.random(len(self.visited))
-            wanted = rewards(self.settings, self.hazard, self.flight_steps, heard, draws)
-        return self.follow(self.solver.solve(self.problem(heard, wanted)))
+            wanted = rewards(self.settings, self.hazard, self.flight_steps, received, draws)
+        return self.follow(self.solver.solve(self.problem(received, wanted)))
 
-    def problem(self, heard: Sequence[Broadcast], wanted: BoolArray) -> Problem:
+    def problem(self, received: Sequence[Broadcast], wanted: BoolArray) -> Problem:
         """Return the problem of the step, with rewards (N,) of 1 for `wanted` cuboids."""
         homing = self.activity is not Activity.SEARCHING
-        self.target = self.home if homing else self._aim(heard)
+        self.target = self.home if homing else self._aim(received)
         if self.settings.around_corners and (self.target != self.position).any():
             self.target = self._paths.first_corner(self.position, self.target)
         return Problem(
@@ -250,13 +253,13 @@ class SearchAgent:
             put_off=self.put_off,
         )
 
-    def _aim(self, heard: Sequence[Broadcast]) -> FloatArray:
+    def _aim(self, received: Sequence[Broadcast]) -> FloatArray:
         centres, unvisited = self.mission.centres, np.flatnonzero(~self.visited)
-        if not heard and len(unvisited):
+        if not received and len(unvisited):
             offset = centres[unvisited] - self._predicted()
             return centres[unvisited[np.argmin((offset * offset).sum(axis=1))]]
         predicted = self.settings.assignment == 'predicted'
-        points = {m.robot: m.predicted if predicted else m.position for m in heard}
+        points = {m.robot: m.predicted if predicted else m.position for m in received}
         points[self.name] = self._predicted() if predicted else self.position
         order = sorted(points)
         stacked = np.stack([points[name] for name in order])

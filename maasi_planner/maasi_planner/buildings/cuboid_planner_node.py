@@ -110,7 +110,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._observed = False
         self._decided_step = -1
         self._link: SearchLink | None = None
-        self._heard: SearchLinkArray | None = None
+        self._received: SearchLinkArray | None = None
         self._command: TwistStamped | None = None
         self._sent_at = 0.0
         self._solve_time = 0.0
@@ -143,7 +143,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._odometry: Subscription = self.create_subscription(
             Odometry, 'odom', self._on_odometry, sensor_reader(lockstep)
         )
-        self.create_subscription(SearchLinkArray, 'link/rx', self._on_heard, RELIABLE)
+        self.create_subscription(SearchLinkArray, 'link/rx', self._on_link, RELIABLE)
         self.expect_publisher(self._odometry.topic_name)
         offer_services(self, [self.name], self._handle_command)
         if not lockstep:
@@ -245,7 +245,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._state = (step, pose, pose.rotation() @ velocity)
         self._wanted_step = step
 
-    def _on_heard(self, message: SearchLinkArray) -> None:
+    def _on_link(self, message: SearchLinkArray) -> None:
         if not self.active:
             return
         if int(message.step) != self._wanted_step:
@@ -253,7 +253,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
                 'stale link', f'link/rx.step: read {message.step}, allowed is {self._wanted_step}'
             )
             return
-        self._heard = message
+        self._received = message
         self._try_step()
 
     def _check_link(self) -> None:
@@ -280,8 +280,12 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
                 self._link_publisher.publish(self._link)
                 self._command_publisher.publish(self._command)
             return
-        if self._decided_step != step and self._heard is not None and self._heard.step == step:
-            self._decide(self._decoded(self._heard))
+        if (
+            self._decided_step != step
+            and self._received is not None
+            and self._received.step == step
+        ):
+            self._decide(self._decoded(self._received))
 
     def _broadcast(self, step: int) -> None:
         assert self._state is not None

@@ -13,7 +13,7 @@ from maasi_msgs.msg import AgentState
 from maasi_planner.coordinator import Coordinator
 from maasi_planner.motion import RobotState
 from maasi_planner.node.search_modes import Mode, SearchModes
-from maasi_planner.node.team_goals import GoalProgress, HeardState, TeamGoals
+from maasi_planner.node.team_goals import GoalProgress, ReceivedState, TeamGoals
 from maasi_planner.node_settings import PlannerNodeSettings
 
 
@@ -137,15 +137,15 @@ class Orders:
         self.goals.forget(name)
         self._coordinator.robots[name].plan.staying = True
 
-    def is_free(self, name: str, heard: HeardState, step: int) -> bool:
+    def is_free(self, name: str, received: ReceivedState, step: int) -> bool:
         """Return whether a robot has no goal from any client."""
         plan, logger = self._coordinator.robots[name].plan, self._node.get_logger()
         # A staying robot has no goal: its last one has ended.
         if not plan.staying and self.goals.has(name):
             number = plan.goal_id
-            if heard.goal == number:
+            if received.goal == number:
                 self._refused_since, self.refused_for = None, 0.0
-            course = self.goals.course(name, number, heard)
+            course = self.goals.course(name, number, received)
             if course is GoalProgress.UNDER_WAY:
                 return False
             if course is GoalProgress.ENDED:
@@ -157,27 +157,27 @@ class Orders:
                 self.refuse(name)
         number = self._homing.get(name, -1)
         if number > 0:
-            course = self.goals.course(name, number, heard)
+            course = self.goals.course(name, number, received)
             if course is not GoalProgress.UNDER_WAY:
-                ended = course is GoalProgress.ENDED and heard.status != AgentState.ABORTED
+                ended = course is GoalProgress.ENDED and received.status != AgentState.ABORTED
                 self._homing[name] = 0 if ended else -1
         if number >= 0:
             return False
-        if self.goals.driven(heard):
-            if not self.goals.ends(name, heard):
-                self._on_external_goal(name, heard, step)
+        if self.goals.driven(received):
+            if not self.goals.ends(name, received):
+                self._on_external_goal(name, received, step)
             return False
         if self.external_goals.pop(name, None) is not None:
             logger.info(f'{name} accepts goals of the planner again')
         return True
 
-    def _on_external_goal(self, name: str, heard: HeardState, step: int) -> None:
-        new = self.external_goals.get(name) != heard.goal
-        self.external_goals[name] = heard.goal
+    def _on_external_goal(self, name: str, received: ReceivedState, step: int) -> None:
+        new = self.external_goals.get(name) != received.goal
+        self.external_goals[name] = received.goal
         if self._modes.of[name] is Mode.SEARCHING:
             self._coordinator.robots[name].on_external_goal(step)
         if new:
             self._node.get_logger().warning(
-                f'{name} follows goal {heard.goal} of another client: it measures, but '
+                f'{name} follows goal {received.goal} of another client: it measures, but '
                 'receives no goals from the planner until that goal has ended'
             )

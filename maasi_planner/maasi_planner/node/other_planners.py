@@ -23,11 +23,11 @@ class OtherPlanners:
         self,
         node: LockstepLifecycleNode[PlannerNodeSettings],
         names: Collection[str],
-        heard: Callable[[], None],
+        on_change: Callable[[], None],
     ) -> None:
         self._node = node
         self._own = sorted(names)
-        self._heard = heard
+        self._on_change = on_change
         self._publishers: dict[str, Publisher] = {}
         self.reset()
 
@@ -74,7 +74,7 @@ class OtherPlanners:
         while len(known) > 2:
             del known[min(known)]
         self._silence[name] = Silence(node)
-        self._heard()
+        self._on_change()
 
     def missing(self, step: int, robots: Collection[str]) -> bool:
         """Return whether destinations are missing in lockstep; later names: of the last step."""

@@ -27,7 +27,7 @@ _PATIENCE = 1.0
 
 
 @dataclass
-class HeardState:
+class ReceivedState:
     """Last received state of a robot."""
 
     step: int
@@ -37,7 +37,7 @@ class HeardState:
     reason: str
     silence: Silence
     charge: float  # of the battery, 0 to 1; otherwise unknown
-    heard_at: float = field(default_factory=time.monotonic)
+    received_at: float = field(default_factory=time.monotonic)
 
 
 class GoalProgress(Enum):
@@ -119,44 +119,48 @@ class TeamGoals:
         """Return whether a robot has a goal of ours whose end was not observed yet."""
         return name in self._sent
 
-    def course(self, name: str, number: int, heard: HeardState) -> GoalProgress:
+    def course(self, name: str, number: int, received: ReceivedState) -> GoalProgress:
         """Return the progress of goal `number` of a robot, by its last received state."""
         sent = self._sent.get(name)
         if sent is None or sent.number != number:
             return GoalProgress.LOST
-        same = heard.goal == number
+        same = received.goal == number
         if self._lockstep:
             if same:
-                return GoalProgress.ENDED if heard.status in ENDED else GoalProgress.UNDER_WAY
-            return self._other(name, sent, heard)
+                return GoalProgress.ENDED if received.status in ENDED else GoalProgress.UNDER_WAY
+            return self._other(name, sent, received)
         if sent.accepted_at is None:
             return GoalProgress.UNDER_WAY
         if sent.status == GoalStatus.STATUS_ABORTED and sent.reason == REPLACED:
             # The last state before the result shows the preempted goal.
             return (
-                GoalProgress.REPLACED if heard.heard_at > sent.ended_at else GoalProgress.UNDER_WAY
+                GoalProgress.REPLACED
+                if received.received_at > sent.ended_at
+                else GoalProgress.UNDER_WAY
             )
-        after = heard.heard_at > sent.accepted_at
-        if same and after and heard.status in ENDED:
+        after = received.received_at > sent.accepted_at
+        if same and after and received.status in ENDED:
             return GoalProgress.ENDED
         if sent.status == GoalStatus.STATUS_ABORTED and not same:
             # Apparently refused: it was never the goal of the robot.
-            return self._other(name, sent, heard, after)
+            return self._other(name, sent, received, after)
         if sent.status is not None:
-            if heard.status == AgentState.MOVING:
+            if received.status == AgentState.MOVING:
                 # A state from before the end, or with a goal of another client.
                 return GoalProgress.UNDER_WAY if same or not after else GoalProgress.REPLACED
             return GoalProgress.ENDED
         if same or time.monotonic() - sent.accepted_at < _PATIENCE:
             return GoalProgress.UNDER_WAY
-        return self._other(name, sent, heard)
+        return self._other(name, sent, received)
 
-    def _other(self, name: str, sent: _Sent, heard: HeardState, after: bool = True) -> GoalProgress:
+    def _other(
+        self, name: str, sent: _Sent, received: ReceivedState, after: bool = True
+    ) -> GoalProgress:
         """Return the progress of a goal that a robot does not have, by a state after its answer."""
-        if heard.status != AgentState.MOVING:
+        if received.status != AgentState.MOVING:
             return GoalProgress.LOST
         before = sent.before
-        if before is not None and heard.goal == before.number:
+        if before is not None and received.goal == before.number:
             # The robot refused this goal, and continues to the one before.
             self._cancelled[name] = ({before.number}, time.monotonic())
             before.cancel()
@@ -164,14 +168,14 @@ class TeamGoals:
         return GoalProgress.REPLACED if after else GoalProgress.LOST
 
     @staticmethod
-    def driven(heard: HeardState) -> bool:
+    def driven(received: ReceivedState) -> bool:
         """Return whether a robot without a goal of the planner follows one of another client."""
-        return heard.status == AgentState.MOVING or heard.reason == REPLACED
+        return received.status == AgentState.MOVING or received.reason == REPLACED
 
-    def ends(self, name: str, heard: HeardState) -> bool:
+    def ends(self, name: str, received: ReceivedState) -> bool:
         """Return whether a robot still moves to a goal that was just cancelled."""
         numbers, at = self._cancelled.get(name, (set(), -math.inf))
-        return heard.goal in numbers and time.monotonic() - at < _PATIENCE
+        return received.goal in numbers and time.monotonic() - at < _PATIENCE
 
     def _answered(self, name: str, sent: _Sent, future: Any) -> None:
         self.waiting.discard((name, sent.number))
