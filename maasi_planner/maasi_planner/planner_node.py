@@ -320,23 +320,23 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if self.settings.lockstep:
             self._try_step()
         else:
-            self._join_or_leave(name, message.goal_status, message.reason)
+            self._update_availability(name, message.goal_status, message.reason)
             self._try_free_step()
 
     # ---- availability of robots and filter ---------------------------------------------------
 
-    def _join_or_leave(self, name: str, status: int, reason: str) -> None:
+    def _update_availability(self, name: str, status: int, reason: str) -> None:
         if status == AgentState.UNAVAILABLE:
-            self._leave(name, reason)
+            self._drop_robot(name, reason)
         elif name in self._away:
             self._away.discard(name)
             self.get_logger().info(f'{name} is available')
 
-    def _leave(self, name: str, reason: str) -> None:
+    def _drop_robot(self, name: str, reason: str) -> None:
         if name in self._away or self.ending:
             return
         self._away.add(name)
-        self._orders.leave(name)
+        self._orders.drop_robot(name)
         self.get_logger().warning(f'{name} is unavailable: {reason}')
 
     def _check_team(self) -> None:
@@ -347,7 +347,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             for name in sorted(self.states):
                 silent = self.states[name].silence.length
                 if silent > self.settings.state_timeout:
-                    self._leave(name, f'no {name}/state for {silent:.1f} s')
+                    self._drop_robot(name, f'no {name}/state for {silent:.1f} s')
             problem = self._guard.problem(now)
             if problem and not self._held:
                 self.get_logger().error(f'{problem}: all robots are held')
@@ -389,9 +389,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._expected = None
         for name in self.coordinator.names:
             if name not in names:
-                self._leave(name, 'not in this step')
+                self._drop_robot(name, 'not in this step')
         for name in names:
-            self._join_or_leave(name, self.states[name].status, self.states[name].reason)
+            self._update_availability(name, self.states[name].status, self.states[name].reason)
         self._plan_step(
             step,
             stamp_from_ros(expected.stamp),

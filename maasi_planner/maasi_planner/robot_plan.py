@@ -194,7 +194,7 @@ class PlannedRobot:
 
     def begin_again(self) -> None:
         """Begin a new search with nothing explored; decision indices continue."""
-        self.leave()
+        self.clear_plan()
         self.schedule.begin_again()
         if self.exploration is not None:
             self.exploration.values[...] = 1.0
@@ -219,7 +219,7 @@ class PlannedRobot:
             staying=chosen.stays,
         )
 
-    def leave(self) -> None:
+    def clear_plan(self) -> None:
         """Discard the plan, as the robot is unavailable."""
         self.plan = RobotPlan(self.plan.decision, waypoint=self.plan.waypoint)
         self.schedule.cancel()
@@ -235,7 +235,7 @@ class PlannedRobot:
         began = self.plan.decided_at
         if began is not None and self.plan.staying and not len(self.plan.positions):
             return  # already noted
-        self.leave()
+        self.clear_plan()
         if began is None:
             began = step
             self.schedule.restart(step)

@@ -128,7 +128,7 @@ class _Search:
                 del self._here[name]
                 self.log.add(Left(self.time, name))
                 (group,) = (group for group in self._groups if name in group.names)
-                group.coordinator.robots[name].leave()
+                group.coordinator.robots[name].clear_plan()
             for robot in self._here.values():
                 robot.observe(round(self.time * 1e9))
             self.log.add_states(self.time, {name: r.state for name, r in self._here.items()})

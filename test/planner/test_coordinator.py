@@ -87,7 +87,7 @@ def test_a_measurement_waits_for_an_image():
 
 def test_one_left_alone_plans_alone_and_the_other_joins_again():
     coordinator = started()
-    coordinator.robots['b'].leave()
+    coordinator.robots['b'].clear_plan()
     assert list(coordinator.plan(5, there(a=(2.0, 2.0))).robots) == ['a']
     robots = there(free=False, a=(3.0, 2.0)) | there(b=(9.0, 9.0))
     assert list(coordinator.plan(9, robots).robots) == ['b']

@@ -176,7 +176,7 @@ def test_a_paused_robot_comes_home_in_time_and_stays_and_one_that_waits_is_not_m
     assert flight.fly(40.0, lambda: math.dist(flight.place('a'), [3.0, 3.0, 10.0]) > 20.0)
     flight.modes['a'] = 'paused'
     flight.followers['a'].end(GoalStatus.CANCELED, 'paused')
-    flight.coordinator.robots['a'].leave()
+    flight.coordinator.robots['a'].clear_plan()
     place = flight.place('a')
     flight.fly(2.0)
     assert math.dist(flight.place('a'), place) < 4.0

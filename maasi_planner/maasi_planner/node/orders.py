@@ -51,7 +51,7 @@ class Orders:
         """Cancel the goals of robots, and discard their plans."""
         for name in names:
             self.goals.cancel(name)
-            self._coordinator.robots[name].leave()
+            self._coordinator.robots[name].clear_plan()
 
     def hold(self, names: Iterable[str]) -> None:
         """Stop robots, except on their path home; they receive new goals afterwards."""
@@ -74,13 +74,13 @@ class Orders:
         if name in self._homing:
             self._homing[name] = -1
 
-    def leave(self, name: str) -> None:
+    def drop_robot(self, name: str) -> None:
         """Forget the goals of an unavailable robot."""
         self.goals.cancel(name)
         self.external_goals.pop(name, None)
         if name in self._homing:
             self._homing[name] = -1
-        self._coordinator.robots[name].leave()
+        self._coordinator.robots[name].clear_plan()
 
     def send(self, name: str, number: int, waypoint: FloatArray, header: Header) -> None:
         """Send a goal to a robot."""
