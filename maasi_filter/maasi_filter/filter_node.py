@@ -88,14 +88,14 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         bounds = settings.environment.array()
         self.area = Area(settings.environment)
         self._marker_size = 0.01 * float((bounds[:, 1] - bounds[:, 0]).max())
-        self._begin_anew()
+        self._reset_state()
         # Batches wait this long for the found targets that the planner retained.
         # Later messages contain what this filter found itself.
         self._kept_until, self._kept_taken = math.inf, False
         if settings.save_file and Path(settings.save_file).exists():
             self._restore(Path(settings.save_file))
 
-    def _begin_anew(self) -> None:
+    def _reset_state(self) -> None:
         settings = self.settings
         self.filter = make_filter(settings.filter, self.area, np.random.default_rng(settings.seed))
         warning = unsuitable_lengths(settings.filter, settings.environment.array())
@@ -215,7 +215,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def reset(self) -> None:
         """Begin a new search."""
-        self._begin_anew()
+        self._reset_state()
         if self.settings.save_file and self.settings.save_batches:
             Path(self.settings.save_file).unlink(missing_ok=True)
 

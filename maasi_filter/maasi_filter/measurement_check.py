@@ -150,7 +150,7 @@ def _reported_error(name: str, reported: FloatArray, d: int) -> float:
     return math.sqrt(float(variances[:d].max()))
 
 
-def check_taken(robot: str, targets: Sequence[FoundTarget], dimension: int) -> None:
+def check_shared(robot: str, targets: Sequence[FoundTarget], dimension: int) -> None:
     """Raise ValueError for targets with non-finite numbers, another dimension, or equal ids."""
     ids = [target.id for target in targets]
     if min(ids, default=1) < 1 or len(set(ids)) < len(ids):

@@ -14,7 +14,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.found_targets import Change, FoundTargets, merge, restore
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
-from maasi_filter.measurement_check import check_taken
+from maasi_filter.measurement_check import check_shared
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
 from maasi_filter.state_file import SavedGenerator, write_state
@@ -155,7 +155,7 @@ class SearchFilter(ABC):
             If a number is not finite, or dimensions do not fit. The filter is then unchanged.
         """
         for robot, targets in others.items():
-            check_taken(robot, targets, self.dimension)
+            check_shared(robot, targets, self.dimension)
         change = merge(self.register(), others)
         self.adopt(change)
         return bool(change)
@@ -165,7 +165,7 @@ class SearchFilter(ABC):
 
         An id in use is replaced by the next free one; ValueError as in `merge`.
         """
-        check_taken('kept', targets, self.dimension)
+        check_shared('kept', targets, self.dimension)
         change = restore(self.register(), targets)
         self.adopt(change)
         return change.changed

@@ -94,9 +94,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._guard = FilterGuard(self)
         self._batches = Batches(self, self._guard, self._try_done)
         self._views = PlannerViews(self)
-        self._begin_anew()
+        self._reset_state()
 
-    def _begin_anew(self) -> None:
+    def _reset_state(self) -> None:
         self.states: dict[str, ReceivedState] = {}
         self._gates: dict[str, StampGate] = {}
         self._away: set[str] = set(self.coordinator.names)
@@ -195,7 +195,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._orders.reset(self.coordinator)
         for part in (self._others, self._guard, self._views):
             part.reset()
-        self._begin_anew()
+        self._reset_state()
         self._keeper.forget()
 
     def fault(self) -> str:

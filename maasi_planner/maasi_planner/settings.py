@@ -268,7 +268,7 @@ class PlannerSettings(Settings):
         given = {key: getattr(self, key) for key in self.model_fields_set}
         if name == self.name and isinstance(self, settings_model({**given, 'name': name})):
             return self
-        return planner_settings(**{**kept_by(name, given), 'name': name})
+        return planner_settings(**{**shared_values(name, given), 'name': name})
 
 
 class JointSettings(PlannerSettings):
@@ -297,7 +297,7 @@ def settings_model(values: Mapping[str, Any]) -> type[PlannerSettings]:
     return model
 
 
-def kept_by(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def shared_values(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of a planner that another one shares, without plugin settings."""
     known = PlannerSettings.model_fields
     with suppress(ValueError):  # unknown names are refused later

@@ -5,7 +5,7 @@ from functools import partial
 
 from rclpy.subscription import Subscription
 
-from maasi_filter.measurement_check import check_taken
+from maasi_filter.measurement_check import check_shared
 from maasi_filter.ros.conversions import found_target_from_ros, stamp_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
@@ -60,7 +60,7 @@ class SharedFoundTargets:
             theirs = [item for item in last.targets if item.robot == name]
             try:
                 targets = [found_target_from_ros(item, search.dimension) for item in theirs]
-                check_taken(name, targets, search.dimension)
+                check_shared(name, targets, search.dimension)
             except ValueError as error:
                 self._node.drop('bad found targets', f'{name}/found_targets: {error}')
                 continue

@@ -185,9 +185,9 @@ class ClockWatch:
         # An exception must not pass through the C code that calls this.
         executor, delta = self._node.executor, jump.delta.nanoseconds
         if executor is not None:
-            executor.create_task(self._judge, delta)
+            executor.create_task(self._check_jump, delta)
 
-    def _judge(self, delta: int) -> None:
+    def _check_jump(self, delta: int) -> None:
         now = self._node.get_clock().now().nanoseconds
         if delta > 0:
             if self._pending is not None and now >= self._pending[0]:

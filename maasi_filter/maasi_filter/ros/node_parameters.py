@@ -59,7 +59,7 @@ class NodeParameters(Generic[SettingsT]):
             close = get_close_matches(name, sorted(known), 1)
             hint = f'; did you mean {close[0]}?' if close else ''
             node.get_logger().warning(f'parameter {name}: is unknown and ignored{hint}')
-        node.add_on_set_parameters_callback(self._judge)
+        node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._note)
 
     def read(self) -> SettingsT:
@@ -93,7 +93,7 @@ class NodeParameters(Generic[SettingsT]):
     def _ours(self, parameters: Iterable[Parameter]) -> list[Parameter]:
         return [item for item in parameters if not item.name.startswith(self._foreign)]
 
-    def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
         objections = self._objections(self._ours(parameters))
         reason = '' if self._changing else next(objections, '')
         return SetParametersResult(successful=not reason, reason=reason)

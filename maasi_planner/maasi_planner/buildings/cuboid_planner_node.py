@@ -95,13 +95,13 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             raise SettingsError(f'parameter {error}') from error
         self.modes = SearchModes([self.name])
         self._gate = StampGate(max(JUMP, round(3e9 * settings.step)))  # odometry may skip steps
-        self._begin_anew()
+        self._reset_state()
 
     def _make_agent(self) -> SearchAgent:
         settings = self.settings
         return SearchAgent(self.name, self._search, self._mission, settings, settings.step)
 
-    def _begin_anew(self) -> None:
+    def _reset_state(self) -> None:
         self._state: tuple[int, Pose, np.ndarray] | None = None
         self._wanted_step = -1
         self._board = MarkerBoard()
@@ -196,7 +196,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         if not self.settings.lockstep:
             self._stop_robot()
         self.agent = self._make_agent()
-        self._begin_anew()
+        self._reset_state()
 
     def status(self) -> dict[str, Any]:
         """Return the state of the search."""

@@ -43,7 +43,7 @@ class SearchAction:
                 cancel_callback=lambda _: CancelResponse.ACCEPT,
             ),
         )
-        server.register_goal_callback(self._judge)
+        server.register_goal_callback(self._check_goal)
         server.register_handle_accepted_callback(self._accept)
 
     def update(
@@ -77,7 +77,7 @@ class SearchAction:
         if self._goal is not None:
             self._conclude(Result.CANCELED, reason)
 
-    def _judge(self, goal: SearchTargets.Goal) -> GoalResponse:
+    def _check_goal(self, goal: SearchTargets.Goal) -> GoalResponse:
         problem = '' if self._node.active else 'the planner is not active'
         if not (math.isfinite(goal.time_limit) and goal.time_limit >= 0.0):
             problem = f'time_limit: read {goal.time_limit}, allowed are finite numbers from 0 [s]'

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.readers import FILES
 from maasi_filter.plugins import is_reference, unknown
-from maasi_planner.settings import kept_by
+from maasi_planner.settings import shared_values
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.checks import (
     Problems,
@@ -159,7 +159,7 @@ def checked(
             if key == ('filter', 'method'):
                 layer.data.get('filter', {}).pop('settings', None)
             elif key == ('planner', 'name') and model is Scenario:
-                layer.data['planner'] = kept_by(value, layer.data.get('planner', {}))
+                layer.data['planner'] = shared_values(value, layer.data.get('planner', {}))
             layer = merge(layer, under(key, value, {key: origin}, layer.folder))
         layer = _with_folders(layer)
     scenario = validate(model, layer)
