@@ -1,15 +1,34 @@
-"""Headless Chromium for tests of pages; skipped by name where there is none."""
+"""Headless Chromium for tests of pages, which are skipped without one."""
 
 import contextlib
 import os
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import sync_playwright
 from waiting import PATIENCE, wait_until
 
-CHROMIUM = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
+_WORKSPACE = Path(os.environ.get('MAASI_WORKSPACE', Path(__file__).parents[1] / '.workspace'))
+_FETCHED = Path(os.environ.get('PLAYWRIGHT_BROWSERS_PATH', _WORKSPACE / 'browsers'))
+
+
+def _chromium():
+    """Return the Chromium of the system, or one that scripts/test has fetched and that starts."""
+    for name in ('chromium', 'chromium-browser'):
+        if found := shutil.which(name):
+            return found
+    for file in sorted(_FETCHED.glob('chromium-*/chrome-linux*/chrome')):
+        # Libraries may be missing.
+        if subprocess.run([file, '--version'], capture_output=True, check=False).returncode == 0:
+            return str(file)
+    return None
+
+
+CHROMIUM = _chromium()
 
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None, reason='no Chromium on this machine (sudo apt install chromium)'
@@ -17,18 +36,18 @@ needs_chromium = pytest.mark.skipif(
 
 
 class Page:
-    """A page, and what it complained of and asked for."""
+    """A page with its errors and requests."""
 
     def __init__(self, page):
         self.page = page
         self.errors = []
         self.requests = []
         page.set_default_timeout(1000.0 * PATIENCE)
-        page.on('console', self._hear)
+        page.on('console', self._add_message)
         page.on('pageerror', lambda error: self.errors.append(str(error)))
         page.on('request', lambda request: self.requests.append(request.url))
 
-    def _hear(self, message):
+    def _add_message(self, message):
         if message.type in ('error', 'warning'):
             self.errors.append(message.text)
 
@@ -44,12 +63,12 @@ class Page:
         self.settle()
 
     def until(self, condition, limit=PATIENCE):
-        """Wait until an expression is true; the page lets nothing be evaluated inside it."""
+        """Wait until an expression is true; the page forbids evaluation inside of it."""
         evaluate, rest = self.page.evaluate, self.page.wait_for_timeout
         wait_until(lambda: evaluate(condition), lambda: rest(50), condition, limit)
 
     def settle(self):
-        """Wait until what was asked for is drawn."""
+        """Wait until the page has drawn its state."""
         self.page.evaluate(
             'new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))'
         )
@@ -57,7 +76,7 @@ class Page:
 
 @contextlib.contextmanager
 def browser():
-    """Yield a browser for several pages, one after the other."""
+    """Yield a browser for successive pages."""
     with sync_playwright() as player:
         # Root, as in containers, has no sandbox.
         arguments = ['--no-sandbox'] if os.geteuid() == 0 else []
@@ -70,7 +89,7 @@ def browser():
 
 @contextlib.contextmanager
 def page_of(browser, width=1280, height=720, reduced_motion='reduce', **options):
-    """Yield a page that complains of nothing and asks no other host; no replay plays by itself."""
+    """Yield a page, which must report no errors and contact no other host; no autoplay."""
     viewport = {'width': width, 'height': height}
     page = browser.new_page(viewport=viewport, reduced_motion=reduced_motion, **options)
     try:
@@ -85,6 +104,11 @@ def page_of(browser, width=1280, height=720, reduced_motion='reduce', **options)
 
 @contextlib.contextmanager
 def chromium(*size, **options):
-    """Yield a page in a browser of its own."""
+    """Yield a page in its own browser."""
     with browser() as own, page_of(own, *size, **options) as shown:
         yield shown
+
+
+if __name__ == '__main__':
+    # For scripts/test.
+    sys.exit(CHROMIUM is None)
