@@ -17,9 +17,10 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.geodesy import OriginSettings, to_map
-from maasi_filter.geometry.polygons import short, sound, warn
+from maasi_filter.geometry.map_files import LABEL, READERS, read_map_file
+from maasi_filter.geometry.polygons import is_wkt, short, sound, warn
 
-_FILES = ('.json', '.geojson')
+FILES = ('.json', '.geojson', *READERS)  # with features
 _ROLES = ('area', 'keep_out', 'prior')  # of polygons
 _POINT_ROLES = ('start', 'home', 'charger')
 _BEYOND = 10.0  # degrees by which areas of the page may exceed 180 degrees
@@ -48,9 +49,9 @@ class Feature:
 
 
 def is_geojson(value: Any) -> bool:
-    """Return whether a value is GeoJSON or the name of a GeoJSON file."""
+    """Return whether a value is GeoJSON or the name of a file with features."""
     if isinstance(value, str):
-        return Path(value).suffix.lower() in _FILES
+        return Path(value).suffix.lower() in FILES and not is_wkt(value)
     return isinstance(value, Mapping) and 'type' in value
 
 
@@ -182,11 +183,15 @@ def features_of(value: Any) -> list[Feature]:
         left += rest
         if feature is not None:
             found.append(feature)
+    more = f' and {len(left) - _NAMED} more' if len(left) > _NAMED else ''
+    words = '; '.join(left[:_NAMED]) + more
     if not found:
-        raise ValueError(f'{source}there is no polygon in it' if source else 'holds no polygon')
+        read = f', read {words}' if left else ''
+        raise ValueError(
+            f'{source}there is no polygon in it{read}' if source else f'holds no polygon{read}'
+        )
     if left:
-        more = f' and {len(left) - _NAMED} more' if len(left) > _NAMED else ''
-        warn(f'{source}left out, as these are no polygons: {"; ".join(left[:_NAMED])}{more}')
+        warn(f'{source}left out, as these are no polygons: {words}')
     return found
 
 
@@ -218,6 +223,8 @@ def _parsed(value: Any, named: bool) -> Any:
         return value
     if not named and not value.lstrip().startswith('{'):
         raise ValueError(f'read {short(value)}, allowed is GeoJSON, or the name of its file')
+    if named and Path(value).suffix.lower() in READERS:
+        return read_map_file(value)
     try:
         # Some programs begin a file with a byte order mark.
         return json.loads(Path(value).read_text(encoding='utf-8-sig') if named else value)
@@ -255,7 +262,7 @@ def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature 
     facts = properties or {}
     values = [facts.get('name'), facts.get('title'), row.get('id'), facts.get('id')]
     title = next((str(word) for word in values if word not in (None, '')), '')
-    name = f'feature {number}' + (f' ({title[:40]})' if title else '')
+    name = str(row.get(LABEL) or f'feature {number}') + (f' ({title[:40]})' if title else '')
     where, left, shapes = f'{source}{name}', [], []
     parts = list(_parts(row.get('geometry'), where)) or [('empty', None)]
     for kind, coordinates in parts:

@@ -11,6 +11,8 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
+_WKT = re.compile(r'\s*(MULTI)?POLYGON\s*(Z|M|ZM)?\s*(\(|EMPTY)', re.IGNORECASE)
+
 
 class InputWarning(UserWarning):
     """An assumption about an input, or an ignored part of it."""
@@ -45,7 +47,7 @@ def sound(found: BaseGeometry, words: str, unit: str = 'm') -> BaseGeometry:
 
 def is_wkt(value: Any) -> bool:
     """Return whether a value is well-known text of polygons."""
-    return isinstance(value, str) and value.lstrip().upper().startswith(('POLYGON', 'MULTIPOLYGON'))
+    return isinstance(value, str) and _WKT.match(value) is not None
 
 
 def of_text(value: str) -> BaseGeometry:

@@ -12,6 +12,7 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.geometry.geodesy import OriginSettings
+from maasi_filter.geometry.geojson import FILES as FEATURE_FILES
 from maasi_filter.geometry.geojson import (
     Feature,
     by_role,
@@ -29,7 +30,7 @@ from maasi_filter.settings import Settings
 _NUMBER = '-+.0123456789'  # first characters of numbers
 _MAPS = ('.yaml', '.yml')
 _IMAGES = ('.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff')
-FILES = ('.geojson', '.json', *_MAPS, *_IMAGES)
+FILES = (*FEATURE_FILES, *_MAPS, *_IMAGES)
 _ROLE_OF = {'keep_outs': 'keep_out', 'obstacles': 'keep_out', 'prior': 'prior'}  # by key
 _DEGREES = 0.1  # shorter areas are in degrees [m]
 _LARGEST = 10e9  # of an area in degrees [m^2]
@@ -206,7 +207,7 @@ def shapes_of_texts(zones: Iterable[str]) -> list[Any]:
         elif text and text[0] in _NUMBER:
             known = len(text.split()) in (3, 4)
         else:
-            known = text.upper().startswith(('POLYGON', 'MULTIPOLYGON'))
+            known = is_wkt(text)
         if not known:
             raise ValueError(
                 f'keep_outs: {index}: got {text[:60]!r}, allowed are x y radius, '

@@ -1,0 +1,393 @@
+"""Reads files of map programs and ground stations as features of GeoJSON.
+
+KML, KMZ, GPX, QGroundControl `.plan`, Mission Planner `.poly` and `.waypoints`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import lzma
+import math
+import re
+import struct
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+import numpy as np
+
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.polygons import short
+
+Row = dict[str, Any]
+LABEL = 'maasi:label'  # member of a feature: the element it was read from, for messages
+
+_MOST_BYTES = 20_000_000  # of a file, and of the KML in a KMZ
+_MOST_ELEMENTS = 1_000_000  # of XML
+_CORNERS = 64  # of the polygon of a circle
+_GAP = 0.05  # most between the ends of a closed track, relative to its length
+_DEGREE = 111_195.0  # of latitude [m]
+# Beginnings of names, and of names of KML folders, that are a role.
+_POLYGON_WORDS = {'keep_out': r'keep[-_ ]?outs?|no[-_ ]?(?:fly|go)', 'prior': 'prior'}
+_POINT_WORDS = {'start': 'starts?', 'home': 'home', 'charger': 'chargers?'}
+_KML_SHAPES = ('Polygon', 'LinearRing', 'LineString', 'Point', 'Model', 'Track', 'MultiTrack')
+_RING = '%sBoundaryIs/LinearRing'
+_KML_OTHERS = ('NetworkLink', 'GroundOverlay', 'ScreenOverlay', 'PhotoOverlay', 'Tour')
+# Fence commands of MAVLink.
+_VERTICES = {5001: True, 5002: False}
+_CIRCLES = {5003: True, 5004: False}
+_ZIP_ERRORS = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError),
+    *(NotImplementedError, RuntimeError, ValueError, LookupError),
+)
+
+
+def read_map_file(path: str) -> Row:
+    """Return a file as a GeoJSON feature collection; ValueError names the wrong element."""
+    try:
+        with Path(path).open('rb') as file:
+            data = file.read(_MOST_BYTES + 1)
+        _check_size(data)
+        rows = [*READERS[Path(path).suffix.lower()](data)]
+    except OSError as error:
+        raise ValueError(f'{path}: {error.strerror}') from None
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
+    return {'type': 'FeatureCollection', 'features': rows}
+
+
+def _check_size(data: bytes) -> None:
+    if len(data) > _MOST_BYTES:
+        raise ValueError(f'is too large, allowed are {_MOST_BYTES // 1_000_000} MB')
+
+
+def _row(label: str, shape: str, coordinates: Any = None, **properties: Any) -> Row:
+    """Return a feature; a shape that is not of GeoJSON is the text of a warning."""
+    known = {key: value for key, value in properties.items() if value not in (None, '')}
+    geometry = {'type': shape, 'coordinates': coordinates}
+    return {'type': 'Feature', LABEL: label, 'geometry': geometry, 'properties': known}
+
+
+def _role(words: Mapping[str, str], texts: Iterable[str]) -> tuple[str, str]:
+    """Return the role at the beginning of the first text with one, and the rest of that text."""
+    for text in texts:
+        for role, word in words.items():
+            if found := re.match(rf'\s*(?:{word})(?![a-z])[\W_]*', text, re.IGNORECASE):
+                return role, text[found.end() :].strip()
+    return '', ''
+
+
+def _point(label: str, position: Any, name: str, texts: Sequence[str], facts: Row) -> Row:
+    role, rest = _role(_POINT_WORDS, texts)
+    role, robot = facts.get('role') or role, facts.get('robot')
+    if role not in _POINT_WORDS:
+        what = f'point without a role, allowed at the start of its name: {", ".join(_POINT_WORDS)}'
+        return _row(label, what, name=name)
+    if role == 'start' and not robot:
+        robot = rest or name
+    return _row(label, 'Point', position, name=name, role=role, robot=robot)
+
+
+# ----------------------------------------------------------------------------- XML
+
+
+def _xml(data: bytes, root: str) -> Element:
+    """Return the root of XML: tags without namespaces, each with its `line`."""
+    builder, parser, count = TreeBuilder(), expat.ParserCreate(namespace_separator=' '), 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count
+        count += 1
+        if count > _MOST_ELEMENTS:
+            raise ValueError(f'has too many elements, allowed are {_MOST_ELEMENTS:,}')
+        line = str(parser.CurrentLineNumber)
+        builder.start(tag.rpartition(' ')[2], {**attributes, 'line': line})
+
+    def refuse(*_: Any) -> None:
+        line = parser.CurrentLineNumber
+        raise ValueError(f'line {line}: read DOCTYPE, allowed is XML without one')
+
+    parser.StartElementHandler, parser.StartDoctypeDeclHandler = start, refuse
+    parser.EndElementHandler = lambda tag: builder.end(tag.rpartition(' ')[2])
+    parser.CharacterDataHandler = builder.data
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        reason = expat.ErrorString(error.code)
+        raise ValueError(f'line {error.lineno}: is not XML: {reason}') from None
+    except LookupError:
+        raise ValueError('line 1: its encoding is unknown, allowed is UTF-8') from None
+    found = builder.close()
+    if found.tag != root:
+        line = found.get('line')
+        raise ValueError(f'line {line}: read <{short(found.tag)}>, allowed is <{root}>')
+    return found
+
+
+def _text(element: Element, path: str) -> str:
+    return (element.findtext(path) or '').strip()
+
+
+def _kml(data: bytes) -> Iterator[Row]:
+    root = _xml(data, 'kml')
+    parents = {child: parent for parent in root.iter() for child in parent}
+    for number, mark in enumerate(root.iter('Placemark'), 1):
+        label, name = f'Placemark {number} in line {mark.get("line")}', _text(mark, 'name')
+        facts = {str(item.get('name')): _text(item, 'value') for item in mark.iter('Data')}
+        for item in mark.iter('SimpleData'):
+            facts[str(item.get('name'))] = (item.text or '').strip()
+        texts, above = [name], mark
+        while (above := parents.get(above)) is not None:  # type: ignore[assignment]
+            texts.append(_text(above, 'name') if above.tag == 'Folder' else '')
+        shapes = [item for item in mark.iter() if item.tag in _KML_SHAPES]
+        # A ring of a polygon belongs to it.
+        shapes = [item for item in shapes if not parents[item].tag.endswith('BoundaryIs')]
+        polygons = []
+        for shape in shapes:
+            if shape.tag in ('Polygon', 'LinearRing'):
+                outer = [shape] if shape.tag == 'LinearRing' else shape.findall(_RING % 'outer')
+                if len(outer) != 1:
+                    read = f'{len(outer)} outer boundaries'
+                    raise ValueError(f'{label}: read {read}, allowed is one in each polygon')
+                rings = [*outer, *shape.findall(_RING % 'inner')]
+                polygons.append([_kml_positions(ring, label) for ring in rings])
+            elif shape.tag == 'Point':
+                (position, *_) = _kml_positions(shape, label) or [None]
+                yield _point(label, position, name, texts, facts)
+            else:
+                yield _row(label, shape.tag, name=name)
+        if polygons:
+            role = facts.get('role') or _role(_POLYGON_WORDS, texts)[0]
+            weight = facts.get('weight')
+            yield _row(label, 'MultiPolygon', polygons, name=name, role=role, weight=weight)
+        if not shapes:
+            yield _row(label, 'no geometry', name=name)
+    for kind, count in Counter(item.tag for item in root.iter()).items():
+        if kind in _KML_OTHERS:
+            yield _row(f'{count} <{kind}>', 'not read')
+
+
+def _kml_positions(shape: Element, label: str) -> list[Any]:
+    positions = []
+    for word in _text(shape, 'coordinates').split():
+        try:
+            east, north = map(float, word.split(',')[:2])
+        except ValueError:
+            raise ValueError(
+                f'{label}: coordinates: read {short(word)}, allowed is longitude,latitude,altitude'
+            ) from None
+        positions.append([east, north])
+    return positions
+
+
+def _kmz(data: bytes) -> Iterator[Row]:
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = [name for name in archive.namelist() if name.lower().endswith('.kml')]
+            if not names:
+                raise zipfile.BadZipFile('it contains no .kml')
+            names.sort(key=lambda name: name.lower() != 'doc.kml')
+            with archive.open(names[0]) as file:
+                inner = file.read(_MOST_BYTES + 1)
+    except _ZIP_ERRORS as error:
+        raise ValueError(f'is not a KMZ archive: {short(str(error))}') from None
+    try:
+        _check_size(inner)
+        yield from _kml(inner)
+    except ValueError as error:
+        raise ValueError(f'{short(names[0])}: {error}') from None
+    for name in names[1:]:
+        yield _row(short(name), f'not read, as {short(names[0])} is')
+
+
+def _gpx(data: bytes) -> Iterator[Row]:
+    root, counts = _xml(data, 'gpx'), Counter[str]()
+    for item in root:
+        counts[item.tag] += 1
+        label = f'{item.tag} {counts[item.tag]} in line {item.get("line")}'
+        name = _text(item, 'name')
+        if item.tag == 'wpt':
+            yield _point(label, _gpx_position(item, label), name, [name], {})
+        for line in [item] if item.tag == 'rte' else item.findall('trkseg'):
+            points = [*line.findall('rtept'), *line.findall('trkpt')]
+            ring = [_gpx_position(point, label) for point in points]
+            gap, length = _gap(ring)
+            if gap <= _GAP * length:
+                role = _role(_POLYGON_WORDS, [name])[0]
+                yield _row(label, 'Polygon', [ring], name=name, role=role)
+            else:
+                what = 'track' if item.tag == 'trk' else 'route'
+                yield _row(
+                    label,
+                    f'open {what}, ends {gap:.0f} m from its start, allowed are {_GAP:.0%} of its '
+                    f'length ({_GAP * length:.0f} m)',
+                    name=name,
+                )
+
+
+def _gpx_position(point: Element, label: str) -> list[float]:
+    where = f'{label}: {point.tag} in line {point.get("line")}'
+    return _flipped([point.get('lat'), point.get('lon')], where)
+
+
+def _gap(ring: Sequence[Sequence[float]]) -> tuple[float, float]:
+    """Return the distance between the ends of a track, and its length [m]."""
+    degrees = np.array(ring).reshape(-1, 2)
+    if not len(degrees):
+        return math.inf, 0.0
+    metres = _DEGREE * degrees * [math.cos(math.radians(degrees[0, 1])), 1.0]
+    length = np.linalg.norm(np.diff(metres, axis=0), axis=1).sum()
+    return float(np.linalg.norm(metres[-1] - metres[0])), float(length)
+
+
+# ------------------------------------------------------------------ Ground stations
+
+
+def _number(value: Any, where: str, most: float, least: float | None = None) -> float:
+    least = -most if least is None else least
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not least <= number <= most:
+        raise ValueError(
+            f'{where}: read {short(value)}, allowed is a number from {least:g} to {most:g}'
+        )
+    return number
+
+
+def _flipped(value: Any, where: str) -> list[float]:
+    """Return longitude and latitude of latitude and longitude."""
+    if not isinstance(value, (list, tuple)) or len(value) < 2:
+        raise ValueError(f'{where}: read {short(value)}, allowed are latitude and longitude')
+    north = _number(value[0], f'{where}: latitude', 90.0)
+    return [_number(value[1], f'{where}: longitude', 360.0), north]
+
+
+def _zone(label: str, rings: Any, inclusion: bool) -> Row:
+    return _row(label, 'Polygon', rings, role='area' if inclusion else 'keep_out')
+
+
+def _circle(label: str, centre: Any, radius: Any, inclusion: bool) -> Row:
+    """Return a polygon inside of a circle that is included, around one that is excluded."""
+    east, north = _flipped(centre, f'{label}: center')
+    size = _number(radius, f'{label}: radius', 1e6, 1e-3)
+    size /= 1.0 if inclusion else math.cos(math.pi / _CORNERS)
+    angles = 2.0 * math.pi / _CORNERS * np.arange(_CORNERS)
+    origin = OriginSettings(latitude=north, longitude=(east + 180.0) % 360.0 - 180.0)
+    ring = geodetic(size * np.stack([np.cos(angles), np.sin(angles)], axis=1), origin)
+    return _zone(label, [ring[:, 1::-1].tolist()], inclusion)
+
+
+def _plan(data: bytes) -> Iterator[Row]:
+    try:
+        plan = json.loads(data.decode('utf-8-sig'))
+    except (ValueError, RecursionError) as error:
+        line = f' in line {error.lineno}' if isinstance(error, json.JSONDecodeError) else ''
+        raise ValueError(f'is not JSON{line}') from None
+    if not isinstance(plan, Mapping) or plan.get('fileType') != 'Plan':
+        read = plan.get('fileType') if isinstance(plan, Mapping) else plan
+        raise ValueError(f'fileType: read {short(read)}, allowed is Plan')
+    fence = _part(plan, 'geoFence', dict)
+    if fence and fence.get('version') != 2:
+        raise ValueError(f'geoFence.version: read {short(fence.get("version"))}, allowed is 2')
+    for kind in ('polygons', 'circles'):
+        for index, item in enumerate(_part(fence, kind, list, 'geoFence.')):
+            label = f'geoFence.{kind}[{index}]'
+            if not isinstance(item, Mapping) or not isinstance(item.get('inclusion'), bool):
+                raise ValueError(f'{label}: read {short(item)}, allowed is a zone with inclusion')
+            inclusion = item['inclusion']
+            if kind == 'polygons':
+                ring = _part(item, 'polygon', list, f'{label}.')
+                yield _zone(label, [[_flipped(corner, label) for corner in ring]], inclusion)
+            else:
+                circle = _part(item, 'circle', dict, f'{label}.')
+                yield _circle(label, circle.get('center'), circle.get('radius'), inclusion)
+    others = {'mission.items': _part(_part(plan, 'mission', dict), 'items', list, 'mission.')}
+    others['rallyPoints.points'] = _part(_part(plan, 'rallyPoints', dict), 'points', list)
+    for label, items in others.items():
+        if items:
+            yield _row(label, f'{len(items)} not read, draw zones as a fence')
+
+
+def _part(data: Mapping[str, Any], key: str, kind: type, where: str = '') -> Any:
+    value = data.get(key)
+    if value is not None and not isinstance(value, kind):
+        allowed = 'a list' if kind is list else 'an object'
+        raise ValueError(f'{where}{key}: read {short(value)}, allowed is {allowed}')
+    return value or kind()
+
+
+def _lines(data: bytes) -> list[tuple[str, list[str]]]:
+    """Return the name and the words of each line that is not empty or a comment."""
+    try:
+        rows = data.decode('utf-8-sig').splitlines()
+    except UnicodeDecodeError:
+        raise ValueError('is not UTF-8 text') from None
+    lines = [(f'line {number}', row.split()) for number, row in enumerate(rows, 1)]
+    return [(label, words) for label, words in lines if words and words[0][0] != '#']
+
+
+def _poly(data: bytes) -> Iterator[Row]:
+    ring = []
+    for label, words in _lines(data):
+        if len(words) != 2:
+            read = short(' '.join(words))
+            raise ValueError(f'{label}: read {read}, allowed are latitude and longitude')
+        ring.append(_flipped(words, label))
+    yield _row('polygon', 'Polygon', [ring])
+
+
+def _waypoints(data: bytes) -> Iterator[Row]:
+    """Yield the fence of a file in MAVLink's text format."""
+    lines = _lines(data)
+    if not lines or lines[0][1][:2] != ['QGC', 'WPL']:
+        read = short(' '.join(lines[0][1])) if lines else 'nothing'
+        raise ValueError(f'line 1: read {read}, allowed is QGC WPL 110')
+    ring: list[list[float]] = []
+    begun, others = (0, 0), Counter[int]()  # command and vertices of an unfinished polygon
+    for label, words in lines[1:]:
+        if len(words) != 12:
+            raise ValueError(f'{label}: read {len(words)} columns, allowed are 12')
+        index, command = (
+            int(_number(words[column], f'{label}: column {column + 1}', 65535.0, 0.0))
+            for column in (0, 3)
+        )
+        if ring and command != begun[0]:
+            raise ValueError(f'{label}: read command {command}, allowed is {begun[0]}: {_FEW}')
+        if command in _VERTICES:
+            count = int(_number(words[4], f'{label}: number of vertices', 65535.0, 3.0))
+            if ring and count != begun[1]:
+                raise ValueError(f'{label}: read {count} vertices, allowed are {begun[1]}: {_FEW}')
+            begun = command, count
+            ring.append(_flipped(words[8:10], label))
+            if len(ring) == count:
+                yield _zone(f'polygon up to {label}', [ring], _VERTICES[command])
+                ring = []
+        elif command in _CIRCLES:
+            yield _circle(label, words[8:10], words[4], _CIRCLES[command])
+        elif index or command != 16:
+            others[command] += 1  # the first item is the home position
+    if ring:
+        raise ValueError(f'{lines[-1][0]}: ends after {len(ring)} of {begun[1]} vertices: {_FEW}')
+    for command, number in others.items():
+        yield _row(f'{number} items with command {command}', 'not read, draw zones as a fence')
+
+
+_FEW = 'the polygon before is not complete'
+
+#: By ending of the name.
+READERS: dict[str, Callable[[bytes], Iterator[Row]]] = {
+    '.kml': _kml,
+    '.kmz': _kmz,
+    '.gpx': _gpx,
+    '.plan': _plan,
+    '.poly': _poly,
+    '.waypoints': _waypoints,
+}
