@@ -99,7 +99,7 @@ def test_runs_that_did_not_finish_count_with_the_limit_and_are_counted():
     np.testing.assert_array_equal(capped, [3.0, 40.0, 40.0])
     # On the page only what is not complete is counted, without medians and ratios.
     assert found.brief().split('<br>')[0] == '122 and 172' and '(medians' not in found.brief()
-    assert 'finished 3 of 4, 2 of 4' in found.brief() and ', x' not in found.brief()
+    assert 'finished 3/4, 2/4' in found.brief() and ', x' not in found.brief()
     assert 'finished' not in finding(a=LOW, b=HIGH).brief()
     # What each run has is not counted.
     assert 'finished' not in finding(quantity='error', a=LOW, b=HIGH).here

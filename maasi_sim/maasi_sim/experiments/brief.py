@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 
 from maasi_sim.experiments.experiment import Experiment
 from maasi_sim.experiments.tables import close, markdown_table
@@ -21,13 +20,16 @@ def brief_tables(experiment: Experiment, cases: Cells, pairs: Sequence[Sequence[
 
     A column stands for a quantity that a claim, a paired difference or a number of the paper uses;
     of the others the range of the means is given, without zeros and computing times. Paired
-    differences that are claims are on their page.
+    differences that are claims are on their page; several to one case are a column.
     """
     heads = list(dict.fromkeys(head for cells in cases.values() for head in cells))
     columns = [
         head for head in heads[1:] if head in _titles(experiment) and not _alike(head, cases)
     ]
     columns = columns or heads[1:2]
+    times = {item.title() for item in experiment.quantities if item.name in _COMPUTATION}
+    others = [_range(head, cases) for head in heads[1:] if head not in {*columns, *times}]
+    others = [text for text in others if not text.endswith(' 0')]
     if len({cells['runs'] for cells in cases.values()}) > 1:
         columns.insert(0, 'runs')
     everywhere = all(name.endswith(_RECOMMENDED) for name in cases)
@@ -35,18 +37,17 @@ def brief_tables(experiment: Experiment, cases: Cells, pairs: Sequence[Sequence[
         _case(name, everywhere): [brief_cell(cells.get(head, '-')) for head in columns]
         for name, cells in cases.items()
     }
+    rest = _unclaimed(experiment, pairs)
     rows = _matrix(table, columns[0]) if len(columns) == 1 else []
-    rows = rows or [['case', *columns], *([name, *cells] for name, cells in table.items())]
-    times = {item.title() for item in experiment.quantities if item.name in _COMPUTATION}
-    others = [_range(head, cases) for head in heads[1:] if head not in {*columns, *times}]
-    others = [text for text in others if not text.endswith(' 0')]
+    if not rows:
+        names = [name.removesuffix(_RECOMMENDED) for name in cases]
+        added, rest = _as_columns(rest, names, len(columns) > 1)
+        rows = [['case', *columns, *added]]
+        for (name, cells), case in zip(table.items(), names):
+            rows.append([name, *cells, *(column.get(case, '') for column in added.values())])
     words = 'All cases have the recommended settings. ' if everywhere else ''
     words += f'Other means: {"; ".join(others)}.' if others else ''
-    return [
-        close(markdown_table(rows)),
-        words.strip() + '\n' if words else '',
-        _paired(experiment, pairs),
-    ]
+    return [close(markdown_table(rows)), words.strip() + '\n' if words else '', _paired(rest)]
 
 
 def _titles(experiment: Experiment) -> set[str]:
@@ -105,38 +106,65 @@ def _range(head: str, cases: Cells) -> str:
 
 
 def _matrix(table: Mapping[str, Sequence[str]], title: str) -> list[list[str]]:
-    """Return a table of one quantity by the first and the last part of the names, or []."""
-    parts = [name.rpartition(', ') for name in table]
-    lines = {first: [part[2] for part in group] for first, group in groupby(parts, lambda p: p[0])}
-    heads = next(iter(lines.values()))
-    if len(table) < _MATRIX or any(line != heads for line in lines.values()) or len(heads) < 2:
+    """Return a table of one quantity by the first and the other parts of the names, or []."""
+    if len(table) < _MATRIX:
         return []
-    cells = [[table[f'{first}, {head}'][0] for head in heads] for first in lines]
-    return [[title, *heads], *([first, *line] for first, line in zip(lines, cells))]
+    for split in (lambda name: name.rpartition(', ')[::2], lambda name: name.partition(', ')[::-2]):
+        keys = {split(name): cells[0] for name, cells in table.items()}
+        lines, heads = (list(dict.fromkeys(part)) for part in zip(*keys))
+        if (
+            len(heads) > 1
+            and len(heads) < len(lines) + 1
+            and len(keys) > 0.6 * len(lines) * len(heads)
+        ):
+            cells = [[keys.get((line, head), '') for head in heads] for line in lines]
+            return [[title, *heads], *([line, *row] for line, row in zip(lines, cells))]
+    return []
 
 
-def _paired(experiment: Experiment, pairs: Sequence[Sequence[str]]) -> str:
+Row = Sequence[str]  # first minus second, quantity, maps, difference
+
+
+def _unclaimed(experiment: Experiment, pairs: Sequence[Row]) -> list[Row]:
     claimed = {
         (f'{item.first} minus {item.second}', experiment.quantity(item.quantity).title())
         for item in experiment.claims
         if not item.case
     }
-    rows = [row for row in pairs if (row[0], row[1]) not in claimed]
+    return [row for row in pairs if (row[0], row[1]) not in claimed]
+
+
+def _as_columns(
+    rows: Sequence[Row], names: Sequence[str], several: bool
+) -> tuple[dict[str, dict[str, str]], list[Row]]:
+    """Return differences of several cases to one as columns, and the other rows."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row[0].split(' minus ')[1], row[1]), []).append(row)
+    columns: dict[str, dict[str, str]] = {}
+    rest: list[Row] = []
+    for (second, quantity), group in groups.items():
+        firsts = [row[0].split(' minus ')[0] for row in group]
+        if len(group) > 1 and set(firsts) <= set(names) and len({row[2] for row in group}) == 1:
+            head = f'{quantity}, minus {second}' if several else f'minus {second}'
+            columns[head] = {name: _ZERO_WIDTH.sub('', row[3]) for name, row in zip(firsts, group)}
+        else:
+            rest += group
+    return columns, rest
+
+
+def _paired(rows: Sequence[Row]) -> str:
     if not rows:
         return ''
     heads = list(dict.fromkeys(row[1] for row in rows))
-    title, others = 'paired difference', {row[0].split(' minus ')[1] for row in rows}
-    if len(others) == 1:
-        title += f', minus {others.pop()}'
-        rows = [(name.split(' minus ')[0], *rest) for name, *rest in rows]
     counts: dict[str, str] = {}
     gaps: dict[str, dict[str, str]] = {}
     for name, head, count, gap in rows:
         counts[name] = count
         gaps.setdefault(name, {})[head] = _ZERO_WIDTH.sub('', gap)
     differ = len(set(counts.values())) > 1
-    table = [[title, *(['runs'] if differ else []), *heads]]
+    table = [['paired difference', *(['runs'] if differ else []), *heads]]
     for name, cells in gaps.items():
         runs = [counts[name]] if differ else []
-        table.append([name, *runs, *(cells.get(head, '-') for head in heads)])
+        table.append([name, *runs, *(cells.get(head, '') for head in heads)])
     return close(markdown_table(table))

@@ -75,9 +75,11 @@ class Finding:
         kept = [means]
         for part in parts:
             counts = [count.split(' of ') for count in part.removeprefix('finished ').split(', ')]
-            if part.startswith('finished') and all(done == every for done, every in counts):
-                continue
-            kept.append(part.split(', x ')[0].replace('none in any', 'no difference in any'))
+            if not part.startswith('finished'):
+                text = part.split(', x ')[0].removeprefix('difference ')
+                kept.append(text.replace('none in any', 'no difference in any'))
+            elif any(done != every for done, every in counts):
+                kept.append('finished ' + ', '.join(map('/'.join, counts)))
         return '<br>'.join(kept)
 
     def marked(self, level: float) -> str:
