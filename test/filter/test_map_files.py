@@ -116,8 +116,13 @@ def test_each_format_is_the_same_area_with_a_keep_out(tmp_path, name):
 
 def test_an_archive_and_a_bare_polygon_are_an_area(tmp_path):
     with zipfile.ZipFile(tmp_path / 'field.kmz', 'w') as archive:
-        archive.writestr('doc.kml', FILES['name.kml'])
-    assert len(environment(tmp_path / 'field.kmz').keep_outs) == 1
+        # As GDAL writes it: a list of links to its own files.
+        link = '<NetworkLink><Link><href>layers/1.kml</href></Link></NetworkLink>'
+        archive.writestr('doc.kml', kml(link))
+        archive.writestr('layers/1.kml', FILES['name.kml'])
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert len(environment(tmp_path / 'field.kmz').keep_outs) == 1
     rows = [f'{north} {east}' for north, east in closed(FIELD)]
     text = '\n'.join(['#saved by Mission Planner 1.3.80', *rows])
     file = written(tmp_path, 'field.poly', text)
@@ -232,10 +237,10 @@ def test_nothing_is_left_out_without_a_warning(tmp_path):
 def test_archives_and_files_without_end_are_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / 'big.kmz', 'w', zipfile.ZIP_DEFLATED) as archive:
         archive.writestr('doc.kml', ' ' * 30_000_000)
-    assert 'doc.kml: is too large, allowed are 20 MB' in refusal(tmp_path / 'big.kmz')
+    assert 'its .kml are too large, allowed are 20 MB' in refusal(tmp_path / 'big.kmz')
     with zipfile.ZipFile(tmp_path / 'none.kmz', 'w') as archive:
         archive.writestr('picture.png', '')
-    assert 'it contains no .kml' in refusal(tmp_path / 'none.kmz')
+    assert 'there is no .kml in it' in refusal(tmp_path / 'none.kmz')
     written(tmp_path, 'big.poly', '1 2\n' * 6_000_000)
     assert 'is too large' in refusal(tmp_path / 'big.poly')
     assert 'No such file' in refusal(tmp_path / 'gone.gpx')

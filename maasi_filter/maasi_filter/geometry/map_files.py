@@ -134,7 +134,8 @@ def _text(element: Element, path: str) -> str:
     return (element.findtext(path) or '').strip()
 
 
-def _kml(data: bytes) -> Iterator[Row]:
+def _kml(data: bytes, archive: Sequence[str] = ()) -> Iterator[Row]:
+    """Yield the features of KML; links into its own archive are not warned of."""
     root = _xml(data, 'kml')
     parents = {child: parent for parent in root.iter() for child in parent}
     for number, mark in enumerate(root.iter('Placemark'), 1):
@@ -168,9 +169,10 @@ def _kml(data: bytes) -> Iterator[Row]:
             yield _row(label, 'MultiPolygon', polygons, name=name, role=role, weight=weight)
         if not shapes:
             yield _row(label, 'no geometry', name=name)
-    for kind, count in Counter(item.tag for item in root.iter()).items():
-        if kind in _KML_OTHERS:
-            yield _row(f'{count} <{kind}>', 'not read')
+    others = [item for item in root.iter() if item.tag in _KML_OTHERS]
+    others = [item for item in others if _text(item, 'Link/href') not in archive]
+    for kind, count in Counter(item.tag for item in others).items():
+        yield _row(f'{count} <{kind}>', 'not read')
 
 
 def _kml_positions(shape: Element, label: str) -> list[Any]:
@@ -187,23 +189,25 @@ def _kml_positions(shape: Element, label: str) -> list[Any]:
 
 
 def _kmz(data: bytes) -> Iterator[Row]:
+    files, left = {}, _MOST_BYTES
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            names = [name for name in archive.namelist() if name.lower().endswith('.kml')]
-            if not names:
-                raise zipfile.BadZipFile('it contains no .kml')
-            names.sort(key=lambda name: name.lower() != 'doc.kml')
-            with archive.open(names[0]) as file:
-                inner = file.read(_MOST_BYTES + 1)
+            for name in archive.namelist():
+                if name.lower().endswith('.kml'):
+                    with archive.open(name) as file:
+                        files[name] = file.read(left + 1)
+                    left -= len(files[name])
     except _ZIP_ERRORS as error:
         raise ValueError(f'is not a KMZ archive: {short(str(error))}') from None
-    try:
-        _check_size(inner)
-        yield from _kml(inner)
-    except ValueError as error:
-        raise ValueError(f'{short(names[0])}: {error}') from None
-    for name in names[1:]:
-        yield _row(short(name), f'not read, as {short(names[0])} is')
+    if left < 0:
+        raise ValueError(f'its .kml are too large, allowed are {_MOST_BYTES // 1_000_000} MB')
+    if not files:
+        raise ValueError('there is no .kml in it')
+    for name, inner in files.items():
+        try:
+            yield from _kml(inner, [*files])
+        except ValueError as error:
+            raise ValueError(f'{short(name)}: {error}') from None
 
 
 def _gpx(data: bytes) -> Iterator[Row]:
