@@ -14,7 +14,16 @@ import yaml
 
 from maasi_sim.experiments.brief import brief_tables
 from maasi_sim.experiments.campaign import Campaign, maps_in, plan
-from maasi_sim.experiments.claims import Finding, claims_page, findings, summary, with_summary
+from maasi_sim.experiments.claims import (
+    DIFFERS,
+    HOLDS,
+    ONE_RUN,
+    Finding,
+    claims_page,
+    findings,
+    summary,
+    with_summary,
+)
 from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
 from maasi_sim.experiments.figures import as_png
 from maasi_sim.experiments.papers import FOLDER, experiments, named, title_of
@@ -155,11 +164,11 @@ def page(sections: dict[str, Section]) -> str:
     known: dict[str, list[Experiment]] = {}
     for name, experiment in experiments().items():
         known.setdefault(name[:3], []).append(experiment)
-    parts = [introduction]
-    for paper, items in known.items():
-        links = [_link(item.name, item.name in sections) for item in items]
-        parts.append(f'- {named(paper)}: {", ".join(links)}')
-    parts.append('')
+    links = {
+        paper: ', '.join(_link(item.name, item.name in sections) for item in items)
+        for paper, items in known.items()
+    }
+    parts = [introduction, ''.join(f'- {named(paper)}: {text}\n' for paper, text in links.items())]
     for paper, items in known.items():
         items = [item for item in items if item.name in sections]
         if not items:
@@ -200,7 +209,10 @@ def _spans(numbers: Sequence[int]) -> str:
 
 def _verdicts(found: Sequence[Finding]) -> str:
     count = Counter(one.verdict() for one in found)
-    said = ', '.join(f'{number} {verdict}' for verdict, number in count.items())
+    plural = {HOLDS: 'hold', DIFFERS: 'differ', ONE_RUN: 'without interval'}
+    said = ', '.join(
+        f'{number} {plural.get(verdict, verdict)}' for verdict, number in count.items()
+    )
     return f' [Claims](claims.md): {said}.' if said else ''
 
 
