@@ -74,7 +74,7 @@ def test_compiling_is_said_and_loading_from_the_cache_is_not(tmp_path):
         )
         assert done.stdout == '4\n'
         said.append(done.stderr.splitlines())
-    assert said == [['compiling, once: a minute or two (0 of about 80)'], []]
+    assert said == [['compiling kernels (once on a machine, takes a minute or two): 0 done'], []]
 
 
 def test_a_search_says_that_it_compiles(monkeypatch, capsys):
@@ -85,4 +85,4 @@ def test_a_search_says_that_it_compiles(monkeypatch, capsys):
         return make_planner(settings.name, settings)
 
     search(scenario_from_values(SMALL_FIELD, 'field'), 1, 1, planner)
-    assert capsys.readouterr().err.startswith('compiling, once: a minute or two (0 of about ')
+    assert capsys.readouterr().err.startswith('compiling kernels')
