@@ -18,7 +18,7 @@ from maasi_filter.models.detection import detection_probability_at
 from maasi_filter.models.measurement import wrap
 
 # Weight of a hypothesis relative to the best one of its group, and how many a group has.
-LEAST_WEIGHT, MOST_HYPOTHESES = 1e-6, 3000
+LEAST_WEIGHT, MOST_HYPOTHESES = 1e-6, 1000
 LEAST_EXISTENCE = 1e-5  # r of a track
 ROOT = 32  # cells on a side of the coarsest grid
 LEAST_SPACING = 0.03  # of cells [m]
@@ -26,7 +26,7 @@ TOLERANCE = 1e-3  # change of the log of F at which a grid is fine enough
 # Logs of densities relative to the largest one, below which cells are left out: of a grid, and of
 # one that is refined.
 CUT, LOOSE_CUT = 16.0, 25.0
-GATE = 40.0  # squared normalised distance of a detection from the nearest cell
+GATE = 36.0  # squared normalised distance of a detection from the nearest cell
 CORNERS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
 
 
@@ -187,7 +187,7 @@ class Reference:
             }
             for j, longer in new.items():
                 log_ratio = longer.log_weight - track.log_weight - born[j].log_weight
-                if log_ratio > math.log(0.01 * LEAST_WEIGHT):
+                if log_ratio > math.log(LEAST_WEIGHT):
                     joined[track, j] = math.exp(min(log_ratio, 600.0)), longer
                     linked[j].add(g)
         # Groups that a detection links become one.
