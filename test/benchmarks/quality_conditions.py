@@ -119,6 +119,19 @@ CONDITIONS = {
         for per_scan in (0.2, 1.0, 3.0)
         for told in (True, False)
     },
+    **{
+        f'{name}, 3 false per scan in the area, {"told" if told else "not told"}': [
+            noise(name),
+            robots(
+                simulated={'clutter_per_scan': 3.0, 'clutter_in': 'area'},
+                sensor={'clutter': 3.0 / SIDE**3, 'clutter_in': 'area'}
+                if told
+                else {'clutter': 3.0 / SPACE},
+            ),
+        ]
+        for name in NOISES
+        for told in (True, False)
+    },
     'pi 0.7 of believed': [robots(simulated={'probability_factor': 0.7})],
     'pi 0.9 of believed': [robots(simulated={'probability_factor': 0.9})],
     'positions off by 1 m': [robots(odometry={'position_noise': 1.0})],
