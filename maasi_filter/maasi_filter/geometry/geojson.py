@@ -96,8 +96,9 @@ def by_role(value: Any) -> dict[str, list[Feature]]:
             raise ValueError(f'{feature.name}: role: read {role}, allowed are {", ".join(_ROLES)}')
         roles[role].append(feature)
     if not roles['area']:
+        source = value if isinstance(value, str) and is_geojson(value) else short(value)
         raise ValueError(
-            f'{short(value)}: no polygon has the role area; keep-outs alone belong under '
+            f'{source}: no polygon has the role area; keep-outs alone belong under '
             'environment.keep_outs'
         )
     return roles

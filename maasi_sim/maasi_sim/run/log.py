@@ -315,6 +315,12 @@ class RunLog(RunRecord):
             self.measured_from[robot] = [item for item in poses if item[0] <= until]
         super().close(end, until)
 
+    def planned_paths(self) -> dict[str, FloatArray]:
+        """Return the start and the chosen waypoints of each robot, (n, 3) [m]."""
+        starts = {robot: path[:1, 1:] for robot, path in self.trajectories.items()}
+        chosen = {robot: [place for _, place in self.waypoints.get(robot, ())] for robot in starts}
+        return {robot: np.vstack([start, *chosen[robot]]) for robot, start in starts.items()}
+
     @property
     def explored(self) -> float:
         """Explored share, from the planner that reports the largest."""

@@ -120,8 +120,8 @@ class Mission(Protocol[Record]):
     def report(self, record: Record) -> dict[str, Any]:
         """Return the report as plain values."""
 
-    def tables(self, record: Record) -> dict[str, str]:
-        """Return the texts of further report files, by name."""
+    def tables(self, record: Record) -> dict[str, str | bytes]:
+        """Return the contents of further report files, by name."""
         return {}
 
     def summary(self, report: dict[str, Any]) -> str:

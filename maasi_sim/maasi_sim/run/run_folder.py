@@ -39,11 +39,12 @@ def make_folder(out: Path | None, suffix: str = '') -> Path:
         raise kind(f'--out: {error.filename}: {error.strerror}') from None
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str | bytes) -> None:
     """Write a file of the run; its folder is made."""
     try:
         path.parent.mkdir(exist_ok=True)
-        write_whole(path, lambda file: file.write_text(text, encoding='utf-8'))
+        data = text.encode() if isinstance(text, str) else text
+        write_whole(path, lambda file: file.write_bytes(data))
     except OSError as error:
         raise ResultsError(f'{path}: {error.strerror}') from error
 

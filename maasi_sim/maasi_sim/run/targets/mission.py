@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +17,16 @@ from maasi_filter.settings import unsuitable_lengths, unused_settings
 from maasi_sim.run.log import RunLog
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, common_parameters, guard_plan, sim_plan
 from maasi_sim.run.run_options import Options
+from maasi_sim.run.targets.exports import map_files
 from maasi_sim.run.targets.observer import TargetObserver
-from maasi_sim.run.targets.report import build_report, target_summary
-from maasi_sim.run.targets.tables import csv_text, found_geojson, found_rows, ways_geojson
+from maasi_sim.run.targets.report import build_report, explored_after, target_summary
+from maasi_sim.run.targets.tables import (
+    collection,
+    csv_text,
+    found_geojson,
+    found_rows,
+    searched,
+)
 from maasi_sim.run.topics import BATCH, within
 from maasi_sim.scenario.checks import never_seen
 from maasi_sim.scenario.layering import ScenarioError
@@ -77,14 +85,22 @@ class TargetMission:
     report = staticmethod(build_report)
     summary = staticmethod(target_summary)
 
-    def tables(self, record: RunLog) -> dict[str, str]:
+    def tables(self, record: RunLog) -> dict[str, str | bytes]:
         """See `Mission.tables`."""
         origin = self.scenario.environment.origin
         rows = found_rows(record.found_targets, record.truth, record.pairs, origin)
-        files = {'found_targets.csv': csv_text(rows, record.scenario.dimension, origin)}
+        files: dict[str, str | bytes] = {
+            'found_targets.csv': csv_text(rows, record.scenario.dimension, origin)
+        }
         if origin is not None:
+            explored = explored_after(record)
+            features = searched(record, explored, origin)
             files['found_targets.geojson'] = found_geojson(rows)
-            files['ways.geojson'] = ways_geojson(record, origin)
+            files['ways.geojson'] = collection(features)
+            now = datetime.now(timezone.utc)
+            paths = record.planned_paths()
+            made = map_files(self.name, rows, features, paths, explored, origin, now)
+            files |= {f'map_files/{name}': content for name, content in made.items()}
         return files
 
     def figure(self, record: RunLog) -> Figure:

@@ -15,8 +15,8 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.log import RunLog
-from maasi_sim.run.targets.report import explored_after
 
 Row = dict[str, Any]
 
@@ -83,13 +83,12 @@ def found_geojson(rows: Sequence[Row]) -> str:
         properties, digits = dict(row), {'longitude': 8, 'latitude': 8, 'altitude': 3}
         place = [round(properties.pop(name), number) for name, number in digits.items()]
         features.append(_feature({'type': 'Point', 'coordinates': place}, properties))
-    return _collection(features)
+    return collection(features)
 
 
-def ways_geojson(record: RunLog, origin: OriginSettings) -> str:
-    """Return the paths of the robots and the explored area."""
-    area = _area(record, origin)
-    return _collection([*area, _explored(record, origin), *_ways(record, origin)])
+def searched(record: RunLog, explored: UnexploredMap, origin: OriginSettings) -> list[Row]:
+    """Return the area, the explored ground and the paths of the robots as features."""
+    return [*_area(record, origin), _explored(explored, origin), *_ways(record, origin)]
 
 
 def _area(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
@@ -99,9 +98,8 @@ def _area(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
             yield _polygon(polygon, origin, {'kind': kind})
 
 
-def _explored(record: RunLog, origin: OriginSettings) -> Row:
+def _explored(explored: UnexploredMap, origin: OriginSettings) -> Row:
     """Return the explored area (less than half unseen), in 3D over the whole height."""
-    explored = explored_after(record)
     unseen = np.atleast_3d(explored.values).mean(axis=2)
     # Consecutive cells along y form a box: row, first cell, end.
     edges = np.diff(unseen < 0.5, axis=1, prepend=False, append=False)
@@ -147,6 +145,7 @@ def _feature(geometry: Any, properties: Row) -> Row:
     return {'type': 'Feature', 'geometry': geometry, 'properties': properties}
 
 
-def _collection(features: Iterable[Row]) -> str:
+def collection(features: Iterable[Row]) -> str:
+    """Return features as the text of GeoJSON."""
     content = {'type': 'FeatureCollection', 'features': [*features]}
     return json.dumps(content, indent=1, allow_nan=False) + '\n'

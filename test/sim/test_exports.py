@@ -1,0 +1,152 @@
+"""Results for map programs: complete, readable by others, and without the true targets."""
+
+import io
+import json
+import re
+import warnings
+from datetime import datetime, timezone
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from small_field import SMALL_FIELD
+
+from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.geodesy import geodetic, to_map
+from maasi_filter.geometry.polygons import InputWarning
+from maasi_filter.records import Label
+from maasi_sim.run.targets.exports import cot_text, gpx_text, kml_text, map_files
+from maasi_sim.run.targets.mission import TargetMission
+from maasi_sim.run.targets.report import explored_after
+from maasi_sim.run.targets.tables import found_rows, searched
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.search import search
+
+NOW = datetime(2026, 5, 4, 3, 2, 1, tzinfo=timezone.utc)
+ODD = Label('cup <a&b>', 0.5, 'tag\x00\x1b"3"\ufffe')
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    environment = {
+        'area': [[0, 0], [60, 0], [60, 60], [0, 60]],
+        'expected_targets': 2.0,
+        'origin': {'latitude': 46.0, 'longitude': 23.5, 'altitude': 350.0},
+        'keep_outs': [[[40, 40], [50, 40], [50, 50]]],
+    }
+    path = tmp_path_factory.mktemp('field') / 'field.yaml'
+    path.write_text(yaml.safe_dump({**SMALL_FIELD, 'environment': environment}))
+    return search(load_scenario(path), 2)
+
+
+@pytest.fixture
+def files(run):
+    return files_of(run, run.truth)
+
+
+def files_of(run, truth):
+    origin, explored = run.scenario.environment.origin, explored_after(run)
+    pairs = [(index, index) for index in range(min(len(truth), len(run.found_targets)))]
+    rows = found_rows(run.found_targets, truth, pairs, origin)
+    features = searched(run, explored, origin)
+    return map_files('field', rows, features, run.planned_paths(), explored, origin, NOW)
+
+
+def elements(text):
+    found = list(ElementTree.fromstring(text).iter())
+    for item in found:
+        item.tag = item.tag.rpartition('}')[2]
+    return found
+
+
+def test_no_file_depends_on_the_true_targets(run, files):
+    other = files_of(run, run.truth + np.array([7.0, -3.0]))
+    assert files == other and len(run.found_targets) > 0
+    for name, content in files.items():
+        if isinstance(content, str):
+            for axis in run.truth.ravel():
+                assert repr(float(axis)) not in content, name
+            assert not re.search(r'\b(truth|error|rmse)\b', content), name
+
+
+def test_a_run_writes_them_into_a_folder_of_their_own(run):
+    made = TargetMission('field', run.scenario).tables(run)
+    names = {'search.kml', 'found_targets.gpx', 'found_targets.cot', 'drone.plan'}
+    names |= {'detection_probability.png', 'detection_probability.pgw'}
+    assert {name for name in made if '/' in name} == {f'map_files/{name}' for name in names}
+
+
+def test_found_targets_are_where_they_were_found(run, files):
+    origin = run.scenario.environment.origin
+    fixes = geodetic(np.array([item.position for item in run.found_targets]), origin)
+    marks = [item for item in elements(files['search.kml']) if item.tag == 'Point']
+    kml = [list(map(float, item[0].text.split(',')))[::-1] for item in marks]
+    points = [item for item in elements(files['found_targets.gpx']) if item.tag == 'wpt']
+    gpx = [[float(item.get(key)) for key in ('lat', 'lon')] for item in points]
+    events = [item for item in elements(files['found_targets.cot']) if item.tag == 'point']
+    cot = [[float(item.get(key)) for key in ('lat', 'lon', 'hae')] for item in events]
+    assert np.allclose(kml, fixes[:, :2], atol=1e-8) and np.allclose(gpx, kml)
+    assert np.allclose(cot, fixes, atol=1e-3)
+    spread = [np.sqrt(np.linalg.eigvalsh(item.covariance)[-1]) for item in run.found_targets]
+    assert np.allclose([float(item.get('ce')) for item in events], spread, atol=1e-3)
+    times = [item for item in elements(files['found_targets.cot']) if item.tag == 'event']
+    assert times[0].get('time') == '2026-05-04T03:02:01Z' < times[0].get('stale')
+
+
+def test_the_area_comes_back_from_kml_and_plan(run, files, tmp_path):
+    environment = run.scenario.environment
+    for name in ('drone.plan', 'search.kml'):
+        (tmp_path / name).write_text(files[name])
+        values = {'area': str(tmp_path / name), 'origin': environment.origin.model_dump()}
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', InputWarning)
+            made = EnvironmentSettings.model_validate(values)
+        assert made.area.area == pytest.approx(3600.0, abs=0.1)
+        (kept,) = made.keep_outs
+        assert kept.polygon.area == pytest.approx(50.0, abs=0.01)
+
+
+def test_a_plan_has_the_waypoints_above_the_start(run, files):
+    mission = json.loads(files['drone.plan'])['mission']
+    chosen = [place for _, place in run.waypoints['drone']]
+    items = np.array([item['params'][4:] for item in mission['items']])
+    origin = run.scenario.environment.origin
+    assert np.allclose(to_map(items[:, 1::-1], origin), np.array(chosen)[:, :2], atol=0.01)
+    heights = run.planned_paths()['drone'][:, 2]
+    assert np.allclose(items[:, 2], heights[1:] - heights[0], atol=0.01)
+    assert [item['doJumpId'] for item in mission['items']] == [*range(1, len(chosen) + 1)]
+
+
+def test_the_picture_shows_what_would_have_been_found(run, files):
+    explored = explored_after(run)
+    image = np.asarray(Image.open(io.BytesIO(files['detection_probability.png'])))
+    a, d, b, e, c, f = map(float, files['detection_probability.pgw'].split())
+    origin = run.scenario.environment.origin
+    for place in ([10.0, 12.0], [30.0, 5.0], [55.0, 55.0]):
+        latitude, longitude = geodetic(np.array([place]), origin)[0, :2]
+        column, row = np.linalg.solve([[a, b], [d, e]], [longitude - c, latitude - f])
+        x, y = (column * explored.step[0], 60.0 - row * explored.step[1])
+        assert (x, y) == pytest.approx(place, abs=0.01)
+        pixel = image[round(row), round(column)]
+        shown = 1.0 - explored.values[round(column), len(image) - 1 - round(row)]
+        assert pixel[0] == pytest.approx(255.0 * shown, abs=1.0) and pixel[3] == 255
+    # A target cannot be in the keep-out.
+    assert image[round((60.0 - 42.5) / explored.step[1]), round(47.5 / explored.step[0]), 3] == 0
+
+
+def test_any_text_of_a_detection_is_valid_xml(run):
+    rows = found_rows(run.found_targets, run.truth, [], run.scenario.environment.origin)
+    rows = [{**row, 'class_id': ODD.class_id, 'identity': ODD.identity} for row in rows]
+    for text in (kml_text('a&b', rows, []), gpx_text(rows), cot_text('<"', rows, NOW)):
+        assert any('cup <a&b>' in (item.text or '') for item in elements(text)) or (
+            'cup &lt;a&amp;b&gt;' in text
+        )
+
+
+def test_a_search_without_finds_or_paths_is_written_too(run):
+    origin, explored = run.scenario.environment.origin, explored_after(run)
+    paths = {'drone': np.zeros((1, 3)), 'other': np.zeros((0, 3))}
+    made = map_files('field', [], [], paths, explored, origin, NOW)
+    assert 'drone.plan' not in made and elements(made['search.kml'])
