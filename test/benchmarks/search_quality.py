@@ -212,21 +212,33 @@ def full(works):
 
 
 def compact(works):
-    """Return a table in Markdown with a row for each regime and planner, as documents have it."""
-    heads = 'planner', 'seeds', 'complete', 'time to find all [s]', 'minus `before` [s]'
-    table = [['regime (limit)', *heads, 'mean time to find [s]']]
-    for name, work in works.items():
-        found = SearchTable(work.results())
-        regime = f'{name} ({REGIMES[name].limit:g} s)'
-        for case, means in found.means.items():
-            gap = found.differences[case]['time'] if case in found.differences else None
-            spans = [f'{means[key].mean:.1f}±{means[key].half_width:.1f}' for key in MEANS]
-            change = f'{gap.mean:+.1f} [{gap.low:+.1f}, {gap.high:+.1f}]' if gap else '-'
-            complete = found.complete[case].number
-            seeds = means['complete'].number
-            table.append([regime, case, f'{seeds}', f'{complete}', spans[0], change, spans[1]])
-            regime = ''
-    return '\n' + markdown_table(table)
+    """Return tables with a row for each regime and a column for each planner, for documents."""
+    text, tables = '', {name: SearchTable(work.results()) for name, work in works.items()}
+    for key, words in MEANS.items():
+        heads = list(dict.fromkeys(case for table in tables.values() for case in table.cases))
+        rows, differences = [['regime (limit)', *heads]], [['regime', *heads[1:]]]
+        for name, table in tables.items():
+            cells = {case: compact_mean(table, case, key) for case in table.cases}
+            regime = f'{name} ({REGIMES[name].limit:g} s)'
+            rows.append([regime, *(cells.get(case, '-') for case in heads)])
+            gaps = {case: gap[key] for case, gap in table.differences.items()}
+            spans = {
+                case: f'{gap.mean:+.3g} [{gap.low:+.3g}, {gap.high:+.3g}]'
+                for case, gap in gaps.items()
+            }
+            differences.append([name, *(spans.get(case, '-') for case in heads[1:])])
+        text += f'\n{words} [s]:\n\n{markdown_table(rows)}'
+        if key == 'time' and heads[1:]:
+            text += f'\nThe same minus `{heads[0]}` [s]:\n\n{markdown_table(differences)}'
+    return text
+
+
+def compact_mean(table, case, key):
+    """Return a mean with its half width, and how many searches were complete if not all were."""
+    one = table.means[case][key]
+    complete, seeds = table.complete[case].number, table.means[case]['complete'].number
+    some = f' ({complete}/{seeds})' if key == 'time' and complete < seeds else ''
+    return f'{one.mean:.3g}±{one.half_width:.2g}{some}'
 
 
 def short(works):
@@ -252,7 +264,7 @@ def short(works):
 
 
 FOUND = ('half_time', 'most_time', 'time')  # in each cell
-MEANS = ('time', 'mean_time')
+MEANS = {'time': 'Time to find all', 'mean_time': 'Mean time to find a target'}
 
 
 def main():
