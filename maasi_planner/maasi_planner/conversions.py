@@ -146,7 +146,7 @@ def planner_markers(
             marker.color = tint
             markers.append(marker)
         thinned = path[:: max(1, len(path) // 50)]
-        for namespace, line, width in (
+        for namespace, corners, width in (
             ('ways', thinned, 0.2 * size),
             ('tours', [waypoint, *tour], 0.07 * size),
         ):
@@ -154,7 +154,7 @@ def planner_markers(
             line.pose.orientation.w = 1.0
             line.scale.x = width
             line.color = tint
-            line.points = [point_to_ros(point) for point in line]
+            line.points = [point_to_ros(point) for point in corners]
             line.action = Marker.ADD if len(line.points) > 1 else Marker.DELETE
             markers.append(line)
     return MarkerArray(markers=markers)
