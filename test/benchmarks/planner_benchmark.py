@@ -1,10 +1,15 @@
-"""Median times of whole decisions, predicted trajectories included."""
+"""Median times of whole decisions, with predicted trajectories, and of paths around obstacles."""
 
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
-from timing import entry, few, median_time
+from scipy.sparse import block_array, csr_array
+from scipy.sparse.csgraph import dijkstra
+from timing import against, entry, few, median_time
 
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
@@ -22,7 +27,10 @@ from maasi_planner import (
     warm_up,
 )
 from maasi_planner.endurance import Endurance, EnduranceSettings
+from maasi_planner.guidance import length_to
+from maasi_planner.keep_out import CORNERS, KeepOut
 from maasi_planner.planners.options import options_of
+from maasi_planner.visibility import VisibilityGraph, _last_legs
 
 CUBE = np.array([[0.0, 260.0]] * 3)
 FLOOR = np.array([[-0.3, 2.4]] * 2)
@@ -105,6 +113,66 @@ def field(batteries):
     return TeamView(0, 0.1, robots, [], UnexploredMap(bounds, 5.0))
 
 
+def among_obstacles():
+    """Return the keep-out regions of a robot among 16 discs in a square of 400 m."""
+    rng = np.random.default_rng(3)
+    places = 100.0 * (np.indices((4, 4)).reshape(2, 16).T + rng.uniform(0.3, 0.7, (16, 2)))
+    zones = [{'centre': place, 'radius': rng.uniform(10.0, 25.0)} for place in places.tolist()]
+    return KeepOut(Area(EnvironmentSettings(bounds=[[0.0, 400.0]] * 2, keep_outs=zones)), 0.5, 1.0)
+
+
+def pyvisgraph_times(keep_out, start, goal):
+    """Return the times in which pyvisgraph builds the same graph, and finds a path [ms]."""
+    import pyvisgraph
+
+    rings = keep_out.around.vertices.reshape(-1, CORNERS, 2).tolist()
+    polygons = [[pyvisgraph.Point(*corner) for corner in ring] for ring in rings]
+    graph, ends = pyvisgraph.VisGraph(), [pyvisgraph.Point(*end[:2]) for end in (start, goal)]
+    build = median_time(partial(graph.build, polygons, status=False), 1)
+    find = partial(graph.shortest_path, *ends)
+    path = np.array([(point.x, point.y) for point in find()])
+    theirs = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+    ours = keep_out.path_length(start, goal)
+    if abs(theirs - ours) > 0.01 * ours:
+        raise RuntimeError(f'pyvisgraph: another shortest path, {theirs} m and not {ours} m')
+    return 1e3 * build, 1e3 * median_time(find, 3)
+
+
+def dijkstra_time(graph, goal, repeats):
+    """Return the time in which SciPy finds the lengths to a goal on the same graph [s]."""
+    first, ends, lengths = graph._edges
+    last = _last_legs(goal, graph.around)
+    seen, number = np.flatnonzero(last < np.inf), len(last)
+    to_goal = csr_array((last[seen], (seen, np.zeros_like(seen))), (number, 1))
+    edges = csr_array((lengths, ends, first), (number, number))
+    edges = block_array([[edges, to_goal], [to_goal.T, None]], format='csr')
+    find = partial(dijkstra, edges, indices=number)
+    if not np.allclose(find()[:number], graph.to_goal(goal)):
+        raise RuntimeError('SciPy: other shortest lengths')
+    return median_time(find, repeats)
+
+
+def paths_around_obstacles(share):
+    """Yield times of a visibility graph of 192 corners, of its lengths to a goal, and of a path."""
+    keep_out, start, goal = among_obstacles(), (5.0, 5.0, 0.0), (395.0, 390.0, 0.0)
+    graph, repeats = VisibilityGraph(keep_out.around, 0.4), few(share, 200)
+    length = partial(length_to, start, goal, graph.to_goal(goal), keep_out.around)
+    build, to_goal, path = (
+        1e3 * median_time(call, repeats)
+        for call in (
+            partial(VisibilityGraph, keep_out.around, 0.4),
+            partial(graph.to_goal, goal),
+            lambda: (graph.to_goal(goal), length()),
+        )
+    )
+    theirs = cache(partial(pyvisgraph_times, keep_out, start, goal))
+    yield against('visibility_graph', build, 'pyvisgraph', lambda: theirs()[0])
+    yield against('shortest_path', path, 'pyvisgraph', lambda: theirs()[1])
+    scipy = 1e3 * dijkstra_time(graph, goal, repeats)
+    what = f'SciPy, dijkstra, {scipy:.3g} ms, without visibility of the goal'
+    yield entry('shortest_lengths', to_goal, 'ms', what, scipy / to_goal)
+
+
 def whole_grid_decision(team):
     """Return the best value of one robot by (17) to (22) as they are written."""
     from plain_objective import plain_terms
@@ -136,6 +204,7 @@ def run(share=1.0):
             ('e on the whole grid, h = 10 m', whole / value) if name == 'asi_decision' else ()
         )
         yield entry(name, 1e3 * value, 'ms', *compared)
+    yield from paths_around_obstacles(share)
     for batteries in (False, True):
         team, planners = field(batteries), [make_planner('tour') for _ in range(few(share, 5) + 1)]
         first = median_time(lambda: planners.pop().decide(team), len(planners) - 1)  # noqa: B023
