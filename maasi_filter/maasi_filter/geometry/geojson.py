@@ -223,7 +223,10 @@ def _parsed(value: Any, named: bool) -> Any:
     if not isinstance(value, str):
         return value
     if not named and not value.lstrip().startswith('{'):
-        raise ValueError(f'read {short(value)}, allowed is GeoJSON, or the name of its file')
+        raise ValueError(
+            f'read {short(value)}, allowed is GeoJSON, or the name of a file '
+            f'({", ".join(FILES)}); {_CONVERT}'
+        )
     if named and Path(value).suffix.lower() in READERS:
         return read_map_file(value)
     try:
