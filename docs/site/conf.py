@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
@@ -19,6 +20,8 @@ html_title = project
 html_show_copyright = False
 html_copy_source = False
 html_static_path = html_css_files = ['site.css']
+# Pages rank above entries of the API.
+html_search_scorer = str(Path(__file__).with_name('scorer.js'))
 # They would be fetched page by page, which a browser refuses to a page from a file.
 html_show_search_summary = False
 # Backticks in docstrings name code, as in Markdown.
@@ -72,7 +75,8 @@ def short_contents(app: Any, page: str, template: str, context: Any, doctree: An
     """List the modules of the API beside its own pages only; beside all they take minutes."""
     whole = context.get('toctree')
     if whole:
-        context['toctree'] = lambda **options: whole(**{**options, 'collapse': True})
+        short = {'collapse': True} if page.startswith('api/') else {'maxdepth': 2}
+        context['toctree'] = lambda **options: whole(**{**options, **short})
 
 
 def setup(app: Any) -> None:

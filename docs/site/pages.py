@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 from page_tables import code, table
@@ -18,27 +19,54 @@ from maasi_filter.ros.parameters import parameters_of
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / 'docs'
-# What each part of the site holds, in order; a page of docs/ that is in no part goes to the last.
+# What each part of the site holds, in order, under its title and what it is for; a page of docs/
+# that is in no part goes to the last.
 PARTS = {
-    'Start': ['README', 'first_search', 'install'],
-    'Tutorials': [
-        f'tutorials/{name}' for name in ('student', 'ros_engineer', 'researcher', 'area', 'field')
-    ],
-    'How to': [
-        *(f'how_to/{name}' for name in ('detections', 'planner', 'robot', 'bags')),
-        *('plugins', 'compare', 'view', 'robots', 'robots_mambo', 'robots_mavlink'),
-    ],
-    'Reference': [
-        *('scenario_keys', 'commands', 'nodes'),
-        *(f'reference/{name}' for name in ('parameters', 'messages')),
-        *('report', 'parameters', 'messages', 'measurement_feed', 'filter_presets', 'api/api'),
-    ],
-    'Explanation': [
-        *('architecture', 'filter', 'planners', 'cuboid_mpc', 'reliability', 'repeatability'),
-        *('claims', 'reproduction', 'judge'),
-    ],
+    'tutorials': (
+        'Tutorials',
+        'Learn: complete examples, from the first search to real robots.',
+        [
+            'first_search',
+            *(
+                f'tutorials/{name}'
+                for name in ('student', 'area', 'ros_engineer', 'field', 'researcher')
+            ),
+        ],
+    ),
+    'how_to': (
+        'How-to',
+        'Do: one task each, with the commands or the code.',
+        [
+            'install',
+            *(f'how_to/{name}' for name in ('search_area', 'map_files', 'keep_outs', 'batteries')),
+            *(
+                f'how_to/{name}'
+                for name in ('robot', 'autopilots', 'detections', 'planner', 'filter')
+            ),
+            *('plugins', 'how_to/bags', 'compare', 'view'),
+            *('robots', 'robots_mavlink', 'robots_mambo'),
+        ],
+    ),
+    'reference': (
+        'Reference',
+        'Look up: keys, commands, topics, parameters, fields, classes.',
+        [
+            *('scenario_keys', 'commands', 'nodes'),
+            *(f'reference/{name}' for name in ('parameters', 'messages')),
+            *('report', 'parameters', 'messages', 'measurement_feed', 'filter_presets', 'api/api'),
+        ],
+    ),
+    'background': (
+        'Background',
+        'Understand: methods, guarantees, and how well it works.',
+        [
+            *('words_search_and_rescue', 'words_tracking', 'architecture', 'filter', 'planners'),
+            *('cuboid_mpc', 'reliability', 'repeatability', 'search_quality', 'filter_quality'),
+            *('judge', 'reproduction', 'claims'),
+        ],
+    ),
 }
-LAST = 'Explanation'
+LAST = 'background'
 # Outside of docs/.
 SHOWN = (Path('README.md'), Path('CONTRIBUTING.md'))
 PICTURES = ('.png', '.gif')
@@ -51,15 +79,16 @@ NODES = [
     ('maasi_sim', 'simulation.sim_node', 'SimNode'),
     ('maasi_sim', 'run.buildings.cuboid_sim_node', 'CuboidSimNode'),
 ]
-HOME = """# MAASI
+HOME = """# MAASI: multi-robot search for targets
 
-A team of robots finds an unknown number of targets: a suite for ROS 2 Jazzy in Python, and a
-library without ROS.
+Plan and run team searches: drones and ground robots find an unknown number of targets in your area.
 
-![The page of a run: where robots go, and why](view.png)
+![Two drones and a rover search a valley](field.gif)
 
-Two commands, in a clone and without any ROS ([what they need](README.md#try-it)). Two
-simulated robots find twelve markers, on the page above:
+DOORS
+
+Two commands in a clone, without any ROS ([what they need](README.md#try-it)). Two simulated robots
+find twelve markers, shown on a page:
 
 ```sh
 ./scripts/demo --view
@@ -71,8 +100,6 @@ All tests:
 ./scripts/test
 ```
 
-New here: [the first search](first_search.md), then the tutorial that fits. Something particular to
-do: *How to*. A name or a number to look up: *Reference*. Why it is as it is: *Explanation*.
 """
 
 
@@ -120,18 +147,29 @@ def copy_pages(target: Path) -> None:
         shutil.copyfile(picture, place)
 
 
-def home(names: set[str]) -> str:
-    """Return the first page, with the contents of the whole site."""
-    listed = {name for part in PARTS.values() for name in part}
-    text = [HOME]
-    for title, part in PARTS.items():
-        rows = [name for name in part if name in names]
-        if title == LAST:
-            rows += sorted(names - listed)
-        text.append(
-            '\n'.join([f'```{{toctree}}\n:caption: {title}\n:maxdepth: 1\n', *rows, '```\n'])
-        )
-    return '\n'.join(text)
+def doors() -> str:
+    """Return links to the four kinds of documents."""
+    links = [
+        f'<a href="{name}.html"><strong>{title}</strong> {text}</a>'
+        for name, (title, text, _) in PARTS.items()
+    ]
+    return '\n'.join(['<div class="doors">', *links, '</div>'])
+
+
+def contents(names: Iterable[str], options: str = '') -> str:
+    return '\n'.join(['```{toctree}', ':maxdepth: 1', options, *names, '```', ''])
+
+
+def write_contents(target: Path, names: set[str]) -> None:
+    """Write the first page and that of each part of the site."""
+    listed = {name for _, _, part in PARTS.values() for name in part}
+    rest = sorted(names - listed - {str(path.with_suffix('')) for path in SHOWN})
+    for name, (title, text, part) in PARTS.items():
+        rows = [page for page in part if page in names] + (rest if name == LAST else [])
+        (target / f'{name}.md').write_text(f'# {title}\n\n{text}\n\n{contents(rows)}')
+    shown = [*PARTS, 'About <README>', 'CONTRIBUTING']
+    first = HOME.replace('DOORS', doors())
+    (target / 'index.md').write_text(first + contents(shown, ':hidden:'))
 
 
 def parameters_page() -> str:
@@ -186,7 +224,7 @@ def main() -> None:
     names = {path.relative_to(target).with_suffix('').as_posix() for path in target.rglob('*.md')}
     if (target / 'api').is_dir():
         names.add('api/api')
-    (target / 'index.md').write_text(home(names))
+    write_contents(target, names)
 
 
 if __name__ == '__main__':

@@ -71,11 +71,11 @@ def table_rows(heading):
     return [[cell.strip() for cell in row.strip('|').split('|')] for row in rows]
 
 
-def test_each_room_is_described_and_each_described_room_exists():
-    described = {row[0].strip('`') for row in table_rows('Rooms')}
+def test_each_package_is_described_and_each_described_folder_exists():
+    described = {row[0].strip('`') for row in table_rows('Folders')}
     inits = [path for name in PACKAGES for path in ROOT.glob(f'{name}/*/**/__init__.py')]
     assert {path.parent.relative_to(ROOT).as_posix() for path in inits} <= described
-    assert all((ROOT / room).is_dir() for room in described)
+    assert all((ROOT / folder).is_dir() for folder in described)
 
 
 def test_names_of_the_glossary_stand_in_their_files():

@@ -33,7 +33,7 @@ def test_every_page_is_in_the_contents_and_needs_no_network(site: Path) -> None:
     loaded = r'<(?:script|link|img)\b[^>]*\b(?:src|href)="(?:https?:)?//'
     assert [page.name for page in site.rglob('*.html') if re.search(loaded, page.read_text())] == []
     contents = (site / 'index.html').read_text()
-    assert 'view.png' in contents
+    assert 'field.gif' in contents
     words = re.sub(r'<[^>]+>', '', contents)
     assert './scripts/demo --view\n' in words
     assert 'Copyright' not in words and '©' not in words

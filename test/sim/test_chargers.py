@@ -119,9 +119,9 @@ def test_random_chargers_are_those_that_the_robot_gets_to():
     assert min(counts.values()) > 20
 
 
-def test_the_block_of_the_tutorial_names_a_robot_that_is_charged():
+def test_the_block_of_the_how_to_names_a_robot_that_is_charged():
     """As it stands there, in the scenario that it is of."""
-    text = (Path(__file__).parents[2] / 'docs' / 'tutorials' / 'area.md').read_text()
+    text = (Path(__file__).parents[2] / 'docs' / 'how_to' / 'batteries.md').read_text()
     (block,) = (
         item
         for item in re.findall(r'```yaml\n(.*?)```', text, re.S)
