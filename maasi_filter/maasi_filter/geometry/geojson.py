@@ -224,7 +224,7 @@ def _parsed(value: Any, named: bool) -> Any:
         return value
     if not named and not value.lstrip().startswith('{'):
         raise ValueError(
-            f'read {short(value)}, allowed is GeoJSON, or the name of a file '
+            f'read {short(Path(value).name)}, allowed is GeoJSON, or the name of a file '
             f'({", ".join(FILES)}); {_CONVERT}'
         )
     if named and Path(value).suffix.lower() in READERS:
