@@ -93,8 +93,9 @@ def brief_cell(text: str) -> str:
 
 
 def _range(head: str, cases: Cells) -> str:
-    texts = [cells[head].removeprefix('more than ') for cells in cases.values() if head in cells]
-    numbers = [re.split('[ ,<]', text)[0] for text in texts]
+    texts = [cells[head] for cells in cases.values() if head in cells]
+    never = 'more than ' if all(text.startswith('more than ') for text in texts) else ''
+    numbers = [re.split('[ ,<]', text.removeprefix('more than '))[0] for text in texts]
     low, high = (pick(numbers, key=float) for pick in (min, max))
     label, _, unit = head.removesuffix(']').partition(' [')
     span = low if float(low) == float(high) else f'{low} to {high}'
@@ -102,7 +103,7 @@ def _range(head: str, cases: Cells) -> str:
     paper = next(
         (f' (paper {re.split("[ <]", parts[1])[0]})' for parts in printed if parts[1:]), ''
     )
-    return f'{label} {span} {unit}'.strip() + (paper if len(set(numbers)) == 1 else '')
+    return f'{label} {never}{span} {unit}'.strip() + (paper if len(set(numbers)) == 1 else '')
 
 
 def _matrix(table: Mapping[str, Sequence[str]], title: str) -> list[list[str]]:

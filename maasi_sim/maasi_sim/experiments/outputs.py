@@ -14,16 +14,7 @@ import yaml
 
 from maasi_sim.experiments.brief import brief_tables
 from maasi_sim.experiments.campaign import Campaign, maps_in, plan
-from maasi_sim.experiments.claims import (
-    DIFFERS,
-    HOLDS,
-    ONE_RUN,
-    Finding,
-    claims_page,
-    findings,
-    summary,
-    with_summary,
-)
+from maasi_sim.experiments.claims import Finding, claims_page, findings, summary, with_summary
 from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
 from maasi_sim.experiments.figures import as_png
 from maasi_sim.experiments.papers import FOLDER, experiments, named, title_of
@@ -209,10 +200,7 @@ def _spans(numbers: Sequence[int]) -> str:
 
 def _verdicts(found: Sequence[Finding]) -> str:
     count = Counter(one.verdict() for one in found)
-    plural = {HOLDS: 'hold', DIFFERS: 'differ', ONE_RUN: 'without interval'}
-    said = ', '.join(
-        f'{number} {plural.get(verdict, verdict)}' for verdict, number in count.items()
-    )
+    said = ', '.join(f'{verdict} {number}' for verdict, number in count.items())
     return f' [Claims](claims.md): {said}.' if said else ''
 
 
@@ -224,7 +212,11 @@ def wrapped(text: str) -> str:
             lines.append(line)
             continue
         mark = line.split(' ', 1)[0]
-        indent = ' ' * (len(mark) + 1) if mark == '-' or mark[:-1].isdecimal() else ''
+        indent = (
+            ' ' * (len(mark) + 1)
+            if mark == '-' or (mark[-1:] == '.' and mark[:-1].isdecimal())
+            else ''
+        )
         lines += textwrap.wrap(
             line, _COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
         )
