@@ -91,7 +91,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._reset_state()
         # Batches wait this long for the found targets that the planner retained.
         # Later messages contain what this filter found itself.
-        self._kept_until, self._kept_taken = math.inf, False
+        self._kept_until, self.kept_received = math.inf, False
         if settings.save_file and Path(settings.save_file).exists():
             self._restore(Path(settings.save_file))
 
@@ -113,7 +113,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def _continue_from(self, progress: Progress) -> None:
         self._progress = progress
-        self._batches = BatchAssembly(self, self._sensors, progress)
+        self.batches = BatchAssembly(self, self._sensors, progress)
 
     def _restore(self, file: Path) -> None:
         """Resume the saved search, or the run of a process that died."""
@@ -223,7 +223,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         """Return the state of the search."""
         return {
             'batches': self._progress.batch,
-            'waiting batches': len(self._batches.pending),
+            'waiting batches': len(self.batches.pending),
             'particles': len(self.filter.weights),
             'expected number': f'{self.filter.expected_number:.3f}',
             'found': len(self.filter.found_targets),
@@ -247,30 +247,30 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 'the search starts again'
             )
             self.reset()
-        self._batches.add(batch)
+        self.batches.add(batch)
         self._process_complete()
 
     def _on_detections(self, name: str, message: DetectionArray) -> None:
         if not self.active:
             return
-        late = self._batches.receive(name, message)
+        late = self.batches.receive(name, message)
         if late is not None:
             late.step = max(late.step, self._progress.step or 0)
             self._process(late)
         self._process_complete()
 
     def _give_up_waiting(self) -> None:
-        if self._batches.give_up(self.settings.batch_timeout):
+        if self.batches.give_up(self.settings.batch_timeout):
             self._process_complete()
 
     # ---- the step ----------------------------------------------------------------------------
 
     def _process_complete(self) -> None:
         # New ids must differ from those of targets that were found before a restart.
-        awaited = not self._kept_taken and time.monotonic() < self._kept_until
-        if awaited and self._batches.pending and self.count_publishers(self._kept_topic):
+        awaited = not self.kept_received and time.monotonic() < self._kept_until
+        if awaited and self.batches.pending and self.count_publishers(self._kept_topic):
             return
-        while (batch := self._batches.next_complete()) is not None:
+        while (batch := self.batches.next_complete()) is not None:
             self._process(batch)
 
     def _process(self, batch: PendingBatch) -> None:
@@ -368,9 +368,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def _on_kept(self, message: FoundTargetArray) -> None:
         """Restore found targets after a restart without a saved state."""
-        if not self.active or self._kept_taken:
+        if not self.active or self.kept_received:
             return
-        self._kept_taken = True
+        self.kept_received = True
         try:
             if message.header.frame_id != self.settings.frame and message.targets:
                 raise ValueError(

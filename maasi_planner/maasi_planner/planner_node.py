@@ -89,10 +89,10 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         longest = max(1.0, 2.0 * self.settings.state_timeout)
         self._jump = round(longest / self.settings.step)
         self.coordinator = Coordinator(self.settings)
-        self._orders = Orders(self, self.coordinator, self.modes)
-        self._others = OtherPlanners(self, self.coordinator.names, self._try_step)
-        self._guard = FilterGuard(self)
-        self._batches = Batches(self, self._guard, self._try_done)
+        self.orders = Orders(self, self.coordinator, self.modes)
+        self.others = OtherPlanners(self, self.coordinator.names, self._try_step)
+        self.guard = FilterGuard(self)
+        self.batches = Batches(self, self.guard, self._try_done)
         self._views = PlannerViews(self)
         self._reset_state()
 
@@ -100,12 +100,12 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self.states: dict[str, ReceivedState] = {}
         self._gates: dict[str, StampGate] = {}
         self._away: set[str] = set(self.coordinator.names)
-        self._taken_step = -1
+        self.planned_step = -1
         self._expected: LockstepStep | None = None
-        self._batches.reset(self.coordinator)
+        self.batches.reset(self.coordinator)
         self._decisions = 0
         # Running freely: why the robots are held, or empty.
-        self._held = ''
+        self.held = ''
         self._planning_time = 0.0
         self._batteries = BatteryLog(self)
 
@@ -126,7 +126,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             )
         # Before the publisher of batches: a filter must discover the retained targets first.
         self._keeper = FoundKeeper(self)
-        self._batches.set_up()
+        self.batches.set_up()
         self._decision_publisher = self.create_publisher(PlanDecision, 'decisions', RELIABLE)
         self._views.set_up()
         self._path_publishers = {}
@@ -140,9 +140,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 partial(self._on_state, name),
                 RELIABLE,
             )
-        self._others.set_up()
-        self._guard.set_up()
-        self._goals = self._orders.set_up(names, self._try_done)
+        self.others.set_up()
+        self.guard.set_up()
+        self.goals = self.orders.set_up(names, self._try_done)
         self._action = SearchAction(self, lambda: self._command('start', None), self._stand)
         offer_services(self, names, self._command)
         self._keep_outs = KeepOutTopic(
@@ -167,15 +167,15 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     def _stand(self) -> None:
         self.modes.command('stop')
-        self._orders.set_homing(self.coordinator.names, False)
-        self._orders.stop(self.coordinator.names)
+        self.orders.set_homing(self.coordinator.names, False)
+        self.orders.stop(self.coordinator.names)
 
     def destroy_node(self) -> None:
         """Send the result of the search to its client, and shut down."""
         self.active = False
         if self.configured and self.executor is not None:
             deadline = time.monotonic() + _ANSWERS
-            while self._goals.waiting and time.monotonic() < deadline:
+            while self.goals.waiting and time.monotonic() < deadline:
                 self.executor.spin_once(0.01)
             for _ in range(_LAST_TASKS):
                 self.executor.spin_once(timeout_sec=0.0)
@@ -189,22 +189,22 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     def reset(self) -> None:
         """Begin a new search."""
         for name in self.coordinator.names:
-            self._goals.cancel(name)
-        self._goals.waiting.clear()
+            self.goals.cancel(name)
+        self.goals.waiting.clear()
         self.coordinator = Coordinator(self.settings, self.coordinator.area)
-        self._orders.reset(self.coordinator)
-        for part in (self._others, self._guard, self._views):
+        self.orders.reset(self.coordinator)
+        for part in (self.others, self.guard, self._views):
             part.reset()
         self._reset_state()
         self._keeper.forget()
 
     def fault(self) -> str:
         """Return why the robots are held, or that they accept no goals."""
-        if self._held:
-            return f'robots are held: {self._held}'
+        if self.held:
+            return f'robots are held: {self.held}'
         if alarms := self._batteries.alarms:
             return '; '.join(f'{name}: {text}' for name, text in sorted(alarms.items()))
-        refused = self._orders.refused_for
+        refused = self.orders.refused_for
         return f'no goal accepted for {refused:.0f} s' if refused >= _REFUSAL_PATIENCE else ''
 
     def _command(self, word: str, names: list[str] | None) -> tuple[bool, str]:
@@ -219,8 +219,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if word == 'start' and self.coordinator.finished is not None:
             self.coordinator.begin_again()
         if word in ('pause', 'stop', 'home'):
-            self._orders.stop(follow)
-        self._orders.set_homing(follow, word == 'home')
+            self.orders.stop(follow)
+        self.orders.set_homing(follow, word == 'home')
         if not self.modes.under_way:
             self._action.stop('stopped by search/stop')
         answer = f'{word}: {", ".join(follow)}'
@@ -229,7 +229,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 received = self.states.get(name)
                 why = received.reason if received is not None else f'no {name}/state yet'
                 answer += f'; {name} is unavailable: {why or "no state received"}'
-        for text in self._orders.warnings(follow):
+        for text in self.orders.warnings(follow):
             answer += f'; {text}, which continues'
         self.get_logger().info(answer)
         return True, answer
@@ -252,17 +252,17 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         return {
             'search': self.modes.describe(),
             'finished': self.coordinator.finished or '',
-            'goals of other clients': self._orders.describe_external(),
+            'goals of other clients': self.orders.describe_external(),
             'robots': ', '.join(name for name in self.coordinator.names if name not in self._away),
             'decisions': self._decisions,
-            'batches': self._batches.last,
+            'batches': self.batches.last,
             'explored': f'{self.coordinator.exploration.explored_fraction():.3f}',
             'last planning [ms]': f'{1e3 * self._planning_time:.2f}',
         }
 
     def warnings(self) -> list[str]:
         """Return warnings about goals of other clients and estimated charges."""
-        return self._orders.warnings() + self.coordinator.homing.estimates()
+        return self.orders.warnings() + self.coordinator.homing.estimates()
 
     # ---- input -------------------------------------------------------------------------------
 
@@ -274,12 +274,12 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._restart(f'step {message.step} arrived after {self.step}')
         self.step = message.step
         before = self._expected
-        if before is None and message.step == self._taken_step:
-            self._batches.publish_again()
+        if before is None and message.step == self.planned_step:
+            self.batches.publish_again()
             # A robot that answers later receives a new goal.
-            for name, _ in sorted(self._goals.waiting):
-                self._orders.refuse(name)
-            self._goals.waiting.clear()
+            for name, _ in sorted(self.goals.waiting):
+                self.orders.refuse(name)
+            self.goals.waiting.clear()
             self._try_done()
             return
         if before is not None and message.step == before.step:
@@ -336,7 +336,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if name in self._away or self.ending:
             return
         self._away.add(name)
-        self._orders.drop_robot(name)
+        self.orders.drop_robot(name)
         self.get_logger().warning(f'{name} is unavailable: {reason}')
 
     def _check_team(self) -> None:
@@ -348,24 +348,24 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 silent = self.states[name].silence.length
                 if silent > self.settings.state_timeout:
                     self._drop_robot(name, f'no {name}/state for {silent:.1f} s')
-            problem = self._guard.problem(now)
-            if problem and not self._held:
+            problem = self.guard.problem(now)
+            if problem and not self.held:
                 self.get_logger().error(f'{problem}: all robots are held')
-                self._orders.hold(self.coordinator.names)
-            elif self._held and not problem:
+                self.orders.hold(self.coordinator.names)
+            elif self.held and not problem:
                 self.get_logger().warning('the filter responds again: the search continues')
-            self._held = problem
-        waits = self.settings.lockstep or bool(self._held)
-        if waits and now - self._batches.published_at > _ANSWER_PATIENCE:
-            self._batches.publish_again()
+            self.held = problem
+        waits = self.settings.lockstep or bool(self.held)
+        if waits and now - self.batches.published_at > _ANSWER_PATIENCE:
+            self.batches.publish_again()
         if not self.settings.lockstep:
             self._try_free_step()
-        update = self._batches.update
+        update = self.batches.update
         self._action.update(
-            max(self._taken_step, 0) * self.settings.step,
+            max(self.planned_step, 0) * self.settings.step,
             SearchTargets.Feedback(
                 found=update.found,
-                measurements=self._batches.measurements,
+                measurements=self.batches.measurements,
                 decisions=self._decisions,
                 expected_number=update.expected_number,
                 explored=self.coordinator.exploration.explored_fraction(),
@@ -384,7 +384,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         names = [name for name in expected.robots if name in self.coordinator.names]
         if any(name not in self.states or self.states[name].step != step for name in names):
             return
-        if names and self._others.missing(step, expected.robots):
+        if names and self.others.missing(step, expected.robots):
             return
         self._expected = None
         for name in self.coordinator.names:
@@ -396,9 +396,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             step,
             stamp_from_ros(expected.stamp),
             set(expected.imaging),
-            self._others.taken(step, expected.robots),
+            self.others.taken(step, expected.robots),
         )
-        self._others.before = set(expected.robots)
+        self.others.before = set(expected.robots)
         self._try_done()
 
     def _try_free_step(self) -> None:
@@ -406,15 +406,15 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if not present:
             return
         step = min(self.states[name].step for name in present)
-        if step > self._taken_step:
+        if step > self.planned_step:
             self._plan_step(
-                step, stamp_of_step(step, self.settings.step), None, self._others.taken(step, None)
+                step, stamp_of_step(step, self.settings.step), None, self.others.taken(step, None)
             )
 
     def _plan_step(
         self, step: int, stamp: int, imaging: set[str] | None, taken: list[tuple[FloatArray, float]]
     ) -> None:
-        self._taken_step = step
+        self.planned_step = step
         self.step = step
         header = Header(stamp=stamp_to_ros(stamp), frame_id=self.settings.frame)
         robots = {}
@@ -422,15 +422,15 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             if name in self._away:
                 continue
             received = self.states[name]
-            free = self._orders.is_free(name, received, step)
-            if free and self._orders.send_home(name, received.state, header):
+            free = self.orders.is_free(name, received, step)
+            if free and self.orders.send_home(name, received.state, header):
                 free = False
             mode = self.modes.of[name]
             robots[name] = PresentRobot(
                 received.state,
                 free,
                 received.charge,
-                searches=mode is Mode.SEARCHING and not self._held,
+                searches=mode is Mode.SEARCHING and not self.held,
                 returns=mode not in (Mode.WAITING, Mode.STOPPED),
             )
         commanded = any(robot.returns for robot in robots.values())
@@ -440,7 +440,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._planning_time = time.perf_counter() - begin
         self._batteries.report(self.coordinator.homing)
         known = self.coordinator.robots
-        self._others.publish(
+        self.others.publish(
             header,
             {name: known[name].plan.destination(robot.state) for name, robot in robots.items()},
         )
@@ -450,7 +450,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._announce(decision, header)
         members = self.coordinator.measure(step, robots, imaging)
         if members:
-            self._batches.publish(step, members, header)
+            self.batches.publish(step, members, header)
         self._views.publish(self.coordinator, robots, header, stamp * 1e-9)
 
     def _announce(self, decision: Any, header: Header) -> None:
@@ -461,13 +461,13 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 decision,
                 indices,
                 self.settings.planner.name,
-                self._batches.used,
+                self.batches.used,
                 self.coordinator.exploration.explored_fraction(),
                 header,
             )
         )
         if not decision.robots:
-            found = self._batches.update.found
+            found = self.batches.update.found
             self.get_logger().info(
                 f'finished: the planner expects no further finds ({found} found): {decision.reason}'
             )
@@ -480,20 +480,20 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 continue
             if plan.errand is not None:
                 self.get_logger().info(f'{name} {robot.reason}')
-                self._orders.interrupt_homing(name)
-            self._orders.send(name, plan.goal_id, robot.waypoint, header)
+                self.orders.interrupt_homing(name)
+            self.orders.send(name, plan.goal_id, robot.waypoint, header)
             self._path_publishers[name].publish(path_to_ros(robot.positions, header))
 
     def _try_done(self) -> None:
         if (
             self._done_publisher is not None
             and self._expected is None
-            and self._taken_step >= 0
-            and not self._goals.waiting
-            and not self._batches.waiting
+            and self.planned_step >= 0
+            and not self.goals.waiting
+            and not self.batches.waiting
         ):
             self._done_publisher.publish(
-                LockstepDone(node=self.get_fully_qualified_name(), step=self._taken_step)
+                LockstepDone(node=self.get_fully_qualified_name(), step=self.planned_step)
             )
 
 

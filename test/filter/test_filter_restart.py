@@ -79,7 +79,7 @@ def test_a_node_without_state_takes_found_targets_from_the_latched_topic(kept):
         team.until(lambda: team.tested.count_publishers('/found_targets/kept') == 1)
         # The batch waits for the message: a new target would get the id of a kept one.
         team.measure(20, THREE)
-        pending = team.tested._batches.pending
+        pending = team.tested.batches.pending
         team.until(lambda: 20 in pending and not pending[20].missing)
         assert not team.updates
         publisher.publish(kept)
@@ -113,7 +113,7 @@ def test_kept_targets_that_cannot_be_used_are_dropped_and_the_wait_for_them_has_
         team.until(lambda: team.tested.count_publishers('/found_targets/kept') == 1)
         team.see(1)
         for number, message in enumerate((frame, nan, twice), start=1):
-            team.tested._kept_taken = False
+            team.tested.kept_received = False
             publisher.publish(message)
             team.until(lambda n=number: team.tested.dropped['bad found targets'] == n)
         team.see(2)

@@ -159,7 +159,7 @@ class World(Player):
 
     def start_planner(self):
         self.planner = self.start(PlannerNode, self.settings)
-        goals = self.planner._goals.clients.values()
+        goals = self.planner.goals.clients.values()
         self.until(
             lambda: (
                 all(client.server_is_ready() for client in goals)

@@ -47,7 +47,7 @@ def test_a_planner_that_ends_stops_robots_whose_next_goal_is_on_its_way(world):
         for robot in world.robots.values():
             robot.move(world.step)
         for _ in range(10):
-            if not world.planner._goals.waiting:
+            if not world.planner.goals.waiting:
                 world.executor.spin_once(timeout_sec=0.001)
                 world.own.spin_once(0.001)
 
@@ -58,7 +58,7 @@ def test_a_planner_that_ends_stops_robots_whose_next_goal_is_on_its_way(world):
             assert robot.state.goal_status == AgentState.CANCELED
             assert robot.is_near(*place[:2], 0.3)
 
-    wait_until(lambda: world.planner._goals.waiting, turn)
+    wait_until(lambda: world.planner.goals.waiting, turn)
     # The drivers answer after that.
     for transition in ('deactivate', 'cleanup'):
         assert getattr(world.planner, f'trigger_{transition}')().name == 'SUCCESS'
@@ -66,7 +66,7 @@ def test_a_planner_that_ends_stops_robots_whose_next_goal_is_on_its_way(world):
     for transition in ('configure', 'activate'):
         assert getattr(world.planner, f'trigger_{transition}')().name == 'SUCCESS'
     world.until(world.moving)
-    wait_until(lambda: world.planner._goals.waiting, turn)
+    wait_until(lambda: world.planner.goals.waiting, turn)
     # As its process does it; the drivers answer meanwhile.
     planner = world.planner
     end = threading.Thread(target=lambda: (planner.halt(), world.end_planner()))
@@ -100,8 +100,8 @@ def test_robots_that_refuse_waypoints_are_stopped_and_planned_for_again(world, m
         world.until(lambda: world.planner.fault().startswith('no goal accepted for '))
     world.until(lambda: world.moving() and not world.planner.fault())
     # A driver that is ended is no warning.
-    warnings, sent = [], world.planner._goals._sent['b']
-    monkeypatch.setattr(world.planner._goals, '_warn', lambda _, text: warnings.append(text))
+    warnings, sent = [], world.planner.goals._sent['b']
+    monkeypatch.setattr(world.planner.goals, '_warn', lambda _, text: warnings.append(text))
     assert world.drivers[1].trigger_deactivate().name == 'SUCCESS'
     world.until(lambda: sent.reason == 'the driver stops')
     assert warnings == []

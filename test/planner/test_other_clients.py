@@ -59,7 +59,7 @@ def test_a_planner_that_starts_again_waits_for_the_last_goal_of_the_one_before()
         world.until(lambda: a.state.goal_id == FOREIGN)
         world.end_planner()
         world.start_planner()
-        world.until(lambda: world.planner._orders.external_goals.get('a') == FOREIGN)
+        world.until(lambda: world.planner.orders.external_goals.get('a') == FOREIGN)
         world.until(result.done)
         assert result.result().status == GoalStatus.STATUS_SUCCEEDED
         world.until(lambda: a.state.goal_id not in (0, FOREIGN) and a.moves)

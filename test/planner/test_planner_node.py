@@ -116,7 +116,7 @@ class Team(Player):
                 all(item.get_subscription_count() == 1 for item in publishers)
                 and node.count_publishers('/decisions') == 1
                 and node.count_publishers('/measurement_batch') == 1
-                and all(item.server_is_ready() for item in self.tested._goals.clients.values())
+                and all(item.server_is_ready() for item in self.tested.goals.clients.values())
             )
         )
 
@@ -218,7 +218,7 @@ def test_wrong_states_and_updates_are_dropped_counted_and_told_and_change_nothin
     team.states['a'].publish(state_of('a', 10**9))
     team.until(lambda: team.tested.dropped['bad state'] == 4)
     team.tell(16)
-    team.until(lambda: team.tested._taken_step == 16)
+    team.until(lambda: team.tested.planned_step == 16)
 
     def values():
         return {item.key: item.value for item in team.status().values}
@@ -254,7 +254,7 @@ def test_a_step_that_comes_again_brings_the_batch_again_and_no_other():
         for name in ROBOTS:
             team.states[name].publish(state_of(name, goal_id=1))
         team.steps.publish(step)
-        goals = team.tested._goals
+        goals = team.tested.goals
         team.until(lambda: team.batches and all(team.goals.values()) and not goals.waiting)
         step.imaging = []
         team.steps.publish(step)
@@ -284,7 +284,7 @@ def test_other_robots_have_colours_of_the_team_and_wrong_destinations_are_droppe
             message.header.frame_id = 'map'
             publisher.publish(changed(message, changes))
             team.until(lambda number=number: team.tested.dropped['bad destination'] == number)
-        assert team.tested._others.taken(0, None)[0][0].tolist() == [0.2, 1.8, 0.0]
+        assert team.tested.others.taken(0, None)[0][0].tolist() == [0.2, 1.8, 0.0]
         search = ActionClient(team.node, SearchTargets, 'search')
         team.until(search.server_is_ready)
         for limit in (math.nan, -1.0):
@@ -343,7 +343,7 @@ def test_robots_are_held_until_the_filter_answers_again(silent, planner):
     with running(filter_timeout=4.0, planner=planner_settings(name=planner)) as team:
         beats = team.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         beat = DiagnosticArray(status=[DiagnosticStatus(name='/team')])
-        guard = team.tested._guard
+        guard = team.tested.guard
         team.until(lambda: '/team' in guard.names and beats.get_subscription_count())
         team.begin()
         if silent == 'heartbeat':
@@ -355,7 +355,7 @@ def test_robots_are_held_until_the_filter_answers_again(silent, planner):
         decisions, batches = len(team.decisions), len(team.batches)
         for step in (40, 60):
             team.tell(step)
-            team.until(lambda step=step: team.tested._taken_step == step)
+            team.until(lambda step=step: team.tested.planned_step == step)
         assert len(team.decisions) == decisions
         if silent == 'updates':
             # It is asked for again, so that a restarted filter can answer.
@@ -364,7 +364,7 @@ def test_robots_are_held_until_the_filter_answers_again(silent, planner):
         else:
             beats.publish(beat)
         team.answer()
-        team.until(lambda: not team.tested._held)
+        team.until(lambda: not team.tested.held)
         team.tell(80)
         team.until(lambda: len(team.decisions) > decisions)
 

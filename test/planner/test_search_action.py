@@ -25,7 +25,7 @@ rclpy.spin(node)
 
 def find(world, number):
     """Publish an update of the filter that has found so many targets."""
-    message = FilterUpdate(batch_id=world.planner._batches.last, found=number)
+    message = FilterUpdate(batch_id=world.planner.batches.last, found=number)
     message.header.frame_id = 'map'
     world.updates.publish(message)
 
@@ -65,9 +65,9 @@ def a_goal_is_executing_and_ends_as_it_says(world):
     handle, result = world.ask(targets=12)
     world.until(world.moving)
     world.until(lambda: handle.status == GoalStatus.STATUS_EXECUTING)
-    world.until(lambda: world.planner._batches.last > 0)
+    world.until(lambda: world.planner.batches.last > 0)
     find(world, 11)
-    world.until(lambda: world.planner._batches.update.found == 11)
+    world.until(lambda: world.planner.batches.update.found == 11)
     world.pass_steps(5)
     assert not result.done() and handle.status == GoalStatus.STATUS_EXECUTING
     find(world, 12)

@@ -55,7 +55,7 @@ def test_a_batch_is_given_up_in_simulated_time(world):
     members = [BatchMember(robot='rover', measurement=1)]
     batch = MeasurementBatch(id=1, step=1, members=members)
     world.publisher(MeasurementBatch, '/measurement_batch').publish(batch)
-    world.until(lambda: world.tested._batches.pending)
+    world.until(lambda: world.tested.batches.pending)
     world.wait_in_vain()
     assert not updates
     world.tell(2 * SECOND)

@@ -26,7 +26,7 @@ class Zone(Settings):
     radius: Positive | None = Field(None, description='Radius of a round zone [m]')
     polygon: Shape | None = Field(
         None,
-        description='Corners [m, map], GeoJSON or the name of its file; stored as well-known text',
+        description='Corners [m, map], GeoJSON or a file as for area; stored as well-known text',
     )
 
     @model_validator(mode='before')
@@ -58,7 +58,7 @@ class Zone(Settings):
 class PriorPart(Settings):
     """A polygon with another density of targets than elsewhere."""
 
-    polygon: Shape = Field(description='Corners [m, map], GeoJSON or the name of its file')
+    polygon: Shape = Field(description='Corners [m, map], GeoJSON or a file as for area')
     weight: float = Field(
         ge=0.0, description='Density of targets inside, relative to 1 outside of all polygons [1]'
     )
@@ -76,7 +76,7 @@ class PriorPart(Settings):
 
 
 class PriorSettings(Settings):
-    """Density of targets as polygons with weights or as a raster; it is normalised."""
+    """Density of targets, not normalised: polygons with weights, or a raster."""
 
     polygons: list[PriorPart] = Field(default_factory=list, description='Polygons with weights')
     raster: str | None = Field(
@@ -133,8 +133,8 @@ class EnvironmentSettings(Settings):
     )
     area: Shape | None = Field(
         None,
-        description='Polygons in place of bounds: corners or rings [m, map], GeoJSON or its file; '
-        'stored as well-known text',
+        description='Polygons in place of bounds: corners or rings [m, map], GeoJSON, or a file: '
+        '.geojson, .kml, .kmz, .gpx, .plan, .waypoints, .poly; stored as well-known text',
     )
     altitude: Vector2 | None = Field(
         None, description='With area: lowest and highest z of targets; default: 2D [m]'
@@ -155,8 +155,8 @@ class EnvironmentSettings(Settings):
     )
     origin: OriginSettings | None = Field(
         None,
-        description="Geographic position of the map's origin; default with GeoJSON: the centre of "
-        'the area',
+        description="Geographic position of the map's origin; default with an area in degrees: "
+        'its centre',
     )
 
     background: BackgroundSettings = Field(
