@@ -85,12 +85,13 @@ def estimates(search, method):
 
 
 def true_of(items, truth):
-    """Return which estimates are targets: one to one, the most probable within four deviations."""
+    """Return which estimates are targets: the likeliest one-to-one, within four deviations."""
     cost = np.zeros((len(items), len(truth)))
-    for row, (_, mean, spread, _) in zip(cost, items):
+    for row, (r, mean, spread, _) in zip(cost, items):
         errors, spread = truth - mean, spread + np.eye(2) * LEAST_DEVIATION**2
         squares = (errors * np.linalg.solve(spread, errors.T).T).sum(axis=1)
-        row[squares < 16.0] = (squares + math.log(np.linalg.det(spread)) - 100.0)[squares < 16.0]
+        log = math.log(np.linalg.det(spread)) - 2.0 * math.log(r)
+        row[squares < 16.0] = squares[squares < 16.0] + log - 100.0
     rows, columns = linear_sum_assignment(cost)
     return np.isin(np.arange(len(items)), rows[cost[rows, columns] < 0.0])
 
@@ -117,6 +118,7 @@ def run_one(key):
         items = estimates(search, method)
         best = np.array([mean for r, mean, _, _ in items if r > 0.5]).reshape(-1, 2)
         scores.append(gospa(best, truth, CUTOFF).total)
+        items = [item for item in items if item[0] >= EDGES[0]]
         existence = np.array([r for r, _, _, _ in items])
         right = true_of(items, truth[first <= step])
         for b, (low, high) in enumerate(pairwise(EDGES)):

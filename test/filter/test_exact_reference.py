@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from exact_pmbm import ExactPmbm
 from exact_reference import Reference
+from reference_quality import run_one
 from searches import SIDE, cells, densities, observe, plane_sensor
 
 from maasi_filter import Pose
@@ -68,3 +69,14 @@ def test_estimates_are_those_of_the_best_hypothesis_with_probabilities_of_all():
     for _ in range(12):
         reference.update(Pose(np.array([60.0, 45.0, 0.0])), np.empty((0, 2)))
     assert sum(item[0] for item in reference.targets()) < existence
+
+
+def test_scores_of_one_scene_are_those_of_filters_that_find_the_targets():
+    runs = {method: run_one(('no clutter', method, 20_002)) for method in ('reference', 'pmb')}
+    for run in runs.values():
+        assert run['found'] == run['targets'] == 3
+        assert run['false'] == 0
+    exact, ours = runs['reference']['gospa'], runs['pmb']['gospa']
+    assert ours == pytest.approx(exact, rel=0.2)
+    expected, true, number = np.sum(runs['reference']['bins'], axis=1)
+    assert true == pytest.approx(expected, abs=0.05 * number)

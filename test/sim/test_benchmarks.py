@@ -8,6 +8,7 @@ import bench
 import pytest
 import search_quality
 from clairvoyant import clairvoyant
+from timing import against
 
 from maasi_sim.experiments.searches import find_times
 from maasi_sim.scenario.loading import load_scenario
@@ -37,8 +38,17 @@ def test_quick_figures(run_bench, tmp_path, capsys):
     file = tmp_path / 'figures.json'
     run_bench('drivers', '--quick', '--json', file)
     rows = json.loads(file.read_text())
-    assert len(rows) == len(capsys.readouterr().out.splitlines()) == 4
+    assert len(rows) == len(capsys.readouterr().out.splitlines()) == 6
     assert all(row['value'] > 0.0 for row in rows)
+
+
+def test_a_peer_that_is_not_installed_is_named_as_not_measured():
+    def measure():
+        import no_such_package  # noqa: F401
+
+    text = bench.show(against('kernel', 2.0, 'Peer', measure))
+    assert 'Peer: not measured' in text and 'no_such_package' in text
+    assert '2 x faster than Peer, 4 ms' in bench.show(against('kernel', 2.0, 'Peer', lambda: 4.0))
 
 
 def test_each_target_has_the_time_at_which_so_many_were_found():
