@@ -288,3 +288,17 @@ def test_damaged_files_raise_nothing_but_the_error_of_the_reader(
                 read(str(file))
             except ValueError as error:
                 assert str(error).startswith(str(file))
+
+
+def test_a_fence_of_pymavlink_is_an_area(tmp_path):
+    mavwp = pytest.importorskip('pymavlink.mavwp')
+    from pymavlink.dialects.v20 import ardupilotmega
+
+    loader = mavwp.MAVWPLoader()
+    for command, corners in ((5001, FIELD), (5002, POND)):
+        for place in corners:
+            values = (0, 0, 0, 3, command, 0, 1, len(corners), 0, 0, 0, *place, 0)
+            loader.add(ardupilotmega.MAVLink_mission_item_message(*values))
+    loader.save(str(tmp_path / 'fence.waypoints'))
+    made = environment(tmp_path / 'fence.waypoints')
+    assert made.area.area == pytest.approx(SIZES['area'], rel=1e-3) and len(made.keep_outs) == 1
