@@ -117,7 +117,13 @@ def test_pages_from_files_fit_a_phone_are_dark_at_night_and_found(site: Path) ->
         page = shown.page
         page.goto((site / 'index.html').as_uri())
         assert page.locator('button.copybtn').count() == 2
+        for door in page.locator('.doors a').all():
+            assert (site / str(door.get_attribute('href'))).is_file()
+        assert page.locator('.doors a').count() == 4
         page.fill('input[name=q]', 'nearest_widest')
         page.press('input[name=q]', 'Enter')
+        scores = "['api/a', 'planners'].map((name) => Scorer.score([name, '', '', '', 20, '']))"
+        of_api, of_page = page.evaluate(scores)
+        assert of_api < 0 < of_page
         page.click('#search-results a:has-text("Planners and robot models")')
         page.wait_for_selector('h1:has-text("Planners and robot models")')
