@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import sys
 import warnings
 from datetime import datetime, timezone
 from xml.etree import ElementTree
@@ -16,6 +17,7 @@ from small_field import SMALL_FIELD
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import geodetic, to_map
 from maasi_filter.geometry.polygons import InputWarning
+from maasi_filter.geometry.raster import read_raster
 from maasi_filter.records import Label
 from maasi_sim.run.targets.exports import cot_text, gpx_text, kml_text, map_files
 from maasi_sim.run.targets.mission import TargetMission
@@ -74,7 +76,7 @@ def test_no_file_depends_on_the_true_targets(run, files):
 def test_a_run_writes_them_into_a_folder_of_their_own(run):
     made = TargetMission('field', run.scenario).tables(run)
     names = {'search.kml', 'found_targets.gpx', 'found_targets.cot', 'drone.plan'}
-    names |= {'detection_probability.png', 'detection_probability.pgw'}
+    names |= {f'detection_probability.{kind}' for kind in ('png', 'pgw', 'tif')}
     assert {name for name in made if '/' in name} == {f'map_files/{name}' for name in names}
 
 
@@ -150,3 +152,19 @@ def test_a_search_without_finds_or_paths_is_written_too(run):
     paths = {'drone': np.zeros((1, 3)), 'other': np.zeros((0, 3))}
     made = map_files('field', [], [], paths, explored, origin, NOW)
     assert 'drone.plan' not in made and elements(made['search.kml'])
+
+
+def test_the_geotiff_is_a_prior_with_the_values_of_the_map(run, files, tmp_path, monkeypatch):
+    """Read back as any GeoTIFF; without rasterio there is none."""
+    pytest.importorskip('rasterio')
+    path = tmp_path / 'seen.tif'
+    path.write_bytes(files['detection_probability.tif'])
+    explored = explored_after(run)
+    environment = run.scenario.environment.model_dump() | {'prior': {'raster': str(path)}}
+    raster = read_raster(EnvironmentSettings.model_validate(environment))
+    nodes, unseen = explored.nodes(), explored.unseen().ravel()
+    wanted = np.where(unseen >= 0.0, 1.0 - unseen, 0.0)
+    read = raster.at(*nodes.T)
+    assert np.allclose(read * wanted.max() / read.max(), wanted, atol=1e-6)
+    monkeypatch.setitem(sys.modules, 'rasterio', None)
+    assert 'detection_probability.tif' not in files_of(run, run.truth)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
@@ -50,14 +51,12 @@ def map_files(
     robot (n, 3) [m]; written: now, in UTC.
     """
     found = [{key: value for key, value in row.items() if key not in _TRUTH} for row in found]
-    picture, world = probability_png(explored, origin)
     plans = {f'{robot}.plan': plan_text(path, searched, origin) for robot, path in paths.items()}
     return {
         'search.kml': kml_text(name, found, searched),
         'found_targets.gpx': gpx_text(found),
         'found_targets.cot': cot_text(name, found, written),
-        'detection_probability.png': picture,
-        'detection_probability.pgw': world,
+        **probability_rasters(explored, origin),
         **{name: text for name, text in plans.items() if text},
     }
 
@@ -216,24 +215,46 @@ def plan_text(path: FloatArray, searched: Sequence[Row], origin: OriginSettings)
     return json.dumps(plan, indent=1, allow_nan=False) + '\n'
 
 
-def probability_png(explored: UnexploredMap, origin: OriginSettings) -> tuple[bytes, str]:
-    """Return where a target would have been found, and the world file of the picture.
+def probability_rasters(explored: UnexploredMap, origin: OriginSettings) -> dict[str, str | bytes]:
+    """Return where a target would have been found, as PNG with its world file and as GeoTIFF.
 
-    Grey 255 is certain; where no target can be, it is transparent. In space it is the mean over
-    the heights. Coordinates are degrees (WGS 84).
+    In the PNG 255 is certain; where no target can be, it is transparent. In space it is the mean
+    over the heights. Coordinates are degrees (WGS 84). GeoTIFF needs rasterio.
     """
     unseen = np.atleast_3d(explored.unseen())
     known = unseen >= 0.0
     sums = np.where(known, 1.0 - unseen, 0.0).sum(axis=2)
-    share = sums / np.maximum(known.sum(axis=2), 1)
-    grey, opaque = (np.rint(255.0 * part) for part in (share, known.any(axis=2)))
-    rows = np.stack([grey, grey, grey, opaque], axis=2).transpose(1, 0, 2)[::-1]
-    picture = cv2.imencode('.png', rows.astype(np.uint8))[1].tobytes()
+    # The first row is in the north.
+    share = (sums / np.maximum(known.sum(axis=2), 1)).T[::-1]
+    possible = known.any(axis=2).T[::-1]
+    pixels = np.rint(255.0 * np.stack([share, share, share, possible], axis=2)).astype(np.uint8)
     # The plane that is closest to longitude and latitude of the pixels.
     x, y = explored.axes()[:2]
     column, row = np.meshgrid(np.arange(len(x)), np.arange(len(y)))
     positions = np.stack([x[column.ravel()], y[::-1][row.ravel()]], axis=1)
     degrees = geodetic(positions, origin)[:, 1::-1]
-    pixels = np.column_stack([column.ravel(), row.ravel(), np.ones(column.size)])
-    plane = np.linalg.lstsq(pixels, degrees, rcond=None)[0]
-    return picture, ''.join(f'{value:.12f}\n' for value in plane.ravel())
+    factors = np.column_stack([column.ravel(), row.ravel(), np.ones(column.size)])
+    plane = np.asarray(np.linalg.lstsq(factors, degrees, rcond=None)[0], dtype=float)
+    files: dict[str, str | bytes] = {
+        'detection_probability.png': cv2.imencode('.png', pixels)[1].tobytes(),
+        'detection_probability.pgw': ''.join(f'{value:.12f}\n' for value in plane.ravel()),
+    }
+    with contextlib.suppress(ImportError):
+        files['detection_probability.tif'] = _geotiff(np.where(possible, share, -1.0), plane)
+    return files
+
+
+def _geotiff(values: FloatArray, plane: FloatArray) -> bytes:
+    """Return values below 0 as no data; plane (3, 2): degrees of the centres of pixels."""
+    import rasterio
+    from rasterio.io import MemoryFile
+
+    step, corner = plane[:2].T, plane[2] - 0.5 * plane[:2].sum(axis=0)
+    transform = rasterio.Affine(*np.column_stack([step, corner]).ravel())
+    facts = {'height': len(values), 'width': values.shape[1], 'count': 1, 'dtype': 'float32'}
+    with MemoryFile() as memory:
+        with memory.open(
+            driver='GTiff', crs='EPSG:4326', transform=transform, nodata=-1.0, **facts
+        ) as file:
+            file.write(values.astype(np.float32), 1)
+        return bytes(memory.read())
