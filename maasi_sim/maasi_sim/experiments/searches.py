@@ -46,7 +46,7 @@ QUANTITIES = (
     Quantity('filter_time', 'filter step', 's'),
     Quantity('planning_time', 'decision', 's'),
     Quantity('explored', 'share explored in the end'),
-    Quantity('lanes', 'share of the way in lanes'),
+    Quantity('lanes', 'share of the path in lanes'),
     Quantity('clearance', 'smallest distance to an obstacle', 'm'),
 )
 
