@@ -17,6 +17,7 @@ from unittest.mock import patch
 
 import numpy as np
 import reference_quality
+import reflection_quality
 from quality_conditions import CONDITIONS, DEGREES, RETURNS, SCENARIOS, changed, wanted
 from scipy.stats import binomtest, chi2
 
@@ -29,6 +30,7 @@ from maasi_sim.search import search
 from maasi_sim.simulation.sensors import RangingSensor
 
 METHODS = ('ic_phd', 'pmb')
+OTHERS = {'reference': reference_quality, 'reflections': reflection_quality}
 KEYS = ('condition', 'method', 'seed')
 # Measurements after which a search ends: in the cube; other scenarios have many images.
 CAP, CAP_OF_IMAGES = 400, 6000
@@ -125,7 +127,7 @@ def main():
         prog='quality',
         description=__doc__,
         epilog='`quality reference [NAME ...]` compares both filters with an exact one on small '
-        'scenes.',
+        'scenes, `quality reflections [NAME ...]` counts what is left and false among reflections.',
     )
     parser.add_argument('--filter', nargs='*', choices=METHODS, default=METHODS)
     parser.add_argument(
@@ -140,16 +142,15 @@ def main():
     parser.add_argument(
         '--stone-soup', action='store_true', help="GOSPA beside Stone Soup's JPDA tracker instead"
     )
-    reference = sys.argv[1:2] == ['reference']
-    if reference:
+    other = OTHERS.get(sys.argv[1]) if len(sys.argv) > 1 else None
+    if other is not None:
         del sys.argv[1]
-    known = reference_quality.CONDITIONS if reference else CONDITIONS
+    known = CONDITIONS if other is None else other.CONDITIONS
     options, conditions, seeds = wanted(parser, known, runs=20, jobs=1)
     warm_up()
     head, table = HEAD, rows(options, conditions, seeds)
-    if reference:
-        head = reference_quality.HEAD
-        table = reference_quality.rows(conditions, seeds, options.jobs)
+    if other is not None:
+        head, table = other.HEAD, other.rows(conditions, seeds, options.jobs)
     elif options.stone_soup:
         # Stone Soup takes seconds to import.
         import stone_soup_quality
