@@ -1,4 +1,4 @@
-"""The command that gives a sensor's noise R from a recording of one target."""
+"""Estimates a sensor's noise R from a recording of one target."""
 
 import argparse
 import json
@@ -27,9 +27,9 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='calibrate_sensor',
-        description='From a recording (rosbag2) of one target, seen from many places: the noise R '
-        'of the sensor, for sensor.noise, and the probability of detection inside its field of '
-        'view. The images go through the same steps as in the driver.',
+        description='Estimate the noise R of a sensor (sensor.noise) and its detection '
+        'probability from a recording (rosbag2) of one target seen from many positions. Images '
+        'are processed as in the driver.',
     )
     add = parser.add_argument
     add('bag', type=Path, help='folder of the recording')
@@ -40,24 +40,27 @@ def build_parser() -> argparse.ArgumentParser:
         metavar='FILE',
         help="the driver's parameter file, for its camera, sensor and start",
     )
-    add('--robot', metavar='NAMESPACE', help='of the robot (default: the only one recorded)')
+    add(
+        '--robot',
+        metavar='NAMESPACE',
+        help='namespace of the robot (default: the only recorded robot)',
+    )
     add(
         '--target',
         type=float,
         nargs='+',
         metavar='X',
-        help='where the target is in the map [m] (default: the mean of where it was seen)',
+        help='position of the target in the map [m] (default: the mean of its detections)',
     )
     add(
         '--use',
         choices=('images', 'detections'),
-        help='segment the recorded images, or take the detections that a driver published '
-        '(default: images, if there are any)',
+        help='use the recorded images or the detections of a driver (default: images, if recorded)',
     )
     add(
         '--poses',
         metavar='TOPIC',
-        help='where the robot was: AgentState or PoseStamped in the map, or Odometry (default: '
+        help='topic of poses: AgentState or PoseStamped in the map, or Odometry (default: '
         'state, else pose, else odom)',
     )
     add(
@@ -65,9 +68,9 @@ def build_parser() -> argparse.ArgumentParser:
         type=float,
         default=0.05,
         metavar='M',
-        help='nearer observations are left out: the bearing means nothing there (default: 0.05)',
+        help='skip closer observations, whose bearing is unreliable [m] (default: 0.05)',
     )
-    add('--json', type=Path, metavar='FILE', help='write the result to a file too')
+    add('--json', type=Path, metavar='FILE', help='write the result to FILE, too')
     return parser
 
 
@@ -86,7 +89,7 @@ def read_parameters(path: Path) -> DriverSettings:
     known = {field.name for field in parameter_fields(DriverSettings, flat)}
     for name in flat:
         if name.startswith(('camera.', 'sensor.', 'environment.')) and name not in known:
-            raise ValueError(f'{path}: {name}: there is no such parameter')
+            raise ValueError(f'{path}: {name}: unknown parameter')
     try:
         settings = DriverSettings.model_validate(unflatten(DriverSettings, flat))
     except ValidationError as error:
@@ -111,7 +114,7 @@ def _dotted(node: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def report(recorded: RecordedRobot, noise: SensorNoise, given: bool) -> str:
-    """Return the result in words, and as what goes into a robot's type or parameters."""
+    """Return the result as text, including lines for the robot's type or parameters."""
     names = ('range', 'bearing', 'elevation')[: len(noise.bias)]
     units = ('m', 'rad', 'rad')
     place = ' '.join(f'{value:.4f}' for value in noise.target)
@@ -119,10 +122,10 @@ def report(recorded: RecordedRobot, noise: SensorNoise, given: bool) -> str:
     lines = [
         f'{recorded.robot or "/"}: {noise.used} {recorded.use} used, at {noise.ranges[0]:.2f} to '
         f'{noise.ranges[1]:.2f} m{poses}',
-        f'target at {place} m, ' + ('as given' if given else 'the mean of where it was seen'),
-        f'left out: {noise.near} from too near, {noise.others} detections of something else, '
-        f'{recorded.left_out} without a pose or not to be used',
-        f'in the field of view {noise.inside} times, not seen {noise.missed} times of those',
+        f'target at {place} m, ' + ('as given' if given else 'the mean of its detections'),
+        f'skipped: {noise.near} from too close, {noise.others} detections of other objects, '
+        f'{recorded.left_out} without a pose or unusable',
+        f'in the field of view {noise.inside} times, missed {noise.missed} times',
     ]
     for name, unit, deviation, bias in zip(names, units, noise.deviations, noise.bias):
         clear = given and abs(bias) > _CLEAR * deviation / np.sqrt(noise.used)
@@ -135,7 +138,7 @@ def report(recorded: RecordedRobot, noise: SensorNoise, given: bool) -> str:
     entries = ', '.join(f'{name}: {value:.4g}' for name, value in zip(names, noise.deviations))
     lines += ['', 'sensor:']
     if noise.inside:
-        # With 1 a single miss would rule a target out for good.
+        # With 1 a single miss would rule out a target.
         lines.append(f'  detection: {{probability: {min(noise.probability, 0.99):.2f}}}')
     lines.append(f'  noise: {{{entries}, as: deviation, angles: radians}}')
     return '\n'.join(lines)

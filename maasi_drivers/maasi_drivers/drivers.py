@@ -1,4 +1,4 @@
-"""The drivers of the suite by executable; MAVLink, an extra, is imported where it is used."""
+"""The drivers of the suite by executable; MAVLink, an extra, is imported on demand."""
 
 from functools import partial
 from pkgutil import resolve_name
@@ -19,8 +19,8 @@ def _link(name: str, driver: RobotNode) -> RobotLink:
         link: RobotLink = resolve_name(f'maasi_drivers.links.{name}')(driver)
     except ModuleNotFoundError as error:
         raise SettingsError(
-            f'parameter link: read {driver.settings.link!r}, which needs {error.name}, of an '
-            'extra of the package (docs/install.md)'
+            f'parameter link: read {driver.settings.link!r}, which needs the Python package '
+            f'{error.name} (docs/install.md)'
         ) from error
     return link
 
@@ -35,7 +35,7 @@ _CLASSES = {
 
 
 def _links(driver: str) -> dict[str, MakeLink]:
-    """Return what makes each link of a driver."""
+    """Return the constructors of a driver's links."""
     return {name: partial(_link, _CLASSES[name]) for name in LINKS[driver]}
 
 
@@ -47,7 +47,7 @@ class MamboDriver(AgentDriver):
 
 
 class MamboOnboardDriver(AgentDriver):
-    """A drone with a program of its own; see `OnboardLink` and docs/measurement_feed.md."""
+    """A drone with its own program; see `OnboardLink` and docs/measurement_feed.md."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(_links('mambo_onboard_driver'), CameraInput, **options)

@@ -16,16 +16,16 @@ from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1
-# Between two checks of the subscriptions, as zeros must not wait for the discovery of a publisher,
-# and between two requests to cancel the goals of Nav2 [s].
+# Time between checks of the subscriptions, as a stop must not wait for discovery, and between
+# requests to cancel the goals of Nav2 [s].
 _REFRESH_PERIOD = 0.5
 
 
 class GuardNode(LockstepLifecycleNode[GuardSettings]):
-    """Publishes zeros while no driver is alive, and nothing while one is.
+    """Publishes zero velocities while the driver is not alive.
 
-    Every robot that is commanded by a topic needs it: without a new one it continues
-    the last one. Where Nav2 drives, its goals are cancelled, or it would continue as well.
+    Robots commanded by a topic need it, as they keep executing the last command. Where Nav2
+    drives, the guard also cancels its goals.
 
     Subscribes
     ----------
@@ -35,17 +35,17 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
     Publishes
     ---------
     `cmd_vel` (geometry_msgs/TwistStamped or Twist), 10 times a second from the loss of liveliness
-    until it is back; nothing before it has heard a driver
+    until it returns; nothing before the first driver
 
     Calls
     -----
-    the cancel service of `navigate_to_pose` (action_msgs/CancelGoal), where it is there
+    the cancel service of `navigate_to_pose` (action_msgs/CancelGoal), if available
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__('guard', GuardSettings, in_robot=True, **options)
         self._last = b''
-        # Whether it ever heard a driver, and whether there is none any more.
+        # Whether it has ever detected a driver, and whether that is lost.
         self._heard = self._lost = False
         self._stop_timer: Any = None
 
@@ -56,9 +56,9 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         self.create_wall_timer(_REFRESH_PERIOD, self._refresh)
         self._lease = lease = self.settings.lease
         quality = liveliness_reader(lease)
-        # Until then it would not notice that the driver is lost.
+        # Before that it would not notice the loss of the driver.
         self.expect(lambda: self._heard)
-        # Of the messages only the last one is used, and only once no other comes.
+        # Only the last message is used, after no other has arrived.
         self.permanent(
             lease,
             lambda: self.create_subscription(
@@ -74,7 +74,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         )
 
     def start(self) -> None:
-        """Stop the robot of a driver that was lost before."""
+        """Stop the robot if its driver was lost before."""
         if self._lost:
             self._begin_stop()
 
@@ -86,7 +86,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             self._stop_timer = None
 
     def status(self) -> dict[str, Any]:
-        """Return whether the driver was lost, and whether the robot is being stopped."""
+        """Return whether the driver is lost and whether the robot is being stopped."""
         return {'driver lost': self._lost, 'stopping': self._stop_timer is not None}
 
     def _on_state(self, message: bytes) -> None:
@@ -94,30 +94,30 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
 
     def _on_liveliness(self, lease: float, event: Any) -> None:
         if lease != self._lease:
-            return  # of an earlier configuration
+            return  # from an earlier configuration
         self._lost = event.alive_count == 0
         if not self._lost:
             self._heard = True
             if self._stop_timer is not None:
-                self.get_logger().info('the driver is back')
+                self.get_logger().info('driver available again')
             self.halt()
         elif self.active and self._stop_timer is None:
             self._begin_stop()
 
     def _begin_stop(self) -> None:
         if self.ending:
-            self.get_logger().info('the driver has ended: zeros on cmd_vel')
+            self.get_logger().info('driver ended: stopping the robot (zero cmd_vel)')
         else:
-            self.get_logger().warning('the driver is dead or hangs: zeros on cmd_vel')
+            self.get_logger().warning('driver not responding: stopping the robot (zero cmd_vel)')
         self._stop_timer = self.create_wall_timer(_STOP_PERIOD, self._command_zeros)
         self._refresh()
         self._command_zeros()
 
     def _refresh(self) -> None:
         self._publisher.refresh()
-        # Repeated: Nav2 may have been about to accept the driver's last goal.
+        # Repeated, as Nav2 may be about to accept the driver's last goal.
         if self._stop_timer is not None and self._nav2.service_is_ready():
-            self._nav2.call_async(CancelGoal.Request())  # without an id: all its goals
+            self._nav2.call_async(CancelGoal.Request())  # without an id: all goals
 
     def _command_zeros(self) -> None:
         if self._stop_timer is None:

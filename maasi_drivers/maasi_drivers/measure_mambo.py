@@ -1,7 +1,8 @@
-"""A command that measures how fast a Mambo flies at its largest tilt: `mambo.full_speed`.
+"""A command that measures a Mambo's speed at its largest tilt: `mambo.full_speed`.
 
-Each leg is the largest tilt one way and then the other for the same time T, from rest: without drag
-g tan(tilt) T^2 long, a bound for any drone. Then it hovers, and flies back.
+Each leg applies the largest tilt in one direction and then the other for the same time T, from
+rest: without drag it is g tan(tilt) T^2 long, an upper bound for any drone. Then the drone hovers
+and flies back.
 """
 
 import argparse
@@ -21,18 +22,18 @@ from maasi_drivers.links.mambo.reckoning import Course, TiltModel
 from maasi_drivers.settings.vehicles import LEAST_TILT, MOST_TILT
 from maasi_filter.arrays import FloatArray
 
-_REST, _STOPPING = 3.0, 1.8  # rest before each leg: the first part for the firmware to stop it [s]
-_EXCESS = 1.5  # above this multiple of the planned distance it has not followed the command
+_REST, _STOPPING = 3.0, 1.8  # rest before each leg; the firmware stops the drone first [s]
+_EXCESS = 1.5  # above this multiple of the planned distance it did not follow the command
 # Longest silence, and longest waits for take-off and connection [s].
 _SILENCE, _PATIENCE = 1.5, 15.0
 _LEAST_BATTERY = 0.2
 # Largest residual of a fit [m], and relative uncertainty of the speed [1].
 _MOST_MISFIT, _MOST_DOUBT = 0.05, 0.35
-_LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)  # drag [1/s] and delay [s] that are searched
+_LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)  # search range of drag [1/s] and delay [s]
 
 
 class MeasurementError(RuntimeError):
-    """The measurement failed; the text has the cause."""
+    """The measurement failed; the text contains the cause."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +41,16 @@ class MeasuredSpeed:
     """Result of a measuring flight."""
 
     full_speed: float  # steady speed at the largest tilt [m/s]
-    delay: float  # from a command until the position shows it [s]
-    doubt: float  # standard deviation of `full_speed`, as a share of it [1]
+    delay: float  # from a command until the position shows its effect [s]
+    doubt: float  # relative standard deviation of `full_speed` [1]
 
 
 @dataclass
 class Leg:
-    """A leg from rest; tilts (share of the largest) and places forward [m] by time from begin."""
+    """A leg from rest: tilts (share of the largest) and positions forward [m] by time."""
 
     begin: float  # monotonic clock [s]
-    origin: float  # where it rested, forward of the take-off point [m]
+    origin: float  # position of rest, forward of the take-off point [m]
     tilts: list[tuple[float, float]] = field(default_factory=list)
     events: list[tuple[float, float]] = field(default_factory=list)
 
@@ -62,16 +63,16 @@ class MeasuringFlight:
         self.number = legs
         self.clock = clock
         self.legs: list[Leg] = []
-        #: Of one tilt [s].
+        # : Duration of one tilt [s].
         self.time = math.sqrt(way / (9.81 * math.tan(link.tilt)))
         self._event: PositionEvent | None = None
 
     def steps(self) -> Iterator[str]:
-        """Take off and fly; yield, every control period, what it does. Landing is the caller's."""
+        """Take off and fly; yields its current action in each control period. The caller lands."""
         link = self.link
         yield from self._await('connecting', lambda: link.connected)
         yield from self._await(
-            'waiting for its state',
+            'waiting for the state of the drone',
             lambda: (
                 link.flying_state == 'landed' and link.battery >= 0.0 and link.position is not None
             ),
@@ -93,8 +94,8 @@ class MeasuringFlight:
         while not condition():
             if self.clock() > end:
                 raise MeasurementError(
-                    f'{what}: {self.link.error or self.link.flying_state or "nothing heard"} after '
-                    f'{_PATIENCE:g} s'
+                    f'{what}: {self.link.error or self.link.flying_state or "nothing received"} '
+                    f'after {_PATIENCE:g} s'
                 )
             self.link.keep_alive()
             yield what
@@ -138,14 +139,14 @@ class MeasuringFlight:
         far = float(np.hypot(*event.position[:2]))
         if far > _EXCESS * self.way:
             raise MeasurementError(
-                f'position: read {far:.2f} m from where it took off, allowed are '
+                f'position: read {far:.2f} m from the take-off point, allowed are '
                 f'{_EXCESS * self.way:.2f} m'
             )
         return event
 
 
 def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
-    """Return speed and delay that explain the legs best, under a tilt [rad]."""
+    """Return the speed and delay that fit the legs best, for a tilt [rad]."""
     from scipy.optimize import least_squares
 
     if sum(len(leg.events) for leg in legs) < 6:
@@ -175,13 +176,13 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
     doubt = math.sqrt(covariance[0, 0]) / drag
     if misfit > _MOST_MISFIT:
         raise MeasurementError(
-            f'misfit: read {misfit:.3f} m, allowed is {_MOST_MISFIT} m: it does not fly as one '
-            'that is told tilts (draught? a floor without texture?)'
+            f'misfit: read {misfit:.3f} m, allowed is {_MOST_MISFIT} m: the flight does not match '
+            'tilt commands (wind? floor without texture?)'
         )
     if doubt > _MOST_DOUBT or not _LEAST[0] * 1.01 < drag < _MOST[0] / 1.01:
         raise MeasurementError(
-            f'speed: known to {100.0 * doubt:.0f} per cent, allowed are {100.0 * _MOST_DOUBT:.0f}: '
-            'fly more legs or a longer way'
+            f'speed: uncertain by {100.0 * doubt:.0f} %, allowed are {100.0 * _MOST_DOUBT:.0f} %: '
+            'fly more or longer legs'
         )
     return MeasuredSpeed(9.81 * math.tan(tilt) / drag, delay, doubt)
 
@@ -204,32 +205,32 @@ _ALLOWED = {
     'port': (1024, 65535),
 }
 _PERIOD = 0.05
-_LANDING = 15.0  # longest wait for it to land [s]
+_LANDING = 15.0  # longest wait for landing [s]
 
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='measure_mambo',
-        description='Have a Mambo take off, tilt forward and backward some times, and land; print '
+        description='Let a Mambo take off, tilt forward and backward repeatedly, and land; print '
         'mambo.full_speed and mambo.delay for its driver. Ctrl-C lands it.',
     )
 
     def add(name: str, help: str, **options: Any) -> None:
         parser.add_argument(f'--{name}', help=help, **options)
 
-    add('fly', 'without it nothing takes off: it says what it would do', action='store_true')
-    add('address', 'of the drone (default: %(default)s)', default='192.168.99.3')
-    add('bluetooth', 'instead of WiFi', action='store_true')
-    add('port', 'on which it is heard (default: %(default)s)', type=int, default=43210)
-    tilt = 'the largest, motion.tilt of its driver [rad] (default: %(default)s)'
+    add('fly', 'take off and fly (default: only print the plan)', action='store_true')
+    add('address', 'address of the drone (default: %(default)s)', default='192.168.99.3')
+    add('bluetooth', 'use Bluetooth instead of WiFi', action='store_true')
+    add('port', 'UDP port for its messages (default: %(default)s)', type=int, default=43210)
+    tilt = 'largest tilt, motion.tilt of its driver [rad] (default: %(default)s)'
     add('tilt', tilt, type=float, default=0.1, metavar='RAD')
     way = (
-        'it keeps within this forward and backward of where it stands, and needs half of it more '
-        'to be safe [m] (default: %(default)s)'
+        'longest distance forward and backward of its position; keep half of it more free '
+        '[m] (default: %(default)s)'
     )
     add('way', way, type=float, default=1.0, metavar='M')
-    add('legs', '(default: %(default)s)', type=int, default=6, metavar='N')
+    add('legs', 'number of legs (default: %(default)s)', type=int, default=6, metavar='N')
     return parser
 
 
@@ -250,11 +251,11 @@ def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Even
             link.land()
             time.sleep(_PERIOD)
         if link.airborne:
-            print('error: the drone has not said that it landed', file=sys.stderr)
+            print('error: the drone did not report that it landed', file=sys.stderr)
     found = fit_speed(flight.legs, link.tilt)
     print(
         f'\nmotion.tilt: {link.tilt:g}\n'
-        f'mambo.full_speed: {found.full_speed:.3g}    # m/s, to {100 * found.doubt:.1f} per cent\n'
+        f'mambo.full_speed: {found.full_speed:.3g}    # m/s, +- {100 * found.doubt:.1f} %\n'
         f'mambo.delay: {found.delay:.2f}    # s'
     )
 
@@ -270,9 +271,9 @@ def main(arguments: list[str] | None = None) -> int:
             return 2
     if not options.fly:
         print(
-            f'It would take off and fly {options.legs} legs of at most {options.way:g} m forward '
-            f'and backward at {options.tilt:g} rad. Keep {1.5 * options.way:g} m free on all '
-            'sides, then add --fly.'
+            f'With --fly it takes off and flies {options.legs} legs of at most {options.way:g} m '
+            f'forward and backward at {options.tilt:g} rad. Keep {1.5 * options.way:g} m free '
+            'on all sides.'
         )
         return 0
     ended = threading.Event()

@@ -1,4 +1,4 @@
-"""Segments images and sends what it sees as a measurement feed: what runs on board of a robot."""
+"""Segments images on board of a robot and sends the blobs as a measurement feed."""
 
 import argparse
 import signal
@@ -22,19 +22,19 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='measurement_feed_sender',
-        description='Segment the images of a camera, and send the blobs to a driver with '
-        'image_source: feed. Ends with the video, or with Ctrl-C.',
+        description='Segment camera images and send the blobs to a driver with image_source: feed. '
+        'Ends with the video or by Ctrl-C.',
     )
     add = parser.add_argument
-    add('video', help='address (rtsp://...), device (/dev/video0) or file, as OpenCV opens it')
-    add('to', metavar='HOST:PORT', help='of the driver')
+    add('video', help='address (rtsp://...), device (/dev/video0) or file that OpenCV can open')
+    add('to', metavar='HOST:PORT', help='address of the driver')
     add('--rule', default='robust', help='segmentation rule: robust or paper (default: robust)')
     add(
         '--exposure-age',
         type=float,
         default=0.0,
         metavar='S',
-        help='from the middle of the exposure until OpenCV has the image [s] (default: 0)',
+        help='time from the middle of the exposure until OpenCV returns the image [s] (default: 0)',
     )
     return parser
 
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
             done = source.ended
             if source.error != said:
                 said = source.error
-                print(said or 'video: frames come', file=sys.stderr)
+                print(said or 'video: receiving frames', file=sys.stderr)
             frame = source.take()
             if frame is None:
                 if done:

@@ -1,4 +1,4 @@
-"""Runs a driver of a user's own: `plugin_driver module:Class`, or the name of an installed one."""
+"""Runs a user's driver: `plugin_driver module:Class`, or an installed one by its name."""
 
 import sys
 
@@ -7,10 +7,10 @@ from maasi_filter.plugins import PluginError, add_folders
 
 _USAGE = """usage: plugin_driver [--check] NAME [FOLDER ...] [--ros-args ...]
 
-Run a driver of your own as a node: a subclass of maasi_drivers.agent.agent_driver.AgentDriver.
+Run your own driver as a node: a subclass of maasi_drivers.agent.agent_driver.AgentDriver.
   NAME      module:Class, or the name of an installed plugin
-  FOLDER    where modules are looked for, too; the current folder is one
-  --check   only look whether it can be loaded"""
+  FOLDER    further folder of modules, besides the current one
+  --check   only check that it can be loaded"""
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Start, pause, resume, send home or stop a search or its robots; arm, show and move robots."""
+"""Commands a team or robots: start, pause, resume, send home, stop, arm, move, show state."""
 
 import argparse
 import math
@@ -22,11 +22,11 @@ from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
 from maasi_planner.node.search_modes import COMMANDS
 
-# Until rclpy (7.1) deletes an executor that Ctrl-C interrupted in its constructor without a word.
+# rclpy before 7.1 prints an error when Ctrl-C interrupts the constructor of an executor.
 SingleThreadedExecutor._sigint_gc = None  # type: ignore[assignment]
 
 DONE, FAILED, ABSENT, INTERRUPTED = 0, 1, 2, 130
-# Commands that only drivers have.
+# Commands of drivers only.
 _OF_DRIVERS = ('release', 'arm')
 _HELP = {
     'start': 'start or restart the search',
@@ -97,7 +97,7 @@ def _path(*names: str) -> str:
 
 
 def wanted(services: dict[str, list[str]], options: argparse.Namespace) -> set[str]:
-    """Return the services that a command calls, among the available ones."""
+    """Return the available services that a command calls."""
     command, robots, top = options.command, options.robots, _path(options.namespace)
     known = {name for name, types in services.items() if 'std_srvs/srv/Trigger' in types}
     one = '|'.join(re.escape(_path(robot)) for robot in robots) or '/[^/]+'
@@ -117,13 +117,13 @@ def wanted(services: dict[str, list[str]], options: argparse.Namespace) -> set[s
 
 
 def _without(services: Iterable[str], options: argparse.Namespace) -> list[str]:
-    """Return the robots asked for that have none of these services."""
+    """Return the requested robots that have none of these services."""
     tops = {robot: _path(options.namespace, robot) + '/' for robot in options.robots}
     return [robot for robot, top in tops.items() if not any(s.startswith(top) for s in services)]
 
 
 def call_all(node: Node, options: argparse.Namespace) -> dict[str, Any]:
-    """Call each service as soon as it is found; return the answers, None without an answer."""
+    """Call each service when it is discovered; return the answers, None without one."""
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     calls: dict[str, Any] = {}
@@ -132,7 +132,7 @@ def call_all(node: Node, options: argparse.Namespace) -> dict[str, Any]:
     begin = changed = time.monotonic()
     while time.monotonic() - begin < options.timeout:
         found = wanted(dict(node.get_service_names_and_types()), options)
-        # Without the planner of the team, the services found may cover only a part of the robots.
+        # Without the team's planner the discovered services may cover only some robots.
         for name in sorted(found - set(clients)):
             clients[name] = node.create_client(Trigger, name)
             changed = time.monotonic()
@@ -155,7 +155,7 @@ def _call(node: Node, options: argparse.Namespace) -> int:
     absent = _without(answers, options)
     if absent or not answers:
         what = f'{options.command} of {", ".join(absent)}' if absent else options.command
-        print(f'no service for {what} within {options.timeout:g} s: is its node there?')
+        print(f'no service for {what} within {options.timeout:g} s: is its node running?')
         return ABSENT
     return DONE if all(answer and answer.success for answer in answers.values()) else FAILED
 
@@ -169,7 +169,7 @@ class _Robot:
         self._interrupted = threading.Event()
 
     def _wait(self, condition: Callable[[], object], timeout: float = math.inf) -> bool:
-        """Return whether it became true in time; an interrupt ends a wait without a limit."""
+        """Return whether a condition became true in time; an interrupt ends unlimited waits."""
         end = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > end or (timeout == math.inf and self._interrupted.is_set()):
@@ -179,7 +179,7 @@ class _Robot:
 
     def _require(self, condition: Callable[[], object], what: str) -> None:
         if not self._wait(condition, self._options.timeout):
-            print(f'{what} for {self._options.timeout:g} s: is its driver there?')
+            print(f'{what} for {self._options.timeout:g} s: is its driver running?')
             raise SystemExit(ABSENT)
 
     def state(self) -> int:
@@ -199,12 +199,12 @@ class _Robot:
         received: list[AgentState] = []
         topic = f'{self._top}/state'
         self._node.create_subscription(AgentState, topic, received.append, SENSOR)
-        self._require(lambda: received, f'nothing on {topic}')
+        self._require(lambda: received, f'no message on {topic}')
         return received[-1]
 
     def go(self) -> int:
-        """Send it to the waypoint, and wait; an interrupt cancels the goal."""
-        # One that flies is not sent into the ground.
+        """Send the robot to the waypoint and wait; an interrupt cancels the goal."""
+        # A flying robot keeps its height.
         z = self._options.Z
         height = self._next_state().pose.pose.position.z if z is None else z
         topic = f'{self._top}/go_to'
@@ -217,25 +217,25 @@ class _Robot:
         # From here on an interrupt cancels the goal before the context ends.
         signal.signal(signal.SIGINT, lambda *_: self._interrupted.set())
         answer = client.send_goal_async(goal)
-        # After an interrupt too: only a goal whose answer is known can be cancelled.
+        # Also after an interrupt: only a goal with a known answer can be cancelled.
         if not (self._wait(answer.done) or self._wait(answer.done, _CANCEL_TIME)):
-            print('interrupted; nothing was heard of the goal')
+            print('interrupted before the driver answered the goal')
             return FAILED
         handle = answer.result()
         if handle is None or not handle.accepted:
-            print('refused: the log of its driver says why')
+            print('refused; see the log of its driver')
             return FAILED
         result = handle.get_result_async()
         if not self._wait(result.done):
             handle.cancel_goal_async()
             if not self._wait(result.done, _CANCEL_TIME):
-                print('cancelled; nothing was heard of its end')
+                print('cancelled; no confirmation received')
                 return FAILED
         end: Any = result.result()
         at = end.result.pose.position
         reached = end.status == GoalStatus.STATUS_SUCCEEDED
         said = 'reached' if reached else f'not reached: {end.result.reason}'
-        print(f'{said}; it stands at ({at.x:.3f}, {at.y:.3f}, {at.z:.3f}) m')
+        print(f'{said}; position ({at.x:.3f}, {at.y:.3f}, {at.z:.3f}) m')
         return DONE if reached else FAILED
 
 

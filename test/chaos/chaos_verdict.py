@@ -117,7 +117,7 @@ def signs_of_driver(bag, robot):
     heard = [
         item.time * 1e-9
         for item in bag.messages(['/rosout'])
-        if item.message.name == f'{robot}.guard' and item.message.msg == 'the driver is back'
+        if item.message.name == f'{robot}.guard' and item.message.msg == 'driver available again'
     ]
     return sorted([*states, *heard])
 

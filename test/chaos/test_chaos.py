@@ -135,7 +135,7 @@ def test_a_robot_that_moves_when_it_must_stand_is_found(problems_of):
 
 
 def test_a_driver_that_its_guard_hears_again_is_not_silent_before_it_is_recorded(problems_of):
-    back = ('/rosout', 3.0, Log(name='mambo.guard', msg='the driver is back'))
+    back = ('/rosout', 3.0, Log(name='mambo.guard', msg='driver available again'))
     states = [('/mambo/state', time, state()) for time in (1.0, 7.0)]
     messages = [*states, ('/mambo/odom', 5.0, MOVING)]
     assert problems_of(*messages) == [MOVES.format('mambo', 0.2, 5.0, 'its driver', 1.0)]

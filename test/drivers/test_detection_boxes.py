@@ -237,7 +237,7 @@ def test_a_camera_that_turns_on_the_robot_is_where_tf_says(searching):
 def test_boxes_of_other_classes_are_reported_with_the_classes_seen(searching, capfd):
     _, driver, team, _ = searching
     for labels, said in (
-        ([('0', 0.9), ('Person', 0.8)], "'person'; seen are '0', 'Person', 'dog'"),
+        ([('0', 0.9), ('Person', 0.8)], "'person'; received are '0', 'Person', 'dog'"),
         ([('0', 0.9)], ''),  # said already
         ([('2', 0.9)], "seen are '0', '2', 'Person', 'dog'"),
         ([('person', 0.9)], ''),

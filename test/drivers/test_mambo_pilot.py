@@ -112,7 +112,7 @@ def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
     [
         ({'arm': False}, 'mambo.arm'),
         ({'full_speed': None}, 'mambo.full_speed'),
-        ({'battery': 0.05}, 'battery at 0.05, below 0.10'),
+        ({'battery': 0.05}, 'battery at 5 %, below 10 %'),
     ],
 )
 def test_what_keeps_it_on_the_ground(changes, text):
@@ -152,8 +152,8 @@ def test_each_call_of_the_service_is_for_one_take_off():
 @pytest.mark.parametrize(
     ('fault', 'reason'),
     [
-        ({'cut_down': True}, 'link lost: nothing from the Mambo'),
-        ({'cut_down': True, 'cut_up': True}, 'link lost: nothing from the Mambo'),
+        ({'cut_down': True}, 'link lost: no data from the Mambo'),
+        ({'cut_down': True, 'cut_up': True}, 'link lost: no data from the Mambo'),
         ({'sent': 'none'}, 'no position'),
         ({'sent': 'stuck'}, 'the position has not changed'),
     ],
@@ -190,7 +190,7 @@ def drift(flight):
     flight.firmware.body.position[0] += 0.05
 
 
-STOPPED = f'landed: its take-off was stopped, {UNTIL_ARM}'
+STOPPED = f'landed: take-off stopped, {UNTIL_ARM}'
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ STOPPED = f'landed: its take-off was stopped, {UNTIL_ARM}'
         (
             None,
             lambda flight: setattr(flight.firmware.charge, 'charge', 0.08),
-            f'battery at 0.08, below 0.10, {UNTIL_ARM}',
+            f'battery at 8 %, below 10 %, {UNTIL_ARM}',
         ),
         (None, drift, f'outside the geofence, -0.4 to 2.5 m, {UNTIL_ARM}'),
         (None, lambda flight: flight.firmware.land(), f'by itself, {UNTIL_ARM}'),
@@ -270,8 +270,8 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
 @pytest.mark.parametrize(
     ('ignored', 'text'),
     [
-        ('take_off', 'it did not take off in 5 s'),
-        ('pilot', 'it did not come to its altitude in 5 s'),
+        ('take_off', 'no take-off within 5 s'),
+        ('pilot', 'altitude not reached within 5 s'),
     ],
 )
 def test_a_take_off_that_takes_too_long_is_given_up(ignored, text):

@@ -53,10 +53,10 @@ def test_a_barometer_that_drifts_before_arming_does_not_keep_it_at_its_take_off(
 @pytest.mark.parametrize(
     ('second_gnss', 'lost', 'muted', 'text'),
     [
-        (False, False, 'EKF_STATUS_REPORT', 'no EKF_STATUS_REPORT any more'),
-        (False, False, 'GPS_RAW_INT', 'GNSS is lost (no GPS_RAW_INT any more)'),
-        (False, True, '', 'GNSS is lost (GPS_RAW_INT.fix_type 1)'),
-        (True, True, 'GPS2_RAW', 'GNSS is lost (GPS_RAW_INT.fix_type 1, no GPS2_RAW any more)'),
+        (False, False, 'EKF_STATUS_REPORT', 'EKF_STATUS_REPORT lost'),
+        (False, False, 'GPS_RAW_INT', 'GNSS fix lost (GPS_RAW_INT lost)'),
+        (False, True, '', 'GNSS fix lost (GPS_RAW_INT.fix_type 1)'),
+        (True, True, 'GPS2_RAW', 'GNSS fix lost (GPS_RAW_INT.fix_type 1, GPS2_RAW lost)'),
     ],
 )
 def test_the_loss_of_position_or_its_status_is_seen_in_flight(second_gnss, lost, muted, text):
@@ -105,7 +105,7 @@ def test_a_restarted_driver_has_the_map_and_the_heights_of_before(tmp_path, orig
     play.start_driver()
     play.run(6.0)
     assert_allclose(play.vehicle.estimate.origin, before, atol=1e-6)
-    assert 'the origin of the flight before is kept' in play.said
+    assert 'the origin of the previous flight' in play.said
     play.permitted().fly()
     assert_allclose(play.vehicle.estimate.origin[:2], before[:2], atol=1e-6)
 
@@ -114,12 +114,12 @@ def test_a_driver_that_finds_its_vehicle_in_the_air_does_not_guess_where_it_is()
     play = far_away(None, 'here')
     play.start_driver()
     play.run(6.0)
-    assert 'its place in the map is not known' in play.fault
+    assert 'position in the map is unknown' in play.fault
     assert play.vehicle.estimate.telemetry is None
     # After a landing it is not at its start either.
     play.autopilot.take_mode('LAND')
     play.until(lambda: not play.autopilot.armed).run(3.0)
-    assert 'its place in the map is not known' in play.permit()
+    assert 'position in the map is unknown' in play.permit()
 
 
 @pytest.mark.parametrize('change', ['autopilot', 'start', 'ground', 'broken', 'host'])
@@ -163,5 +163,5 @@ def test_a_position_that_is_frozen_or_not_finite_is_no_news():
     play.autopilot.frozen = (math.nan, *[0.0] * 5)
     play.run(1.0)
     assert data.telemetry is last
-    for what in ('frozen', 'not finite'):
-        assert data.dropped[f'LOCAL_POSITION_NED that is {what}'] > 10
+    for what in ('frozen', 'invalid'):
+        assert data.dropped[f'{what} LOCAL_POSITION_NED'] > 10

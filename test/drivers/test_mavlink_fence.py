@@ -76,7 +76,7 @@ def test_without_the_protocol_that_is_said_and_it_flies():
     play = play_of()
     play.autopilot.capabilities = 0
     play.fly()
-    assert 'not uploaded: the autopilot has no protocol for it' in play.said
+    assert 'not uploaded: the autopilot does not support it' in play.said
     assert not play.sent('MISSION_COUNT') and play.autopilot.fence.items == []
 
 
@@ -97,8 +97,8 @@ def without_space(fence):
 @pytest.mark.parametrize(
     ('flaw', 'reason'),
     [
-        (moved, 'read back, item 5 differs'),
-        (opened, 'read back, the number of its items differs'),
+        (moved, 'not verified: item 5'),
+        (opened, 'not verified: the number'),
         (without_space, 'not verified (MAV_MISSION_NO_SPACE)'),
         (None, 'not verified (no answer)'),
     ],
@@ -126,12 +126,12 @@ def test_where_it_has_another_fence_it_is_not_armed_and_takes_no_goals(flaw, rea
         spoilt[0] = True
         play.vehicle.fence.begin()
     play.run(16.0)
-    assert f'its fence is {reason}' in play.fault
+    assert f'fence {reason}' in play.fault
     assert play.said.count(f'fence: {reason}') == 1
     if in_air:
         assert play.phase is VehiclePhase.FLYING and play.autopilot.armed
     else:
-        assert f'its fence is {reason}' in play.permit()
+        assert f'fence {reason}' in play.permit()
         play.run(5.0)
         assert not play.commands(ARM)
     # It is tried again.

@@ -53,7 +53,7 @@ def test_a_fault_ends_it(fault, text):
         ([(0.5, 0.1)], 'fewer than 6'),
         ([(0.2 * n, 0.3 * math.sin(2.0 * n)) for n in range(10)], 'misfit'),
         # It never left the place.
-        ([(0.1 * n, 0.0) for n in range(10)], 'speed: known to'),
+        ([(0.1 * n, 0.0) for n in range(10)], 'speed: uncertain'),
     ],
 )
 def test_what_says_too_little_or_does_not_fit_is_refused(places, text):

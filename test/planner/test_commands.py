@@ -173,7 +173,7 @@ def charging(world, a, reason):
         (stopped, True, STOPPED),
         (fault, False, 'vehicle: not armed: until the service arm is called'),
         (fault, True, '3.0 m outside of the area'),
-        (fault, True, 'link: nothing heard from system 1'),
+        (fault, True, 'link: no message from system 1'),
     ],
 )
 def test_from_every_state_it_comes_home_at_once_or_when_it_can(state, searching, reason):
@@ -217,7 +217,7 @@ def test_a_keep_out_on_the_way_home_leads_it_around_and_one_at_home_lets_it_wait
         assert world.call('a/search/home').success
         world.until(lambda: a.moves and a.place[0] < 1.7)
         close('POLYGON ((1.0 0.3, 1.2 0.3, 1.2 0.8, 1.0 0.8, 1.0 0.3))')
-        world.listen(lambda: world.logged('a keep-out lies on its way'))
+        world.listen(lambda: world.logged('path blocked by a keep-out zone'))
         came_home(world, a)
 
         _, result = world.send('a', (1.8, 0.5), 901)
@@ -307,7 +307,7 @@ def test_a_robot_is_shown_sent_and_stopped(world):
 
     x, y = a.place[0] + 0.1, a.place[1]
     code, said = robot('go', 'a', f'{x}', f'{y}')
-    assert code == DONE and said.startswith('reached; it stands at'), said
+    assert code == DONE and said.startswith('reached; position ('), said
     assert abs(a.place[0] - x) < 0.05
 
     code, said = robot('go', 'a', '100', '0')

@@ -136,7 +136,7 @@ class FieldSearch(_Search):
             free = [] if ways is None else [motion.keep_out.is_free(place) for place in ways[0]]
             # The part on which it leaves a zone does not count.
             if not all(free[free.index(True) if True in free else 0 :]):
-                follower.end(GoalStatus.ABORTED, 'a keep-out lies on its way')
+                follower.end(GoalStatus.ABORTED, 'path blocked by a keep-out zone')
 
 
 @dataclass

@@ -147,7 +147,7 @@ def test_a_recording_cut_anywhere_gives_what_is_before_the_cut(whole, tmp_path, 
                 steps = read_steps(bag)
                 assert bag.recovered
         except BagError as error:
-            assert length < 60 and 'no whole record' in str(error)
+            assert length < 60 and 'no complete record' in str(error)
             steps = []
         assert steps == list(range(len(steps)))
         counts.append(len(steps))

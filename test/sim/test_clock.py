@@ -195,7 +195,7 @@ def test_a_robot_stands_when_the_time_jumps_back_and_goes_on_with_a_new_pose(wor
 
     world.until(go_back)
     world.until(world.stands)
-    assert result.result().result.reason == 'the time jumped back'
+    assert result.result().result.reason == 'time jumped back'
     world.until(lambda: world.states[-1].goal_status == AgentState.UNAVAILABLE)
     assert 'odometry' in world.states[-1].reason
     rover.now = rover.step = SECOND

@@ -401,7 +401,7 @@ def test_a_linked_robot_is_cut_off_while_it_is_away(make_team, tmp_path):
         team.spin_until(lambda: drone.of('ranges'))
         assert drone.of('ranges')[0].ranges[0].range == pytest.approx(4.0, abs=2.0)
         team.spin_until(lambda: not link.vehicle.flying)
-        assert link.vehicle.fault == 'link: nothing heard from system 1'
+        assert link.vehicle.fault == 'link: no message from system 1'
         team.spin_until(lambda: link.vehicle.flying)
         assert not drone.of('odom') and not drone.of('battery_state')
         assert drone.command.get_subscription_count() == 0

@@ -51,9 +51,9 @@ def test_three_vehicles_find_all_through_the_real_protocol(tmp_path):
     assert min(run.report['distance'].values()) > 2.0
     for name, system in (('drone', 'ArduCopter'), ('rov', 'ArduSub'), ('other', 'PX4')):
         log = (run.folder / f'{name}_driver.log').read_text()
-        assert f'{system} is there as system' in log
+        assert f'{system} connected as system' in log
         # Positions came, before the simulated time did.
-        assert 'no LOCAL_POSITION_NED yet' not in log
+        assert 'no LOCAL_POSITION_NED received' not in log
 
 
 def small_demo():
@@ -82,4 +82,4 @@ def test_a_mambo_reached_by_pyparrot_and_a_turtlebot_find_all(tmp_path):
     assert 'Success in setting up the wifi network to the drone' in log
     for phase in ('taking off', 'climbing', 'flying'):
         assert f'] [mambo.driver]: {phase}' in log
-    assert 'has not reported that it lands' not in log
+    assert 'has not reported landing' not in log

@@ -230,11 +230,11 @@ def test_a_run_leaves_its_page_which_is_made_again_of_its_bag_or_of_the_newest_r
     page = (run.folder / REPLAY).read_text()
     assert 10_000 < len(page) < 5_000_000
     assert main([str(tmp_path / 'nothing'), '--no-browser']) == 2
-    assert 'there is no such recording' in capsys.readouterr().err
+    assert 'no such recording' in capsys.readouterr().err
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match='2'):
         main(['--no-browser'])
-    assert 'there is no run in runs' in capsys.readouterr().err
+    assert 'runs contains no run' in capsys.readouterr().err
     (tmp_path / 'runs').mkdir()
     (tmp_path / 'runs' / 'mine').symlink_to(run.folder)
     for recording in ([str(run.bag)], []):

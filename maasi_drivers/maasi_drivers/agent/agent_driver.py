@@ -1,4 +1,4 @@
-"""The driver of a robot: a node that joins a link, a sensor, goals, and answers to batches."""
+"""The driver of a robot: a node that joins a link, a sensor, goals and batch answers."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -24,11 +24,12 @@ from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.qos import LATCHED
 from maasi_filter.ros.run_node import run as run_node
+from maasi_filter.wording import number
 from maasi_msgs.msg import LockstepStep
 from maasi_planner.motion import RobotState
 
-# Reason in `state` while the robot is stopped by the service.
-STOPPED = 'stopped by the service stop, until the service release is called'
+# Reason in `state` while the service has stopped the robot.
+STOPPED = 'stopped by the service stop; call the service release'
 
 MakeLink = Callable[[RobotNode], RobotLink]
 MakeSensor = Callable[[RobotNode], SensorInput]
@@ -79,8 +80,8 @@ class AgentDriver(RobotNode):
     ) -> None:
         super().__init__(**options)
         self._links, self._make_sensor = links, make_sensor
-        self._opened: list[RobotLink | SensorInput] = []  # what has to be closed
-        self._stop_latched = False  # outlives *cleanup* and *configure*, but not the process
+        self._opened: list[RobotLink | SensorInput] = []  # parts to close
+        self._stop_latched = False  # outlives *cleanup* and *configure*
 
     def prepare(self) -> None:
         """Make link, sensor and controller."""
@@ -101,7 +102,7 @@ class AgentDriver(RobotNode):
         self._pose_speed = PoseSpeed()
 
     def set_up(self) -> None:
-        """Compile, make the parts and connect."""
+        """Compile kernels, make the parts and connect."""
         settings = self.settings
         ahead = self.start_pose.position + np.array([0.1, 0.1, 0.0])
         self._motion.command(RobotState(self.start_pose), ahead)
@@ -129,12 +130,12 @@ class AgentDriver(RobotNode):
             self.create_wall_timer(PERIOD, self._watchdog.check)
 
     def start(self) -> None:
-        """Begin to work."""
+        """Start working."""
         self.silence.end()
         self.link.activate()
 
     def halt(self) -> None:
-        """Give the goal up, and stop the robot."""
+        """Abort the goal and stop the robot."""
         if not self.configured:
             return
         self.end_goal(GoalStatus.ABORTED, 'the driver stops')
@@ -147,7 +148,7 @@ class AgentDriver(RobotNode):
         self._opened = []
 
     def destroy_node(self) -> None:
-        """Send the last results, and leave the graph."""
+        """Send the last results and destroy the node."""
         self.active = False
         if hasattr(self, 'goals'):
             self.goals.settle()
@@ -155,12 +156,12 @@ class AgentDriver(RobotNode):
         self.tear_down()
 
     def reset(self) -> None:
-        """Discard what belongs to the time before a jump back."""
-        self.end_goal(GoalStatus.ABORTED, 'the time jumped back')
+        """Discard data from before a jump back in time."""
+        self.end_goal(GoalStatus.ABORTED, 'time jumped back')
         if not self.settings.lockstep:
-            # Its pose is unknown: it is stopped until a new one comes.
+            # Its pose is unknown: it stays stopped until a new one arrives.
             self.link.hold()
-            self.health.begin(ODOMETRY, f'no {self.pose_name} since the time jumped back')
+            self.health.begin(ODOMETRY, f'no {self.pose_name} since time jumped back')
         self.history.clear()
         self.frames.clear()
         self._responder.reset()
@@ -171,29 +172,31 @@ class AgentDriver(RobotNode):
         self.link.reset()
 
     def status(self) -> dict[str, Any]:
-        """Return goal, fault and counts."""
+        """Return goal, fault and counts for the diagnostics."""
         left_out, goal = self._responder.left_out, self.follower.goal
         return {
             'goal': f'{0 if goal is None else goal.id}: {self.follower.status.name}',
             'fault': self.health.text,
             'battery': f'{self._state.charge:.2f}',
             'open batches': len(self._responder.queue),
-            **{f'detections left out: {key}': number for key, number in left_out.items()},
+            **{f'dropped detections: {key}': number for key, number in left_out.items()},
             **self.link.status(),
         }
 
     def take_pose(self, placed: StampedPose) -> None:
-        """Take the robot's pose, and do the control step for it."""
+        """Handle the robot's pose with a control step."""
         self.link.observe(placed)
         self.silence.end()
         outside, allowed = self.volume.beyond_border(placed.pose.position)
         if outside > allowed + MARGIN:
-            self.health.begin(AREA, f'{outside:.1f} m outside of the area')
+            self.health.begin(AREA, f'{number(outside)} m outside of the area')
         elif outside <= allowed:
             self.health.end(AREA, 'inside the area again')
         self._watchdog.watch_charge(placed.stamp)
         if self.health.end(ODOMETRY, f'{self.pose_name}: received again'):
-            self._watchdog.sensed_at = None  # it may have been silent with the odometry
+            self._watchdog.sensed_at = (
+                None  # battery messages may have been missing together with odometry
+            )
         if self.settings.lockstep:
             self.link.begin_step(placed.stamp)
         else:
@@ -203,7 +206,7 @@ class AgentDriver(RobotNode):
         self._responder.serve()
 
     def refuse_pose(self, stamp: int) -> None:
-        """Stop the robot in lockstep, where the step of a stamp [ns] waits for the command."""
+        """In lockstep, stop the robot: the step of a stamp [ns] awaits a command."""
         if self.settings.lockstep:
             self._state.publish_status(stamp, self.step_of(stamp))
             self.link.hold_step(stamp)
@@ -218,9 +221,9 @@ class AgentDriver(RobotNode):
             self.take_pose(self._pose_speed.place(stamp, pose))
 
     def _adopt_area(self, area: Area) -> None:
-        """Take other keep-outs; give a goal up whose way leads into one: the robot stops.
+        """Adopt new keep-out zones; abort a goal whose path crosses one.
 
-        The part of the way on which a robot leaves a zone that it is in does not count.
+        The part of the path on which a robot leaves its current zone does not count.
         """
         self.volume.area, motion, latest = area, self._motion, self.history.latest
         goal, ways = self.follower.current, None
@@ -231,24 +234,24 @@ class AgentDriver(RobotNode):
         if ways is not None:
             free = [motion.keep_out.is_free(position) for position in ways[0]]
             if not all(free[free.index(True) if True in free else 0 :]):
-                self.end_goal(GoalStatus.ABORTED, 'a keep-out lies on its way')
+                self.end_goal(GoalStatus.ABORTED, 'path blocked by a keep-out zone')
 
     def take_charge(self, charge: float) -> None:
-        """Take the charge of the battery, 0 to 1; anything else is unknown."""
+        """Update the battery charge, 0 to 1; other values are unknown."""
         self._watchdog.update_charge(charge)
 
     def receive_frame(self, topic: str, stamp: int, data: Any, *, repeated: bool = False) -> None:
-        """Take an image or sweep; see `RobotNode.receive_frame`."""
+        """Handle an image or sweep; see `RobotNode.receive_frame`."""
         self._responder.receive_frame(topic, stamp, data, repeated)
 
     def end_goal(self, status: GoalStatus, reason: str) -> None:
-        """End the present goal, if there is one."""
+        """End the current goal, if any."""
         goal = self.follower.end(status, reason)
         if goal is not None:
             self.goals.finish(goal)
 
     def publish_fault(self) -> None:
-        """Publish `state` with the fault of a robot that has no pose yet."""
+        """Publish `state` with the fault of a robot without a pose."""
         if self.health.text and self.history.latest is None:
             self._state.publish_status(self.get_clock().now().nanoseconds)
 
@@ -257,7 +260,7 @@ class AgentDriver(RobotNode):
         robot = RobotState(placed.pose, placed.velocity, placed.angular_velocity)
         command, reached = self.link.steer(robot, step if self.settings.lockstep else None)
         if FROZEN_POSE in self.health:
-            command = np.zeros(4)  # such a pose cannot be controlled with
+            command = np.zeros(4)  # such a pose cannot be used for control
         self._watchdog.moving = self.link.is_moving(placed, command)
         if reached is not None:
             self.goals.finish(reached)
@@ -282,7 +285,7 @@ class AgentDriver(RobotNode):
                 self.link.hold()
             self.link.latch_stop()
         response.success = True
-        response.message = 'the robot is stopped; it takes no goals until release'
+        response.message = 'robot stopped; goals are refused until release'
         return response
 
     def _on_release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -290,7 +293,7 @@ class AgentDriver(RobotNode):
         if self.configured:
             self.health.end(STOP, 'released: goals are accepted')
         response.success = True
-        response.message = 'the robot takes goals' if was else 'the robot was not stopped'
+        response.message = 'robot released' if was else 'the robot was not stopped'
         return response
 
 

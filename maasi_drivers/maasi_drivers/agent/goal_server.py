@@ -1,4 +1,4 @@
-"""The action `go_to` of a robot: which goals it takes, and how they end."""
+"""The action `go_to` of a robot: accepts, aborts and concludes goals."""
 
 import time
 
@@ -12,23 +12,23 @@ from maasi_drivers.links.robot_link import RobotLink
 from maasi_filter.ros.conversions import pose_to_ros
 from maasi_msgs.action import GoToWaypoint
 
-# At the end: longest wait for the last results, and executor tasks that send them [s].
+# At the end: longest wait for the last results [s], and executor tasks that send them.
 _SETTLE_TIME, _LAST_TASKS = 0.3, 5
 
 
 class GoalServer:
-    """Takes goals of `go_to`, each in place of the one before; a bad one is aborted, with why."""
+    """Handles goals of `go_to`: a new one replaces the current one, an invalid one is aborted."""
 
     def __init__(self, driver: RobotNode, link: RobotLink) -> None:
         self._driver, self._link = driver, link
         self.away = False
-        # Goals that have ended, until their results are sent.
+        # Ended goals whose results are not sent yet.
         self._ended: dict[bytes, Goal] = {}
         self._feedback_at = 0
         server = driver.permanent(
             'go_to', lambda: ActionServer(driver, GoToWaypoint, 'go_to', self._conclude)
         )
-        # Without configuration goals are refused.
+        # Without a configuration goals are refused.
         server.register_goal_callback(
             lambda _: GoalResponse.ACCEPT if driver.configured else GoalResponse.REJECT
         )
@@ -37,25 +37,25 @@ class GoalServer:
         server.register_execute_callback(self._conclude)
 
     def finish(self, goal: Goal) -> None:
-        """Have the result of a goal sent: the executor calls `_conclude` for it."""
+        """Let the executor send the result of a goal."""
         self._link.goal_ended(goal)
         self._ended[bytes(goal.handle.goal_id.uuid)] = goal
         goal.handle.execute()
 
     def settle(self) -> None:
-        """Wait until the results of ended goals are sent, before the node is destroyed."""
+        """Wait until the results of ended goals are sent."""
         executor = self._driver.executor
         if not self._ended or executor is None:
             return
         deadline = time.monotonic() + _SETTLE_TIME
         while self._ended and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.01)
-        # Concluded results are sent by later tasks.
+        # Later tasks send concluded results.
         for _ in range(_LAST_TASKS):
             executor.spin_once(timeout_sec=0.0)
 
     def publish_feedback(self, placed: StampedPose) -> None:
-        """Publish the distance left, twice a second by the stamps of the poses."""
+        """Publish the remaining distance, twice per second of pose stamps."""
         follower = self._driver.follower
         if (
             follower.status == GoalStatus.MOVING
@@ -67,17 +67,17 @@ class GoalServer:
             follower.goal.handle.publish_feedback(GoToWaypoint.Feedback(distance=distance))
 
     def problem(self, request: GoToWaypoint.Goal) -> str | None:
-        """Return why a goal is refused: field, what was read, what is allowed; else None."""
+        """Return why a goal is refused (field, value read, allowed values), or None."""
         driver = self._driver
         if not driver.active:
             return 'the driver is not active'
         if self.away:
-            return 'the robot has left'
+            return 'the robot left the team'
         if driver.health.text:
-            return f'the robot cannot go on: {driver.health.text}'
+            return f'robot unavailable: {driver.health.text}'
         latest = driver.history.latest
         if latest is None and not driver.settings.lockstep:
-            return f'no {driver.pose_name} yet'
+            return f'no {driver.pose_name} received yet'
         now = driver.get_clock().now().nanoseconds if latest is None else latest.stamp
         if problem := self._driver.frames.to_map(request.waypoint, now):
             return problem
@@ -109,7 +109,7 @@ class GoalServer:
             self.finish(goal)
             return
         replaced = self._driver.follower.adopt(goal)
-        # Before the end of the other: the link must not stop the robot in between.
+        # Before the other goal ends: the link must not stop the robot in between.
         self._link.goal_taken(goal)
         if replaced is not None:
             self.finish(replaced)
@@ -117,7 +117,7 @@ class GoalServer:
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         goal = self._driver.follower.current
         if goal is None or goal.handle is not handle:
-            return CancelResponse.REJECT  # it has ended or was replaced
+            return CancelResponse.REJECT  # already ended or replaced
         self._driver.end_goal(GoalStatus.CANCELED, 'cancelled')
         if not self._driver.settings.lockstep:
             self._link.hold()

@@ -1,4 +1,4 @@
-"""A robot's answers to measurement batches: batch, image and pose to detections."""
+"""Answers measurement batches with the detections of an image at its pose."""
 
 from collections import Counter, deque
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from maasi_msgs.msg import DetectionArray, MeasurementBatch
 
 @dataclass(frozen=True)
 class MeasurementRequest:
-    """A measurement that a robot is to take, by the first image at or after the stamp [ns]."""
+    """A measurement that a robot must take with the first image at or after a stamp [ns]."""
 
     batch: int
     stamp: int
@@ -33,7 +33,7 @@ class MeasurementRequest:
 
 
 class MeasurementQueue:
-    """Matches requests with images (or sweeps), one for each, and poses, in any order."""
+    """Matches requests, images (or sweeps) and poses in any order, one image per request."""
 
     def __init__(
         self, history: PoseHistory, offset: int = 0, frames: int = 8, requests: int = 16
@@ -54,7 +54,7 @@ class MeasurementQueue:
         self.latest = stamp
 
     def add_request(self, request: MeasurementRequest) -> MeasurementRequest | None:
-        """Add a request, unless it waits already; return one that is dropped for it."""
+        """Add a new request; return one that is dropped for it."""
         if request not in self._requests:
             self._requests.append(request)
         return self._requests.pop(0) if len(self._requests) > self._capacity else None
@@ -66,9 +66,10 @@ class MeasurementQueue:
         self.latest = None
 
     def next(self) -> tuple[MeasurementRequest, int, Any, StampedPose] | None:
-        """Return the next request that can be answered, stamp and image for it, and the pose then.
+        """Return the next request that can be answered, with stamp, image and its pose.
 
-        The image is taken; the request stays until `answered`: another image may have to answer it.
+        The image is removed; the request stays until `answered`, as another image may
+        answer it.
         """
         latest = self.history.latest
         if not self._requests or latest is None:
@@ -81,28 +82,28 @@ class MeasurementQueue:
                 return None
             self._frames.popleft()
             pose = self.history.at(stamp + self.offset)
-            # Before the request, or before the first pose, an image is of no use any more.
+            # Images before the request or the first pose are useless.
             if request.stamp <= stamp and pose is not None:
                 return request, stamp, data, pose
         return None
 
     def answered(self, request: MeasurementRequest) -> None:
-        """Take off a request that `next` returned."""
+        """Remove a request that `next` returned."""
         self._requests.remove(request)
 
 
-_AHEAD = 2_000_000_000  # how far stamps of images or batches may be ahead of the odometry [ns]
+_AHEAD = 2_000_000_000  # largest lead of image or batch stamps over the odometry [ns]
 
 
 class MeasurementResponder:
-    """Answers each batch that the robot is in by the detections of one image or sweep."""
+    """Answers each batch of the robot with the detections of one image or sweep."""
 
     def __init__(self, driver: RobotNode, sensor: SensorInput, watchdog: Watchdog) -> None:
         self._driver, self._sensor, self._watchdog = driver, sensor, watchdog
         #: Batches without an answer yet.
         self.queue = MeasurementQueue(driver.history, sensor.offset)
         self._answer: DetectionArray | None = None
-        # The last image with its stamp [ns].
+        # The last image and its stamp [ns].
         self._frame: tuple[int, Any] | None = None
         self.left_out: Counter[str] = Counter()
         self._publisher = driver.create_publisher(DetectionArray, 'detections', RELIABLE)
@@ -112,12 +113,12 @@ class MeasurementResponder:
         driver.expect_subscribers(self._publisher, names={'filter_node'})
 
     def reset(self) -> None:
-        """Discard what belongs to another time."""
+        """Discard data from another time."""
         self.queue.clear()
         self._answer = self._frame = None
 
     def receive_frame(self, topic: str, stamp: int, data: Any, repeated: bool) -> None:
-        """Take an image or sweep; see `RobotNode.receive_frame`."""
+        """Handle an image or sweep; see `RobotNode.receive_frame`."""
         driver = self._driver
         if not driver.active or self._is_ahead('image stamp', f'{topic}.header.stamp', stamp):
             return
@@ -145,7 +146,7 @@ class MeasurementResponder:
             try:
                 reading = self._sensor.detect(data, pose)
             except ValueError as error:
-                # No empty answer: a miss is information. The next image answers instead.
+                # No empty answer, as a miss is information; the next image answers.
                 self._driver.drop('image', str(error))
                 continue
             self.queue.answered(request)
@@ -157,7 +158,9 @@ class MeasurementResponder:
             return
         stamp = stamp_from_ros(message.stamp)
         if message.id > batch_id_limit(0):
-            driver.drop('batch', f'measurement_batch.id: read {message.id}, allowed are small ones')
+            driver.drop(
+                'batch', f'measurement_batch.id: read {message.id}, allowed are smaller numbers'
+            )
             return
         if self._is_ahead('batch', 'measurement_batch.stamp', stamp):
             return
@@ -167,17 +170,20 @@ class MeasurementResponder:
             and answer.batch_id == message.id
             and stamp_from_ros(answer.header.stamp) >= stamp
         ):
-            # Duplicate batch: publish the cached answer again, a restarted peer may need it.
+            # Repeat the answer to a repeated batch: a restarted peer may need it.
             self._publisher.publish(answer)
             return
         for member in message.members:
             if member.robot == driver.robot:
                 request = MeasurementRequest(int(message.id), stamp, int(member.measurement))
                 if (old := self.queue.add_request(request)) is not None:
-                    driver.drop('batch', f'batch {old.batch}: no image for it, too many newer ones')
+                    driver.drop(
+                        'batch',
+                        f'batch {old.batch}: dropped without an image, too many newer batches',
+                    )
                 self.serve()
-                # In lockstep no other image comes. After a restart it may have answered the batch
-                # before, which is published again.
+                # In lockstep no other image comes. After a restart it may have answered the
+                # previous batch, which is published again.
                 frame = self._frame if driver.settings.lockstep and len(self.queue) else None
                 if frame is not None and frame[0] == stamp:
                     self.queue.add_frame(*frame)
@@ -185,7 +191,7 @@ class MeasurementResponder:
                 return
 
     def _is_ahead(self, reason: str, what: str, stamp: int) -> bool:
-        """Return whether a stamp [ns] is far ahead of the odometry, and drop it then."""
+        """Return whether a stamp [ns] is far ahead of the odometry and must be dropped."""
         latest = self._driver.history.latest
         if self._driver.settings.lockstep or latest is None or stamp <= latest.stamp + _AHEAD:
             return False

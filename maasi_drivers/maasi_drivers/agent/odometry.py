@@ -1,4 +1,4 @@
-"""Odometry placed in the map, velocities from poses, and poses at a stamp. Without ROS."""
+"""Odometry in the map, velocities from poses, and poses at a stamp. Without ROS."""
 
 import math
 from bisect import bisect_left
@@ -14,7 +14,7 @@ from maasi_filter.models.pose import Pose, compose, finite_vector, inverse
 
 @dataclass(frozen=True)
 class StampedPose:
-    """Where a robot was at a stamp.
+    """Pose and velocity of a robot at a stamp.
 
     Attributes
     ----------
@@ -38,15 +38,10 @@ class StampedPose:
 
 
 class MapOdometry:
-    """Turns a robot's odometry, which starts at zero, into poses in the map.
+    """Converts odometry, which starts at zero, into poses in the map.
 
-    Parameters
-    ----------
-    initial : Pose
-        Of the robot in the map when its odometry stood at ``origin``.
-    origin : Pose, optional
-        What the odometry showed then; without it, zero. A robot that was not restarted shows
-        something else: give its first message.
+    initial: pose of the robot in the map when the odometry showed `origin`; origin: default
+    zero; for a robot that was not restarted, its first message.
     """
 
     def __init__(self, initial: Pose, origin: Pose | None = None) -> None:
@@ -61,23 +56,10 @@ class MapOdometry:
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
     ) -> StampedPose:
-        """Place one odometry message in the map.
+        """Convert an odometry message; raises ValueError if a number is not finite.
 
-        Parameters
-        ----------
-        stamp : int
-            [ns].
-        pose : Pose
-            Of the robot in its odometry frame.
-        covariance : array_like, shape (6, 6), optional
-            Of the pose, in the odometry frame, as in ``nav_msgs/Odometry``; none: zero.
-        velocity, angular_velocity : array_like, shape (3,)
-            The twist, in the robot's frame [m/s, rad/s].
-
-        Raises
-        ------
-        ValueError
-            Where a number is not finite.
+        stamp in ns; pose and covariance (6, 6, default zero) in the odometry frame, as in
+        `nav_msgs/Odometry`; twist in the robot's frame [m/s, rad/s].
         """
         matrix = np.zeros((6, 6))
         if covariance is not None:
@@ -96,7 +78,7 @@ class MapOdometry:
 
 
 def is_in_map(frame: str, origin: str, map_frame: str) -> bool:
-    """Return whether odometry is in the map: by its `header.frame_id`, or by `odometry_origin`."""
+    """Return whether odometry is in the map, by its `header.frame_id` or `odometry_origin`."""
     return origin == 'map' or frame.strip('/') == map_frame
 
 
@@ -130,7 +112,7 @@ def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedP
 
 
 class PoseHistory:
-    """A robot's latest poses, to look up its pose when an image was taken."""
+    """The latest poses of a robot, to find its pose at an image."""
 
     def __init__(self, length: int = 512) -> None:
         self.length = length
@@ -143,11 +125,11 @@ class PoseHistory:
 
     @property
     def first(self) -> int | None:
-        """The earliest stamp kept [ns], or None."""
+        """The earliest retained stamp [ns], or None."""
         return self._poses[0].stamp if self._poses else None
 
     def add(self, pose: StampedPose) -> None:
-        """Add a pose, unless its stamp is not after the last one's."""
+        """Add a pose, unless its stamp is not later than the last one."""
         if self._poses and pose.stamp <= self._poses[-1].stamp:
             return
         self._poses.append(pose)
@@ -158,7 +140,7 @@ class PoseHistory:
         self._poses.clear()
 
     def at(self, stamp: int) -> StampedPose | None:
-        """Return the pose at a stamp [ns], interpolated; None outside of those kept."""
+        """Return the interpolated pose at a stamp [ns], or None outside of the retained range."""
         poses = self._poses
         if not poses or not poses[0].stamp <= stamp <= poses[-1].stamp:
             return None
@@ -167,13 +149,13 @@ class PoseHistory:
 
 
 class PoseSpeed:
-    """Differences of poses over time."""
+    """Velocities from differences of poses."""
 
     def __init__(self) -> None:
         self._before: tuple[int, Pose] | None = None
 
     def place(self, stamp: int, pose: Pose) -> StampedPose:
-        """Return a pose at a stamp [ns], with velocities by the difference from the one before."""
+        """Return a pose at a stamp [ns] with the velocity since the last one."""
         velocity, turning = np.zeros(3), np.zeros(3)
         before, self._before = self._before, (stamp, pose)
         if before is not None and 0 < stamp - before[0] < 1_000_000_000:
@@ -184,7 +166,7 @@ class PoseSpeed:
             half = float(np.linalg.norm(change[1:]))
             angle = 2.0 * math.atan2(half, float(change[0]))
             turning = change[1:] * (angle / half if half > 0.0 else 2.0) / period
-            # Faster than this is a jump of the pose [m/s, rad/s].
+            # Faster changes are jumps of the pose [m/s, rad/s].
             if max(np.linalg.norm(velocity), np.linalg.norm(turning)) > 50.0:
                 velocity, turning = np.zeros(3), np.zeros(3)
         return StampedPose(stamp, pose, velocity=velocity, angular_velocity=turning)

@@ -1,4 +1,4 @@
-"""A robot's frames on /tf and /tf_static, its description, and poses of other nodes there."""
+"""A robot's frames on /tf and /tf_static, its description, and poses from transforms."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, TRANSFORMS
 _OPTICAL = (-0.5 * math.pi, 0.0, -0.5 * math.pi)
 
 
-# A frame that is fixed on a robot: parent, name, place in the parent [m], turned by `rpy` [rad].
+# A fixed frame of a robot: parent, name, position in the parent [m], rotation `rpy` [rad].
 FixedFrame = tuple[str, str, Sequence[float], Sequence[float]]
 
 
@@ -40,7 +40,7 @@ def base_frame(robot: str, settings: DriverSettings) -> str:
 
 
 def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
-    """Return the frames of a robot's sensors, as far as the settings say where these sit."""
+    """Return the frames of the robot's sensors that the settings locate."""
     base = base_frame(robot, settings)
     frames: list[FixedFrame] = []
     if settings.camera is not None:
@@ -57,7 +57,7 @@ def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
 
 
 def robot_description(robot: str, settings: DriverSettings) -> str:
-    """Return the URDF of a robot: a cylinder as high as its radius, and its sensors' frames."""
+    """Return the URDF of a robot: a cylinder as high as its radius, and its sensor frames."""
     root = ElementTree.Element('robot', name=robot)
     link = ElementTree.SubElement(root, 'link', name=base_frame(robot, settings))
     for part in ('visual', 'collision'):
@@ -76,7 +76,7 @@ def robot_description(robot: str, settings: DriverSettings) -> str:
 
 
 class RobotFrames:
-    """The frames of one robot, on the team's `tf` and `tf_static`, unread in lockstep."""
+    """The frames of a robot, on the team's `tf` and `tf_static`; in lockstep only published."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class RobotFrames:
                 ) from error
             node.get_logger().warning(
                 'the package tf2_msgs is not installed (sudo apt install ros-$ROS_DISTRO-tf2-msgs):'
-                f' nothing is published on tf and tf_static, and goals have to be in the frame '
+                f' tf and tf_static are not published, and goals must be in the frame '
                 f'{settings.frame!r}'
             )
         else:
@@ -134,12 +134,12 @@ class RobotFrames:
                 node.create_subscription(kind, node.team_topic(topic), heard, quality)
 
     def clear(self) -> None:
-        """Discard what moves, as after a jump of the clock."""
+        """Discard transforms that are not static, after a jump of the clock."""
         self._buffer.clear()
         self._slot = self._taken = None
 
     def publish(self, placed: StampedPose, map_from_odom: Pose) -> None:
-        """Publish where the robot is, `tf_rate` times a second of its stamps at most."""
+        """Publish the robot's pose, at most `tf_rate` times per second of its stamps."""
         settings = self._settings
         if settings.poses == 'tf' or not settings.tf_rate:
             return
@@ -163,11 +163,11 @@ class RobotFrames:
     def _transform(
         self, parent: str, child: str, pose: Pose, stamp: int | None = None
     ) -> TransformStamped:
-        """Return a transform, and know it; without a stamp [ns] it is static."""
+        """Return a transform and store it; without a stamp [ns] it is static."""
         try:
             self._buffer.add(parent, child, pose, stamp or 0, static=stamp is None)
         except ValueError as error:
-            # For example a peer publishes a parent frame of the same name.
+            # For example, another node publishes a parent frame of the same name.
             self._node.drop('transform', f'frames of this robot: {error}')
         made = TransformStamped(child_frame_id=child)
         made.header.frame_id, made.header.stamp = parent, stamp_to_ros(stamp or 0)
@@ -177,7 +177,7 @@ class RobotFrames:
         return made
 
     def _publish_static(self) -> None:
-        # All of them each time: only the last message is latched.
+        # All of them each time, as only the last message is latched.
         if self._static_publisher is not None and self._static:
             self._static_publisher.publish(self._type(transforms=[*self._static.values()]))
 
@@ -226,7 +226,7 @@ class RobotFrames:
         self._on_pose(stamp, pose)
 
     def on_robot(self, frame: str, stamp: int) -> Pose:
-        """Return where a frame was on the robot at a stamp [ns]; `ValueError` if tf cannot tell."""
+        """Return the pose of a frame on the robot at a stamp [ns], or raise `ValueError`."""
         try:
             return self._buffer.pose(self._base, frame, stamp)
         except TransformError as error:
@@ -234,7 +234,7 @@ class RobotFrames:
             raise ValueError(f'header.frame_id: read {frame[:40]!r}, {allowed}') from error
 
     def to_map(self, waypoint: PoseStamped, now: int) -> str | None:
-        """Bring a waypoint into the map at a time [ns]; return what is wrong where it cannot be."""
+        """Transform a waypoint into the map at a time [ns]; return the problem if that fails."""
         header, settings = waypoint.header, self._settings
         frame = header.frame_id.strip('/')
         if header.frame_id == settings.frame:
@@ -250,7 +250,7 @@ class RobotFrames:
                 age = 1e-9 * (stamp - latest)
                 if age > settings.odometry_timeout:
                     return (
-                        f'{problem}the transform is {age:.1f} s too old, allowed are '
+                        f'{problem}the transform is {age:.1f} s old, allowed are '
                         f'{settings.odometry_timeout:g} s (odometry_timeout)'
                     )
                 pose = self._buffer.pose(settings.frame, frame, min(stamp, latest))

@@ -1,4 +1,4 @@
-"""The node of one robot, as its link, its sensor and the parts of its driver see it."""
+"""The node of a robot, as seen by its link, sensor and the parts of its driver."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -18,13 +18,13 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.ros.clocks import JUMP, ArrivalClock, Silence, StampGate
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 
-# Kinds of faults that every robot can have.
+# Kinds of faults of all robots.
 ODOMETRY, FROZEN_POSE, SENSOR = 'odometry', 'frozen pose', 'sensor'
 AREA, BATTERY, STOP = 'area', 'battery', 'stop'
 
 
 class Health:
-    """The present faults of a robot; without any it can follow goals."""
+    """The current faults of a robot; without any it can follow goals."""
 
     def __init__(self, logger: RcutilsLogger, on_fault: Callable[[str], None]) -> None:
         self._logger, self._on_fault = logger, on_fault
@@ -39,20 +39,20 @@ class Health:
         return '; '.join(self._faults.values())
 
     def get(self, kind: str) -> str:
-        """Return the text of a fault; empty if there is none of this kind."""
+        """Return the text of a fault, or an empty text."""
         return self._faults.get(kind, '')
 
     def begin(self, kind: str, text: str) -> bool:
-        """Set a fault, or the text of one that is set; return whether it is new, and log it."""
+        """Set a fault or its text; return whether it is new, and log it then."""
         new = kind not in self._faults
         self._faults[kind] = text
         if new:
-            self._logger.warning(f'{text}: the robot takes no goals')
+            self._logger.warning(f'{text}: refusing goals')
             self._on_fault(text)
         return new
 
     def end(self, kind: str, recovered: str = '') -> bool:
-        """Clear a fault; return whether it was set, and log what has recovered."""
+        """Clear a fault; return whether it was set, and log the recovery then."""
         was = self._faults.pop(kind, None) is not None
         if was and recovered:
             self._logger.info(recovered)
@@ -61,16 +61,16 @@ class Health:
 
 @dataclass(frozen=True)
 class FeedPeer:
-    """The only sender of a measurement feed that is used: its address, and what takes its poses."""
+    """The accepted sender of a measurement feed: its address, and the receiver of its poses."""
 
     address: str
     on_pose: Callable[[int, Any], None]
 
 
 class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
-    """Where link, sensor and parts of a driver meet: the state they share, what they report to.
+    """The shared state of link, sensor and parts of a driver, and what they report to.
 
-    All of it but `arrivals` is made again in *configure*.
+    *configure* creates all of it, except `arrivals`.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         super().destroy_node()
 
     def prepare(self) -> None:
-        """Make the shared state."""
+        """Create the shared state."""
         settings = self.settings
         self.dimension = settings.environment.dimension
         self.volume = OperatingVolume(Area(settings.environment), settings.radius)
@@ -135,12 +135,12 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         return round(stamp * 1e-9 / self.settings.step)
 
     def is_new_pose(self, what: str, stamp: int) -> bool:
-        """Return whether a pose of a stamp [ns] is to be used; one far back restarts the driver."""
+        """Return whether to use a pose with a stamp [ns]; a far earlier one restarts the driver."""
         if not (self.settings.lockstep or self._gate.accepts(stamp)):
             self.drop(
                 'odometry stamp',
-                f'{what}: read {stamp} ns, which is far from the one before; allowed if the next '
-                'one follows it',
+                f'{what}: read {stamp} ns, far from the previous one; accepted if the next one '
+                'follows it',
             )
             return False
         latest = self.history.latest
@@ -158,33 +158,33 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         return False
 
     def restart_if_back(self, what: str, stamp: int) -> bool:
-        """Restart the driver if a stamp [ns] is far before the latest pose's; return whether."""
+        """Restart the driver if a stamp [ns] is far before the latest pose; return whether."""
         latest, least = self.history.latest, 0 if self.settings.lockstep else JUMP
         if latest is None or latest.stamp - stamp <= least:
             return False
         self.get_logger().warning(
-            f'{what} jumped back by {1e-9 * (latest.stamp - stamp):.3f} s: starting anew'
+            f'{what} jumped back by {1e-9 * (latest.stamp - stamp):.3f} s: restarting'
         )
         self.reset()
         return True
 
     @abstractmethod
     def take_pose(self, placed: StampedPose) -> None:
-        """Take the robot's pose, later than all before; the next command is sent with it."""
+        """Handle the robot's pose, later than all before; the next command uses it."""
 
     def refuse_pose(self, stamp: int) -> None:
-        """Note that the odometry of a stamp [ns] could not be used."""
+        """Note that the odometry with a stamp [ns] was unusable."""
 
     def answer_again(self) -> None:
-        """Answer odometry that came twice in lockstep: a restarted peer missed the answer."""
+        """Answer repeated odometry in lockstep: a restarted peer missed the answer."""
 
     @abstractmethod
     def take_charge(self, charge: float) -> None:
-        """Take the charge of the battery, 0 to 1; anything else is unknown."""
+        """Update the battery charge, 0 to 1; other values are unknown."""
 
     @abstractmethod
     def receive_frame(self, topic: str, stamp: int, data: Any, *, repeated: bool = False) -> None:
-        """Take an image or sweep.
+        """Handle an image or sweep.
 
         Parameters
         ----------
@@ -200,14 +200,14 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
 
     @abstractmethod
     def end_goal(self, status: GoalStatus, reason: str) -> None:
-        """End the present goal, if there is one."""
+        """End the current goal, if any."""
 
     @abstractmethod
     def publish_fault(self) -> None:
-        """Publish `state` with the fault of a robot that has no pose yet."""
+        """Publish `state` with the fault of a robot without a pose."""
 
     def judge(self, kind: str, problem: str, recovered: str) -> None:
-        """Begin or end a fault by what a link reports.
+        """Begin or end a fault that a link reports.
 
         Parameters
         ----------
@@ -221,7 +221,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         if problem:
             self.health.begin(kind, problem)
         elif self.health.end(kind, recovered):
-            self.follower.stay()  # the position that it held is outdated
+            self.follower.stay()  # the held position is outdated
 
     def offer_arm(self, arm: Callable[[], str], in_air: Callable[[], bool] = lambda: False) -> None:
         """Offer the service `arm` of a robot that takes off, or is taken over `in_air`."""
@@ -234,9 +234,9 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
                 response.message = problem
                 self.get_logger().warning(f'arm: refused: {problem}')
                 return response
-            response.message = 'it takes off as soon as it is ready'
+            response.message = 'taking off as soon as it is ready'
             if in_air():
-                response.message = 'it is in the air: it is taken over where it is'
+                response.message = 'in the air: taking control at its position'
             self.get_logger().info(f'arm: {response.message}')
             return response
 

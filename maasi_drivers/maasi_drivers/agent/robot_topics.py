@@ -1,4 +1,4 @@
-"""What a robot says on topics: poses by odometry or a localiser, and the charge."""
+"""Topics of a robot: poses from odometry or a localiser, and the battery charge."""
 
 import math
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from maasi_filter.ros.qos import sensor_reader
 
 
 class OdometryTopic:
-    """Hands poses on `odom` to `driver.take_pose`."""
+    """Passes poses on `odom` to `driver.take_pose`."""
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
-        self._in_map: bool | None = None  # of the messages so far
+        self._in_map: bool | None = None  # of previous messages
         quality = sensor_reader(driver.settings.lockstep)
         driver.create_subscription(Odometry, 'odom', self._on_odometry, quality)
 
@@ -56,7 +56,7 @@ class OdometryTopic:
         if self._in_map not in (None, in_map):
             before = 'in' if self._in_map else 'not in'
             raise ValueError(
-                f'header.frame_id: read {frame!r}, while messages before were {before} '
+                f'header.frame_id: read {frame!r}, but previous messages were {before} '
                 f'{settings.frame!r}; allowed is one frame'
             )
         pose = pose_from_ros(message.pose.pose)
@@ -68,8 +68,8 @@ class OdometryTopic:
             )
             if in_map and settings.odometry_origin != 'map':
                 driver.get_logger().warning(
-                    f'odom: header.frame_id is {frame!r}: poses are taken as in the map, start and '
-                    'yaw are not added; odometry_origin: map confirms it'
+                    f'odom: header.frame_id is {frame!r}: using its poses as map poses, without '
+                    'adding start and yaw; set odometry_origin: map to confirm'
                 )
         self._in_map = in_map
         linear, angular = message.twist.twist.linear, message.twist.twist.angular
@@ -88,7 +88,7 @@ class OdometryTopic:
 
 
 class PoseTopic:
-    """Where a robot is by motion capture, SLAM or another localiser: `pose`, in the map."""
+    """Poses in the map on `pose`, from motion capture, SLAM or another localiser."""
 
     def __init__(
         self, node: LockstepLifecycleNode[DriverSettings], on_pose: Callable[[int, Pose], None]
@@ -108,23 +108,23 @@ class PoseTopic:
         self._on_pose(stamp_from_ros(message.header.stamp), pose)
 
 
-# A full battery may read more than 1: a TurtleBot3 with 12.6 V says 116.7 per cent, as OpenCR maps
-# 10.5 V to 12.3 V on 0 to 100 (`update_battery_status` in turtlebot3.cpp).
+# A full battery may read more than 1: a TurtleBot3 with 12.6 V reports 116.7 %, as OpenCR maps 10.5
+# V to 12.3 V on 0 to 100 (`update_battery_status` in turtlebot3.cpp).
 _MOST = 1.5
 
 
 def charge_of(percentage: float, unit: BatteryUnit) -> float:
-    """Return the charge, 0 to 1, or -1 for what is none in this unit."""
+    """Return the charge, 0 to 1, or -1 for an invalid value."""
     charge = percentage if unit == 'fraction' else 0.01 * percentage
     return min(charge, 1.0) if 0.0 <= charge <= _MOST else -1.0
 
 
 class BatteryTopic:
-    """Hands charges on `battery_state` to `driver.take_charge`."""
+    """Passes charges on `battery_state` to `driver.take_charge`."""
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
-        # Of lockstep: stamp [ns] and reading.
+        # In lockstep: stamp [ns] and reading.
         self._waiting: list[tuple[int, float]] = []
         self._subscription = driver.create_subscription(
             BatteryState, 'battery_state', self._on_battery, sensor_reader(driver.settings.lockstep)
@@ -148,7 +148,7 @@ class BatteryTopic:
         self._driver.take_charge(charge)
 
     def receive_before(self, stamp: int) -> None:
-        """In lockstep: take the readings before a stamp [ns], which have arrived in any case."""
+        """In lockstep, handle the readings before a stamp [ns]."""
         handle = self._subscription.handle
         while (taken := handle.take_message(BatteryState, False)) is not None:
             self._on_battery(taken[0])

@@ -1,4 +1,4 @@
-"""A ground robot's laser scan: placed in the map, and avoided by a dynamic window. Without ROS."""
+"""A ground robot's laser scan in the map, and obstacle avoidance by a dynamic window. No ROS."""
 
 import math
 
@@ -17,10 +17,10 @@ from maasi_planner.motion.unicycle import window_command
 from maasi_planner.obstacles import all_felt, is_clear
 from maasi_planner.settings import MotionSettings
 
-_CELL = 0.03  # size of the cells in which points count as one [m]
-_HEADINGS = 72  # number of headings that are tried where the straight way is blocked
-_STEADINESS = 0.3  # cost of a change of the last heading, relative to that of a detour [1/rad]
-_SKIN = 1e-3  # below this distance the robot touches the point, and may still leave it [m]
+_CELL = 0.03  # cell size within which points count as one [m]
+_HEADINGS = 72  # number of headings to try where the straight path is blocked
+_STEADINESS = 0.3  # cost of a heading change relative to that of a detour [1/rad]
+_SKIN = 1e-3  # below this distance the robot touches the point but may leave it [m]
 
 
 def scan_points(
@@ -31,7 +31,7 @@ def scan_points(
     placed: StampedPose,
     mount: ArrayLike,
 ) -> FloatArray:
-    """Return where the beams of a scan ended, (n, 2) in the map [m]."""
+    """Return the end points of a scan's beams, (n, 2) in the map [m]."""
     distances = np.asarray(ranges, dtype=float)
     names = ('angle_min', 'angle_increment', 'range_min', 'range_max', 'time_increment')
     for name, value in zip(names, (*angles, *limits, seconds_per_beam), strict=True):
@@ -75,10 +75,10 @@ def way_around(
     reach: float,
     before: float,
 ) -> tuple[float, float, float]:
-    """Return a free point towards the target, at most `reach` away [m], and the heading to it.
+    """Return a free point towards the target, at most `reach` away [m], and its heading.
 
-    Free headings near the straight way and the one chosen before are preferred; the target itself
-    where the straight way is free, or none is.
+    Prefers headings near the straight path and the last choice; returns the target itself if
+    the straight path is free or no heading is.
     """
     dx = target_x - x
     dy = target_y - y
@@ -87,7 +87,7 @@ def way_around(
     for part in (1.0, 0.5):
         if _is_free(x, y, straight, part * min(away, reach), circles):
             return target_x, target_y, straight
-        # Other headings, for the whole distance even if the target is nearer.
+        # Other headings over the full distance, even if the target is closer.
         look = part * reach
         best = np.inf
         chosen = np.nan
@@ -110,7 +110,7 @@ def way_around(
 
 
 class ScanUnicycle(Unicycle):
-    """A ground robot that plans around known obstacles and avoids what its scanner sees locally."""
+    """Plans around known obstacles and avoids those that the scanner sees."""
 
     def __init__(
         self, settings: MotionSettings, area: Area, radius: float, scan: ScanSettings
@@ -121,7 +121,7 @@ class ScanUnicycle(Unicycle):
         self._heading = math.nan
 
     def see(self, points: ArrayLike) -> None:
-        """Take the points (n, 2) of a scan in the map [m]; they replace those before."""
+        """Replace the scan points (n, 2) in the map [m]."""
         array = np.asarray(points, dtype=float).reshape(-1, 2)
         _, first = np.unique(np.floor(array / _CELL), axis=0, return_index=True)
         self.points = array[np.sort(first)]

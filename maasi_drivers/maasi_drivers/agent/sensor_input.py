@@ -1,4 +1,4 @@
-"""A robot's sensor as its driver uses it, and a sensor of range, bearing and elevation."""
+"""A robot's sensor as used by its driver, and a sensor of range, bearing and elevation."""
 
 import math
 from abc import ABC, abstractmethod
@@ -21,9 +21,9 @@ DataT = TypeVar('DataT')
 
 
 class SensorInput(ABC, Generic[DataT]):
-    """Where images or sweeps come from, and how targets are detected in them.
+    """A source of images or sweeps, and the detection of targets in them.
 
-    Each image or sweep goes to `driver.receive_frame`.
+    Each image or sweep is passed to `driver.receive_frame`.
 
     Parameters
     ----------
@@ -49,11 +49,11 @@ class SensorInput(ABC, Generic[DataT]):
 
     @abstractmethod
     def set_up(self) -> None:
-        """Compile the kernels and subscribe, in *configure*."""
+        """Compile kernels and subscribe, in *configure*."""
 
     @abstractmethod
     def detect(self, data: DataT, pose: StampedPose) -> SensorReading:
-        """Return what an image or sweep shows.
+        """Return the detections in an image or sweep.
 
         Raises
         ------
@@ -62,11 +62,11 @@ class SensorInput(ABC, Generic[DataT]):
         """
 
     def close(self) -> None:
-        """Release what is no ROS entity; may be called more than once."""
+        """Release what is no ROS entity; may be called repeatedly."""
 
 
 class RangingMount:
-    """Turns sweeps of a mounted sensor, by its R, into measurements from the robot's position."""
+    """Converts sweeps of a mounted sensor into measurements from the robot's position."""
 
     def __init__(self, settings: RangingSettings, sensor: Sensor) -> None:
         self._model = sensor.measurement
@@ -81,7 +81,7 @@ class RangingMount:
     def measurements(
         self, sweep: FloatArray, pose: StampedPose
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return values (m, d), covariances and positions in the map of a sweep (m, 3) [m, rad]."""
+        """Return values (m, d), covariances and map positions of a sweep (m, 3) [m, rad]."""
         d = self._model.dimension
         if not len(sweep):
             return np.zeros((0, d)), np.zeros((0, d, d)), np.zeros((0, d))
@@ -103,7 +103,7 @@ class RangingMount:
         arms = self._position @ body.T + (ranges[:, None] * unit) @ turn.T
         by_sweep = turn @ slopes
         spread = by_sweep @ self._noise @ by_sweep.transpose(0, 2, 1)
-        # A small rotation about the map's axes moves a target by its cross product with the arm.
+        # A small rotation about the map's axes moves a target by the cross product with its arm.
         by_turn = np.cross(np.eye(3), arms[:, None]).transpose(0, 2, 1)
         spread = spread + by_turn @ pose.covariance[3:, 3:] @ by_turn.transpose(0, 2, 1)
         positions = (pose.pose.position + arms)[:, :d]
@@ -112,7 +112,7 @@ class RangingMount:
 
 
 class RangingInput(SensorInput[Sweep]):
-    """A sensor that measures range and direction of what is near.
+    """A sensor of range and direction; `ranging.frame` defines its angles.
 
     Subscribes
     ----------

@@ -1,4 +1,4 @@
-"""What a sensor reads at one instant. Without ROS."""
+"""The reading of a sensor at one instant. Without ROS."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from maasi_filter.records import Label
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a ranging sensor returns at one instant: values and labels as in `SensorReading`."""
+    """The returns of a ranging sensor at one instant: values and labels as in `SensorReading`."""
 
     values: FloatArray
     labels: tuple[Label, ...] = ()
 
 
-# Variance of an angle of which nothing is known: uniform over the circle [rad^2].
+# Variance of a completely unknown angle: uniform over the circle [rad^2].
 _ANY_ANGLE = np.pi**2 / 3.0
 
 
 def measured(
     model: RangeAndAngles, positions: FloatArray, covariances: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray]:
-    """Return range and angles of targets (n, d) [m, map], and their covariances, to first order.
+    """Return range and angles of targets (n, d) [m, map] with first-order covariances.
 
-    Right over a target the bearing says nothing: its variance is that of a uniform angle at most.
+    Right above a target the bearing is unknown: its variance is at most that of a uniform
+    angle.
     """
-    # Straight above there is no derivative: that of a nanometre beside.
+    # Straight above the derivative does not exist; use that at a distance of 1 nm.
     beside = np.array(positions)
     beside[(beside[:, :2] == pose.position[:2]).all(axis=1), 0] += 1e-9
     slopes = model.jacobian(beside, pose)
@@ -69,13 +70,13 @@ class SensorReading:
 
     @classmethod
     def of_sweep(cls, sweep: Sweep, sensor: Sensor, pose: Pose) -> SensorReading:
-        """Return the detections of a sweep, on the map's axes, that are in the field of view."""
+        """Return the detections of a sweep in the field of view, on the map's axes."""
         positions = sensor.measurement.inverse(sweep.values, pose)
         reading = cls(sweep.values, None, positions, {}, sweep.labels)
         return reading.in_field_of_view(sensor, pose)
 
     def in_field_of_view(self, sensor: Sensor, pose: Pose) -> SensorReading:
-        """Return the detections with pi(x, q) > 0 within the maximum range; the rest is counted."""
+        """Return the detections in the field of view (pi(x, q) > 0, in range); count the rest."""
         if not len(self.values):
             return self
         inside = sensor.detection.probability(self.positions, pose) > 0.0
@@ -83,7 +84,7 @@ class SensorReading:
         return self.only(inside, 'outside the field of view')
 
     def only(self, keep: BoolArray, reason: str) -> SensorReading:
-        """Return the detections where `keep` (m,) is true; the rest is counted under a reason."""
+        """Return the detections where `keep` (m,) is true; count the rest under a reason."""
         left_out = int(np.count_nonzero(~keep))
         if not left_out:
             return self

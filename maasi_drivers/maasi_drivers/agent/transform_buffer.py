@@ -1,4 +1,4 @@
-"""Transforms on /tf, at any stamp, without ROS: the wheels of ROS 2 have no tf2_ros."""
+"""Transforms on /tf at any stamp, without ROS: the ROS 2 wheels have no tf2_ros."""
 
 from dataclasses import dataclass, field
 
@@ -8,19 +8,19 @@ from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.clocks import StampGate
 
-# Upper bound on frames, against floods.
+# Limits against floods.
 _MOST_FRAMES = 2000
 _LONGEST_NAME = 200
-_JUMP = 10_000_000_000  # a stamp that is farther from the one before is one of another time [ns]
+_JUMP = 10_000_000_000  # a stamp farther from the previous one belongs to another time [ns]
 
 
 class TransformError(LookupError):
-    """A transform is not known, or not at that stamp."""
+    """A transform is unknown, or unknown at a stamp."""
 
 
 @dataclass
 class _Edge:
-    """The pose of a frame in its parent: a fixed one, or its latest ones."""
+    """The pose of a frame in its parent: fixed, or its latest ones."""
 
     parent: str
     fixed: Pose | None
@@ -29,12 +29,12 @@ class _Edge:
 
     @property
     def last(self) -> int | None:
-        """Latest stamp; none where it is fixed [ns]."""
+        """Latest stamp [ns]; None if fixed."""
         latest = self.history.latest
         return None if latest is None else latest.stamp
 
     def add(self, stamp: int, pose: Pose) -> None:
-        """Add a pose; one far from those before replaces them, once the next one follows it."""
+        """Add a pose; one far from the previous ones replaces them once the next follows it."""
         if not self.gate.accepts(stamp):
             return
         if self.last is not None and abs(stamp - self.last) > _JUMP:
@@ -43,19 +43,19 @@ class _Edge:
 
 
 class TransformBuffer:
-    """Poses of frames in their parents, interpolated in time; nothing is extrapolated."""
+    """Poses of frames in their parents, interpolated but never extrapolated."""
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
 
     def clear(self) -> None:
-        """Forget all transforms that are not static, as after a jump of the clock."""
+        """Discard transforms that are not static."""
         self._edges = {name: edge for name, edge in self._edges.items() if edge.fixed is not None}
 
     def add(
         self, parent: str, child: str, pose: Pose, stamp: int = 0, *, static: bool = False
     ) -> None:
-        """Add a transform, later than before [ns]; a frame with a new parent loses its old ones."""
+        """Add a transform, later than before [ns]; a new parent replaces the old transforms."""
         for name in (parent, child):
             if not 0 < len(name) <= _LONGEST_NAME:
                 raise ValueError(
@@ -66,7 +66,7 @@ class TransformBuffer:
         edge = self._edges.get(child)
         if edge is None or edge.parent != parent or (edge.fixed is not None) != static:
             if edge is None and len(self._edges) >= _MOST_FRAMES:
-                raise ValueError(f'{child!r}: there are {_MOST_FRAMES} frames, no more are allowed')
+                raise ValueError(f'{child!r}: more than {_MOST_FRAMES} frames, allowed are fewer')
             if child in self._path(parent):
                 raise ValueError(f'{parent!r} to {child!r}: a loop, allowed is a tree of frames')
             edge = self._edges[child] = _Edge(parent, pose if static else None)
@@ -87,7 +87,7 @@ class TransformBuffer:
         known = {edge.parent for edge in self._edges.values()} | self._edges.keys()
         for name in (target, source):
             if name not in known:
-                raise TransformError(f'frame {name!r} is not known')
+                raise TransformError(f'unknown frame {name!r}')
         up, down = self._path(target), self._path(source)
         common = next((name for name in down if name in up), None)
         if common is None:
@@ -100,12 +100,12 @@ class TransformBuffer:
         return ups, downs
 
     def latest(self, target: str, source: str) -> int | None:
-        """Return the latest stamp [ns] known of all between two frames; None: all are static."""
+        """Return the latest common stamp [ns] between two frames; None if all are static."""
         ups, downs = self._between(target, source)
         return min((edge.last for edge in [*ups, *downs] if edge.last is not None), default=None)
 
     def pose(self, target: str, source: str, stamp: int | None = None) -> Pose:
-        """Return the pose of `source` in `target` at a stamp [ns], by default at `latest`."""
+        """Return the pose of `source` in `target` at a stamp [ns], default: `latest`."""
         stamp = self.latest(target, source) if stamp is None else stamp
         sides = []
         for edges in self._between(target, source):
@@ -116,7 +116,7 @@ class TransformBuffer:
                     found = then.pose
                 if found is None:
                     raise TransformError(
-                        f'{source!r} in {target!r} at {stamp} ns is not known, allowed is from '
+                        f'{source!r} in {target!r} at {stamp} ns is unknown, allowed is from '
                         f'{edge.history.first} to {edge.last} ns'
                     )
                 placed = compose(found, placed)

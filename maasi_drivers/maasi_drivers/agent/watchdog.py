@@ -1,4 +1,4 @@
-"""The topic `state` of a robot, and the faults that its driver finds by itself."""
+"""The topic `state` of a robot, and faults that its driver detects itself."""
 
 import time
 
@@ -17,7 +17,7 @@ class StatePublisher:
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
-        #: Of the battery; -1: not known.
+        # : Battery charge; -1 if unknown.
         self.charge = -1.0
         self._state = AgentState(robot=driver.robot, battery=-1.0)
         self._state.header.frame_id = driver.settings.frame
@@ -37,7 +37,7 @@ class StatePublisher:
         self.publish_status(placed.stamp, step)
 
     def publish_status(self, stamp: int | None = None, step: int | None = None) -> None:
-        """Publish goal and faults with the last pose; by default with its stamp [ns] and step."""
+        """Publish goal and faults with the last pose; default: its stamp [ns] and step."""
         state, follower = self._state, self._driver.follower
         if stamp is not None:
             state.header.stamp = stamp_to_ros(stamp)
@@ -59,7 +59,7 @@ class StatePublisher:
 
 
 PERIOD = 0.1
-# Time without a first pose, or without a charge, after which a warning is logged [s].
+# Time without a first pose or a charge until a warning is logged [s].
 _PATIENCE, _CHARGE_PATIENCE = 3.0, 10.0
 _DEFAULT_MINIMUM = DriverSettings.model_fields['battery_minimum'].default
 
@@ -72,23 +72,23 @@ class Watchdog:
     ) -> None:
         self._driver, self._link, self._sensor, self._state = driver, link, sensor, state
         self.moving = False
-        # Stamps of the last change of the pose, and of the pose at the last image [ns].
+        # Stamps of the last pose change, and of the pose at the last image [ns].
         self._changed_at = 0
         self.sensed_at: int | None = None
         self._checked_at = self._charged_at = time.monotonic()
-        # Stamp of the pose at the last charge [ns], and that charge.
+        # Stamp of the pose at the last charge [ns], and the charge.
         self._charge_stamp: int | None = None
         self._last_charge = -1.0
         self._stalled = False
         self._checks = 0
 
     def reset(self) -> None:
-        """Discard what belongs to another time."""
+        """Discard data from another time."""
         self.sensed_at = None
         self.moving = False
 
     def check(self) -> None:
-        """Stop a robot without odometry; called on wall time, as the clock may stand still."""
+        """Stop a robot without odometry; called on wall time, as the clock may stop."""
         driver = self._driver
         if not driver.active:
             return
@@ -97,23 +97,25 @@ class Watchdog:
         self._checked_at = now
         self._stalled = now - before > 2.0 * PERIOD and not self._stalled
         if self._stalled:
-            return  # this process was suspended: odometry may be waiting in the queue
+            return  # this process was suspended; odometry may be queued
         self._link.poll()
-        # The default minimum is for robots that report a charge at all.
+        # The default minimum is for robots that report a charge.
         minimum = driver.settings.battery_minimum
         asked = minimum not in (0.0, _DEFAULT_MINIMUM) or (minimum and self._last_charge >= 0.0)
         if asked and now - self._charged_at > _CHARGE_PATIENCE:
             driver.warn_throttled(
                 'battery',
-                f'no charge of the battery for {now - self._charged_at:.0f} s: battery_minimum '
-                'cannot act',
+                f'no battery charge for {now - self._charged_at:.0f} s: battery_minimum has '
+                'no effect',
             )
         health, silence = driver.health, driver.silence
         age, timeout = silence.length, driver.settings.odometry_timeout
         if driver.history.latest is None and ODOMETRY not in health:
             # Before a simulation begins there is none.
             if age > _PATIENCE and self._link.expects_pose():
-                driver.warn_throttled('no odometry', f'no {driver.pose_name} yet, for {age:.0f} s')
+                driver.warn_throttled(
+                    'no odometry', f'no {driver.pose_name} received for {age:.0f} s'
+                )
         elif age > timeout or ODOMETRY in health:
             if health.begin(ODOMETRY, f'no {driver.pose_name} for {age:.1f} s'):
                 self._checks = 0
@@ -121,11 +123,11 @@ class Watchdog:
             if self._checks % 2 == 0:
                 self._state.publish_status()
         elif silence.wall > timeout + 0.5:
-            # Without a fault: the simulated clock is slow or stands, which real robots do not.
+            # No fault: a slow or stopped simulated clock, which real robots do not have.
             self._link.hold()
 
     def update_charge(self, charge: float) -> None:
-        """Take a charge, 0 to 1; anything else is unknown and leaves a fault as it is."""
+        """Update the charge, 0 to 1; other values are unknown and keep a fault."""
         self._state.charge = charge if 0.0 <= charge <= 1.0 else -1.0
         if self._state.charge < 0.0:
             return
@@ -134,12 +136,14 @@ class Watchdog:
         self._charge_stamp = None if latest is None else latest.stamp
         minimum, health = self._driver.settings.battery_minimum, self._driver.health
         if charge < minimum:
-            health.begin(BATTERY, f'battery at {charge:.2f}, below {minimum:.2f}')
+            health.begin(
+                BATTERY, f'battery at {100.0 * charge:.0f} %, below {100.0 * minimum:.0f} %'
+            )
         else:
             health.end(BATTERY)
 
     def watch_charge(self, stamp: int) -> None:
-        """Let a charge of long before a pose's stamp [ns] be unknown, and say so once."""
+        """Let a charge much older than a pose's stamp [ns] become unknown; report it once."""
         timeout = self._driver.settings.battery_timeout
         if self._state.charge < 0.0 or not timeout:
             return
@@ -149,8 +153,8 @@ class Watchdog:
         elif (age := 1e-9 * (stamp - before)) > timeout:
             self._state.charge = -1.0
             self._driver.get_logger().warning(
-                f'no charge of the battery for {age:.0f} s, since {1e-9 * before:.1f} s: it was '
-                f'{self._last_charge:.2f} and counts as unknown'
+                f'no battery charge for {age:.0f} s, since {1e-9 * before:.1f} s: treating it as '
+                f'unknown (last {100.0 * self._last_charge:.0f} %)'
             )
 
     def note_frame(self, topic: str, repeated: bool) -> None:
@@ -158,15 +162,15 @@ class Watchdog:
         latest, health = self._driver.history.latest, self._driver.health
         if latest is None:
             return
-        # A robot at rest may see the same twice; a sensor that hung has to deliver something new.
+        # A robot at rest may see the same twice; after a fault the sensor must deliver new data.
         if not repeated or not (self.moving or SENSOR in health):
             self.sensed_at = latest.stamp
             health.end(SENSOR, f'{topic}: received again')
 
     def note_pose(self, placed: StampedPose) -> None:
-        """Check a new pose, before it is added to the history; not in lockstep."""
+        """Check a new pose before it joins the history; not in lockstep."""
         health, settings = self._driver.health, self._driver.settings
-        # A pose that stays the same to the bit under a command to move.
+        # A bit-identical pose under a command to move.
         before = self._driver.history.latest
         same = before is not None and placed.pose == before.pose
         if not same:

@@ -1,4 +1,4 @@
-"""What a robot does about its goal: go there, hold, stop. Without ROS."""
+"""Waypoint following, holding and stopping. Without ROS."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from maasi_planner.motion import MotionModel, RobotState
 
 
 class GoalStatus(IntEnum):
-    """What a robot is doing; the numbers of maasi_msgs/AgentState."""
+    """Activity of a robot; numbers as in maasi_msgs/AgentState."""
 
     IDLE = 0
     MOVING = 1
@@ -28,16 +28,16 @@ class Goal:
     """A waypoint of a robot."""
 
     id: int  # index of its decision plus one
-    step: int  # it takes effect in the next one
+    step: int  # takes effect in the next step
     waypoint: FloatArray  # (3,) [m, map]
-    tolerance: float = 0.0  # within this it counts as reached; 0: the robot's own [m]
-    handle: Any = None  # that of its client
+    tolerance: float = 0.0  # counts as reached within this; 0: the robot's tolerance [m]
+    handle: Any = None  # handle of its client
     status: GoalStatus = GoalStatus.MOVING
     reason: str = ''  # why it ended without success
 
 
 class WaypointFollower:
-    """Steers a robot to its waypoints and holds it there; `goal` is the last that took effect."""
+    """Steers a robot to waypoints and holds it there; `goal` is the last active one."""
 
     def __init__(self, motion: MotionModel) -> None:
         self.motion = motion
@@ -48,12 +48,12 @@ class WaypointFollower:
 
     @property
     def status(self) -> GoalStatus:
-        """What the robot is doing."""
+        """Activity of the robot."""
         return GoalStatus.IDLE if self.goal is None else self.goal.status
 
     @property
     def current(self) -> Goal | None:
-        """The goal that has not ended, or None."""
+        """The active goal, or None."""
         if self._next is not None:
             return self._next
         if self.goal is not None and self.goal.status == GoalStatus.MOVING:
@@ -61,13 +61,13 @@ class WaypointFollower:
         return None
 
     def adopt(self, goal: Goal) -> Goal | None:
-        """Take a new goal, and return the one that it replaces."""
+        """Adopt a new goal; return the replaced one."""
         replaced = self.end(GoalStatus.ABORTED, 'replaced')
         self._next = goal
         return replaced
 
     def end(self, status: GoalStatus, reason: str) -> Goal | None:
-        """End the goal; return it, or None if there is none."""
+        """End the goal; return it, or None."""
         goal = self.current
         if goal is None:
             return None
@@ -82,7 +82,7 @@ class WaypointFollower:
         return math.hypot(*offset[:2]) if self.on_ground else math.hypot(*offset)
 
     def update(self, state: RobotState, step: int | None = None) -> tuple[FloatArray, Goal | None]:
-        """Return vx, vy, vz [m/s, body] and yaw rate of a step, and the goal reached in it."""
+        """Return a step's command (vx, vy, vz [m/s, body], yaw rate) and the goal reached."""
         position = state.pose.position
         if self._next is not None and (step is None or step > self._next.step):
             self.goal, self._next = self._next, None
@@ -97,7 +97,7 @@ class WaypointFollower:
             goal.status = GoalStatus.REACHED
             self._hold = goal.waypoint
             reached = goal
-        # In a zone it stays as well: it leaves that when it is sent out.
+        # It also stays in a zone, and leaves it only for a goal.
         if self.on_ground or self.exit_from(position) is not None:
             return np.zeros(4), reached
         if self._hold is None:
@@ -105,7 +105,7 @@ class WaypointFollower:
         return self.motion.command(state, self._hold), reached
 
     def _resting(self, position: FloatArray) -> FloatArray:
-        """Return where a robot holds: where it is, or inside of the border if it is far outside."""
+        """Return the position to hold, inside of the border if the robot is far outside."""
         keep_out = self.motion.keep_out
         if keep_out.area.outside_by(position) > MARGIN + keep_out.radius:
             inside = keep_out.exit_from(position)
@@ -114,7 +114,7 @@ class WaypointFollower:
         return np.array(position)
 
     def exit_from(self, position: FloatArray) -> FloatArray | None:
-        """Return where a robot leaves a closed zone that it is in, (3,); None outside of zones."""
+        """Return the exit position from the zone around a robot, (3,), or None."""
         keep_out = self.motion.keep_out
         if not len(keep_out) or keep_out.area.outside_by(position):
             return None
@@ -122,16 +122,16 @@ class WaypointFollower:
 
     @property
     def target(self) -> FloatArray | None:
-        """The position that it goes to or holds [m, map]; None before the first update."""
+        """The position to reach or hold [m, map]; None before the first update."""
         if self.goal is not None and self.goal.status == GoalStatus.MOVING:
             return self.goal.waypoint
         return self._hold
 
     def stay(self) -> None:
-        """Hold where the robot is at the next step, even if a waypoint was reached before."""
+        """Hold the position of the next step, even if a waypoint was reached before."""
         self._hold = None
 
     def let_go(self) -> None:
-        """Hold, from the next step on, where the robot is then."""
+        """Hold the position of the next step from then on."""
         if self.status != GoalStatus.REACHED:
             self._hold = None

@@ -1,1 +1,1 @@
-"""A sensor calibrated from recordings of one target. Without ROS."""
+"""Calibration of sensors from recordings of one target. Without ROS."""

@@ -1,4 +1,4 @@
-"""Read recordings (rosbag2), also MCAP files whose end is missing."""
+"""Read recordings (rosbag2), also MCAP files without their end."""
 
 import contextlib
 import importlib
@@ -25,10 +25,10 @@ _END = b'\x0f' + (4).to_bytes(8, 'little') + bytes(4)
 _END += b'\x02' + (20).to_bytes(8, 'little') + bytes(20) + _MAGIC
 _METADATA = 'metadata.yaml'
 _SUFFIXES = ('.mcap', '.db3', '.bag')
-# The module of zstd: of Python 3.14, else what the version of rosbags installs.
+# The zstd module: of Python 3.14, else installed with rosbags.
 _ZSTD = ('compression.zstd', 'backports.zstd', 'zstandard')
-_PART = 2**16  # a shorter rest is lost with the end of a cut file [bytes]
-_FRAME = b'\x28\xb5\x2f\xfd'  # what a zstd frame begins with, and no message
+_PART = 2**16  # shorter rests are lost at the end of a cut file [bytes]
+_FRAME = b'\x28\xb5\x2f\xfd'  # begin of a zstd frame, and of no message
 
 
 class BagError(RuntimeError):
@@ -54,7 +54,7 @@ def has_end(path: Path) -> bool:
 
 
 def whole_length(path: Path) -> int:
-    """Return the number of bytes of an MCAP file up to the end of its last whole record."""
+    """Return the number of bytes of an MCAP file up to the end of its last complete record."""
     size = path.stat().st_size
     with path.open('rb') as file:
         magic = file.read(len(_MAGIC))
@@ -71,12 +71,12 @@ def whole_length(path: Path) -> int:
                 break
             end = after
     if end <= len(_MAGIC):
-        raise BagError(f'is cut off: its {size} bytes hold no whole record')
+        raise BagError(f'is cut off: its {size} bytes contain no complete record')
     return end
 
 
 def _sealed(path: Path, folder: Path) -> Path:
-    """Copy what is whole of an MCAP file; end it without an index, as the format allows."""
+    """Copy the complete records of an MCAP file and add an end without an index."""
     length = whole_length(path)
     copy = folder / path.name
     with path.open('rb') as source, copy.open('wb') as target:
@@ -95,7 +95,7 @@ def _unpacked(source: Path | io.BytesIO) -> Any:
 
 
 def _copied(path: Path, folder: Path) -> Path:
-    """Copy a compressed file as it was before; of a cut one what is before the cut."""
+    """Decompress a file; of a cut one the part before the cut."""
     copy = folder / path.stem
     with _unpacked(path) as source, copy.open('wb') as target, contextlib.suppress(EOFError):
         while part := source.read(_PART):
@@ -104,15 +104,15 @@ def _copied(path: Path, folder: Path) -> Path:
 
 
 class BagReader:
-    """Read a recording, also one whose end is missing (its writer was killed, or the disk full).
+    """Reads a recording, also without its end (writer killed or disk full).
 
-    Topics of the keys of `remap` are named by its values.
+    `remap`: new names of recorded topics.
     """
 
     def __init__(self, path: Path, remap: Mapping[str, str] | None = None) -> None:
         path = Path(path)
         if not path.exists():
-            raise BagError(f'{path}: there is no such recording')
+            raise BagError(f'{path}: no such recording')
         if (path / 'bag').is_dir():
             path = path / 'bag'
         self.path = path
@@ -165,7 +165,7 @@ class BagReader:
             return files
         folder = self._folder()
         missing = ', '.join(file.name for file in cut)
-        self.recovered = f'{path}: the end of {missing} is missing; what is before it is read'
+        self.recovered = f'{path}: the end of {missing} is missing; reading the part before it'
         return [_sealed(file, folder) if file in cut else file for file in files]
 
     def _folder(self) -> Path:
@@ -189,7 +189,7 @@ class BagReader:
         return counts
 
     def raw(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Yield topic, type, time [ns] and serialised message, in order of time."""
+        """Yield topic, type, time [ns] and serialised message, by time."""
         chosen = [
             item
             for item in self._reader.connections
@@ -205,18 +205,20 @@ class BagReader:
             except Exception as error:
                 raise BagError(f'{self.path}: is damaged: {_words(error)}') from error
             if data[: len(_FRAME)] == _FRAME:
-                # Each message is compressed, which only the lacking metadata tell.
+                # Each message is compressed, which only the missing metadata says.
                 with _unpacked(io.BytesIO(data)) as whole:
                     data = whole.read()
             yield self._name(connection.topic), connection.msgtype, time, data
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
-        """Yield the messages of `topics` (all if None), in order of time."""
+        """Yield the messages of `topics` (all if None), by time."""
         for topic, type_name, time, data in self.raw(topics):
             try:
                 message = self._reader.deserialize(data, type_name)
             except Exception as error:
-                raise BagError(f'{self.path}: holds no {type_name}: {_words(error)}') from error
+                raise BagError(
+                    f'{self.path}: contains no valid {type_name}: {_words(error)}'
+                ) from error
             yield BagMessage(topic, time, type_name, message)
 
     def close(self) -> None:
@@ -237,5 +239,5 @@ def _absolute(topic: str) -> str:
 def _words(error: Exception) -> str:
     text = ' '.join(str(error).split()) or type(error).__name__
     if 'Profile is not ros2' in text:
-        text = 'is MCAP of another profile than ros2, as of ROS 1: give the .bag file it is made of'
+        text = 'is an MCAP file of another profile than ros2, for example ROS 1: use its .bag file'
     return text if len(text) <= 300 else f'{text[:297]}...'

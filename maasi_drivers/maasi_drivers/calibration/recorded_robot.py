@@ -1,4 +1,4 @@
-"""A robot in a recording: where it was, and its images or detections."""
+"""A robot in a recording: its poses, and its images or detections."""
 
 import sys
 from collections import Counter
@@ -18,15 +18,15 @@ from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.models.pose import Pose
 
-# Topics of a robot that show targets.
+# Topics of a robot with targets.
 USED = {
     'images': ('/camera/image_raw', '/camera/image_raw/compressed'),
     'detections': ('/detections',),
 }
-# The driver's own poses come first: its detections are relative to them.
+# The driver's poses first, as its detections are relative to them.
 _POSES = ('/state', '/pose', '/odom', '/amcl_pose')
 _POSE_TYPES = ('AgentState', 'Odometry', 'PoseStamped', 'PoseWithCovarianceStamped')
-# Where none of those is: the transforms from the map to the robot's frame, in no namespace.
+# Otherwise the transforms from the map to the robot's frame, without a namespace.
 _TRANSFORMS, _FIXED = '/tf', '/tf_static'
 _TRANSFORM_TYPES = ('TFMessage', 'tfMessage')
 _IMAGES = {'Image': image_to_array, 'CompressedImage': decode_image}
@@ -45,9 +45,9 @@ class RecordedRobot:
         remap: Mapping[str, str] | None = None,
     ) -> None:
         self.settings = settings
-        #: Images and detections that are not used, by reason.
+        # : Number of unused images or detections, by reason.
         self.reasons: Counter[str] = Counter()
-        self.in_map = False  # whether its odometry is, so that its start is not added
+        self.in_map = False  # whether its odometry is in the map, so that its start is not added
         self._bag, self._remap = bag, remap
         with BagReader(bag, remap) as reader:
             self._types = {topic: reader.types[topic] for topic, n in reader.counts.items() if n}
@@ -87,19 +87,19 @@ class RecordedRobot:
 
     @property
     def left_out(self) -> int:
-        """Number of images or detections that are not used."""
+        """Number of unused images or detections."""
         return self.reasons.total()
 
     @property
     def why(self) -> str:
-        """How many are not used, for which reason."""
+        """Numbers of unused ones by reason, as text."""
         return '; '.join(f'{reason} ({number})' for reason, number in self.reasons.most_common())
 
     def _topic(self, name: str) -> str:
         return f'/{self.robot}{name}' if self.robot else name
 
     def pose_source(self) -> str:
-        """Return what its poses are, for messages; once they are read."""
+        """Return the topic of its poses for messages, after reading them."""
         return self.poses + (' (in the map: start and yaw are not added)' if self.in_map else '')
 
     def records(self, name: str) -> bool:
@@ -113,17 +113,17 @@ class RecordedRobot:
                     yield item.type.rpartition('/')[2], item.message
             except BagError as error:
                 # Messages before the damage are used.
-                self.recovered = f'{error}; what is before it is read'
+                self.recovered = f'{error}; using the part before it'
 
     def observations(self) -> list[Observation]:
-        """Return what it saw, each with where it was then."""
+        """Return its observations with their poses."""
         if self.use == 'images' and self.settings.camera is None:
             raise ValueError(
-                'parameter camera: got nothing, allowed with images are the settings of a camera'
+                'parameter camera: read nothing, allowed with images are the settings of a camera'
             )
         seen = list(self._published() if self.use == 'detections' else self._segmented())
         if self.reasons and not seen:
-            raise ValueError(f'{self._bag}: {self.use}: none can be used: {self.why}')
+            raise ValueError(f'{self._bag}: {self.use}: none is usable: {self.why}')
         return seen
 
     def _published(self) -> Iterator[Observation]:
@@ -148,7 +148,7 @@ class RecordedRobot:
             yield Observation(placed.pose, seen.values)
 
     def detector(self) -> MarkerDetector:
-        """Return the detector of its camera, calibrated as recorded."""
+        """Return the detector of its camera, with the recorded calibration."""
         assert self.settings.camera is not None
         camera = self.settings.camera
         for _, message in self._messages(self._topic('/camera/camera_info')):
@@ -161,7 +161,7 @@ class RecordedRobot:
         return MarkerDetector(camera, self.settings.environment.dimension)
 
     def images(self, period: float = 0.0) -> Iterator[tuple[StampedPose, ImageArray]]:
-        """Yield where it was at its images, and these: in each period [s] the first good one."""
+        """Yield poses and images: the first valid image in each period [s]."""
         assert self.settings.camera is not None
         history, due = self._history(), 0
         offset, gap = round(self.settings.camera.stamp_offset * 1e9), round(period * 1e9)
@@ -219,8 +219,8 @@ class RecordedRobot:
         return history
 
     def _transformed(self) -> Iterator[StampedPose]:
-        """Yield the poses of the robot's frame in the map that the transforms tell."""
-        # It needs ROS, which other poses do not.
+        """Yield the poses of the robot's frame in the map from the transforms."""
+        # It needs ROS, unlike other poses.
         from maasi_drivers.agent.transform_buffer import TransformBuffer, TransformError
 
         buffer, problem, last = TransformBuffer(), 'there is none', -1
@@ -258,7 +258,7 @@ def _stamp(message: Any) -> int:
 
 
 def _pose(message: Any) -> Pose | None:
-    """Return a pose, or a transform as one; None if its numbers are none."""
+    """Return a pose from a pose or transform; None if its numbers are invalid."""
     if hasattr(message, 'rotation'):
         point, turn = message.translation, message.rotation
     else:

@@ -1,4 +1,4 @@
-"""A sensor's noise R from observations at one target, as in 000, section 5.2."""
+"""Estimation of a sensor's noise R from observations of one target (paper 000, section 5.2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 
-LEAST_OBSERVATIONS = 10  # least number of observations for a covariance
-# Detections farther from the target than this multiple of the median are of something else.
+LEAST_OBSERVATIONS = 10  # smallest number of observations for a covariance
+# Detections farther from the target than this multiple of the median are other objects.
 _FAR = 8.0
-# Below this all detections agree to rounding [m].
+# Below this all detections are equal up to rounding [m].
 _ROUNDING = 1e-9
 _ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What a sensor saw at one instant: values (m, d) [m, rad] from a pose in the map."""
+    """Detections of a sensor at one instant: values (m, d) [m, rad], and its pose in the map."""
 
     pose: Pose
     values: FloatArray
@@ -28,17 +28,17 @@ class Observation:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """A sensor's noise, and the observations that it rests on."""
+    """A sensor's noise and its observations."""
 
     covariance: FloatArray  # R, (d, d): of the errors of range [m] and angles [rad]
     bias: FloatArray  # (d,): their mean
-    target: FloatArray  # (d,): as given, or the mean of where it was seen [m, map]
-    ranges: tuple[float, float]  # smallest and largest of those used [m]
-    used: int  # observations from which R is estimated
-    near: int  # left out because the target was too near for a bearing
-    others: int  # detections of something else
+    target: FloatArray  # (d,): as given, or the mean of the detections [m, map]
+    ranges: tuple[float, float]  # smallest and largest used range [m]
+    used: int  # number of observations for R
+    near: int  # skipped because the target was too close for a bearing
+    others: int  # detections of other objects
     inside: int  # observations with the target in the field of view
-    missed: int  # of those, the ones that did not show it
+    missed: int  # of those, the ones without a detection
 
     @property
     def deviations(self) -> FloatArray:
@@ -47,7 +47,7 @@ class SensorNoise:
 
     @property
     def probability(self) -> float:
-        """Share of the observations with the target in the field of view that showed it."""
+        """Detected share of the observations with the target in the field of view."""
         return 1.0 - self.missed / self.inside if self.inside else float('nan')
 
 
@@ -57,9 +57,10 @@ def sensor_noise(
     target: ArrayLike | None = None,
     least_range: float = 0.05,
 ) -> SensorNoise:
-    """Return a sensor's noise by observations of a target (d,) [m, map].
+    """Estimate a sensor's noise from observations of a target (d,) [m, map].
 
-    The nearest detection counts, unless it is eight times as far from the target as the median.
+    The detection closest to the target counts, unless it is eight times as far from it as the
+    median.
     """
     model = sensor.measurement
     seen = [model.inverse(observation.values, observation.pose) for observation in observations]
@@ -72,12 +73,10 @@ def sensor_noise(
     else:
         every = np.concatenate([np.zeros((0, model.dimension)), *seen])
         if not len(every):
-            raise ValueError(
-                f'target: it was seen 0 times, allowed is at least {LEAST_OBSERVATIONS}'
-            )
+            raise ValueError(f'target: detected 0 times, allowed is at least {LEAST_OBSERVATIONS}')
         place = np.median(every, axis=0)
     nearest: list[int | None] = []
-    # Without a given target, from the median to the mean of what is near it.
+    # Without a given target: from the median to the mean of close detections.
     for _ in range(1 if target is not None else _ROUNDS):
         nearest = _nearest(seen, place)
         chosen = [spots[i] for spots, i in zip(seen, nearest) if i is not None]
@@ -98,8 +97,8 @@ def sensor_noise(
         ranges.append(float(expected[0]))
     if len(errors) < LEAST_OBSERVATIONS:
         raise ValueError(
-            f'target: it was seen {len(errors)} times from {least_range:g} m or farther, '
-            f'allowed is at least {LEAST_OBSERVATIONS}'
+            f'target: detected {len(errors)} times at {least_range:g} m or more, allowed is at '
+            f'least {LEAST_OBSERVATIONS}'
         )
     array = np.array(errors)
     return SensorNoise(

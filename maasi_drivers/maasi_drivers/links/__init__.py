@@ -1,1 +1,1 @@
-"""The wires to robots: topics, Parrot Mambo, MAVLink."""
+"""Links to robots: topics, Parrot Mambo, MAVLink."""

@@ -1,4 +1,4 @@
-"""How a driver reaches its robot: the interface that every link implements."""
+"""The interface between a driver and its robot, which every link implements."""
 
 # Optional hooks do nothing.
 
@@ -18,8 +18,8 @@ from maasi_planner.motion import MotionModel, RobotState, make_motion
 class RobotLink(LinkHooks, ABC):
     """The link to one robot.
 
-    A driver makes it in *configure*. Everything that comes in goes to `driver`: poses to
-    `take_pose`, the charge to `take_charge`, faults to `judge`. No method waits, except `stop`.
+    A driver creates it in *configure*. The link passes poses to `driver.take_pose`, charges to
+    `take_charge` and faults to `judge`. No method waits, except `stop`.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class RobotLink(LinkHooks, ABC):
 
     @abstractmethod
     def connect(self) -> None:
-        """Open the link, in *configure*; where this raises, the node stays unconfigured."""
+        """Open the link, in *configure*; if this raises, the node stays unconfigured."""
 
     @abstractmethod
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
@@ -48,15 +48,15 @@ class RobotLink(LinkHooks, ABC):
 
     @abstractmethod
     def hold(self) -> None:
-        """Stop the robot now: its goal was cancelled, or its pose is unknown."""
+        """Stop the robot now: its goal was cancelled or its pose is unknown."""
 
     def hold_step(self, stamp: int) -> None:
-        """Answer the step at `stamp` [ns], whose odometry could not be used, by a stop."""
+        """Answer the step at `stamp` [ns], whose odometry was unusable, with a stop."""
         self.hold()
 
     @abstractmethod
     def stop(self) -> None:
-        """Stop the robot because the driver ends; may wait until that is confirmed."""
+        """Stop the robot because the driver ends; may wait for confirmation."""
 
     @abstractmethod
     def poll(self) -> None:
@@ -70,22 +70,22 @@ class RobotLink(LinkHooks, ABC):
         return {}
 
     def prepare(self) -> None:
-        """Check the settings, before `connect`; `SettingsError` for what is not allowed."""
+        """Check the settings, before `connect`; raises `SettingsError`."""
 
     def activate(self) -> None:
-        """Begin to work, in *activate*: from now on the robot may move."""
+        """Start working, in *activate*: from now on the robot may move."""
 
     def reset(self) -> None:
-        """Discard what belongs to the time before a jump back of the clock."""
+        """Discard data from before a jump back of the clock."""
 
     def latch_stop(self) -> None:
         """Handle the service `stop`, after `hold`."""
 
     def observe(self, placed: StampedPose) -> None:
-        """Take note of a new pose, before it is used."""
+        """Handle a new pose, before it is used."""
 
     def goal_taken(self, goal: Goal) -> None:
-        """Take note of a new goal."""
+        """Handle a new goal."""
 
     def make_motion(self) -> MotionModel:
         """Return the controller."""

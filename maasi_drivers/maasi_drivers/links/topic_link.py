@@ -25,13 +25,13 @@ _TYPES: dict[str, type] = {
 
 
 class CommandPublisher:
-    """Publishes TwistStamped (TurtleBot3 of Jazzy), Twist (of Humble) or what is subscribed."""
+    """Publishes TwistStamped (TurtleBot3 on Jazzy), Twist (on Humble) or the subscribed type."""
 
     def __init__(self, node: Node, topic: str, kind: CommandType, lockstep: bool = False) -> None:
         self._node = node
         self._quality = RELIABLE if lockstep else COMMANDS
         self.topic = node.resolve_topic_name(topic)
-        #: None where the type is not known yet.
+        # : None until the type is known.
         self.publisher: Any = None
         self._kind: type = TwistStamped
         self._auto = kind == 'auto' and not lockstep
@@ -41,13 +41,13 @@ class CommandPublisher:
             self._use(Twist if kind == 'twist' else TwistStamped)
 
     def _use(self, kind: type) -> None:
-        # A process can have only one type under one name.
+        # A process can have only one type per topic.
         self.destroy()
         self._kind = kind
         self.publisher = self._node.create_publisher(kind, self.topic, self._quality)
 
     def refresh(self) -> str:
-        """Follow the type that is subscribed to; return why no command is received, or nothing."""
+        """Follow the subscribed type; return why no command is received, or nothing."""
         if self.publisher is not None and self.publisher.get_subscription_count():
             return ''
         known = self._node.get_subscriptions_info_by_topic(self.topic)
@@ -58,14 +58,14 @@ class CommandPublisher:
         if not wanted:
             return f'{self.topic}: no subscription; is the robot running?'
         if any(_TYPES.get(name) is self._kind for name in wanted):
-            return ''  # known, and not connected yet
+            return ''  # discovered, but not connected yet
         return (
-            f'{self.topic}: no subscription of this type; the robot wants {", ".join(wanted)}, '
-            'see the parameter command_type'
+            f'{self.topic}: the robot subscribes to {", ".join(wanted)}; set the parameter '
+            'command_type'
         )
 
     def publish(self, command: TwistStamped) -> None:
-        """Publish a command, without its header where that is subscribed to."""
+        """Publish a command, in the subscribed type."""
         if self.publisher is not None:
             self.publisher.publish(command if self._kind is TwistStamped else command.twist)
 
@@ -77,9 +77,9 @@ class CommandPublisher:
 
 
 _ZERO = (0.0, 0.0, 0.0, 0.0)
-# At the end: commands, and longest wait until the last one has arrived [s].
+# At the end: commands, and longest wait for the acknowledgement of the last one [s].
 _STOP_COMMANDS, _STOP_TIME = 3, Duration(seconds=0.3)
-_GUARD_POLLS = 5  # polls from one look for the guard to the next
+_GUARD_POLLS = 5  # polls between two checks for the guard
 
 
 class TopicLink(RobotLink):
@@ -92,15 +92,15 @@ class TopicLink(RobotLink):
 
     Publishes
     ---------
-    `cmd_vel` (geometry_msgs/TwistStamped or Twist, as the robot listens), with each pose, and
-    zeros on a fault and at the end
+    `cmd_vel` (geometry_msgs/TwistStamped or Twist, as subscribed) with each pose, and zeros on a
+    fault and at the end
     """
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
         settings = driver.settings
         if settings.motion.model != 'unicycle':
-            # In the plane the bounds of the environment have no heights.
+            # In 2D the bounds of the environment have no heights.
             driver.volume = flight_volume(driver.volume.area, settings, FlightSettings())
         self._commands = CommandPublisher(
             driver, 'cmd_vel', settings.command_type, settings.lockstep
@@ -112,7 +112,7 @@ class TopicLink(RobotLink):
         self._command.header.frame_id = f'{driver.robot}/base_link'
 
     def connect(self) -> None:
-        """Subscribe, and expect that the robot does."""
+        """Subscribe to the robot."""
         driver = self.driver
         if driver.settings.poses == 'odometry':
             OdometryTopic(driver)
@@ -133,14 +133,14 @@ class TopicLink(RobotLink):
         self._publish(_ZERO)
 
     def stop(self) -> None:
-        """Publish zeros, and wait until they have arrived."""
+        """Publish zero commands and wait for the acknowledgement."""
         for _ in range(_STOP_COMMANDS):
             self._publish(_ZERO)
         if self._commands.publisher is not None:
             self._commands.publisher.wait_for_all_acked(_STOP_TIME)
 
     def poll(self) -> None:
-        """Follow the type that the robot subscribes to; warn where nothing does."""
+        """Follow the subscribed type; warn if nothing subscribes."""
         if problem := self._commands.refresh():
             self.driver.warn_throttled('cmd_vel', problem)
         if self._polls % _GUARD_POLLS == 0:
@@ -150,15 +150,15 @@ class TopicLink(RobotLink):
         self._polls += 1
         if self._was_guarded and not self._guarded and not self.driver.ending:
             self.driver.warn_throttled(
-                'guard', 'the guard has gone: nobody stops the robot if this driver dies'
+                'guard', 'guard lost: if this driver dies, nothing stops the robot'
             )
 
     def status(self) -> dict[str, Any]:
         """Return whether there is a guard."""
-        return {'guard': 'is there' if self._guarded else 'is not there'}
+        return {'guard': 'available' if self._guarded else 'not available'}
 
     def begin_step(self, stamp: int) -> None:
-        """Take the readings of the battery before this step."""
+        """Handle the battery readings before this step."""
         self._battery.receive_before(stamp)
 
     def hold_step(self, stamp: int) -> None:

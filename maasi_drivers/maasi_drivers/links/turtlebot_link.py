@@ -1,4 +1,4 @@
-"""Ground robots with topics: by the driver's own commands, with a laser scan, or by Nav2."""
+"""Ground robots with topics: driven by the driver, with a laser scan, or by Nav2."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,15 +22,15 @@ from maasi_filter.ros.qos import sensor_reader
 from maasi_planner.motion import MotionModel, RobotState
 
 _SCAN = 'scan'  # kind of fault
-_PROGRESS = 0.02  # a distance to the waypoint that is smaller by this is progress [m]
+_PROGRESS = 0.02  # smaller distances to the waypoint by this much are progress [m]
 
 
 class TurtlebotLink(TopicLink):
     """A differential drive; see `TopicLink`.
 
-    A TurtleBot has no time limit on commands: it executes the last one for ever. So zeros are
-    published when the driver stops, loses odometry, camera or scan, or ends, and by `guard_node`
-    when the driver dies.
+    A TurtleBot has no timeout on commands: it keeps executing the last one. So the driver
+    publishes zero commands when it stops, loses odometry, camera or scan, or ends; `guard_node`
+    does when the driver dies.
 
     Subscribes
     ----------
@@ -39,11 +39,11 @@ class TurtlebotLink(TopicLink):
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
-        self._motion: ScanUnicycle | None = None  # its controller, where it uses the scan
+        self._motion: ScanUnicycle | None = None  # its controller, if it uses the scan
         self.reset()
 
     def make_motion(self) -> MotionModel:
-        """Return the controller, which uses the scan where there is one."""
+        """Return the controller, which uses the scan if there is one."""
         settings = self.driver.settings
         if settings.scan is None:
             return super().make_motion()
@@ -63,14 +63,14 @@ class TurtlebotLink(TopicLink):
         self.driver.create_subscription(LaserScan, 'scan', self._on_scan, sensor_reader(False))
 
     def reset(self) -> None:
-        """Discard the scan of another time."""
+        """Discard the scan from another time."""
         self._scan: LaserScan | None = None
         self._scanned_at: int | None = None
-        # The present goal, the least distance that was left to it [m], and its stamp [ns].
+        # The current goal, the smallest distance to it [m], and its stamp [ns].
         self._nearest: tuple[Goal, float, int] | None = None
 
     def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
-        """Return command and goal reached; without scans it is stopped, blocked it gives up."""
+        """Return command and goal reached; stop without scans, abort when blocked."""
         driver, settings, latest = (
             self.driver,
             self.driver.settings.scan,
@@ -88,7 +88,7 @@ class TurtlebotLink(TopicLink):
         if self._without_progress(latest) > settings.blocked_timeout:
             driver.end_goal(
                 GoalStatus.ABORTED,
-                f'blocked: no nearer to the waypoint for {settings.blocked_timeout:g} s',
+                f'blocked: no closer to the waypoint for {settings.blocked_timeout:g} s',
             )
             command = np.zeros(4)
         return command, reached
@@ -122,7 +122,7 @@ class TurtlebotLink(TopicLink):
         if placed is None:
             driver.drop(
                 'scan',
-                f'scan.header.stamp: read {stamp} ns, allowed is what the odometry covers, up to '
+                f'scan.header.stamp: read {stamp} ns, allowed is the range of the odometry, up to '
                 f'{latest.stamp} ns',
             )
             return
@@ -149,7 +149,7 @@ class Nav2Link(TurtlebotLink):
     Actions
     -------
     client of `navigate_to_pose` (nav2_msgs/NavigateToPose); `cmd_vel` is Nav2's while the robot is
-    on its way
+    moving
     """
 
     def __init__(self, driver: RobotNode) -> None:
@@ -162,7 +162,7 @@ class Nav2Link(TurtlebotLink):
                 "(sudo apt install ros-$ROS_DISTRO-nav2-msgs); allowed without it is 'own'"
             ) from error
         self._type = NavigateToPose
-        # Since the last answer or feedback.
+        # Time since the last answer or feedback.
         self._silence = Silence(driver)
         self._client = driver.permanent(
             'navigate_to_pose', lambda: ActionClient(driver, NavigateToPose, 'navigate_to_pose')
@@ -174,35 +174,35 @@ class Nav2Link(TurtlebotLink):
         self._replaced: Any = None
 
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
-        """Return whether it moves, by the velocity of the odometry."""
+        """Return whether it moves, from the velocity of the odometry."""
         velocity = np.array([*placed.velocity, placed.angular_velocity[2]])
         return super().is_moving(placed, velocity)
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
-        """Publish zeros, and nothing while Nav2 drives."""
+        """Publish zero commands, and nothing while Nav2 drives."""
         self._command.header.stamp = stamp_to_ros(placed.stamp)
         if self._goal is None:
             self.hold()
 
     def poll(self) -> None:
-        """Check the link; stop a robot whose Nav2 is gone or silent."""
+        """Check the link; stop a robot if Nav2 is lost or silent."""
         super().poll()
         silence = self._silence.length
-        # DDS notices a killed server only after some 20 s.
+        # DDS detects a killed server only after about 20 s.
         gone = not self._client.server_is_ready()
         if self._goal is None or not (gone or silence > self.driver.settings.nav2_timeout):
             return
-        silent = f'no answer or feedback of Nav2 for {silence:.1f} s'
-        self.driver.end_goal(GoalStatus.ABORTED, 'Nav2 is gone' if gone else silent)
+        silent = f'no answer or feedback from Nav2 for {silence:.1f} s'
+        self.driver.end_goal(GoalStatus.ABORTED, 'Nav2 not available' if gone else silent)
         self.hold()
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Refuse goals without Nav2."""
         there = self._client.server_is_ready()
-        return None if there else 'navigate_to_pose: Nav2 is not there'
+        return None if there else 'navigate_to_pose: Nav2 not available'
 
     def goal_taken(self, goal: Goal) -> None:
-        """Send the goal to Nav2, which replaces the one before without a stop."""
+        """Send the goal to Nav2, which replaces the previous one without a stop."""
         latest, heading = self.driver.history.latest, self.driver.settings.yaw
         if latest is not None:
             ahead = goal.waypoint - latest.pose.position
@@ -220,7 +220,7 @@ class Nav2Link(TurtlebotLink):
         future.add_done_callback(lambda answer: self._answered(goal, answer.result()))
 
     def goal_ended(self, goal: Goal) -> None:
-        """Have Nav2 stop, if it is on the way to this goal."""
+        """Let Nav2 stop if it is driving to this goal."""
         if goal is not self._goal:
             return
         handle, self._goal, self._handle = self._handle, None, None
@@ -233,12 +233,12 @@ class Nav2Link(TurtlebotLink):
         if handle is None or not handle.accepted:
             if goal is self._goal:
                 self._stop_replaced()
-            self._end(goal, GoalStatus.ABORTED, 'Nav2 refuses the waypoint')
+            self._end(goal, GoalStatus.ABORTED, 'Nav2 rejected the waypoint')
             return
         if goal is self._goal:
             self._handle, self._replaced = handle, None
         elif self._goal is None:
-            # Given up before Nav2 had answered.
+            # Aborted before Nav2 answered.
             handle.cancel_goal_async()
             return
         elif self._handle is None:
@@ -250,8 +250,8 @@ class Nav2Link(TurtlebotLink):
         if answer.status == ActionStatus.STATUS_SUCCEEDED:
             self._end(goal, GoalStatus.REACHED, '')
             return
-        ended = 'cancelled it' if answer.status == ActionStatus.STATUS_CANCELED else 'gave it up'
-        # Humble's result is empty, newer ones have code and text.
+        ended = 'cancelled it' if answer.status == ActionStatus.STATUS_CANCELED else 'aborted it'
+        # Humble's result is empty, newer ones have a code and a text.
         code = getattr(answer.result, 'error_code', 0)
         text = getattr(answer.result, 'error_msg', '')
         reason = f'Nav2 {ended}{f", error {code}" if code else ""}{f": {text}" if text else ""}'

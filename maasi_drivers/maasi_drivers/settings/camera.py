@@ -1,4 +1,4 @@
-"""Settings of a robot's camera: intrinsics, mount, noise and how markers are segmented."""
+"""Settings of a robot's camera: intrinsics, mount, noise and marker segmentation."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from maasi_filter.plugins import OwnSettings, PluginGroup
 from maasi_filter.settings import Finite, Settings, Vector3
 from maasi_filter.wording import problems
 
-# Beyond these limits a camera cannot be one.
+# Plausible ranges of a camera.
 Focal = Annotated[Finite, Field(gt=0.0, le=1e6)]
 Pixel = Annotated[Finite, Field(ge=-1e6, le=1e6)]
 Coefficient = Annotated[Finite, Field(ge=-1e4, le=1e4)]
 
 DistortionModel = Literal['plumb_bob', 'rational_polynomial', 'equidistant']
-# Numbers of coefficients that each model can have, next to none.
+# Allowed numbers of coefficients of each model, besides none.
 COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}
 
 DETECTORS = PluginGroup(
@@ -39,25 +39,28 @@ class SegmentationSettings(Settings):
 
     rule: Annotated[str, DETECTORS, AfterValidator(DETECTORS.check)] = Field(
         'robust',
-        description="'paper': fixed blue excess (001, eq. (16)), blobs of any size from "
-        "minimum_area on; 'robust': adapts to light, and gates on size and shape; 'aruco': "
-        'fiducial markers, whose ids are the identities of targets; or module:Class of your own',
+        description="'paper': fixed blue excess (paper 001, eq. (16)), blobs of at least "
+        "minimum_area; 'robust': adapts to light and checks size and shape; 'aruco': fiducial "
+        'markers, whose ids identify targets; or your own module:Class',
     )
     settings: Annotated[Any, _DETECTOR, AfterValidator(_DETECTOR.check)] = Field(
-        None, validate_default=True, description='Settings of a detector of your own'
+        None, validate_default=True, description='Settings of your own detector'
     )
     dictionary: Literal[
         '4X4_50', '4X4_250', '5X5_50', '5X5_250', '6X6_50', '6X6_250', 'APRILTAG_36h11'
     ] = Field('4X4_50', description='Aruco rule: dictionary of the markers')
     threshold: float = Field(
-        35.0, ge=0, le=255, description='Paper rule: blue excess over this is marker [grey levels]'
+        35.0,
+        ge=0,
+        le=255,
+        description='Paper rule: smallest blue excess of a marker pixel [grey levels]',
     )
     minimum_area: float = Field(
         2e-4,
         ge=0,
         lt=1,
-        description="Paper rule: smallest blob kept, as a share of the image's pixels; 4 px of "
-        '160 x 120; 0 keeps single pixels [-]',
+        description="Paper rule: smallest blob, as a share of the image's pixels; default: 4 px of "
+        '160 x 120; 0: single pixels [-]',
     )
     saturation: float = Field(
         0.40,
@@ -67,19 +70,24 @@ class SegmentationSettings(Settings):
         'white balance [-]',
     )
     peak_saturation: float = Field(
-        0.70, gt=0, le=3, description='Robust rule: blueness reached inside a marker [-]'
+        0.70, gt=0, le=3, description='Robust rule: least peak blueness of a marker [-]'
     )
     noise_factor: float = Field(
         7.0, gt=0, description="Robust rule: threshold in deviations (MAD) of the floor's blueness"
     )
     maximum_aspect: float = Field(
-        2.5, ge=1, description='Robust rule: longest allowed length over width of a blob [-]'
+        2.5, ge=1, description='Robust rule: largest ratio of length to width of a blob [-]'
     )
     minimum_solidity: float = Field(
-        0.80, gt=0, le=1, description='Robust rule: least area over that of its ellipse [-]'
+        0.80,
+        gt=0,
+        le=1,
+        description='Robust rule: smallest ratio of area to that of its ellipse [-]',
     )
     minimum_diameter: float = Field(
-        0.55, gt=0, description='Robust rule: least diameter on the floor, in marker diameters [-]'
+        0.55,
+        gt=0,
+        description='Robust rule: smallest diameter on the floor, in marker diameters [-]',
     )
     maximum_diameter: float = Field(
         1.6, gt=0, description='Robust rule: largest diameter on the floor, in marker diameters [-]'
@@ -101,7 +109,7 @@ class SegmentationSettings(Settings):
 
 
 class MountSettings(Settings):
-    """Where the camera sits on the robot (REP-103); without rpy it looks forward, image top up."""
+    """Pose of the camera on the robot (REP-103); without rpy it looks forward, image top up."""
 
     position: Vector3 = Field(
         [0.0, 0.0, 0.0], description="Optical centre in the robot's frame [m]"
@@ -113,34 +121,33 @@ class MountSettings(Settings):
 
 
 class BoxSettings(Settings):
-    """What is taken of the boxes that a detector of another package publishes.
+    """How to use the boxes that a detector of another package publishes.
 
-    Boxes of one object that overlap by three quarters, as two people draw them, are 7 to 14 % of
-    their size apart: the default of `error`.
+    Boxes of one object that overlap by three quarters, as two people draw them, differ by 7 to
+    14 % of their size, hence the default of `error`.
     """
 
-    classes: list[str] = Field([], description='Classes (class_id) of which targets are; none: all')
+    classes: list[str] = Field([], description='Classes (class_id) of targets; default: all')
     point: Literal['foot', 'centre'] = Field(
         'foot',
-        description="What of a box is on the floor: 'foot', the middle of its lower side, of "
-        "things that stand, seen from the side; 'centre', of what lies flat, or from above",
+        description="Point of a box on the floor: 'foot' (middle of the lower side, for standing "
+        "objects seen from the side) or 'centre' (for flat objects or views from above)",
     )
     error: float = Field(
         0.1,
         gt=0.0,
         le=0.5,
-        description='Deviation of that point, as a share of the width and height of its box; of a '
-        'box that the border cuts it is 0.5 [1]',
+        description='Deviation of that point, as a share of the width and height of its box; 0.5 '
+        'for boxes that the border cuts [1]',
     )
 
 
 class CameraSettings(Settings):
     """A camera that sees the floor.
 
-    The defaults are those of a drone at 1 m: 160 x 120 px, looking down, the image's width across
-    the robot. With 260 px of focal length the papers' field of view of +-0.2 m lies in the image,
-    markers of 3 cm included and 1.6 cm to spare. (At the nominal 300 px the image's height is just
-    0.40 m at 1 m, and markers at its edge are cut.)
+    The defaults suit a drone at 1 m: 160 x 120 px, looking down. A focal length of 260 px
+    covers the papers' field of view of +-0.2 m with markers of 3 cm; at the nominal 300 px
+    markers at its edge are cut.
     """
 
     width: int = Field(160, ge=8, le=16384, description='Image width [px]')
@@ -149,13 +156,13 @@ class CameraSettings(Settings):
         [260.0, 260.0],
         min_length=2,
         max_length=2,
-        description='Focal length along image x and y (beta_x, beta_y of 001, eq. (18)) [px]',
+        description='Focal length along image x and y (beta_x, beta_y of paper 001, eq. (18)) [px]',
     )
     principal_point: list[Pixel] | None = Field(
         None,
         min_length=2,
         max_length=2,
-        description="Optical centre, pixel centres at whole numbers; none: the image's centre [px]",
+        description="Optical centre; pixel centres are integers; default: the image's centre [px]",
     )
     distortion: list[Coefficient] = Field(
         default_factory=list,
@@ -168,36 +175,34 @@ class CameraSettings(Settings):
         "k4, k5, k6[, of thin prism and tilt: 4 or 6]; 'equidistant' (fisheye): k1, k2, k3, k4",
     )
     mount: MountSettings = Field(
-        default_factory=MountSettings, description='Where the camera sits on the robot'
+        default_factory=MountSettings, description='Pose of the camera on the robot'
     )
     rate: float = Field(10.0, gt=0, description='Images per second [Hz]')
-    stamp_offset: float = Field(
-        0.0, description='Added to an image stamp: minus the latency where stamps are late [s]'
-    )
+    stamp_offset: float = Field(0.0, description='Added to image stamps: minus their latency [s]')
     marker_diameter: float = Field(0.03, gt=0, description='Diameter of the markers [m]')
     pixel_noise: float = Field(
         0.1,
         gt=0,
-        description='Deviation of a centroid beyond what image noise explains; about 0.03 for raw '
+        description='Deviation of a centroid in addition to image noise; about 0.03 for raw '
         'images and the robust rule, 0.1 for JPEG or the paper rule [px]',
     )
     position_noise: float = Field(
-        0.0, ge=0, description="Deviation of each of the pose's coordinates if it carries none [m]"
+        0.0, ge=0, description="Deviation of the pose's coordinates if its message has none [m]"
     )
     orientation_noise: float = Field(
-        0.0, ge=0, description="Deviation of each of the pose's angles if it carries none [rad]"
+        0.0, ge=0, description="Deviation of the pose's angles if its message has none [rad]"
     )
     cut_blobs: Literal['keep', 'drop'] = Field(
         'keep',
-        description='Blobs that the image border cuts: kept with more covariance, or dropped',
+        description='Blobs cut by the image border: keep with a larger covariance, or drop',
     )
     segmentation: SegmentationSettings = Field(
-        default_factory=SegmentationSettings, description='How markers are segmented'
+        default_factory=SegmentationSettings, description='Segmentation of markers'
     )
     detections: BoxSettings | None = Field(
         None,
-        description='What is taken of camera/detections (vision_msgs/Detection2DArray), in place '
-        'of images; none: the driver finds markers in images',
+        description='Use of camera/detections (vision_msgs/Detection2DArray) instead of images; '
+        'default: the driver detects markers in images',
     )
 
     @model_validator(mode='after')
@@ -212,14 +217,14 @@ class CameraSettings(Settings):
 
     @property
     def least_coefficients(self) -> int:
-        """Number of coefficients of a camera without distortion."""
+        """Smallest number of coefficients without distortion."""
         return {'plumb_bob': 5}.get(self.distortion_model, COEFFICIENTS[self.distortion_model][0])
 
     def with_camera_info(self, info: Any) -> CameraSettings:
         """Return these settings with the intrinsics of a ``sensor_msgs/CameraInfo``.
 
-        Its calibration is that of the full image, of which the images show the region of interest,
-        with pixels binned.
+        The calibration is for the full image; images may show a region of interest with
+        binned pixels.
         """
         k, roi, size = [float(value) for value in info.k], info.roi, []
         for axis, whole, start, length, bins in (
@@ -233,7 +238,7 @@ class CameraSettings(Settings):
                     f'0 to {whole}'
                 )
             k[4 * axis] /= count
-            # Pixel centres are at whole numbers: that of a binned one is the middle of its bin.
+            # Pixel centres are integers: that of a binned pixel is the middle of its bin.
             k[2 + 3 * axis] = (k[2 + 3 * axis] - start + 0.5) / count - 0.5
             size.append(shown // count)
         return self.with_calibration(size[0], size[1], k, list(info.d), str(info.distortion_model))
@@ -261,7 +266,7 @@ class CameraSettings(Settings):
             'height': height,
             'focal_length': [matrix[0], matrix[4]],
             'principal_point': [matrix[2], matrix[5]],
-            # Some cameras fill unused coefficients with zeros, as many as they like.
+            # Some cameras fill unused coefficients with zeros.
             'distortion': [float(value) for value in d] if any(d) else [],
             'distortion_model': model,
         }
@@ -272,7 +277,7 @@ class CameraSettings(Settings):
 
 
 def load_calibration(path: str | Path, settings: CameraSettings) -> CameraSettings:
-    """Return settings with the intrinsics of a calibration file of ROS's ``camera_calibration``."""
+    """Return settings with the intrinsics of a ROS ``camera_calibration`` file."""
     try:
         content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
         return settings.with_calibration(

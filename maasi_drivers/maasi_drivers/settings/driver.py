@@ -18,8 +18,8 @@ BatteryUnit = Literal['fraction', 'percent']
 CommandType = Annotated[
     Literal['auto', 'stamped', 'twist'],
     Field(
-        description='Type of cmd_vel: TwistStamped, Twist, or the type that it subscribes to; auto '
-        'is stamped in lockstep'
+        description='Type of cmd_vel: TwistStamped, Twist, or (auto) the type that the robot '
+        'subscribes to; auto is stamped in lockstep'
     ),
 ]
 
@@ -36,88 +36,88 @@ DRIVERS = PluginGroup(
     'maasi.drivers',
     'driver',
     'maasi_drivers.agent.agent_driver:AgentDriver',
-    # Those of robots that the simulation stands in for.
+    # Links of simulated robots.
     {name: f'maasi_drivers.drivers:{name}' for name, has in LINKS.items() if 'topics' in has},
 )
 
 
 class RangingSettings(Settings):
-    """What the angles of `ranges` are relative to, and where the sensor sits."""
+    """Reference of the angles in `ranges`, and mount of the sensor."""
 
     frame: Literal['map', 'body'] = Field(
         'map',
         description="'map': bearings from the map's x axis, elevations from the horizontal plane; "
-        "'body': both in the frame of the sensor on the robot, as real ones give them, with slant "
-        'ranges',
+        "'body': both in the frame of the sensor on the robot, with slant ranges, as real "
+        'sensors measure',
     )
     position: Vector3 = Field(
-        [0.0, 0.0, 0.0], description="Of the sensor in the robot's frame, with frame body [m]"
+        [0.0, 0.0, 0.0],
+        description="Position of the sensor in the robot's frame, for frame body [m]",
     )
     rpy: Vector3 = Field(
         [0.0, 0.0, 0.0],
-        description='Roll, pitch, yaw of the sensor about fixed axes of the robot, with frame body '
+        description='Roll, pitch, yaw of the sensor about fixed axes of the robot, for frame body '
         '[rad]',
     )
 
 
 class ScanSettings(Settings):
-    """How a ground robot keeps clear of what its laser scanner sees."""
+    """How a ground robot avoids what its laser scanner sees."""
 
     position: Vector2 = Field(
-        [0.0, 0.0], description="Of the scanner in the robot's frame, x and y [m]"
+        [0.0, 0.0], description="Position of the scanner in the robot's frame, x and y [m]"
     )
-    yaw: Finite = Field(0.0, description="Of the scanner in the robot's frame [rad]")
+    yaw: Finite = Field(0.0, description="Yaw of the scanner in the robot's frame [rad]")
     reach: float = Field(
-        0.7, gt=0.0, le=10.0, description='How far ahead the way has to be free [m]'
+        0.7, gt=0.0, le=10.0, description='Length of the path ahead that must be free [m]'
     )
     timeout: float = Field(
         1.0,
         gt=0.0,
-        description='Time by the odometry without a scan after which the robot is stopped [s]',
+        description='Odometry time without a scan after which the robot is stopped [s]',
     )
     blocked_timeout: float = Field(
         15.0,
         gt=0.0,
-        description='Time by the odometry without getting nearer to a waypoint after which it is '
-        'given up [s]',
+        description='Odometry time without progress to a waypoint after which its goal is aborted '
+        '[s]',
     )
 
 
 class DrivenRobot(RobotModel):
-    """What driver and simulation know of a robot."""
+    """Settings of a robot that driver and simulation share."""
 
     link: Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink'] = Field(
         'topics',
-        description='How it is reached: ROS topics; pyparrot over WiFi or Bluetooth '
-        '(mambo_driver); a program of its own by UDP (mambo_onboard_driver); MAVLink '
-        '(mavlink_driver)',
+        description='Connection: ROS topics; pyparrot over WiFi or Bluetooth (mambo_driver); its '
+        'own program by UDP (mambo_onboard_driver); MAVLink (mavlink_driver)',
     )
     mambo: MamboSettings | None = Field(
         None,
-        description='With a link mambo_...: how, and what it may be made to do; where the drone '
-        'is simulated, an address that is not of this host is replaced',
+        description='For links mambo_...: connection and permissions; for a simulated drone an '
+        'address of another host is replaced',
     )
     mavlink: MavlinkSettings | None = Field(
-        None, description='With link mavlink: how, and what it may be made to do'
+        None, description='For link mavlink: connection and permissions'
     )
     yaw: Finite = Field(0.0, description='Heading at the start, from the x axis of the map [rad]')
-    camera: CameraSettings | None = Field(None, description='Its camera; none: a ranging sensor')
+    camera: CameraSettings | None = Field(None, description='Its camera; default: a ranging sensor')
     battery_unit: BatteryUnit = Field(
         'fraction',
-        description='Unit of battery_state.percentage: fraction, 0 to 1 as its definition says, or '
-        'percent, 0 to 100 as a TurtleBot3 has it',
+        description='Unit of battery_state.percentage: fraction (0 to 1, as defined) or percent '
+        '(0 to 100, as of a TurtleBot3)',
     )
     battery_minimum: float = Field(
         0.05,
         ge=0.0,
         lt=1.0,
-        description='Charge below which its driver takes no goals, and lands it where it can; '
-        '0: disabled [1]',
+        description='Charge below which its driver refuses goals and, if possible, lands it; 0 '
+        'disables this [1]',
     )
 
 
 class DriverSettings(DrivenRobot, NodeSettings):
-    """What the driver of a robot needs to know."""
+    """Settings of the driver of a robot."""
 
     live: ClassVar[frozenset[str]] = frozenset(
         {
@@ -131,115 +131,112 @@ class DriverSettings(DrivenRobot, NodeSettings):
         }
     )
 
-    environment: EnvironmentSettings = Field(description='Where the robot may go')
+    environment: EnvironmentSettings = Field(description='Area of the robot')
     ranging: RangingSettings = Field(
         default_factory=RangingSettings,
-        description='What the angles of `ranges` are relative to; of drivers with a ranging sensor',
+        description='Reference of the angles in `ranges`, for drivers with a ranging sensor',
     )
     scan: ScanSettings | None = Field(
         None,
-        description='How a ground robot uses its laser scan; none: it drives by the known '
-        'obstacles alone; not in lockstep',
+        description='Use of the laser scan of a ground robot; default: only known obstacles; not '
+        'in lockstep',
     )
     navigation: Literal['own', 'nav2'] = Field(
         'own',
-        description="What drives a ground robot to its waypoints: the driver, or Nav2's "
-        'NavigateToPose; not in lockstep',
+        description="Navigation of a ground robot: by the driver or Nav2's NavigateToPose; not in "
+        'lockstep',
     )
     nav2_timeout: float = Field(
         2.0,
         gt=0.0,
-        description='Longest silence of Nav2 while it has a goal, answer or feedback: then the '
-        'goal is aborted and the robot stopped [s]',
+        description='Time without an answer or feedback from Nav2 after which the goal is aborted '
+        'and the robot stopped [s]',
     )
     image_source: Literal['topic', 'video', 'feed'] = Field(
         'topic',
-        description='Where images come from: a topic, what `video` names, or blobs that the robot '
-        'finds on board and sends to `feed_port` (docs/measurement_feed.md)',
+        description='Source of images: a topic, `video`, or blobs that the robot detects on board '
+        'and sends to `feed_port` (docs/measurement_feed.md)',
     )
     video: str = Field(
-        '', description='Address (rtsp://...), device (/dev/video0) or file, as OpenCV opens it'
+        '', description='Address (rtsp://...), device (/dev/video0) or file that OpenCV can open'
     )
     feed_port: int = Field(14700, ge=1, le=65535, description='UDP port of the measurement feed')
     feed_address: str = Field(
         '127.0.0.1',
         min_length=1,
-        description='Address of this host on which the measurement feed is received; 0.0.0.0: all, '
-        'from a robot on the network',
+        description='Address of this host for the measurement feed; 0.0.0.0: all addresses, for a '
+        'robot on the network',
     )
     image_transport: Literal['raw', 'compressed'] = Field(
-        'raw', description='Images as camera/image_raw, or as camera/image_raw/compressed'
+        'raw', description='Topic of images: camera/image_raw or camera/image_raw/compressed'
     )
     image_reliability: Literal['best_effort', 'reliable'] = Field(
         'best_effort',
-        description='Quality of service with which images are read; best_effort matches every '
+        description='Quality of service of the image subscription; best_effort matches every '
         'camera',
     )
     calibration_file: str = Field(
         '',
-        description="Calibration of the camera as ROS's camera_calibration writes it (YAML); "
-        'none: the parameters of the camera',
+        description="Calibration file of ROS's camera_calibration (YAML); default: the parameters "
+        'of the camera',
     )
     odometry_frame: str = Field(
         '',
-        description='What odom.header.frame_id has to be; none: odom, with this namespace or '
-        'without one',
+        description='Required odom.header.frame_id; default: odom, with or without this namespace',
     )
     odometry_origin: Literal['zero', 'first', 'map'] = Field(
         'zero',
-        description='What the odometry shows at the start: zero, or its first message; '
-        'map: it is in the map already, and so is its header.frame_id. Odometry with this '
-        'frame_id is taken as in the map in any case',
+        description='Odometry at the start: zero, or its first message; map: poses are map poses '
+        'already. Odometry with the frame_id of the map always counts as map poses',
     )
     pose_source: Literal['odometry', 'tf', 'pose'] | None = Field(
         None,
-        description='Where poses come from: `odom` (with link mavlink the autopilot), the '
-        'transform from the frame map to `base_frame` on /tf, or the topic `pose` '
-        '(geometry_msgs/PoseStamped, in the map); none: tf with navigation nav2, so that targets '
-        'are placed where the robot drives, else odometry; the others not in lockstep, and with '
-        'link topics or mavlink',
+        description='Source of poses: `odom` (with link mavlink the autopilot), the transform '
+        'from map to `base_frame` on /tf, or the topic `pose` (geometry_msgs/PoseStamped, in the '
+        'map). Default: tf with navigation nav2, else odometry. tf and pose need link topics or '
+        'mavlink, without lockstep',
     )
-    base_frame: str = Field('', description="The robot's own frame on /tf; none: <robot>/base_link")
+    base_frame: str = Field('', description="The robot's frame on /tf; default: <robot>/base_link")
     tf_rate: float = Field(
         20.0,
         ge=0.0,
         le=1000.0,
-        description="How often the robot's pose is published on /tf, at most; 0: neither its "
-        'frames nor robot_description are published [Hz]',
+        description="Largest rate of the robot's pose on /tf; 0: no frames and no "
+        'robot_description [Hz]',
     )
     odometry_timeout: float = Field(
         0.5,
         ge=0.1,
-        description='Time without odometry, or without a pose on /tf, after which the robot is '
-        'stopped; not in lockstep [s]',
+        description='Time without odometry, or a pose on /tf, after which the robot is stopped; '
+        'not in lockstep [s]',
     )
     frozen_pose_timeout: float = Field(
         1.0,
         ge=0.0,
-        description='Time by the odometry for which its pose may be the same to the bit under a '
-        'command to move, before the robot is stopped; 0: disabled; not in lockstep [s]',
+        description='Odometry time with a bit-identical pose under a command to move after which '
+        'the robot is stopped; 0 disables this; not in lockstep [s]',
     )
     sensor_timeout: float | None = Field(
         None,
         ge=0.0,
-        description='Time by the odometry without a new image or sweep after which the robot is '
-        'stopped; none: three periods of the sensor, at least 1 s; 0: disabled; not in '
+        description='Odometry time without a new image or sweep after which the robot is stopped; '
+        'default: three periods of the sensor, at least 1 s; 0 disables this; not in '
         'lockstep [s]',
     )
     command_type: CommandType = 'auto'
     battery_timeout: float = Field(
         30.0,
         ge=0.0,
-        description='Time by the odometry without a charge after which that counts as unknown; '
-        '0: the last one stays [s]',
+        description='Odometry time without a charge after which it counts as unknown; 0: the last '
+        'charge stays [s]',
     )
     chargers: list[Vector3] = Field(
-        default_factory=list, description='Where it is charged; none: at its start [m, map]'
+        default_factory=list, description='Position of its charger; default: its start [m, map]'
     )
 
     @property
     def poses(self) -> str:
-        """Where poses come from: odometry, tf or pose."""
+        """Source of poses: odometry, tf or pose."""
         if self.pose_source is not None:
             return self.pose_source
         return 'tf' if self.navigation == 'nav2' else 'odometry'
@@ -288,14 +285,14 @@ class DriverSettings(DrivenRobot, NodeSettings):
 
 
 class GuardSettings(NodeSettings):
-    """What the guard of a robot needs to know."""
+    """Settings of the guard of a robot."""
 
     lease: float = Field(
         LIVELINESS_LEASE,
         ge=LIVELINESS_LEASE,
         le=60.0,
-        description='Time without an assertion of liveliness after which the driver is dead '
-        '[s of wall time]',
+        description='Wall time without an assertion of liveliness after which the driver counts as '
+        'lost [s]',
     )
 
     command_type: CommandType = 'auto'

@@ -1,4 +1,4 @@
-"""A camera as a robot's sensor: image source, decoding, detection; or boxes of another detector."""
+"""A camera as a robot's sensor: images to detections, or boxes of another detector."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,10 +29,10 @@ from maasi_filter.ros.qos import RELIABLE, SENSOR, sensor_reader
 
 
 def boxes_to_blobs(message: Any, camera: CameraSettings) -> tuple[Blobs, list[str]]:
-    """Return the boxes of a `vision_msgs/Detection2DArray` that are used, and errors of others.
+    """Return the usable boxes of a `vision_msgs/Detection2DArray`, and errors of the others.
 
-    A box is labelled by its hypothesis with the largest score; one that is not a number is left
-    out. The id of a tracker is no identity: it is another one when a target is seen again.
+    A box is labelled by its hypothesis with the largest finite score. A tracker's id is no
+    identity, as it changes when a target is seen again.
     """
     settings, size = camera.detections, np.array([camera.width, camera.height], dtype=float)
     assert settings is not None
@@ -53,11 +53,11 @@ def boxes_to_blobs(message: Any, camera: CameraSettings) -> tuple[Blobs, list[st
     points, extents = 0.5 * (low + high), high - low
     if settings.point == 'foot':
         points[:, 1] = high[:, 1]
-    # Of a cut box the point may be outside of the image.
+    # The point of a cut box may be outside of the image.
     cut = ((low < 1.0) | (high > size - 1.0)).any(axis=1)
     deviations = np.where(cut, 0.5, settings.error)[:, None] * extents
     blobs = Blobs(
-        # A box that is 1 px wide reaches from 0 to 1, while pixel centres are at whole numbers.
+        # A box of 1 px reaches from 0 to 1, while pixel centres are integers.
         points - 0.5,
         extents.prod(axis=1),
         extents,
@@ -70,7 +70,7 @@ def boxes_to_blobs(message: Any, camera: CameraSettings) -> tuple[Blobs, list[st
 
 
 def _best(item: Any) -> tuple[Any, list[float]]:
-    """Return the hypothesis of a box with the largest score, and scores that are not a number."""
+    """Return the hypothesis of a box with the largest score, and invalid scores."""
     given = [result.hypothesis for result in item.results]
     known = [hypothesis for hypothesis in given if not np.isnan(hypothesis.score)]
     if given and not known:
@@ -80,7 +80,7 @@ def _best(item: Any) -> tuple[Any, list[float]]:
 
 
 def _corners(box: Any, size: FloatArray) -> FloatArray:
-    """Return the least and largest x and y of a box, which may be turned, in the image (2, 2)."""
+    """Return the least and largest x and y of a (possibly rotated) box in the image (2, 2)."""
     place, turn = box.center.position, box.center.theta
     numbers = np.array([place.x, place.y, box.size_x, box.size_y, turn])
     centre, extent = numbers[:2], numbers[2:4]
@@ -100,7 +100,7 @@ def _corners(box: Any, size: FloatArray) -> FloatArray:
     return np.clip([centre - half, centre + half], 0.0, size)
 
 
-# Decodes an image, or returns the blobs found on board; called only for images that answer a batch.
+# Decodes an image or returns the blobs found on board; only called for images that answer a batch.
 Picture = Callable[[], ImageArray | Blobs]
 
 
@@ -110,13 +110,12 @@ CALIBRATION = 'calibration'  # kind of fault
 class CameraInput(SensorInput[Picture]):
     """A camera that sees markers on the floor.
 
-    Calibration: from the file of the parameter `calibration_file`, else from the parameters;
-    a `camera_info` with a focal length replaces either. One that cannot be used is a fault.
-
-    Images come from a topic, or by the parameter `image_source` from a video (a stream, a device
-    or a file), or as blobs that were found on board (measurement feed); with `camera.detections`
-    boxes come instead. These are seen by the camera whose optical frame their header names: that
-    of the settings (`<robot>/camera_optical`, or no name), or one that tf connects with the robot.
+    Calibration: from the parameter `calibration_file`, else the parameters; a `camera_info`
+    with a focal length replaces either. An invalid one is a fault. Images come from a topic, a
+    video (stream, device or file), or as blobs from on board (measurement feed), by the
+    parameter `image_source`; with `camera.detections` boxes come instead. The header names the
+    camera's optical frame: that of the settings (`<robot>/camera_optical`, or no name), or one
+    that tf connects with the robot.
 
     Subscribes
     ----------
@@ -129,19 +128,19 @@ class CameraInput(SensorInput[Picture]):
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
-        # None where images come from a topic.
+        # None if images come from a topic.
         self._source: VideoSource | FeedReceiver | None = None
         self._calibration: tuple[object, ...] | None = None
         self._classes: set[str] = set()  # of boxes
-        self._unusable = ''  # why the calibration cannot be used
+        self._unusable = ''  # why the calibration is unusable
         self._checksum: int | None = None
 
     def prepare(self) -> None:
-        """Open the image source, and make the detector."""
+        """Open the image source and create the detector."""
         settings = self.driver.settings
         if settings.camera is None:
             raise SettingsError(
-                'parameter camera: got nothing, allowed are the settings of a camera '
+                'parameter camera: read nothing, allowed are the settings of a camera '
                 '(camera.width, ...)'
             )
         if settings.image_source != 'topic':
@@ -176,7 +175,7 @@ class CameraInput(SensorInput[Picture]):
         self.camera, self._detector = camera, detector
 
     def set_up(self) -> None:
-        """Compile and connect."""
+        """Compile kernels and connect."""
         driver, settings = self.driver, self.driver.settings
         grey = np.full((self.camera.height, self.camera.width, 3), 120, np.uint8)
         # Images are read-only views of messages.
@@ -198,7 +197,7 @@ class CameraInput(SensorInput[Picture]):
         if settings.image_source != 'topic':
             driver.create_wall_timer(0.01, self._poll_source)
             return
-        # Reliable images are sent again when lost: on a slow network that delays the next ones.
+        # Lost reliable images are sent again, which delays the next ones on a slow network.
         if settings.image_reliability == 'reliable':
             quality = RELIABLE if settings.lockstep else SENSOR
         if settings.image_transport == 'raw':
@@ -217,7 +216,7 @@ class CameraInput(SensorInput[Picture]):
     # ---- image to detections -----------------------------------------------------------------
 
     def detect(self, data: Picture, pose: StampedPose) -> SensorReading:
-        """Decode an image, and return the markers in it."""
+        """Decode an image and return its markers."""
         if self._unusable:
             raise ValueError(self._unusable)
         picture = data()
@@ -230,8 +229,8 @@ class CameraInput(SensorInput[Picture]):
         if share > 0.01:
             self.driver.warn_throttled(
                 'exposure',
-                f'image: {share:.0%} of the pixels are clipped at 255, good is at most 1%: '
-                'lower the exposure, or markers are missed or misplaced',
+                f'image: {100.0 * share:.0f} % of the pixels are clipped at 255 (good: at most '
+                '1 %); reduce the exposure to avoid missed or misplaced markers',
             )
         return reading
 
@@ -288,12 +287,12 @@ class CameraInput(SensorInput[Picture]):
     # ---- image source: topic ------------------------------------------------------------------
 
     def _on_calibration(self, message: CameraInfo) -> None:
-        # Without a focal length the camera has not been calibrated.
+        # Without a focal length the camera is not calibrated.
         if message.k[0] == 0.0:
             self.driver.warn_throttled(
                 'calibration',
-                'camera/camera_info: k is zero, the camera is not calibrated: the intrinsics of '
-                'the settings are used',
+                'camera/camera_info: k is zero, so the camera is not calibrated: using the '
+                'intrinsics of the settings',
             )
             return
         roi = message.roi
@@ -308,13 +307,13 @@ class CameraInput(SensorInput[Picture]):
         try:
             self._use(self.camera.with_camera_info(message))
         except (ValueError, np.linalg.LinAlgError) as error:
-            # Measurements by other intrinsics would be wrong.
+            # Measurements with other intrinsics would be wrong.
             self._unusable = f'camera/camera_info: {error}'
             health.begin(CALIBRATION, self._unusable)
             self.driver.publish_fault()
             return
         self._unusable = ''
-        health.end(CALIBRATION, 'camera/camera_info: a calibration that can be used')
+        health.end(CALIBRATION, 'camera/camera_info: valid calibration received')
 
     def _on_image(self, message: Image) -> None:
         try:
@@ -347,7 +346,7 @@ class CameraInput(SensorInput[Picture]):
         self.driver.receive_frame('camera/detections', stamp, lambda: blobs)
 
     def _watch_classes(self, message: Any) -> None:
-        """Warn of each new class while there was no box of the classes that are looked for."""
+        """Warn of each new class while no box has a wanted class."""
         settings, number = self.camera.detections, len(self._classes)
         if settings is None or not settings.classes or self._classes.intersection(settings.classes):
             return
@@ -359,26 +358,25 @@ class CameraInput(SensorInput[Picture]):
             return
         self.driver.get_logger().warning(
             f'camera/detections: no box has a class of camera.detections.classes, '
-            f'{", ".join(map(repr, settings.classes))}; seen are '
+            f'{", ".join(map(repr, settings.classes))}; received are '
             f'{", ".join(repr(name[:40]) for name in sorted(self._classes)[:20])}'
         )
 
     def _placed(self, frame: str, stamp: int) -> Camera:
-        """Return the camera, where its optical frame is on the robot at a stamp [ns]."""
+        """Return the camera with the pose of its optical frame on the robot at a stamp [ns]."""
         camera = Camera.from_settings(self.camera)
         if frame in ('', f'{self.driver.robot}/camera_optical'):
             return camera
         pose = self.driver.frames.on_robot(frame, stamp)
         if pose.rotation()[2, 2] > 0.5:
             raise ValueError(
-                f'camera/detections.header.frame_id: read {frame[:40]!r}, whose z axis points up, '
-                'as that of a body; allowed is the optical frame of the camera (x right, y down, '
-                'z forward)'
+                f'camera/detections.header.frame_id: read {frame[:40]!r}, whose z axis points up; '
+                'allowed is the optical frame of the camera (x right, y down, z forward)'
             )
         return replace(camera, position=pose.position, rotation=pose.rotation())
 
     def _is_repeated(self, data: Any) -> bool:
-        """Return whether an image is the one before to the bit: noise never is."""
+        """Return whether an image is bit-identical to the last one, which noise prevents."""
         if self.driver.settings.lockstep or not self.driver.settings.sensor_patience:
             return False
         before, self._checksum = self._checksum, crc32(data)

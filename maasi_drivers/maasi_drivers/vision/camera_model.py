@@ -1,4 +1,4 @@
-"""Pinhole camera on a robot: pixels to the floor and back."""
+"""Pinhole camera on a robot: projection to pixels and to the floor."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from maasi_filter.models.pose import Pose
 # From optical axes (x right, y down, z forward) to REP-103 axes (x forward, y left, z up).
 _OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
-_STEPS, _EXACT = 60, 1e-11  # of the iteration that undoes a distortion: number, error [px]
-_MISSED = 1e-6  # farther than this from its pixel an undistorted point is none [px]
+_STEPS, _EXACT = 60, 1e-11  # iterations to invert a distortion: number, error [px]
+_MISSED = 1e-6  # undistorted points farther from their pixel are invalid [px]
 
 
 @dataclass(frozen=True)
 class Camera:
     """A calibrated camera mounted on a robot.
 
-    `matrix` (3, 3) is the left part of C in 001, eq. (18) [px], `distortion` has the coefficients
-    of the `model` in the order of OpenCV. Centre and rotation of the optical frame are in the
-    robot's [m].
+    `matrix` (3, 3) is the left part of C in paper 001, eq. (18) [px]; `distortion` has the
+    coefficients of the `model` in OpenCV's order. Centre [m] and rotation of the optical frame
+    are in the robot's frame.
     """
 
     width: int
@@ -39,7 +39,7 @@ class Camera:
 
     @classmethod
     def from_settings(cls, settings: CameraSettings) -> Camera:
-        """Build the camera that the settings describe."""
+        """Create the camera of the settings."""
         cx, cy = settings.principal_point or (
             (settings.width - 1) / 2.0,
             (settings.height - 1) / 2.0,
@@ -64,10 +64,10 @@ class Camera:
         return np.asarray(pose.position) + pose.rotation() @ self.position
 
     def project(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Return the pixels (n, 2) of positions (n, 3) in the map (001, eq. (17)) [m].
+        """Return the pixels (n, 2) of positions (n, 3) in the map (paper 001, eq. (17)) [m].
 
-        Also outside the image; not a number for what is behind the camera or so far off its axis
-        that the distortion model does not hold.
+        Also outside of the image; nan behind the camera, or too far off its axis for the
+        distortion model.
         """
         points = np.reshape(np.asarray(positions, float), (-1, 3)) - self.centre(pose)
         points = points @ (pose.rotation() @ self.rotation)
@@ -79,7 +79,7 @@ class Camera:
         return pixels
 
     def _distorted(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the pixels (n, 2) of normalised points (n, 2), and their derivatives (n, 2, 2)."""
+        """Return the pixels (n, 2) of normalised points (n, 2) with derivatives (n, 2, 2)."""
         if not len(points):
             return np.empty((0, 2)), np.empty((0, 2, 2))
         still = np.zeros(3)
@@ -91,14 +91,13 @@ class Camera:
         return np.reshape(pixels, (-1, 2)), np.reshape(slopes[:, first : first + 2], (-1, 2, 2))
 
     def undistort(self, pixels: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return rays (n, 2) of pixels, nan: no inverse; their derivatives (n, 2, 2) [1/px]."""
+        """Return rays (n, 2) of pixels (nan: no inverse) with derivatives (n, 2, 2) [1/px]."""
         given = np.reshape(np.asarray(pixels, float), (-1, 2))
         points = (given - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]
         points *= np.minimum(1.0, 0.9 * self.largest_radius / np.hypot(*points.T).clip(1e-9))[
             :, None
         ]
-        # Newton's method, for all models; from a step that leads farther off it goes half of the
-        # distance back.
+        # Newton's method for all models; a step that increases the error is halved.
         active, step = np.arange(len(given)), np.zeros_like(points)
         missed, share = np.full(len(given), np.inf), np.ones(len(given))
         for _ in range(_STEPS):
@@ -125,15 +124,15 @@ class Camera:
     def back_project(
         self, pixels: ArrayLike, pose: Pose, height: float = 0.0
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return where pixels are on the plane z = height [m, map] (001, eq. (17) with z_w known).
+        """Return pixel positions on the plane z = height [m, map] (paper 001, eq. (17), z_w known).
 
-        Positions (n, 2), not a number where a ray does not meet the plane; derivatives by the pixel
-        (n, 2, 2) [m/px], and (n, 2, 6) by x, y, z of the robot and by rotations about the axes of
-        the map [m/m, m/rad].
+        Positions (n, 2), nan where a ray does not meet the plane; derivatives by pixel (n,
+        2, 2) [m/px], and (n, 2, 6) by x, y, z of the robot and rotations about map axes
+        [m/m, m/rad].
         """
         points, by_pixel = self.undistort(pixels)
         turn, centre = pose.rotation() @ self.rotation, self.centre(pose)
-        # Directions of the rays in the map, and their way down for one metre along the axis.
+        # Directions of the rays in the map, and their descent per metre along the axis.
         x, y, down = (points[:, :1] * row[0] + points[:, 1:] * row[1] + row[2] for row in turn)
         with np.errstate(invalid='ignore', divide='ignore'):
             scale = (height - centre[2]) / down
@@ -144,8 +143,8 @@ class Camera:
         positions = centre[:2] + scale * rays
         by_u, by_v = (scale * (turn[:2, k] - slopes * turn[2, k]) for k in (0, 1))
         by_pixel = by_u[..., None] * by_pixel[:, None, 0] + by_v[..., None] * by_pixel[:, None, 1]
-        # A small rotation r of the robot moves a point by r x arm. A move w of a point on a ray
-        # moves where the ray meets the plane by w_xy - slope w_z.
+        # A small rotation r of the robot moves a point by r x arm. A shift w of a point on a ray
+        # shifts the intersection with the plane by w_xy - slope w_z.
         arm_x, arm_y = (positions - pose.position[:2]).T
         arm_z = height - pose.position[2]
         by_pose = np.zeros((len(points), 2, 6))
@@ -159,25 +158,25 @@ class Camera:
         return positions, by_pixel, by_pose
 
     def margin(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Return how far inside the image positions (n, 3) are seen, shape (n,) [px].
+        """Return the distance of positions (n, 3) to the image border, inside positive, (n,) [px].
 
-        Negative outside, minus infinity where the camera cannot see at all.
+        Minus infinity where the camera cannot see.
         """
         pixels, last = self.project(positions, pose), np.array([self.width, self.height]) - 1.0
-        # The image reaches half a pixel beyond the outermost pixel centres.
+        # The image extends half a pixel beyond the outermost pixel centres.
         margins = np.minimum(pixels, last - pixels).min(axis=1) + 0.5
         return np.where(np.isnan(margins), -np.inf, margins)
 
 
 def _largest_radius(distortion: FloatArray, model: str) -> float:
-    """Return the radius of a normalised point at which a model ends: beyond it has no inverse."""
+    """Return the radius of a normalised point beyond which a model has no inverse."""
     if model == 'equidistant':
-        # Angles from the axis, up to a quarter of a turn.
+        # Angles from the axis, up to 90 degrees.
         k1, k2, k3, k4 = distortion
         ends = np.roots([9.0 * k4, 7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
     else:
         k1, k2, _, _, k3, *below = distortion[:8].tolist()
-        # Polynomials of the squared radius; the radial model stops growing, or divides by zero.
+        # Polynomials of the squared radius: the radial model stops growing or divides by zero.
         top, bottom = np.poly1d([k3, k2, k1, 1.0]), np.poly1d([*below[::-1], 1.0])
         grows = top * bottom + 2.0 * np.poly1d([1.0, 0.0]) * (
             top.deriv() * bottom - top * bottom.deriv()
@@ -193,10 +192,9 @@ def _largest_radius(distortion: FloatArray, model: str) -> float:
 def box_view_margin(
     camera: Camera, lower: ArrayLike, upper: ArrayLike, robot_height: float
 ) -> float:
-    """Return how far inside the image a box field of view lies.
+    """Return the distance of a box field of view to the image border, inside positive [px].
 
-    The distance to the border [px] is negative where a part of the box is not seen, minus infinity
-    where it lies behind the camera. `lower` and `upper` are offsets from the robot [m].
+    Minus infinity for a box behind the camera. `lower` and `upper`: offsets from the robot [m].
     """
     (left, bottom), (right, top) = (np.asarray(corner, float)[:2] for corner in (lower, upper))
     corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])

@@ -1,4 +1,4 @@
-"""The interface of a detector of a user's own: from an image to where targets are in it."""
+"""The interface of user detectors: from an image to target positions in it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Blobs:
 
 
 class Detector(ABC):
-    """Finds targets in images; one is made for each camera.
+    """Detects targets in images; each camera has its own instance.
 
     Parameters
     ----------
@@ -87,12 +87,12 @@ class Detector(ABC):
         Parameters
         ----------
         image : ndarray, shape (h, w, 3), uint8
-            R, G, B; read only.
+            R, G, B; read-only.
 
         Returns
         -------
         Blobs
-            See `blobs_at`. Each is taken for a point on the floor.
+            See `blobs_at`. Each counts as a point on the floor.
         """
 
 
@@ -106,12 +106,12 @@ def blobs_at(pixels: ArrayLike, deviation: float = 0.5, identities: tuple[str, .
     deviation : float
         Standard deviation of their error on each axis, pixels.
     identities : tuple of str
-        What tells each from all others, such as the id of a marker; empty: not known.
+        Unique name of each, such as the id of a marker; empty: unknown.
 
     Raises
     ------
     ValueError
-        If the shape is another, a number is not finite, or not each has an identity.
+        If the shape is wrong, a number is not finite, or identities are missing.
     """
     centroids = np.array(pixels, dtype=float).reshape(-1, 2)
     number = len(centroids)

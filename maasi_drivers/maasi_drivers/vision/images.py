@@ -1,4 +1,4 @@
-"""Images as arrays: from messages, and from streams, devices and files. Without ROS."""
+"""Images as arrays, from messages, streams, devices and files. Without ROS."""
 
 import threading
 import time
@@ -11,22 +11,21 @@ import numpy as np
 
 from maasi_filter.arrays import ImageArray
 
-# Encoding (sensor_msgs/image_encodings) to bytes per pixel in a row and, if those are not R, G, B,
-# the conversion.
+# Encoding (sensor_msgs/image_encodings): bytes per pixel in a row, and the conversion to RGB.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     'rgb8': (3, None),
     'bgr8': (3, cv2.COLOR_BGR2RGB),
     'rgba8': (4, cv2.COLOR_RGBA2RGB),
     'bgra8': (4, cv2.COLOR_BGRA2RGB),
-    # Luminance at each pixel, colour at every other one.
+    # Luminance of each pixel, colour of every second one.
     'yuv422': (2, cv2.COLOR_YUV2RGB_UYVY),
     'uyvy': (2, cv2.COLOR_YUV2RGB_UYVY),
     'yuv422_yuy2': (2, cv2.COLOR_YUV2RGB_YUY2),
     'yuyv': (2, cv2.COLOR_YUV2RGB_YUY2),
-    # A plane of luminance, then one of colour with half its rows.
+    # A luminance plane, then a colour plane with half its rows.
     'nv12': (1, cv2.COLOR_YUV2RGB_NV12),
     'nv21': (1, cv2.COLOR_YUV2RGB_NV21),
-    # One colour at each pixel; OpenCV names the pattern by its second row.
+    # One colour per pixel; OpenCV names the pattern by its second row.
     'bayer_rggb8': (1, cv2.COLOR_BayerBG2RGB),
     'bayer_bggr8': (1, cv2.COLOR_BayerRG2RGB),
     'bayer_gbrg8': (1, cv2.COLOR_BayerGR2RGB),
@@ -45,7 +44,7 @@ def image_to_array(message: Any) -> ImageArray:
     if encoding not in _ENCODINGS:
         raise ValueError(
             f"image encoding: got '{encoding}', allowed {', '.join(COLOUR_ENCODINGS)} "
-            '(the markers are told by their colour)'
+            '(markers are detected by colour)'
         )
     size, conversion = _ENCODINGS[encoding]
     halved = encoding in ('nv12', 'nv21')
@@ -78,12 +77,13 @@ def decode_image(message: Any) -> ImageArray:
     image = cv2.imdecode(flat, cv2.IMREAD_COLOR) if flat.size else None
     if image is None:
         raise ValueError(
-            f"image: got {flat.size} bytes of '{message.format}', allowed is what OpenCV decodes"
+            f"image: got {flat.size} bytes of '{message.format}', allowed are formats that OpenCV "
+            'decodes'
         )
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-# From one try to open a source to the next [s].
+# Time between attempts to open a source [s].
 _REOPEN = 1.0
 _OPEN_TIMEOUT, _READ_TIMEOUT = 5000, 2000
 
@@ -94,7 +94,7 @@ class ImageSourceError(ValueError):
 
 @dataclass(frozen=True)
 class VideoFrame:
-    """One image (h, w, 3) in R, G, B; when it came, monotonic clock [s]; its number, from 1."""
+    """One image (h, w, 3) in R, G, B; its arrival, monotonic clock [s]; its number, from 1."""
 
     image: ImageArray
     received: float
@@ -102,19 +102,19 @@ class VideoFrame:
 
 
 class VideoSource:
-    """Keeps the newest frame; what breaks off is opened again, a file is played once."""
+    """Keeps the newest frame; reopens a broken stream, plays a file once."""
 
     def __init__(self, source: str) -> None:
         if not source:
             raise ImageSourceError(
-                "video: got '', allowed are an address (rtsp://...), a device (/dev/video0) or a "
+                "video: read '', allowed are an address (rtsp://...), a device (/dev/video0) or a "
                 'file'
             )
         self.source = source
         self.live = '://' in source or source.startswith('/dev/') or source.isdigit()
-        self.error = ''  #: what is wrong; empty while frames come
-        self.ended = False  #: whether a file has come to its end
-        # The newest one, until it is taken.
+        self.error = ''  # : problem; empty while frames arrive
+        self.ended = False  # : whether a file has ended
+        # The newest one until it is taken.
         self._frames: deque[VideoFrame] = deque(maxlen=1)
         self._count = 0
         self._closing = threading.Event()
@@ -144,7 +144,7 @@ class VideoSource:
             capture = cv2.VideoCapture(self.source)
         if not capture.isOpened():
             capture.release()
-            raise ImageSourceError(f'video: {self.source}: OpenCV cannot open it')
+            raise ImageSourceError(f'video: {self.source}: cannot be opened by OpenCV')
         return capture
 
     def _read(self) -> None:

@@ -15,9 +15,9 @@ from maasi_filter.models.sensor import Sensor
 
 
 class MarkerDetector:
-    """The camera as a sensor of range and bearing to markers on the floor (001, section 6.1).
+    """The camera as a sensor of range, bearing and (in 3D) elevation to markers on the floor.
 
-    In 3D of elevation as well.
+    See paper 001, section 6.1.
     """
 
     def __init__(self, settings: CameraSettings, dimension: int = 2) -> None:
@@ -35,14 +35,14 @@ class MarkerDetector:
             )
 
     def segment(self, image: ImageArray) -> Blobs:
-        """Return where markers are in an image, by the rule of the settings."""
+        """Return the markers in an image, by the rule of the settings."""
         self.check_size(*image.shape[1::-1])
         if self._own is not None:
             return self._own.detect(image)
         return segment(image, self.settings.segmentation)
 
     def check_size(self, width: int, height: int) -> None:
-        """Raise `ValueError` for an image of another size than the calibrated one."""
+        """Raise `ValueError` if the image size differs from the calibration."""
         camera = self.camera
         if (width, height) != (camera.width, camera.height):
             raise ValueError(
@@ -53,11 +53,11 @@ class MarkerDetector:
     def detect(
         self, picture: ImageArray | Blobs, pose: Pose, pose_covariance: FloatArray | None = None
     ) -> SensorReading:
-        """Find the markers in an image, or in blobs that were found in it.
+        """Detect the markers in an image, or in blobs found in it.
 
-        To first order, with the covariances of pixels and pose (000, eq. (6) to (9)). Without a
-        covariance (6, 6) of the pose it is that of the settings' deviations. `ValueError` if the
-        image has another size than the calibrated one.
+        First-order errors from the covariances of pixels and pose (paper 000, eq. (6) to
+        (9)); without a pose covariance (6, 6), the settings' deviations count. Raises
+        `ValueError` if the image size differs from the calibration.
         """
         camera, settings = self.camera, self.settings
         blobs = picture if isinstance(picture, Blobs) else self.segment(picture)
@@ -65,7 +65,7 @@ class MarkerDetector:
             pose_covariance = self._pose_covariance
         positions, by_pixel, by_pose = camera.back_project(blobs.centroids, pose)
         on_floor = np.isfinite(positions).all(axis=1)
-        # Areas and extents in the image, in those of a marker there.
+        # Areas and extents in the image, relative to those of a marker there.
         with np.errstate(invalid='ignore'):
             scale = np.abs(
                 by_pixel[:, 0, 0] * by_pixel[:, 1, 1] - by_pixel[:, 0, 1] * by_pixel[:, 1, 0]
@@ -73,12 +73,12 @@ class MarkerDetector:
             parts = 4.0 / np.pi * blobs.areas * scale / settings.marker_diameter**2
             reach = blobs.extents.max(axis=1, initial=0.0) * np.sqrt(scale)
             reach /= settings.marker_diameter
-        # The size of a box says nothing about a marker's.
+        # The size of a box says nothing about a marker's size.
         sized, boxes = np.ones(len(blobs), dtype=bool), settings.detections is not None
         if settings.segmentation.rule == 'robust' and not boxes:
             least = settings.segmentation.minimum_diameter
             most = settings.segmentation.maximum_diameter
-            # Of a marker that the border cuts enough must be left to tell it from other things.
+            # Enough of a cut marker must remain to recognise it.
             sized = (parts <= most**2) & (parts >= np.where(blobs.border_cut, 0.4, least**2))
             sized &= ~blobs.border_cut | (reach <= most)
         whole = ~blobs.border_cut if settings.cut_blobs == 'drop' else np.ones(len(blobs), bool)
@@ -91,7 +91,7 @@ class MarkerDetector:
         blobs, positions = blobs.select(keep), positions[keep]
         pixel_covariances = blobs.covariances + settings.pixel_noise**2 * np.eye(2)
         if blobs.border_cut.any() and not boxes:
-            # A cut marker's centroid is off by up to its radius: a uniform error, in any direction.
+            # A cut marker's centroid is off by up to its radius: uniform error in any direction.
             middle = (camera.width - 1) / 2.0, (camera.height - 1) / 2.0
             area = np.abs(np.linalg.det(camera.back_project([middle], pose)[1][0]))
             radius = 0.5 * settings.marker_diameter * float(1.0 / np.sqrt(area))
@@ -102,7 +102,7 @@ class MarkerDetector:
             covariances = covariances + by_pose @ pose_covariance @ by_pose.transpose(0, 2, 1)
         places, spread = np.zeros((len(positions), 3)), np.zeros((len(positions), 3, 3))
         places[:, :2] = positions
-        # The floor's height is off by 5 mm: covariances stay regular in 3D.
+        # A floor height error of 5 mm keeps covariances regular in 3D.
         spread[:, :2, :2], spread[:, 2, 2] = covariances, 0.005**2
         used = slice(self._model.dimension)
         return SensorReading(
@@ -118,8 +118,8 @@ def read_markers(
 ) -> SensorReading:
     """Return the markers in a decoded image, or blobs: segmentation, projection, field of view.
 
-    Driver and in-process search call this same function. An all-zero covariance of the pose is
-    unknown. `ValueError` for an image of another size than the calibrated one.
+    Used by driver and in-process search. An all-zero pose covariance counts as unknown. Raises
+    `ValueError` if the image size differs from the calibration.
     """
     covariance = pose.covariance if pose.covariance.any() else None
     return detector.detect(picture, pose.pose, covariance).in_field_of_view(sensor, pose.pose)

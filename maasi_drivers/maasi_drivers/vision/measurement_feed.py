@@ -1,7 +1,6 @@
-"""Blobs over UDP: for a robot that segments its images on board. Without ROS.
+"""Blobs over UDP from a robot that segments its images on board. Without ROS.
 
-One datagram is what was seen in one image. The layout is in docs/measurement_feed.md; everything
-is little-endian.
+One datagram per image, little-endian, with the layout in docs/measurement_feed.md.
 """
 
 import socket
@@ -19,28 +18,28 @@ from maasi_drivers.vision.images import ImageSourceError
 
 MAGIC = b'MSMF'
 VERSION = 1
-#: Most blobs of one image.
+# : Most blobs per image.
 MOST = 256
 BORDER_CUT = 1
-HAS_POSE = 1  #: of the flags: the robot's pose follows the header
+HAS_POSE = 1  # : flag: the robot's pose follows the header
 
 _HEADER = struct.Struct('<4sBBHHHII')
 _POSE = struct.Struct('<7fI')
 _BLOB = np.dtype([('numbers', '<f4', 8), ('mark', '<u4')])
 _CHECKSUM = struct.Struct('<I')
-_OLDEST = 10.0  # images older than this are dropped [s]
-# A pose farther from the take-off point, or with more tilt, is invalid [m, rad].
+_OLDEST = 10.0  # older images are dropped [s]
+# Poses farther from the take-off point, or with more tilt, are invalid [m, rad].
 _FARTHEST, _MOST_TILT = 1000.0, 1.5
-_FAR_BEHIND = 1000  # a sequence number that is farther behind belongs to a restarted sender
-_SILENCE = 2.0  # so does any, after a silence of this length [s]
+_FAR_BEHIND = 1000  # a larger decrease of the sequence number means a restarted sender
+_SILENCE = 2.0  # any number is accepted after a silence of this length [s]
 
 
 class FeedError(ValueError):
-    """An invalid datagram; the text has field, value read, values allowed."""
+    """An invalid datagram; the text gives field, value read and allowed values."""
 
 
 class FeedState(IntEnum):
-    """State of flight of a robot that sends its pose."""
+    """Flight state of a robot that sends its pose."""
 
     GROUND = 0
     AIR = 1
@@ -49,11 +48,11 @@ class FeedState(IntEnum):
 
 @dataclass(frozen=True)
 class FeedPose:
-    """The robot's own estimate of its pose when the image was taken.
+    """The robot's own pose estimate at the image.
 
-    `position` is from where it took off: forward, left, up, axes of the heading then [m]. Angles
-    are right-handed about these, yaw from the heading at take-off [rad]. A negative charge is not
-    known.
+    `position` from the take-off point: forward, left, up in the axes of the heading then [m].
+    Angles are right-handed about these axes, yaw from the heading at take-off [rad]. A negative
+    charge is unknown.
     """
 
     position: np.ndarray
@@ -66,7 +65,7 @@ class FeedPose:
 
 @dataclass(frozen=True)
 class FeedPacket:
-    """What was seen in one image: its number, counted up, its age when sent [s], its size [px]."""
+    """The content of one image: number (counted up), age when sent [s], size [px], blobs."""
 
     sequence: int
     age: float
@@ -103,7 +102,7 @@ def encode(packet: FeedPacket) -> bytes:
     rows['mark'][blobs.border_cut] = BORDER_CUT
     data += rows.tobytes()
     data += _CHECKSUM.pack(zlib.crc32(data))
-    # Raises for what a receiver would refuse.
+    # Raises errors for what a receiver would refuse.
     decode(data)
     return data
 
@@ -165,14 +164,14 @@ def _read_pose(values: tuple[float, ...]) -> FeedPose:
 
 
 def _check(numbers: np.ndarray, marks: np.ndarray, width: int, height: int) -> None:
-    """Raise for the first blob that cannot be."""
+    """Raise an error for the first invalid blob."""
     finite = np.isfinite(numbers).all(axis=1)
-    # Pixel centres are at whole numbers.
+    # Pixel centres are integers.
     inside = (numbers[:, :2] >= -0.5).all(axis=1) & (
         numbers[:, :2] <= np.array([width, height]) - 0.5
     ).all(axis=1)
     uu, uv, vv = numbers[:, 2], numbers[:, 3], numbers[:, 4]
-    # Room for the rounding of single precision.
+    # Tolerance for rounding to single precision.
     proper = (uu >= 0.0) & (vv >= 0.0) & (uv * uv <= uu * vv * (1.0 + 1e-5) + 1e-12)
     sized = (numbers[:, 5:] >= 0.0).all(axis=1)
     for good, what in (
@@ -189,9 +188,9 @@ def _check(numbers: np.ndarray, marks: np.ndarray, width: int, height: int) -> N
 
 
 class FeedReceiver:
-    """Receives a feed; poll it often.
+    """Receives a feed; to be polled often.
 
-    `on_drop` takes the reason, a text, and the number of packets that are refused or lost.
+    `on_drop` receives the reason, a text, and the number of refused or lost packets.
     """
 
     def __init__(
@@ -221,10 +220,7 @@ class FeedReceiver:
         self._socket.close()
 
     def take(self) -> list[tuple[FeedPacket, float]]:
-        """Return what has come since the last call, in order.
-
-        With each packet when its image was taken, by the monotonic clock of this host [s].
-        """
+        """Return the packets since the last call with image times (monotonic clock [s])."""
         packets = []
         for _ in range(64):
             try:
@@ -243,9 +239,9 @@ class FeedReceiver:
                 continue
             last = self._last
             if last is not None and now - self._heard_at < _SILENCE:
-                # As a signed difference, so that it may wrap.
+                # As a signed difference, which may wrap.
                 ahead = (packet.sequence - last + 2**31) % 2**32 - 2**31
-                text = f'sequence: read {packet.sequence}, allowed is what follows {last}'
+                text = f'sequence: read {packet.sequence}, allowed are numbers after {last}'
                 if -_FAR_BEHIND < ahead <= 0:
                     self._on_drop('old packet', text, 1)
                     continue

@@ -1,4 +1,4 @@
-"""Markers in RGB images (h, w, 3): the papers' rule, one for any light, and fiducials."""
+"""Markers in RGB images (h, w, 3): the papers' rule, a robust rule, and fiducials."""
 
 import math
 from collections.abc import Callable
@@ -14,24 +14,24 @@ from maasi_drivers.settings.camera import DETECTORS, SegmentationSettings
 from maasi_drivers.vision.detector import Blobs, blobs_at
 from maasi_filter.arrays import BoolArray, ImageArray, IntArray
 
-# Added to the mean of the channels before dividing by it: noise in the dark is not blue.
+# Added to the mean of the channels before division, as noise in the dark is not blue.
 _DARK = 6.0
-_THREE = np.float32(3.0)  # in the type of images: products with it stay so
+_THREE = np.float32(3.0)  # in the images' type, which products with it keep
 
 
 def paper_mask(image: ImageArray, threshold: float = 35.0) -> BoolArray:
-    """Return where B - R/2 - G/2 > threshold (001, eq. (16)), by whole half grey levels."""
+    """Return where B - R/2 - G/2 > threshold (paper 001, eq. (16)), in half grey levels."""
     # Plane by plane, which is faster.
     red, green, blue = (plane.astype(np.int16) for plane in cv2.split(image))
     return np.asarray(2 * blue - red - green > int(np.floor(2.0 * threshold)))
 
 
 def _components(mask: BoolArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
-    """Return the 8-connected components of a mask (h, w), in the order of rows.
+    """Return the 8-connected components of a mask (h, w), by rows.
 
-    Labels (h, w), component plus one; boxes (n, 4): left, top, width, height; plain centroids.
+    Labels (h, w), component plus one; boxes (n, 4): left, top, width, height; centroids.
     """
-    # Labelled pixel by pixel: other algorithms number them in the order of blocks of pixels.
+    # Labelled pixel by pixel; other algorithms number by blocks of pixels.
     _, labels, stats, centroids = cv2.connectedComponentsWithStatsWithAlgorithm(
         mask.view(np.uint8), 8, cv2.CV_32S, cv2.CCL_SAUF
     )
@@ -44,7 +44,7 @@ def _components(mask: BoolArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
 
 
 def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
-    """Find blobs of a fixed blue excess, with the centroid of their pixels (001, section 6.1)."""
+    """Find blobs of a fixed blue excess with unweighted centroids (paper 001, section 6.1)."""
     mask = paper_mask(image, settings.threshold)
     blobs = _components(mask)[2]
     return blobs.select(blobs.areas >= settings.minimum_area * mask.size)
@@ -69,7 +69,7 @@ def _blueness(planes):  # type: ignore[no-untyped-def]
 def _floor_statistics(sample):  # type: ignore[no-untyped-def]
     """Return white-balance gains (3,) from pixels (3, n); median and deviation of blueness."""
     medians = np.array([max(_median(np.bincount(channel)), 1.0) for channel in sample])
-    # Bounded, as an image of mostly marker or coloured sheet is no reference.
+    # Bounded, as an image full of marker or coloured floor is no reference.
     gains = np.clip(medians.sum() / 3.0 / medians, 0.6, 1.7)
     # Blueness is between -3 and 3: bins of 1/256.
     bins = np.floor(_blueness(gains.reshape(3, 1) * sample) * 256.0).astype(np.int64) + 768
@@ -83,12 +83,12 @@ def _floor_statistics(sample):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model='numpy')
 def _is_compact(x, y, aspect, solidity):  # type: ignore[no-untyped-def]
-    """Return whether the aspect of pixels is at most, and their solidity at least, as allowed."""
+    """Return whether aspect and solidity of pixels are allowed."""
     dx, dy = x - x.mean(), y - y.mean()
     xx, yy, xy = (dx * dx).mean(), (dy * dy).mean(), (dx * dy).mean()
     # Each pixel is a square with a second moment of 1/12.
     middle, apart = 0.5 * (xx + yy) + 1.0 / 12.0, math.hypot(0.5 * (xx - yy), xy)
-    # The lengths of the axes go as the roots of the principal second moments.
+    # Axis lengths are proportional to the roots of the principal second moments.
     long, short = middle + apart, middle - apart
     # An ellipse has area 4 pi root(long short).
     least = solidity * 4.0 * math.pi * math.sqrt(long * short)
@@ -97,15 +97,15 @@ def _is_compact(x, y, aspect, solidity):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model='numpy')
 def _weigh(excess, own, floor, x, y):  # type: ignore[no-untyped-def]
-    """Return area, centroid and its variances (5,), by how much of each pixel is marker."""
-    # The excess of a pixel inside a marker: the mean of the upper half of the component.
+    """Return area, centroid and its variances (5,), weighted by the marker share of pixels."""
+    # Excess of a pixel inside a marker: mean of the upper half of the component.
     upper = np.sort(excess.ravel()[own.ravel()])[len(x) // 2 :].mean()
     around, near = floor.copy(), np.zeros_like(own)
     around[max(y.min() - 1, 0) : y.max() + 2, max(x.min() - 1, 0) : x.max() + 2] = False
     outside = excess.ravel()[around.ravel()]
     background, noise = (outside.mean(), outside.var()) if len(outside) else (0.0, 0.0)
     contrast = max(upper - background, 1e-6)
-    # The component and the ring of one pixel around it, in which there is no other component.
+    # The component and a ring of one pixel, without other components.
     for column, row in zip(x, y):
         near[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = True
     rows, columns = np.nonzero(near)
@@ -119,16 +119,16 @@ def _weigh(excess, own, floor, x, y):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model='numpy')
 def _measure(planes, gains, labels, boxes, reached, aspect, solidity):  # type: ignore[no-untyped-def]
-    """Return what `_weigh` does of each component (n, 5); zeros where it is no marker."""
+    """Return `_weigh` of each component (n, 5); zeros if it is no marker."""
     found = np.zeros((len(boxes), 5))
     for blob in np.flatnonzero(reached):
-        # The component's box and three pixels around it, for the floor.
+        # The component's box with three pixels of floor around it.
         first, end = np.maximum(boxes[blob, :2] - 3, 0), boxes[blob, :2] + boxes[blob, 2:] + 3
         rows, columns = slice(first[1], end[1]), slice(first[0], end[0])
         own, floor = labels[rows, columns] == blob + 1, labels[rows, columns] == 0
         y, x = np.nonzero(own)
         if _is_compact(x, y, aspect, solidity):
-            # O_p of 001, which is linear in how much of a pixel is marker.
+            # O_p of paper 001, which is linear in a pixel's marker share.
             red, green, blue = [gains[k] * planes[k, rows, columns] for k in range(3)]
             measured = _weigh(blue - 0.5 * (red + green), own, floor, x, y)
             if measured[0] >= 0.25 * len(x):
@@ -140,10 +140,9 @@ def _measure(planes, gains, labels, boxes, reached, aspect, solidity):  # type: 
 def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     """Find compact blobs that are bluer than the floor, in any light.
 
-    White balance by the image's median; blueness (B - max(R, G)) over the mean, on which neither
-    gradients nor exposure act; hysteresis, with a threshold raised by noise (median absolute
-    deviation); gates on aspect and solidity; centroids weighted by the share of marker in each
-    pixel.
+    White balance by the image's median; blueness (B - max(R, G)) / mean, independent of
+    gradients and exposure; hysteresis with a threshold raised by noise (median absolute
+    deviation); checks of aspect and solidity; centroids weighted by the marker share of pixels.
     """
     planes = np.array(cv2.split(image))
     # About 4096 pixels.
@@ -163,12 +162,12 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     return replace(blobs, centroids=found[:, 1:3], areas=found[:, 0], covariances=covariances)
 
 
-# Corners of a marker in its own plane, in the order of the detector.
+# Corners of a marker in its plane, in the detector's order.
 _SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=np.float32)
 
 
 def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blobs:
-    """Find whole ArUco markers by id; diagonals cross at the centre, from any perspective."""
+    """Find complete ArUco markers by id; their diagonals cross at the centre in any perspective."""
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     found, ids, _ = _detector(settings.dictionary).detectMarkers(grey)
     corners = np.reshape(np.array(found, dtype=np.float32), (-1, 4, 2))
@@ -190,6 +189,6 @@ def _detector(name: str) -> cv2.aruco.ArucoDetector:
 
 
 def segment(image: ImageArray, settings: SegmentationSettings) -> Blobs:
-    """Find marker blobs in an image (h, w, 3), uint8, by the rule that the settings name."""
+    """Find marker blobs in an image (h, w, 3), uint8, by the rule of the settings."""
     rule: Callable[[ImageArray, SegmentationSettings], Blobs] = DETECTORS.load(settings.rule)
     return rule(image, settings)

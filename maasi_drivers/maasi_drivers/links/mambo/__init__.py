@@ -1,1 +1,1 @@
-"""The link to a Parrot Mambo: pyparrot, its pilot, and its dead reckoning. Without ROS."""
+"""The link to a Parrot Mambo: pyparrot, its pilot and its dead reckoning. Without ROS."""

@@ -1,9 +1,8 @@
-"""Connection to a Parrot Mambo: pyparrot over WiFi or Bluetooth, in one thread. Without ROS.
+"""Connection to a Parrot Mambo by pyparrot (WiFi or Bluetooth), in one thread. Without ROS.
 
-Over WiFi pyparrot repeats its last packet after the link is cut: a position event is new only with
-a new stamp of speed, altitude or orientation. Over Bluetooth each notification comes once and
-counts, and so does the acknowledgement of a command, sent when nothing else is received (pyparrot,
-docs/minidronecommands.rst: "more information via wifi than via BLE").
+Over WiFi pyparrot repeats its last packet after a link loss: a position event is new only with a
+new stamp of speed, altitude or orientation. Over Bluetooth each notification counts, and so does
+the acknowledgement of a command, sent when nothing else arrives.
 """
 
 import errno
@@ -25,27 +24,27 @@ HANDSHAKE_PORT = 44444
 AIRBORNE = ('takingoff', 'hovering', 'flying', 'landing')
 
 _STAMPS = ('DroneSpeed_ts', 'DroneAltitude_ts', 'DroneQuaternion_ts')
-_ROUND = 0.05  # period of the thread's loop [s]; requests wake it
-CALLER_TIMEOUT = 0.5  # silence of its caller after which the drone is commanded to hover [s]
-_REPEAT = 0.7  # from one take-off or landing command to the next while the drone does not obey [s]
-# Longest time from a new stamp to the position that came with it; a later one is repeated [s].
+_ROUND = 0.05  # loop period of the thread [s]; requests wake it
+CALLER_TIMEOUT = 0.5  # silence of the caller after which the drone hovers [s]
+_REPEAT = 0.7  # period of take-off or landing commands until the drone obeys [s]
+# Longest delay between a new stamp and its position; a later position is a repetition [s].
 _TOGETHER = 0.4
-_OUTDATED = 1.0  # age of what was heard last after which a reported landing does not count [s]
-# Over Bluetooth: silence after which a command is sent that the drone has to acknowledge [s].
+_OUTDATED = 1.0  # a reported landing does not count after this silence [s]
+# Over Bluetooth: silence after which a command with acknowledgement is sent [s].
 _PROBE_PERIOD = 0.3
-# From one try to connect to the next [s].
+# Period of connection attempts [s].
 _RECONNECT = 1.0
 _BLUETOOTH = re.compile(r'([0-9a-fA-F]{2}:){5}[0-9a-fA-F]{2}')
-_FARTHEST = 1000.0  # farthest that a position can be from the take-off point [m]
+_FARTHEST = 1000.0  # largest distance from the take-off point [m]
 
 
 class MamboLinkError(RuntimeError):
-    """No connection to the drone; the text has cause and remedy."""
+    """No connection to the drone; the text contains cause and remedy."""
 
 
 @dataclass(frozen=True)
 class PositionEvent:
-    """The drone's own estimate of its position, in the axes of its heading at take-off."""
+    """The drone's position estimate, in the axes of its heading at take-off."""
 
     position: FloatArray  # from the take-off point: forward, left, up [m]
     yaw: float  # from the heading at take-off, anticlockwise [rad]
@@ -54,10 +53,10 @@ class PositionEvent:
 
 @dataclass(eq=False)
 class MamboLink:
-    """A connection to one Mambo, whose own thread talks to pyparrot: no call waits.
+    """A connection to one Mambo with its own thread for pyparrot: no call waits.
 
-    That thread is a dead man's switch, too: `CALLER_TIMEOUT` after the last `keep_alive` the drone
-    hovers, and `land_after` later it lands.
+    The thread is also a dead man's switch: `CALLER_TIMEOUT` after the last `keep_alive` the
+    drone hovers, and `land_after` later it lands.
     """
 
     kind: Literal['wifi', 'ble'] = 'wifi'
@@ -68,15 +67,15 @@ class MamboLink:
     land_after: float = 3.0  # [s]
 
     def __post_init__(self) -> None:
-        self.error = ''  #: fault of the link; while it is not connected it keeps trying
+        self.error = ''  # : fault of the link, which keeps trying to connect
         self.connected = False  #: whether the drone has answered
-        #: Of the drone, as pyparrot calls it: landed, takingoff, hovering, flying, ...
+        # : State of the drone, in pyparrot's words: landed, takingoff, hovering, flying, ...
         self.flying_state = ''
         self.battery = -1.0  #: charge, 0 to 1; negative: not received yet
         #: Time of the last new data or acknowledgement, monotonic clock [s].
         self.heard_at = -math.inf
         self.position: PositionEvent | None = None  #: the last position event
-        #: Position events that could not be used.
+        # : Number of unusable position events.
         self.bad_events = 0
         self._drone: Any = None
         self._stamps: dict[str, Any] = {}
@@ -84,7 +83,7 @@ class MamboLink:
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._closing = threading.Event()
-        # Roll, pitch, yaw, climb of a command that was not sent yet.
+        # Roll, pitch, yaw, climb of the next command.
         self._steering: list[int] | None = None
         self._wanted: Literal['', 'take_off', 'land'] = ''
         self._asked_at = -math.inf
@@ -96,7 +95,7 @@ class MamboLink:
     def connect(self) -> None:
         """Begin to connect."""
         make = self._make_drone()
-        # pyparrot's own thread inherits that this one does not keep the process alive.
+        # pyparrot's thread inherits that this one does not keep the process alive.
         self._thread = threading.Thread(
             target=self._work, args=(make,), name='Mambo link', daemon=True
         )
@@ -104,21 +103,21 @@ class MamboLink:
 
     @property
     def airborne(self) -> bool:
-        """Whether the drone reports that it is in the air, landing included."""
+        """Whether the drone reports that it is in the air, including landing."""
         return self.flying_state in AIRBORNE
 
     @property
     def dropped(self) -> Counter[str]:
-        """Datagrams that were not used: reason to number."""
+        """Number of dropped datagrams by reason."""
         receiver = getattr(self._drone, 'drone_connection', None)
         return Counter(getattr(getattr(receiver, 'udp_receive_sock', None), 'dropped', {}))
 
     def take_off(self) -> None:
-        """Take off; repeated until it does, or until something else is requested."""
+        """Take off; repeated until it obeys or until another request."""
         self._want('take_off')
 
     def land(self) -> None:
-        """Land; repeated until it does, also while nothing is received from it."""
+        """Land; repeated until it obeys, also without reception."""
         self._want('land')
 
     def steer(self, forward: float, left: float, up: float, turn: float) -> None:
@@ -137,7 +136,7 @@ class MamboLink:
         self._called_at = time.monotonic()
 
     def close(self, patience: float = 3.0) -> None:
-        """Leave the drone to its firmware, waiting for `patience` seconds at most."""
+        """Close the link, waiting for at most `patience` seconds; the firmware takes over."""
         self._closing.set()
         self._wake.set()
         if self._thread is not None:
@@ -152,9 +151,9 @@ class MamboLink:
         self._wake.set()
 
     def check(self) -> Any:
-        """Return pyparrot's module for such drones, if it can be used here."""
+        """Return pyparrot's module for such drones, or raise an error."""
         try:
-            # Only a driver that has such a robot needs it.
+            # Only a driver of such a robot needs it.
             minidrone = importlib.import_module('pyparrot.Minidrone')
         except ImportError as error:
             raise MamboLinkError(
@@ -178,8 +177,8 @@ class MamboLink:
                 # Without a route to the drone its network may come up later.
                 if error.errno == errno.EADDRINUSE:
                     raise MamboLinkError(
-                        f'UDP port {self.port}: {error.strerror}; allowed is one that is free: one '
-                        'Mambo per process and host'
+                        f'UDP port {self.port}: {error.strerror}; allowed is a free port (one '
+                        'Mambo per process and host)'
                     ) from error
         return minidrone
 
@@ -188,7 +187,7 @@ class MamboLink:
         link = self
 
         class Sensors(minidrone.MinidroneSensors):  # type: ignore[name-defined, misc]
-            """Those of pyparrot, which also report each update."""
+            """pyparrot's sensors, which also report each update."""
 
             def update(self, name: str, value: Any, sensor_enum: Any) -> None:
                 super().update(name, value, sensor_enum)
@@ -206,7 +205,7 @@ class MamboLink:
         drone.drone_connection._set_command_received = handle_answer
         if self.kind == 'wifi':
             connection = drone.drone_connection
-            # With its own name for the type it would know no other address than 192.168.99.3.
+            # With its own name for the type it would accept only the address 192.168.99.3.
             connection.drone_type = 'Minidrone'
             connection.ip_address = self.address
             connection.udp_receive_port = self.port
@@ -243,7 +242,7 @@ class MamboLink:
                     self._wake.wait(_ROUND)
                 self._wake.clear()
         except Exception as error:
-            self.error = f'the link to the Mambo broke: {error}'
+            self.error = f'link to the Mambo lost: {error}'
         finally:
             self.connected = False
             connection = drone.drone_connection
@@ -251,7 +250,7 @@ class MamboLink:
                 drone.disconnect()
             else:
                 connection.is_listening = False
-                connection.listener_thread.join(2.0)  # its listener closes the sockets itself
+                connection.listener_thread.join(2.0)  # its listener closes the sockets
 
     def _watch_caller(self) -> None:
         late = time.monotonic() - self._called_at - CALLER_TIMEOUT
@@ -271,9 +270,9 @@ class MamboLink:
 
     def _try_to_connect(self, drone: Any) -> str:
         try:
-            return '' if drone.connect(num_retries=3) else 'it refused the connection'
+            return '' if drone.connect(num_retries=3) else 'connection refused'
         except Exception as error:
-            # pyparrot raises whatever comes up below it.
+            # pyparrot raises exceptions of all kinds.
             return str(error) or type(error).__name__
 
     def _do_wanted(self) -> None:
@@ -283,10 +282,10 @@ class MamboLink:
             if wanted == 'take_off':
                 obeyed = state in AIRBORNE
                 if obeyed:
-                    # Request it once: a drone that lands by itself stays down.
+                    # Requested once: a drone that lands by itself stays down.
                     self._wanted = ''
             else:
-                # What it reported last may be outdated.
+                # Its last report may be outdated.
                 known = state == 'landed' or now - self.heard_at <= _OUTDATED
                 obeyed = known and state in ('landed', 'landing', 'emergency')
             if not wanted or obeyed or now - self._asked_at < _REPEAT:
@@ -322,7 +321,7 @@ class MamboLink:
             keys = ('posx', 'posy', 'posz', 'psi')
             *place, psi = (float(read[f'DronePosition_{key}']) for key in keys)
             position = 0.01 * np.array(place)
-            # False for what is no number, too.
+            # False also for nan.
             if np.abs(position).max() <= _FARTHEST and math.isfinite(psi):
                 self.position = PositionEvent(position, -math.radians(psi), time.monotonic())
             else:

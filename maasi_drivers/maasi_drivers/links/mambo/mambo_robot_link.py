@@ -22,27 +22,27 @@ from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_planner.motion import MotionModel, RobotState
 
 POLL_PERIOD = 0.05  # longest time between two updates of the pilot [s]
-# At the end: longest wait until the drone reports that it lands, and between two checks [s].
+# At the end: longest wait until the drone reports landing, and time between checks [s].
 _LANDING_TIME, _LANDING_PERIOD = 1.0, 0.02
-# Share of a new difference of positions in the velocity.
+# Weight of a new difference of positions in the velocity.
 _SMOOTHING = 0.5
 _RISING = (MamboPhase.TAKING_OFF, MamboPhase.CLIMBING)
 
 
 class MamboRobotLink(RobotLink):
-    """A Parrot Mambo that pyparrot talks to.
+    """A Parrot Mambo that pyparrot controls.
 
-    It takes off when the service `arm` was called and `mambo.arm` is true, flies by its own
-    position events or by a topic of another system (`mambo.pose`), and lands at the end, on a low
-    battery, and when link or pose are lost for long.
+    It takes off after a call of the service `arm` if `mambo.arm` is true, flies by its position
+    events or by a topic (`mambo.pose`), and lands at the end, on a low battery, and after a
+    long loss of link or pose.
 
     Subscribes
     ----------
-    `pose` (geometry_msgs/PoseStamped) or `odom` (nav_msgs/Odometry) where `mambo.pose` says so
+    `pose` (geometry_msgs/PoseStamped) or `odom` (nav_msgs/Odometry) as `mambo.pose` says
 
     Services
     --------
-    `arm` (std_srvs/Trigger): it takes off once
+    `arm` (std_srvs/Trigger): permits one take-off
     """
 
     def __init__(self, driver: RobotNode) -> None:
@@ -58,7 +58,7 @@ class MamboRobotLink(RobotLink):
         if settings.motion.model == 'unicycle':
             raise SettingsError(
                 f"parameter motion.model: read 'unicycle', allowed with link {settings.link} "
-                'is that of a flying robot, as mambo'
+                'is a model of flying robots such as mambo'
             )
         kind: Literal['wifi', 'ble'] = 'ble' if settings.link == 'mambo_ble' else 'wifi'
         tilt = min(max(settings.motion.tilt, LEAST_TILT), MOST_TILT)
@@ -69,7 +69,7 @@ class MamboRobotLink(RobotLink):
             raise SettingsError(f'parameter link: {error}') from error
 
     def connect(self) -> None:
-        """Connect; it takes off once the driver is active."""
+        """Connect; it takes off only when the driver is active."""
         driver, link = self.driver, self._link
         self.activate()
         link.connect()
@@ -82,7 +82,7 @@ class MamboRobotLink(RobotLink):
         driver.expect(lambda: self._pilot.phase is MamboPhase.FLYING)
 
     def close(self) -> None:
-        """Leave the drone to its firmware."""
+        """Close the link; the firmware takes over."""
         self._link.close()
 
     def activate(self) -> None:
@@ -100,25 +100,25 @@ class MamboRobotLink(RobotLink):
             self.driver.drop('command', str(error))
 
     def hold(self) -> None:
-        """Have the drone hover."""
+        """Let the drone hover."""
         self._pilot.hover()
 
     def stop(self) -> None:
-        """Land, and wait until the drone reports that it does."""
+        """Land and wait until the drone reports it."""
         link = self._link
         self._pilot.end('the driver stops')
         end = time.monotonic() + _LANDING_TIME
         while link.connected and link.airborne and link.flying_state != 'landing':
             if time.monotonic() > end:
                 self.driver.get_logger().error(
-                    'the drone has not reported that it lands: its firmware lands by itself when '
-                    'it receives nothing'
+                    'the drone has not reported landing; without commands its firmware lands by '
+                    'itself'
                 )
                 break
             time.sleep(_LANDING_PERIOD)
 
     def latch_stop(self) -> None:
-        """Have the drone land as `MamboPilot.stop` does; on the ground it stays there."""
+        """Let the drone land as `MamboPilot.stop` does; on the ground it stays there."""
         self._pilot.stop(time.monotonic())
 
     def poll(self) -> None:
@@ -147,7 +147,7 @@ class MamboRobotLink(RobotLink):
             driver.take_charge(link.battery)  # the drone reports only changes
         state, stamp = pilot.state, driver.arrivals.stamp(now)
         if stamp is None:
-            driver.silence.end()  # a simulated time has not begun: nothing is late
+            driver.silence.end()  # before the begin of a simulated time nothing is late
         elif self._mambo.pose == 'events' and pilot.has_pose and state is not None:
             driver.restart_if_back('the clock', stamp)
             latest, covariance = driver.history.latest, pilot.reckoning.covariance()
@@ -164,12 +164,12 @@ class MamboRobotLink(RobotLink):
             self._phase = phase
             why = f': {problem}' if problem and phase not in _RISING else ''
             self.driver.get_logger().info(phase.value + why)
-        # While it takes off, a goal that it has already is kept.
+        # During take-off the current goal is kept.
         if not (problem and phase in _RISING and self.driver.follower.current is not None):
-            self.driver.judge('flight', problem, 'flying: goals are accepted')
+            self.driver.judge('flight', problem, 'flying: accepting goals')
 
     def observe(self, placed: StampedPose) -> None:
-        """Hand a pose of another system to the pilot."""
+        """Pass a pose of another system to the pilot."""
         if self._mambo.pose != 'events':
             self._pilot.update_pose(
                 time.monotonic(), RobotState(placed.pose, placed.velocity, placed.angular_velocity)
@@ -186,7 +186,7 @@ class MamboRobotLink(RobotLink):
         driver.take_pose(replace(placed, covariance=covariance, velocity=velocity))
 
     def make_motion(self) -> MotionModel:
-        """Return the controller, which the pilot uses as well."""
+        """Return the controller, also used by the pilot."""
         self._motion = super().make_motion()
         return self._motion
 
@@ -198,7 +198,7 @@ class MamboRobotLink(RobotLink):
         return super().steer(robot, step)
 
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
-        """Return whether pose and images must change: a command on the ground moves nothing."""
+        """Return whether pose and images must change; on the ground nothing moves."""
         return self._pilot.phase is MamboPhase.FLYING and super().is_moving(placed, command)
 
     def goal_taken(self, goal: Goal) -> None:
@@ -206,5 +206,5 @@ class MamboRobotLink(RobotLink):
         self._pilot.goal_taken()
 
     def goal_cancelled(self) -> None:
-        """Land the drone if no other goal follows."""
+        """Let the drone land if no other goal follows."""
         self._pilot.goal_cancelled(time.monotonic())

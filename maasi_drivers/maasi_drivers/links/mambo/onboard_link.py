@@ -1,4 +1,4 @@
-"""A Mambo with a program of its own as a driver's robot: the feed's poses, orders by UDP (001)."""
+"""A Mambo with its own program: poses from the feed, orders by UDP (paper 001)."""
 
 import socket
 import struct
@@ -22,11 +22,11 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.lifecycle_node import SettingsError
 
-_ORDER = struct.Struct('<4sBBHI4f')  # magic and version, kind, nothing, sequence, position and yaw
+_ORDER = struct.Struct('<4sBBHI4f')  # magic and version, kind, padding, sequence, position and yaw
 
 
 class OrderKind(IntEnum):
-    """What the robot is to do: be on the ground, hover where it is, or fly to the position."""
+    """Order for the robot: be on the ground, hover, or fly to the position."""
 
     LAND = 0
     HOLD = 1
@@ -41,19 +41,19 @@ def encode(sequence: int, kind: OrderKind, position: FloatArray) -> bytes:
     return data + struct.pack('<I', zlib.crc32(data))
 
 
-_PERIOD = 0.1  # between two orders [s]; without them the program on board hovers, then lands
-_LAST_ORDERS, _LAST_PERIOD = 5, 0.05  # at the end: orders to land, and the time between them [s]
+_PERIOD = 0.1  # period of orders [s]; without them the program on board hovers, then lands
+_LAST_ORDERS, _LAST_PERIOD = 5, 0.05  # at the end: number of landing orders, and their period [s]
 
 
 class OnboardLink(RobotLink):
-    """A drone with a program of its own; see docs/measurement_feed.md.
+    """A drone with its own program; see docs/measurement_feed.md.
 
-    The feed carries blobs and pose, orders go back ten times a second: be on the ground, hover, or
-    fly to a waypoint.
+    The feed carries blobs and pose; orders are sent ten times per second: be on the ground,
+    hover, or fly to a waypoint.
 
     Services
     --------
-    `arm` (std_srvs/Trigger): it takes off once, if `mambo.arm` is true
+    `arm` (std_srvs/Trigger): permits one take-off, if `mambo.arm` is true
     """
 
     def __init__(self, driver: RobotNode) -> None:
@@ -89,13 +89,13 @@ class OnboardLink(RobotLink):
         self.driver.offer_arm(self._arm)
 
     def close(self) -> None:
-        """Leave the drone to its program."""
+        """Stop sending; its own program takes over."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def activate(self) -> None:
-        """Begin a flight: it has not risen, and there is no reason why it landed."""
+        """Begin a flight without altitude and landing reason."""
         self._up, self._landed_for = False, ''
         self._rising_since: float | None = None
         self._lost_since: float | None = None
@@ -103,26 +103,26 @@ class OnboardLink(RobotLink):
     def _arm(self) -> str:
         problem = '' if self._mambo.arm else NOT_ALLOWED
         if not problem and self._feed_state is not FeedState.GROUND:
-            problem = 'it is in the air, or not heard'
+            problem = 'it is in the air or not connected'
         if not problem:
             self.activate()
         return self._permission.ask(time.monotonic(), problem)
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
-        """Order it to its target; its own program flies."""
+        """Order a flight to its target; its own program flies."""
         if self._up and not self._landed_for:
             target = self.driver.follower.target
             self._target = placed.pose.position if target is None else target
             self._order = OrderKind.HOLD if self.driver.health.text else OrderKind.GO
 
     def hold(self) -> None:
-        """Have the drone hover."""
+        """Let the drone hover."""
         if self._order is OrderKind.GO:
             self._order = OrderKind.HOLD
             self._send_order()
 
     def stop(self) -> None:
-        """Land: the order is sent some times, as datagrams may be lost."""
+        """Land: the order is repeated, as datagrams may be lost."""
         self._permission.end()
         self._land('the driver stops')
         for _ in range(_LAST_ORDERS):
@@ -133,10 +133,10 @@ class OnboardLink(RobotLink):
         """End the permission to take off, and a take-off."""
         self._permission.end()
         if self._rising_since is not None and not self._up:
-            self._land('its take-off was stopped')
+            self._land('take-off stopped')
 
     def poll(self) -> None:
-        """Land a drone whose feed has been silent for long; on the ground it needs a new arm."""
+        """Land a drone whose feed is silent for long; on the ground it needs a new arm."""
         driver, now = self.driver, time.monotonic()
         if driver.silence.length <= driver.settings.odometry_timeout:
             self._lost_since = None
@@ -146,10 +146,10 @@ class OnboardLink(RobotLink):
         if self._rising_since is not None:
             self._lost_since = self._lost_since or now
             if now - self._lost_since > self._mambo.land_after:
-                self._land('nothing heard from the drone')
+                self._land('no data from the drone')
 
     def status(self) -> dict[str, Any]:
-        """Return the present order."""
+        """Return the current order."""
         return {'order': self._order.name.lower(), 'landed for': self._landed_for}
 
     def _send_order(self) -> None:
@@ -175,7 +175,7 @@ class OnboardLink(RobotLink):
         place = compose(
             self._origin, Pose.from_rpy(pose.position, (pose.roll, pose.pitch, pose.yaw))
         )
-        driver.judge('flight', self._next_order(pose, place), 'flying: goals are accepted')
+        driver.judge('flight', self._next_order(pose, place), 'flying: accepting goals')
         placed = self._speed.place(stamp, place)
         driver.take_pose(replace(placed, covariance=self._mambo.pose_covariance()))
 
@@ -189,7 +189,8 @@ class OnboardLink(RobotLink):
         if not mambo.arm:
             return NOT_ALLOWED
         if 0.0 <= pose.battery < mambo.battery_minimum:
-            return self._land(f'battery at {pose.battery:.2f}, below {mambo.battery_minimum:.2f}')
+            least = 100.0 * mambo.battery_minimum
+            return self._land(f'battery at {100.0 * pose.battery:.0f} %, below {least:.0f} %')
         if too_far := self.driver.volume.drift_problem(place.position):
             return self._land(too_far)
         if self._up:
@@ -205,7 +206,7 @@ class OnboardLink(RobotLink):
         height = start[2] - place.position[2]
         self._up = pose.state == FeedState.AIR and abs(height) <= ALTITUDE_TOLERANCE
         if not self._up and now - self._rising_since > mambo.take_off_timeout:
-            return self._land(f'it did not come to its altitude in {mambo.take_off_timeout:g} s')
+            return self._land(f'altitude not reached within {mambo.take_off_timeout:g} s')
         return '' if self._up else 'taking off'
 
     def _land(self, reason: str) -> str:

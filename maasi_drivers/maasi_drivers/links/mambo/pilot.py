@@ -1,4 +1,4 @@
-"""A Mambo's flight: its commands from take-off to landing. Without ROS."""
+"""Flight control of a Mambo from take-off to landing. Without ROS."""
 
 import math
 from dataclasses import dataclass
@@ -16,23 +16,23 @@ from maasi_filter.models.pose import Pose
 from maasi_planner.motion import MotionModel, RobotState
 
 _SPEED_GAIN = 2.5  # acceleration per speed error [1/s]
-_RAMP = 0.4  # acceleration of the desired speed: little tilt, as images are taken meanwhile [m/s^2]
-_DESIRED_AGE = 0.5  # a desired velocity older than this is discarded [s]
-# Share of the largest acceleration that stops it before the geofence: the rest is for wind.
+_RAMP = 0.4  # acceleration of the desired speed; low, as images need little tilt [m/s^2]
+_DESIRED_AGE = 0.5  # older desired velocities are discarded [s]
+# Share of the largest acceleration for stopping before the geofence; the rest is for wind.
 _BRAKE_SHARE = 0.5
 # Largest speed per metre to the geofence, well below the bandwidth of the speed [1/s].
 _NEAR_RATE = 1.0
 # Placeholder until the speed at the largest tilt is measured; never used in flight [m/s].
 _UNKNOWN_SPEED = 1.0
-ALTITUDE_TOLERANCE = 0.1  # how far from its altitude a Mambo counts as there after take-off [m]
-# Under a command faster than this, an event equal to the bit is no new position [m/s].
+ALTITUDE_TOLERANCE = 0.1  # altitude tolerance after take-off [m]
+# Under a faster command, a bit-identical event is no new position [m/s].
 _LEAST_SPEED = 0.05
 _STILL = np.zeros(4)
-NOT_ALLOWED = 'on the ground: it may not take off (parameter mambo.arm)'
+NOT_ALLOWED = 'on the ground: take-off is disabled (parameter mambo.arm)'
 
 
 class MamboPhase(Enum):
-    """Of a flight."""
+    """Phase of a flight."""
 
     CONNECTING = 'connecting'
     GROUND = 'on the ground'
@@ -44,7 +44,7 @@ class MamboPhase(Enum):
 
 @dataclass(eq=False)
 class MamboPilot:
-    """Flies a Mambo from take-off to landing, in a volume; lands it on a fault."""
+    """Flies a Mambo from take-off to landing in a volume; lands it on a fault."""
 
     link: MamboLink
     motion: MotionModel
@@ -61,7 +61,7 @@ class MamboPilot:
         place = [*home.position[:2], settings.ground]
         self.reckoning = DeadReckoning(model, Pose.from_yaw(place, home.yaw), settings)
         self._event: PositionEvent | None = None
-        # Last position: its time, and that of its last change.
+        # Last position: its time, and the time of its last change.
         self._place: FloatArray | None = None
         self._placed_at = self._moved_at = -math.inf
         # Unchanged in spite of commands: only a changed position is accepted.
@@ -84,21 +84,21 @@ class MamboPilot:
 
     @property
     def state(self) -> RobotState | None:
-        """Where it is; None where that is not known."""
+        """Its state, or None if unknown."""
         return self.reckoning.state if math.isfinite(self._placed_at) else None
 
     def ahead(self) -> RobotState:
-        """Return where it will be, level, when a command that is sent now acts."""
+        """Return its level state when a command that is sent now takes effect."""
         course = self.reckoning.ahead()
         return RobotState(Pose.from_yaw(course.position, course.yaw), course.velocity)
 
     @property
     def has_pose(self) -> bool:
-        """Whether the position is known, and new enough to fly by."""
+        """Whether the position is known and recent enough for flight."""
         return math.isfinite(self._placed_at) and self._lost_since is None
 
     def update_pose(self, now: float, state: RobotState) -> None:
-        """Take a pose of another system."""
+        """Update the pose from another system."""
         self._now = now
         self._note_place(now, state.pose.position)
         self.reckoning.update(state, now, self.flying)
@@ -113,7 +113,7 @@ class MamboPilot:
         self._place, self._placed_at = place, now
 
     def fly(self, command: FloatArray) -> None:
-        """Fly a velocity command (4,), once; without another one the drone hovers."""
+        """Fly a velocity command (4,), once; without a next one the drone hovers."""
         if not np.isfinite(command).all():
             self.hover()
             raise ValueError(f'command: got {command.tolist()}, allowed are finite numbers')
@@ -121,7 +121,7 @@ class MamboPilot:
             self._steer(command)
 
     def hover(self) -> None:
-        """Stop: the drone keeps its place by its own camera."""
+        """Stop: the drone holds its position by its own camera."""
         if self.flying:
             self._desired = -math.inf, np.zeros(2)
             self._send(_STILL, _STILL)
@@ -130,7 +130,7 @@ class MamboPilot:
         model, course = self.reckoning.model, self.reckoning.ahead()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         turned = np.array([[cosine, sine], [-sine, cosine]])
-        # Ramped in the map, from the velocity before.
+        # Ramped in the map, from the previous velocity.
         passed = self._now - self._desired[0]
         before = self._desired[1] if passed <= _DESIRED_AGE else course.velocity[:2]
         change = turned.T @ command[:2] - before
@@ -159,7 +159,7 @@ class MamboPilot:
         self.link.steer(*shares.tolist())
 
     def permit(self, now: float) -> str:
-        """Let it take off once; return why not, empty where it may."""
+        """Permit one take-off; return why not, or an empty text."""
         problem = self._permission.ask(now, self._objection(now))
         if not problem:
             self._ended, self._cancelled_at = '', None
@@ -167,7 +167,7 @@ class MamboPilot:
 
     def _objection(self, now: float) -> str:
         if self.phase is MamboPhase.LANDING:
-            return 'it lands'
+            return 'it is landing'
         if self.phase not in (MamboPhase.CONNECTING, MamboPhase.GROUND):
             return 'it is in the air already'
         unheard = self.problem if self.phase is MamboPhase.CONNECTING else ''
@@ -179,13 +179,13 @@ class MamboPilot:
             return NOT_ALLOWED
         if self.settings.full_speed is None:
             return (
-                'on the ground: its speed at the largest tilt is not measured (parameter '
-                'mambo.full_speed; measure_mambo says it)'
+                'on the ground: the speed at the largest tilt is unknown (set mambo.full_speed; '
+                'measure_mambo measures it)'
             )
         return ''
 
     def goal_taken(self) -> None:
-        """Note that it has somewhere to go."""
+        """Note that it has a goal."""
         self._cancelled_at = None
 
     def goal_cancelled(self, now: float) -> None:
@@ -196,14 +196,14 @@ class MamboPilot:
         self._cancelled_at = now
 
     def stop(self, now: float) -> None:
-        """Give up a take-off, and land; in flight as after a cancelled goal."""
+        """Abort a take-off and land; in flight as after a cancelled goal."""
         if self.phase in (MamboPhase.TAKING_OFF, MamboPhase.CLIMBING):
-            self.end('its take-off was stopped')
+            self.end('take-off stopped')
         else:
             self.goal_cancelled(now)
 
     def end(self, reason: str) -> str:
-        """Land, and do not take off again; return the reason."""
+        """Land and do not take off again; return the reason."""
         self._ended = self._ended or reason
         if self.phase not in (MamboPhase.CONNECTING, MamboPhase.GROUND):
             self._land()
@@ -216,7 +216,7 @@ class MamboPilot:
         self.link.land()
 
     def update(self, now: float) -> None:
-        """Advance to `now`; at least ten times a second."""
+        """Advance to `now`; to be called at least ten times per second."""
         self._now = now
         self.reckoning.go_on(now, self.flying)
         event = self.link.position
@@ -275,11 +275,11 @@ class MamboPilot:
         if not flies:
             if state != 'landed' or self.link.battery < 0.0:
                 what = 'state' if state != 'landed' else 'battery'
-                return f'on the ground: nothing heard of its {what} yet'
+                return f'on the ground: no {what} received yet'
             if not self.has_pose:
                 return f'on the ground: {self._missing(now) or "no position yet"}'
             self.link.take_off()
-        # In the air it was brought by an earlier driver.
+        # It was in the air before this driver started.
         return self._begin(MamboPhase.TAKING_OFF, now)
 
     def _begin(self, phase: MamboPhase, now: float) -> str:
@@ -301,7 +301,7 @@ class MamboPilot:
             if flying_state in ('hovering', 'flying'):
                 self._begin(MamboPhase.CLIMBING, now)
             elif late:
-                return self.end(f'it did not take off in {timeout:g} s: {flying_state}')
+                return self.end(f'no take-off within {timeout:g} s: {flying_state}')
             return MamboPhase.TAKING_OFF.value
         if flying_state in ('landed', 'landing'):
             return self.end(f'the Mambo is {flying_state} by itself')
@@ -313,7 +313,7 @@ class MamboPilot:
                 self._begin(MamboPhase.FLYING, now)
                 return ''
             if late:
-                return self.end(f'it did not come to its altitude in {timeout:g} s')
+                return self.end(f'altitude not reached within {timeout:g} s')
             ahead = self.ahead()
             above = np.array([*ahead.pose.position[:2], self.home.position[2]])
             self._steer(self.motion.command(ahead, above))
@@ -327,17 +327,21 @@ class MamboPilot:
 
     def _low_battery(self) -> str:
         charge, minimum = self.link.battery, self.settings.battery_minimum
-        return f'battery at {charge:.2f}, below {minimum:.2f}' if 0.0 <= charge < minimum else ''
+        return (
+            f'battery at {100.0 * charge:.0f} %, below {100.0 * minimum:.0f} %'
+            if 0.0 <= charge < minimum
+            else ''
+        )
 
     def _missing(self, now: float) -> str:
         for text, since in (
-            ('link lost: nothing from the Mambo', self.link.heard_at),
+            ('link lost: no data from the Mambo', self.link.heard_at),
             ('no position', self._placed_at),
             ('the position has not changed', self._moved_at),
         ):
             age = now - since
             if age > self.settings.link_timeout:
-                return f'{text} for {f"{age:.1f} s" if math.isfinite(age) else "all the time"}'
+                return f'{text} for {f"{age:.1f} s" if math.isfinite(age) else "the whole time"}'
         return ''
 
     def _is_silent(self, now: float) -> bool:

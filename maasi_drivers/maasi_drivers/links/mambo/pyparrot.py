@@ -1,9 +1,9 @@
-"""What pyparrot 1.5.20 lacks for a Mambo by Bluetooth and by UDP. Without ROS.
+"""Corrections of pyparrot 1.5.20 for a Mambo by Bluetooth and UDP. Without ROS.
 
-`bleConnection.py` cannot send one piloting command, only repeat one and wait meanwhile, and waits
-half a second for acknowledgements. The socket of `wifiConnection.py` is bound to all interfaces,
-takes every datagram for the drone's, returns the last one again after a timeout, and its listener
-dies on a truncated frame, or loops forever on one of size zero.
+`bleConnection.py` can only repeat a piloting command, and waits for that; it waits half a second
+for acknowledgements. The socket of `wifiConnection.py` accepts datagrams from everyone, returns the
+last one again after a timeout, and its listener dies on a truncated frame, or loops on an empty
+one.
 """
 
 import math
@@ -16,7 +16,7 @@ _MAX_TILT = (2, 8, 1)  # project, class and command of the largest tilt
 
 
 def mend(connection: Any) -> None:
-    """Give a Bluetooth connection the method by which `fly_direct` sends one command."""
+    """Add to a Bluetooth connection the method by which `fly_direct` sends one command."""
 
     def send_single_pcmd_command(
         command: tuple[int, int, int], roll: int, pitch: int, yaw: int, climb: int
@@ -28,7 +28,7 @@ def mend(connection: Any) -> None:
 
 
 def ask_for_answer(connection: Any, tilt: float) -> None:
-    """Send a command that the drone has to acknowledge; it has this tilt [rad] already."""
+    """Send a command that the drone must acknowledge: the tilt [rad] that it already has."""
     content = struct.pack('<f', math.degrees(tilt))
     _write(connection, 'SEND_WITH_ACK', 'DATA_WITH_ACK', _MAX_TILT, content)
 
@@ -45,11 +45,11 @@ def _write(
 # Type, buffer, sequence, total size.
 _HEADER = struct.Struct('<BBBI')
 _TYPES = range(1, 5)
-_TIMEOUT = 0.3  # longest wait for a datagram: then the listener checks whether it has to end [s]
+_TIMEOUT = 0.3  # longest wait for a datagram until the listener checks its end condition [s]
 
 
 def has_whole_frames(data: bytes) -> bool:
-    """Return whether a datagram is made of frames that pyparrot can take apart."""
+    """Return whether a datagram consists of frames that pyparrot can parse."""
     while data:
         if len(data) < _HEADER.size:
             return False
@@ -61,14 +61,14 @@ def has_whole_frames(data: bytes) -> bool:
 
 
 class DroneSocket:
-    """Receives datagrams of one drone alone."""
+    """Receives the datagrams of one drone only."""
 
     def __init__(self, drone: str, port: int) -> None:
         self.dropped: Counter[str] = Counter()
         self._drone = drone
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            # To the address of this host from which it reaches the drone.
+            # On the address of this host that routes to the drone.
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
                 probe.connect((drone, 9))
                 self._socket.bind((probe.getsockname()[0], port))
@@ -78,7 +78,7 @@ class DroneSocket:
         self._socket.settimeout(_TIMEOUT)
 
     def recvfrom(self, size: int) -> tuple[bytes, Any]:
-        """Return the next datagram; no bytes where none came, or one that must not be used."""
+        """Return the next datagram, or no bytes without a valid one."""
         try:
             data, sender = self._socket.recvfrom(size)
         except OSError:
@@ -95,7 +95,7 @@ class DroneSocket:
 
 
 def guard(connection: Any, drone: str, port: int) -> None:
-    """Make a connection receive by a `DroneSocket`, and drop frames that it cannot parse."""
+    """Let a connection receive by a `DroneSocket` and drop frames that it cannot parse."""
     handle = connection.handle_data
 
     def open_sockets() -> None:

@@ -1,9 +1,9 @@
-"""Where a Mambo is between its position events (two a second), by a model of the commands.
+"""Dead reckoning of a Mambo between position events (two per second), from its commands.
 
-Each event corrects it where it was when the event was made. A tilt accelerates by g tan(tilt), and
-drag opposes the speed, in proportion to it (R. Mahony, V. Kumar, P. Corke, "Multirotor aerial
-vehicles", IEEE Robotics & Automation Magazine 19(3), 2012), so that one measured number is enough:
-the steady speed at the largest tilt. A command acts after a delay.
+Each event corrects the past position at its time. A tilt accelerates by g tan(tilt), and drag
+opposes the speed in proportion to it (R. Mahony, V. Kumar, P. Corke, "Multirotor aerial vehicles",
+IEEE Robotics & Automation Magazine 19(3), 2012), so one measured number suffices: the steady speed
+at the largest tilt. A command acts after a delay.
 """
 
 import math
@@ -26,7 +26,7 @@ _STILL_AIR = np.zeros(2)
 
 
 class Course(NamedTuple):
-    """Where a drone is and how it moves: position and velocity (3,) in the map, yaw [rad]."""
+    """Position and velocity (3,) in the map, yaw [rad]."""
 
     position: FloatArray
     velocity: FloatArray
@@ -37,10 +37,10 @@ class Course(NamedTuple):
 class TiltModel:
     """Response of a Mambo to piloting commands."""
 
-    tilt: float  # of 100 per cent roll or pitch [rad]
-    full_speed: float  # steady speed under it [m/s]
-    climb: float  # of 100 per cent [m/s]
-    turn: float  # of 100 per cent [rad/s]
+    tilt: float  # at 100 % roll or pitch [rad]
+    full_speed: float  # steady speed at that tilt [m/s]
+    climb: float  # at 100 % [m/s]
+    turn: float  # at 100 % [rad/s]
 
     @property
     def thrust(self) -> float:
@@ -55,7 +55,7 @@ class TiltModel:
     def advance(
         self, course: Course, shares: FloatArray, h: float, push: FloatArray = _STILL_AIR
     ) -> Course:
-        """Return the course `h` s later under shares (4,) and another push (2,) [m/s^2, map]."""
+        """Return the course `h` s later, under shares (4,) and a push (2,) [m/s^2, map]."""
         forward, left, up, turn = shares.tolist()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         rate = self.drag if forward or left else self.drag + _HOVER_RATE
@@ -78,32 +78,31 @@ class TiltModel:
         )
 
 
-# Share of the difference to an event by which position and velocity are corrected.
+# Weight of an event's difference in position and velocity.
 _POSITION_GAIN, _VELOCITY_GAIN = 0.8, 0.25
 _EVENT_PERIOD = 0.5
 _JUMP = 0.5  # above this difference an event replaces the estimate [m]
 # Longest time of one prediction [s].
 _LONGEST = 1.0
 _HISTORY = 64
-# Share of a position event's error that is the push; with poses of another system the time in
-# which it is learnt [s]; the largest [m/s^2]; and the speed above which the model's errors are
-# larger than it [m/s].
+# Weight of an event's error in the push; with poses of another system its time constant [s]; its
+# largest value [m/s^2]; and the speed above which the model's errors exceed it [m/s].
 _PUSH_GAIN, _PUSH_TIME, _MOST_PUSH, _SLOW = 0.08, 2.0, 0.5, 0.1
 
 
 class DeadReckoning:
-    """Where the drone is between its position events; times are of the monotonic clock [s]."""
+    """Estimates the drone's state between position events; times: monotonic clock [s]."""
 
     def __init__(self, model: TiltModel, origin: Pose, settings: MamboSettings) -> None:
         self.model, self.origin, self.settings = model, origin, settings
         self.course = Course(origin.position, np.zeros(3), origin.yaw)
-        #: Steady acceleration by wind, or by a level that is off, (2,) [m/s^2, map].
+        # : Steady acceleration by wind or a tilted level, (2,) [m/s^2, map].
         self.push = np.zeros(2)
         #: Time of flight since the last correction [s].
         self.age = 0.0
         self._turn = origin.rotation()
-        self._measured = origin.position  # by the last event [m]
-        # Recent commands, and the time at which each takes effect.
+        self._measured = origin.position  # from the last event [m]
+        # Recent commands with the times at which they take effect.
         self._sent: deque[tuple[float, FloatArray]] = deque([(-math.inf, np.zeros(4))])
         self._now = -math.inf
         # Recent times, positions and headings.
@@ -118,7 +117,7 @@ class DeadReckoning:
         return RobotState(Pose.from_rpy(course.position, angles), course.velocity, rates)
 
     def covariance(self) -> FloatArray:
-        """Return that of the pose, (6, 6): x, y, z [m^2], rotations about the map's axes."""
+        """Return the covariance of the pose, (6, 6): x, y, z [m^2], rotations about map axes."""
         settings, acting = self.settings, self._acting()[:2]
         position = settings.position_noise**2 + (settings.position_growth * self.age) ** 2
         attitude = settings.attitude_noise**2
@@ -136,14 +135,14 @@ class DeadReckoning:
         return next(shares for acts, shares in reversed(self._sent) if acts <= self._now)
 
     def command(self, now: float, shares: FloatArray) -> None:
-        """Take a command, (4,): forward, left, up, turn as shares of the largest."""
+        """Add a command (4,): forward, left, up, turn as shares of the largest."""
         delay, sent = self.settings.delay, self._sent
         sent.append((now + delay, shares))
         while len(sent) > 1 and sent[1][0] <= now - delay:
             sent.popleft()
 
     def go_on(self, now: float, flying: bool) -> None:
-        """Reckon up to `now`; on the ground it stays where it is."""
+        """Predict to `now`; on the ground it stays."""
         before = max(self._now, now - _LONGEST) if math.isfinite(self._now) else now
         self._now = now
         if now <= before:
@@ -154,7 +153,7 @@ class DeadReckoning:
         self._past.append((now, self.course.position, self.course.yaw))
 
     def ahead(self) -> Course:
-        """Return where it will be when a command that is sent now acts."""
+        """Return the course when a command that is sent now takes effect."""
         return self._fly(self.course, self._now, self._now + self.settings.delay)
 
     def _fly(self, course: Course, begin: float, end: float) -> Course:
@@ -167,7 +166,7 @@ class DeadReckoning:
         return course
 
     def update(self, state: RobotState, now: float, flying: bool) -> None:
-        """Take the pose of another system, of `now`."""
+        """Correct by the pose of another system at `now`."""
         self._now = now
         if flying:
             change = (state.velocity - self.course.velocity) / _PUSH_TIME
@@ -175,7 +174,7 @@ class DeadReckoning:
         self.course = Course(state.pose.position, state.velocity, state.pose.yaw)
 
     def correct(self, event: PositionEvent, flying: bool) -> None:
-        """Take a position event."""
+        """Correct by a position event."""
         course, latency = self.course, self.settings.latency
         measured = self.origin.position + self._turn @ event.position
         heading = self.origin.yaw + event.yaw
@@ -196,7 +195,7 @@ class DeadReckoning:
         self._past = deque(moved, maxlen=_HISTORY)
 
     def _learn(self, change: FloatArray, measured: FloatArray) -> None:
-        """Correct the push by what the last prediction missed, at a measured velocity."""
+        """Correct the push by the error of the last prediction at a measured velocity."""
         if float(np.hypot(*measured[:2])) < _SLOW:
             self.push = np.clip(self.push + change[:2], -_MOST_PUSH, _MOST_PUSH)
 

@@ -1,6 +1,6 @@
-"""Vehicles that speak MAVLink: ArduCopter, ArduSub and PX4. Without ROS."""
+"""Vehicles that use MAVLink: ArduCopter, ArduSub and PX4. Without ROS."""
 
 import os
 
-# pymavlink reads it when it is imported, and speaks MAVLink 1 without it.
+# pymavlink reads this on import and uses MAVLink 1 without it.
 os.environ['MAVLINK20'] = '1'

@@ -1,4 +1,4 @@
-"""The messages of an autopilot: its type, mode and parameters, and requests to it."""
+"""An autopilot's messages: type, mode, parameters, and requests to it."""
 
 import math
 import re
@@ -17,7 +17,7 @@ from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.arrays import FloatArray
 
 _HEARTBEAT_PERIOD = 1.0
-# Without attitude, position or their status for so long the messages are requested again [s].
+# After this time without attitude, position or status the messages are requested again [s].
 _STREAM_PATIENCE = 2.0
 # Rates of messages [Hz]; None: that of the settings.
 _MESSAGES = {
@@ -30,15 +30,15 @@ _MESSAGES = {
     'GPS_RAW_INT': 2.0,
     'GPS2_RAW': 2.0,
 }
-# The same of firmwares that fly to set-points by limits: these reject some, and say no more of it.
+# The same for firmwares with limited set-points, which reject some silently.
 _OWN_MESSAGES = {'POSITION_TARGET_LOCAL_NED': 5.0, 'FENCE_STATUS': 2.0}
-# Period and number of tries of a command that is not answered [s, 1].
+# Period and number of attempts of an unanswered command [s, 1].
 _ANSWER_PATIENCE, _TRIES = 0.5, 5
-# Position only, and yaw: no velocity, acceleration, yaw rate; velocity only; and no yaw either.
+# Masks: position and yaw only; velocity only; the former without yaw.
 _POSITION_AND_YAW, _VELOCITY, _NO_YAW = 0x9F8, 0x9C7, 0x400
 
 
-# Of texts on a breach of the fence, of older and newer versions of ArduPilot.
+# Texts on a fence breach, of older and newer versions of ArduPilot.
 _BREACH = re.compile('fence breach', re.IGNORECASE)
 
 
@@ -51,7 +51,7 @@ class _Command:
 
 
 class Autopilot:
-    """One autopilot, as its messages describe it; times are of the steady clock [s]."""
+    """An autopilot as described by its messages; times: steady clock [s]."""
 
     def __init__(
         self, settings: MavlinkSettings, start: list[float], sender: Any, memory: Path | None
@@ -66,26 +66,26 @@ class Autopilot:
         self.mode = -1
         self.lost = False
         self.estimate = Estimate(settings, self.place, self.on_restart)
-        self.commands: deque[_Command] = deque()  #: commands that were not answered yet
-        #: Numbers of those that were accepted in this phase of the flight.
+        self.commands: deque[_Command] = deque()  # : unanswered commands
+        # : Numbers of the commands accepted in this phase of the flight.
         self.accepted: set[int] = set()
         self.fence = FenceUpload(settings, sender, self.log)
         self.setpoints = SetpointCheck()
-        self.breached_at = -math.inf  #: when it reported last that it is outside of its fence
+        self.breached_at = -math.inf  # : time of its last report of a fence breach
         self._sender = sender
         self._received_at = self._heartbeat_at = self._setpoint_at = -math.inf
-        self._requested_at = -math.inf  # of the last request for messages
+        self._requested_at = -math.inf  # time of the last request for messages
 
     @property
     def in_external_mode(self) -> bool:
-        """Whether it is in the mode in which it takes set-points."""
+        """Whether it is in the mode for set-points."""
         return self.firmware is not None and self.mode == self.firmware.external
 
     def on_restart(self) -> None:
-        """Take note that the autopilot was restarted."""
+        """Handle a restart of the autopilot."""
 
     def receive(self, message: Any, now: float) -> tuple[bool, int] | None:
-        """Take a message; of a heartbeat return whether it was armed before, and the mode then."""
+        """Handle a message; for a heartbeat return whether it was armed, and its mode before."""
         kind, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         if self._shows_own_id(message):
             if self.failsafes is not None:
@@ -125,7 +125,7 @@ class Autopilot:
         return None
 
     def _shows_own_id(self, message: Any) -> bool:
-        """Return whether another program has the driver's id; a router passes answers only."""
+        """Return whether another program has the driver's id; routers only forward answers."""
         own = self.settings.own_system
         if message.get_srcSystem() == own:
             return True
@@ -148,7 +148,7 @@ class Autopilot:
             return False
         self.firmware = firmware
         self.read_failsafes()
-        self.log.add(INFO, f'{firmware.name} is there as system {self.settings.system}')
+        self.log.add(INFO, f'{firmware.name} connected as system {self.settings.system}')
         return True
 
     def _handle_parameter(self, message: Any) -> None:
@@ -156,7 +156,7 @@ class Autopilot:
             return
         value = float(message.param_value)
         if self.firmware.px4 and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:
-            # PX4 sends the bytes of an integer in the place of a float.
+            # PX4 sends the bytes of an integer as a float.
             value = float(struct.unpack('<i', struct.pack('<f', value))[0])
         self.failsafes.update(message.param_id.rstrip('\0'), value)
 
@@ -173,12 +173,12 @@ class Autopilot:
         silence, before = now - self._received_at, self.lost
         self.lost = silence > self.settings.link_timeout
         if self.lost != before:
-            text = f'nothing heard for {silence:.1f} s' if self.lost else 'it is back'
+            text = f'link lost: no message for {silence:.1f} s' if self.lost else 'link restored'
             self.log.add(WARNING, f'link: {text}')
         return self.lost != before
 
     def read_failsafes(self) -> None:
-        """Read the failsafe parameters from the beginning, and upload the fence."""
+        """Read the failsafe parameters again and upload the fence."""
         assert self.firmware is not None
         self.fence.begin()
         self.failsafes = FailsafeCheck(self.firmware, self.settings, self._sender, self.log)
@@ -208,7 +208,7 @@ class Autopilot:
         self.command(mavlink.MAV_CMD_DO_SET_MODE, (flag, *numbers))
 
     def command(self, number: int, parameters: tuple[float, ...]) -> None:
-        """Send a command until it is answered, after those before it; report a refusal."""
+        """Send a command until it is answered, after earlier ones; report a refusal."""
         self.commands.append(_Command(number, parameters))
 
     def _conclude(self, result: int | None) -> None:
@@ -221,7 +221,7 @@ class Autopilot:
         why = 'not answered' if result is None else why
         if command.number == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             name = mavlink.mavlink_map[int(command.parameters[0])].msgname
-            self.log.add(DEBUG, f'{name} at another rate: {why}')
+            self.log.add(DEBUG, f'{name}: rate not accepted: {why}')
         else:
             self.log.add(WARNING, f'{mavlink.enums["MAV_CMD"][command.number].name}: {why}')
 
@@ -247,7 +247,7 @@ class Autopilot:
         command.tries += 1
 
     def send_setpoint(self, position: FloatArray | None, yaw: float | None, now: float) -> bool:
-        """Send where it is to be, (3,) [m], if that is due, and return whether; None: it stops.
+        """Send the target position (3,) [m] if due, and return whether; None: stop.
 
         Without a yaw it keeps its own.
         """
@@ -255,7 +255,7 @@ class Autopilot:
             return False
         self._setpoint_at = now
         if position is None:
-            # A velocity of zero: no fence rejects it, other than the place where it is.
+            # Zero velocity is accepted inside every fence.
             self.setpoints.reset()
             mask, place = _VELOCITY, [0.0] * 3
         else:

@@ -1,4 +1,4 @@
-"""The state of a vehicle by its autopilot: pose, batteries, fix, landed or not."""
+"""The state of a vehicle from its autopilot: pose, batteries, fix, landed or not."""
 
 import json
 import math
@@ -16,6 +16,7 @@ from maasi_drivers.links.mavlink.protocol import WARNING, ReportLog, mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import quaternion_product
+from maasi_filter.wording import point
 
 _HALF = math.sqrt(0.5)
 # Turns ENU into NED, and FRD into FLU; w first.
@@ -24,36 +25,36 @@ _FLU_TO_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 
 
 def swap_enu_ned(vector: ArrayLike) -> FloatArray:
-    """Return a vector (3,) of ENU in NED, or the other way round: it is the same swap."""
+    """Return a vector (3,) of ENU in NED, or the reverse."""
     x, y, z = np.asarray(vector, dtype=float)
     return np.array([y, x, -z])
 
 
 def swap_flu_frd(vector: ArrayLike) -> FloatArray:
-    """Return a vector (3,) of a body's FLU axes in FRD, or the other way round."""
+    """Return a vector (3,) of a body's FLU axes in FRD, or the reverse."""
     x, y, z = np.asarray(vector, dtype=float)
     return np.array([x, -y, -z])
 
 
 def swap_yaw(yaw: float) -> float:
-    """Return a yaw [rad] from east, to the left, as one from north, to the right, or back."""
+    """Return a yaw [rad] (from east, anticlockwise) as from north, clockwise, or the reverse."""
     turned = 0.5 * math.pi - yaw
     return math.atan2(math.sin(turned), math.cos(turned))
 
 
 def swap_orientation(quaternion: ArrayLike) -> FloatArray:
-    """Return the orientation (4,) of FLU in ENU from that of FRD in NED, or back; w first."""
-    # Two half turns, each its own inverse but for the sign: the same both ways.
+    """Return the orientation (4,) of FLU in ENU from FRD in NED, or the reverse; w first."""
+    # Two half turns, each its own inverse up to the sign.
     given = np.asarray(quaternion, dtype=float)
     return quaternion_product(quaternion_product(_NED_TO_ENU, given), _FLU_TO_FRD)
 
 
-# Autopilots that were switched on within this time of each other are the same one [s].
+# Boot times within this are of the same start of an autopilot [s].
 _SAME_BOOT = 5.0
 
 
 class FlightOrigin:
-    """The place of the map's start in the local frame, in a file as long as the autopilot is on."""
+    """The map's start in the local frame, in a file that is valid until the autopilot restarts."""
 
     def __init__(
         self, settings: MavlinkSettings, start: list[float], path: Path | None, log: ReportLog
@@ -64,29 +65,29 @@ class FlightOrigin:
         self._path, self._log = path, log
 
     def find(self, position: FloatArray, booted: float, armed: bool) -> FloatArray | None:
-        """Return the place (3,), ENU [m], if known; `booted` [s, steady clock]: switched on."""
+        """Return the position (3,), ENU [m], if known; `booted`: boot time [s, steady clock]."""
         kept = self._load(booted)
         if kept is not None:
             x, y, z = (position - kept).tolist()
             self._log.add(
                 WARNING,
-                f'the origin of the flight before is kept: the vehicle is ({x:.1f}, {y:.1f}, '
-                f'{z:.1f}) m east, north and up of it; for a new one restart the autopilot',
+                f'using the origin of the previous flight: the vehicle is {point((x, y, z))} m '
+                'east, north and up of it; restart the autopilot for a new origin',
             )
             return kept
         if not self._here:
             return np.zeros(3)
         if armed or self.problem:
             self.problem = (
-                'mavlink.origin is here, and it was armed when the driver first heard it: its '
-                'place in the map is not known; land it, put it at start, start the driver again'
+                'mavlink.origin is here, but it was armed before the driver connected: its '
+                'position in the map is unknown; land it, place it at start, restart the driver'
             )
             return None
         self.keep(position, booted)
         return position
 
     def keep(self, place: FloatArray, booted: float) -> None:
-        """Write the place to the file; `booted` as in `find`."""
+        """Write the position to the file; `booted` as in `find`."""
         if self._path is None:
             return
         item = {'boot': [_host_boot(), booted], 'map': self._place, 'place': place.tolist()}
@@ -96,7 +97,7 @@ class FlightOrigin:
             part.write_text(json.dumps(item))
             os.replace(part, self._path)
         except OSError as error:
-            self._log.add(WARNING, f'the origin of the flight cannot be kept: {error}')
+            self._log.add(WARNING, f'cannot store the origin of the flight: {error}')
 
     def _load(self, booted: float) -> FloatArray | None:
         try:
@@ -111,32 +112,32 @@ class FlightOrigin:
 
 
 def _host_boot() -> str:
-    """Return what tells one start of this computer from another: the steady clock begins there."""
+    """Return an id of this boot of the host, which starts the steady clock."""
     return Path('/proc/sys/kernel/random/boot_id').read_text().strip()
 
 
-_RESTART = 1000  # a time since boot that is smaller by more than this means a restart [ms]
-_FIX_3D = 3  # of GPS_RAW_INT: the least fix with a height
-# Of EKF_STATUS_REPORT: a level or absolute position, and none that is only assumed.
+_RESTART = 1000  # a larger decrease of the time since boot means a restart [ms]
+_FIX_3D = 3  # smallest fix type of GPS_RAW_INT with a height
+# Flags of EKF_STATUS_REPORT: relative or absolute position, and an assumed one.
 _EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
-# A status counts for this time; it is asked for twice a second [s].
+# Validity of a status, which is requested twice per second [s].
 _STATUS_AGE = 3.0
 _EKF, _RECEIVERS = 'EKF_STATUS_REPORT', ('GPS_RAW_INT', 'GPS2_RAW')
 
 
 @dataclass(frozen=True, eq=False)
 class Telemetry:
-    """Pose of a vehicle, in the local frame of its autopilot turned to ENU."""
+    """Pose of a vehicle in its autopilot's local frame, converted to ENU."""
 
     arrival: float  # on the steady clock [s]
     position: FloatArray  # (3,) [m]
     velocity: FloatArray  # (3,) [m/s]
-    orientation: FloatArray  # (4,) of FLU in ENU, w first
+    orientation: FloatArray  # (4,) FLU in ENU, w first
     rates: FloatArray  # (3,) angular velocity in FLU [rad/s]
 
 
 class Estimate:
-    """The newest data of an autopilot."""
+    """The latest data of an autopilot."""
 
     def __init__(
         self, settings: MavlinkSettings, place: FlightOrigin, on_restart: Callable[[], None]
@@ -165,28 +166,28 @@ class Estimate:
 
     @property
     def has_fix(self) -> bool:
-        """Whether one GNSS receiver has a fix."""
+        """Whether a GNSS receiver has a fix."""
         return any(fix >= _FIX_3D and not self._silence(name) for name, fix in self._fixes.items())
 
     @property
     def silent_since(self) -> float:
-        """Since when something that was heard is missing, on the steady clock [s]."""
+        """Time since which an earlier message type is missing [s, steady clock]."""
         fixes = max((self._status_at[name] for name in self._fixes), default=math.inf)
         return min(self.heard_at, self._status_at.get(_EKF, math.inf), fixes)
 
     def _silence(self, name: str) -> str:
         silent = self._now - self._status_at.get(name, math.inf) > _STATUS_AGE
-        return f'no {name} any more' if silent else ''
+        return f'{name} lost' if silent else ''
 
     @property
     def charge(self) -> float:
-        """Of the battery that counts, 0 to 1; -1 where it is not known."""
+        """Battery charge, 0 to 1; -1 if unknown."""
         if self._settings.battery >= 0:
             return self._charges.get(self._settings.battery, -1.0)
         return min((value for value in self._charges.values() if value >= 0.0), default=-1.0)
 
     def problem(self, fix_needed: bool) -> str:
-        """Return why the position is not to be trusted in flight; empty where it is."""
+        """Return why the position is unreliable, or an empty text."""
         if self._good is False:
             return 'the autopilot has lost its position estimate'
         if silence := self._silence(_EKF):
@@ -195,11 +196,11 @@ class Estimate:
             receivers = (
                 self._silence(name) or f'{name}.fix_type {fix}' for name, fix in self._fixes.items()
             )
-            return f'GNSS is lost ({", ".join(receivers)})'
+            return f'GNSS fix lost ({", ".join(receivers)})'
         return ''
 
     def update(self, message: Any, now: float, armed: bool) -> None:
-        """Take a message; those of other kinds are left out."""
+        """Handle a message; other kinds are ignored."""
         kind = message.get_type()
         self._now = now
         if kind == 'LOCAL_POSITION_NED':
@@ -209,7 +210,7 @@ class Estimate:
             rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
             norm = float(np.linalg.norm(quaternion))
             if not (np.isfinite(rates).all() and 0.9 < norm < 1.1):
-                self.dropped['ATTITUDE_QUATERNION that is none'] += 1
+                self.dropped['invalid ATTITUDE_QUATERNION'] += 1
                 return
             self._note_time(message.time_boot_ms, now)
             self._attitude = (swap_orientation(quaternion / norm), swap_flu_frd(rates))
@@ -219,7 +220,7 @@ class Estimate:
             self._charges[int(message.id)] = left / 100.0 if 0 <= left <= 100 else -1.0
             self.charge_reports += self._settings.battery in (-1, message.id)
         elif kind == 'SYS_STATUS':
-            # The first battery's charge, where BATTERY_STATUS does not come.
+            # The first battery's charge, without BATTERY_STATUS.
             left = message.battery_remaining
             if 0 <= left <= 100 and not (self._from_batteries and 0 in self._charges):
                 self._charges[0] = left / 100.0
@@ -233,7 +234,7 @@ class Estimate:
             self._good = bool(flags & _EKF_POSITION) and not flags & _EKF_ASSUMED
 
     def _note_time(self, milliseconds: int, now: float) -> None:
-        """Detect a restart by the time since boot, which never decreases otherwise."""
+        """Detect a restart by a decrease of the time since boot."""
         if self._boot_time is not None and milliseconds < self._boot_time - _RESTART:
             self._clear()
             self._on_restart()
@@ -244,7 +245,7 @@ class Estimate:
     def _update_position(self, message: Any, now: float, armed: bool) -> None:
         values = (message.x, message.y, message.z, message.vx, message.vy, message.vz)
         if not all(map(math.isfinite, values)):
-            self.dropped['LOCAL_POSITION_NED that is not finite'] += 1
+            self.dropped['invalid LOCAL_POSITION_NED'] += 1
             return
         self._note_time(message.time_boot_ms, now)
         before = self._position
@@ -252,8 +253,8 @@ class Estimate:
             return  # a duplicate
         self._position = (message.time_boot_ms, values)
         if before is not None and before[1] == values and armed:
-            # An estimate that moves at all never repeats to the bit: it is frozen.
-            self.dropped['LOCAL_POSITION_NED that is frozen'] += 1
+            # A live estimate never repeats bit-identically.
+            self.dropped['frozen LOCAL_POSITION_NED'] += 1
             return
         if self.telemetry is None:
             self.booted = now - 1e-3 * message.time_boot_ms

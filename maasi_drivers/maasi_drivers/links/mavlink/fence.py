@@ -1,4 +1,4 @@
-"""The area of a search as the fence of an autopilot: uploaded, read back and compared."""
+"""The search area as the fence of an autopilot: uploaded, read back and compared."""
 
 import math
 from collections.abc import Generator
@@ -19,22 +19,22 @@ Item = tuple[int, float, int, int]  # command, corners or radius [m], 1e-7 degre
 _FENCE = mavlink.MAV_MISSION_TYPE_FENCE
 _INSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
 _OUTSIDE = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION
-_TWICE = mavlink.MAV_MISSION_INVALID_SEQUENCE  # of an item that came twice, to be ignored
+_TWICE = mavlink.MAV_MISSION_INVALID_SEQUENCE  # for an item that arrived twice
 _ROUND = mavlink.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION
-# Silence after which a message is sent again, how often, and time until the next attempt [s, 1, s].
+# Timeout of a message, number of attempts, and time until the next upload [s, 1, s].
 _PATIENCE, _TRIES, _PAUSE = 1.5, 8, 10.0
-_ROUNDING = 0.5, 0.01, 1.5, 1.5  # of the numbers of an item, as an autopilot keeps them
+_ROUNDING = 0.5, 0.01, 1.5, 1.5  # precision of an item's numbers in an autopilot
 
 
 def fence_items(volume: OperatingVolume, start: list[float]) -> list[Item]:
-    """Return the border of a volume on the map, with its holes and keep-outs."""
+    """Return the border of a volume on the map with its holes and keep-out zones."""
     area = volume.area
     zones, origin = area.settings.keep_outs, area.settings.origin
     assert origin is not None
-    # Goals may lie on the border of a box; the driver itself acts at the margin.
+    # Goals may lie on the border of a box; the driver acts at the margin.
     box = shapely.box(*(volume.limits[:2] + np.array([-MARGIN, MARGIN])).T.ravel())
     parts = shapely.get_parts(area.shapes['area'] or [box])
-    # Autopilots intersect borders: of an area in parts the one at the start counts.
+    # Autopilots intersect borders: of several parts the one at the start counts.
     part = min(parts, key=shapely.Point(start[:2]).distance)
     closed = shapely.get_parts([level_shape(zone) for zone in zones if zone.polygon])
     outside = [*part.interiors, *(polygon.exterior for polygon in closed)]
@@ -49,10 +49,10 @@ def fence_items(volume: OperatingVolume, start: list[float]) -> list[Item]:
 
 
 class FenceUpload:
-    """Gives an autopilot its fence, and checks that it has it; times are of the steady clock."""
+    """Uploads the fence of an autopilot and verifies it; times: steady clock."""
 
     def __init__(self, settings: MavlinkSettings, sender: Any, log: ReportLog) -> None:
-        #: Why the autopilot may have another fence; empty where it has it, or needs none.
+        # : Why the autopilot may have another fence; empty if verified or not needed.
         self.problem = ''
         self._items: list[Item] = []
         self._vehicle = settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1
@@ -60,7 +60,7 @@ class FenceUpload:
         self.begin()
 
     def begin(self, items: list[Item] | None = None) -> None:
-        """Upload a fence, or the same again."""
+        """Upload a fence, or the same one again."""
         self._items = self._items if items is None else items
         self.busy, self._tries = bool(self._items), 0
         self._due = -math.inf if self.busy else math.inf
@@ -80,7 +80,7 @@ class FenceUpload:
             self._send()
 
     def update(self, message: Any, now: float) -> None:
-        """Take a message; what is no answer is left out."""
+        """Handle a message; others than answers are ignored."""
         expected = {'target_system': self._sender.srcSystem, 'mission_type': _FENCE}
         ours = all(getattr(message, key, value) == value for key, value in expected.items())
         ours &= message.get_type() in self._answers and getattr(message, 'type', None) != _TWICE
@@ -92,20 +92,20 @@ class FenceUpload:
                 self._conclude(now, *end.value)
 
     def _conclude(self, now: float, severity: int, result: str) -> None:
-        problem = f'its fence is {result}' if severity == ERROR else ''
+        problem = f'fence {result}' if severity == ERROR else ''
         if not problem or problem != self.problem:
             self._log.add(severity, f'fence: {result}')
         self.problem, self.busy = problem, False
         self._due = now + _PAUSE if problem else math.inf
 
     def _upload(self) -> Generator[Any, Any, tuple[int, str]]:
-        """Yield what to send and what answers it, by MAVLink's mission protocol, there and back."""
+        """Yield messages and expected answers of MAVLink's mission protocol, both directions."""
         sender, to, items = self._sender, self._vehicle, self._items
         what = mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
         ask = partial(sender.command_long_send, *to, *what, *[0.0] * 6)
         version = yield ask, ('AUTOPILOT_VERSION',)
         if not version.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE:
-            return WARNING, 'not uploaded: the autopilot has no protocol for it'
+            return WARNING, 'not uploaded: the autopilot does not support it'
         left, send = len(items), partial(sender.mission_count_send, *to, len(items), _FENCE)
         while True:
             answer = yield send, ('MISSION_REQUEST', 'MISSION_REQUEST_INT', 'MISSION_ACK')
@@ -113,7 +113,7 @@ class FenceUpload:
                 left, (command, size, *place) = len(items) - 1 - answer.seq, items[answer.seq]
                 head = answer.seq, mavlink.MAV_FRAME_GLOBAL, command, 0, 1, size, 0.0, 0.0, 0.0
                 send = partial(sender.mission_item_int_send, *to, *head, *place, 0.0, _FENCE)
-            # Where the last answer was lost, another one comes: what is read decides.
+            # If the last answer is lost, another one arrives: the download decides.
             elif left == 0:
                 break
             elif getattr(answer, 'type', 0) != mavlink.MAV_MISSION_ACCEPTED:
@@ -121,13 +121,13 @@ class FenceUpload:
                 return ERROR, f'not verified ({known.name if known else answer.type})'
         announced = yield partial(sender.mission_request_list_send, *to, _FENCE), ('MISSION_COUNT',)
         if announced.count != len(items):
-            return ERROR, 'read back, the number of its items differs'
+            return ERROR, 'not verified: the number of items read back differs'
         for number, item in enumerate(items):
             send = partial(sender.mission_request_int_send, *to, number, _FENCE)
             while (answer := (yield send, ('MISSION_ITEM_INT',))).seq != number:
                 pass
             read = answer.command, answer.param1, answer.x, answer.y
             if not np.isclose(read, item, 0.0, _ROUNDING).all():
-                return ERROR, f'read back, item {number} differs'
+                return ERROR, f'not verified: item {number} read back differs'
         sender.mission_ack_send(*to, mavlink.MAV_MISSION_ACCEPTED, _FENCE)
         return INFO, f'uploaded and verified, {len(items)} vertices and circles'

@@ -1,4 +1,4 @@
-"""What sets the autopilots apart: their modes, how they start, and the check of their failsafes."""
+"""Differences of autopilots: modes, start, and failsafe checks."""
 
 import math
 from collections import Counter
@@ -19,8 +19,8 @@ COPTERS = frozenset({2, 3, 4, 13, 14, 15, 29})
 class Failsafe:
     """A parameter of an autopilot that defines its reaction to a fault."""
 
-    meaning: str  # when it acts
-    off: tuple[float, ...] = (0.0,)  # values with which it does nothing that helps
+    meaning: str  # condition of its action
+    off: tuple[float, ...] = (0.0,)  # values without a useful action
     guards_link: bool = False  # whether it acts on the loss of the driver
 
 
@@ -32,18 +32,18 @@ class Firmware:
     autopilot: int  # of MAV_AUTOPILOT
     kind: Literal['copter', 'submarine']
     modes: Mapping[int, str]
-    external: int  # mode in which it follows setpoints
-    hold: int  # modes in which it holds its position, and in which it lands or surfaces
+    external: int  # mode for set-points
+    hold: int  # modes for holding the position, and for landing or surfacing
     land: int
-    rise: Literal['command', 'setpoint']  # how it leaves its place
+    rise: Literal['command', 'setpoint']  # how it starts
     failsafes: Mapping[str, Failsafe]  # by parameter
-    # Limits of its guided flight: by kind the names of the parameter, of older and newer versions,
-    # and their units [m, s]. With any, set-points lead by its braking, and it is told its speed.
+    # Limits of guided flight: parameter names (older and newer versions) by kind, and units [m, s].
+    # With any, set-points lead by its braking distance, and its speed is set.
     limits: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def px4(self) -> bool:
-        """Whether it is PX4: its mode needs setpoints first, and a pilot does not give it back."""
+        """Whether it is PX4: its mode needs set-points first, and pilots do not return control."""
         return self.autopilot == PX4
 
     def mode_name(self, mode: int) -> str:
@@ -52,7 +52,7 @@ class Firmware:
 
 
 def px4_mode(main: int, sub: int = 0) -> int:
-    """Return PX4's custom mode of its main and sub mode."""
+    """Return PX4's custom mode from its main and sub mode."""
     return main << 16 | sub << 24
 
 
@@ -66,7 +66,7 @@ ARDUCOPTER = Firmware(
     land=9,
     rise='command',
     failsafes={
-        'FS_GCS_ENABLE': Failsafe('the heartbeats of the driver stop', guards_link=True),
+        'FS_GCS_ENABLE': Failsafe('driver heartbeats stop', guards_link=True),
         'FS_THR_ENABLE': Failsafe('the remote control is lost'),
         'FS_EKF_ACTION': Failsafe('the position estimate fails'),
         'BATT_FS_LOW_ACT': Failsafe('the battery is low'),
@@ -88,10 +88,10 @@ ARDUSUB = Firmware(
     land=9,
     rise='setpoint',
     failsafes={
-        # 1 only warns, 2 disarms: it drifts.
-        'FS_GCS_ENABLE': Failsafe('the heartbeats of the driver stop', (0.0, 1.0, 2.0), True),
+        # 1 only warns, 2 disarms, and it drifts.
+        'FS_GCS_ENABLE': Failsafe('driver heartbeats stop', (0.0, 1.0, 2.0), True),
         'FS_EKF_ACTION': Failsafe('the position estimate fails'),
-        'FS_LEAK_ENABLE': Failsafe('water comes in', (0.0, 1.0)),
+        'FS_LEAK_ENABLE': Failsafe('water leaks in', (0.0, 1.0)),
         'BATT_FS_LOW_ACT': Failsafe('the battery is low'),
     },
 )
@@ -106,10 +106,10 @@ PX4_COPTER = Firmware(
     land=px4_mode(4, 6),
     rise='setpoint',
     failsafes={
-        # Acts once the setpoints stop for COM_OF_LOSS_T; 6 terminates the flight, 7 disarms: it
-        # falls (`Failsafe::fromOffboardLossActParam`).
-        'COM_OBL_RC_ACT': Failsafe('the setpoints of the driver stop', (6.0, 7.0), True),
-        'NAV_DLL_ACT': Failsafe('the heartbeats of the driver stop'),
+        # Acts COM_OF_LOSS_T after the last set-point; 6 terminates the flight, 7 disarms: it falls
+        # (`Failsafe::fromOffboardLossActParam`).
+        'COM_OBL_RC_ACT': Failsafe('driver set-points stop', (6.0, 7.0), True),
+        'NAV_DLL_ACT': Failsafe('driver heartbeats stop'),
         'COM_LOW_BAT_ACT': Failsafe('the battery is low'),
         'GF_ACTION': Failsafe('it leaves the fence of the autopilot'),
     },
@@ -131,26 +131,27 @@ def identify(autopilot: int, vehicle_type: int) -> Firmware:
     )
 
 
-# Parameters of ArduPilot of which one holds the system id of the ground station that it listens
-# to, and the one with the highest of these ids, where newer versions have a range.
+# Parameters of ArduPilot with the system id of its ground station, and the highest id of a range in
+# newer versions.
 _STATION, _HIGHEST = ('SYSID_MYGCS', 'MAV_GCS_SYSID'), 'MAV_GCS_SYSID_HI'
-# Of the factory, where the autopilot does not answer: level acceleration and jerk [m, s].
+# Defaults if the autopilot does not answer: level acceleration and jerk [m, s].
 _FACTORY = {'acceleration': 2.5, 'jerk': 5.0}
-# Period and number of requests for a parameter that is not answered [s, 1].
+# Period and number of requests for an unanswered parameter [s, 1].
 _ANSWER_TIMEOUT, _TRIES = 0.5, 5
 _FOREIGN_AGE = 5.0  # a message with our system id counts for this time [s]
 
 
 class FailsafeCheck:
-    """Whether a vehicle stops by itself when the driver is gone.
+    """Checks that a vehicle stops by itself when the driver is lost.
 
-    ArduPilot looks at the system id alone (`GCS::sysid_is_gcs`): any program with it prevents that.
+    ArduPilot checks only the system id (`GCS::sysid_is_gcs`): any program with it prevents
+    that.
     """
 
     def __init__(
         self, firmware: Firmware, settings: MavlinkSettings, sender: Any, log: ReportLog
     ) -> None:
-        #: Of the parameters; None where the autopilot does not have it.
+        # : Parameter values; None if the autopilot does not have it.
         self.values: dict[str, float | None] = {}
         self.complete = False
         self._firmware, self._settings, self._sender, self._log = firmware, settings, sender, log
@@ -163,7 +164,7 @@ class FailsafeCheck:
         self._asked_at = self._foreign_at = -math.inf
 
     def update(self, name: str, value: float) -> None:
-        """Take the value of a parameter."""
+        """Handle the value of a parameter."""
         if name in self._names:
             self.values[name] = value
 
@@ -175,7 +176,7 @@ class FailsafeCheck:
         self._foreign_at = now
 
     def read(self, now: float) -> None:
-        """Request what is missing; call it repeatedly."""
+        """Request missing values; to be called repeatedly."""
         if self.complete or now - self._asked_at < _ANSWER_TIMEOUT:
             return
         self._asked_at = now
@@ -198,7 +199,7 @@ class FailsafeCheck:
             for name, failsafe in self._firmware.failsafes.items():
                 value = self.values[name]
                 off = value is None or value in failsafe.off
-                rest = ', which does not help' if value is not None and off else ''
+                rest = ', which does not stop the vehicle' if value is not None and off else ''
                 text = f'failsafe for when {failsafe.meaning}: {name} {_state(value)}{rest}'
                 self._log.add(WARNING if off else INFO, text)
             if problem := self._station_problem():
@@ -212,7 +213,7 @@ class FailsafeCheck:
         return _FACTORY[kind]
 
     def problem(self, now: float) -> str:
-        """Return why the vehicle must not be armed; empty where nothing speaks against it."""
+        """Return why the vehicle must not be armed, or an empty text."""
         if not self._settings.require_failsafe:
             return ''
         for name, failsafe in self._firmware.failsafes.items():
@@ -222,12 +223,12 @@ class FailsafeCheck:
         return self._foreign(now) or self._station_problem()
 
     def _foreign(self, now: float) -> str:
-        """Return that another program has the driver's system id, or nothing."""
+        """Return the error that another program has the driver's system id, or nothing."""
         if now - self._foreign_at > _FOREIGN_AGE:
             return ''
         return (
-            f'another program sends with system id {self._settings.own_system}: the '
-            'autopilot would not miss the driver; mavlink.own_system must be its alone'
+            f'another program uses system id {self._settings.own_system}: the autopilot would '
+            'not detect a lost driver; mavlink.own_system must be unique'
         )
 
     def _station_problem(self) -> str:
@@ -235,12 +236,12 @@ class FailsafeCheck:
         name, low = next((item for item in known if item[1] is not None), ('', None))
         if low is None:
             names = ' or '.join(self._station)
-            return f'{names} is not known, and require_failsafe is true' if names else ''
+            return f'{names} is unknown, and require_failsafe is true' if names else ''
         own, high = self._settings.own_system, self.values.get(_HIGHEST)
         if low != own:
             return (
-                f'{name} is {low:g}, mavlink.own_system is {own}: the autopilot would not miss '
-                f'the driver; set {name} to {own}'
+                f'{name} is {low:g}, mavlink.own_system is {own}: the autopilot would not '
+                f'detect a lost driver; set {name} to {own}'
             )
         if high is not None and high > low:
             return (
@@ -251,4 +252,4 @@ class FailsafeCheck:
 
 
 def _state(value: float | None) -> str:
-    return 'is not known' if value is None else f'is {value:g}'
+    return 'is unknown' if value is None else f'is {value:g}'

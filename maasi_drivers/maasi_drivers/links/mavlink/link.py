@@ -1,4 +1,4 @@
-"""Connection to a vehicle, which one thread alone reads and writes."""
+"""Connection to a vehicle; a single thread reads and writes."""
 
 import random
 import threading
@@ -11,23 +11,24 @@ from maasi_drivers.links.mavlink.protocol import mavlink, mavutil
 from maasi_drivers.links.mavlink.vehicle import Vehicle
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 
-_PERIOD = 0.02  # longest time until the next check of what is due [s]
-_RETRY = 1.0  # between two tries to open a device that is not there [s]
-# Component ids that MAVLink leaves to private networks: no ground station has one of them.
+_PERIOD = 0.02  # longest time between two checks [s]
+_RETRY = 1.0  # time between attempts to open a missing device [s]
+# Component ids reserved for private networks, which no ground station uses.
 _COMPONENTS = range(mavlink.MAV_COMP_ID_USER1, mavlink.MAV_COMP_ID_USER43 + 1)
 
 
 def make_sender(system: int) -> Any:
-    """Return what packs the messages of a driver, with another component id at each start.
+    """Return the message packer of a driver, with another component id at each start.
 
-    ArduPilot passes no heartbeat to a link with the same system and component
-    (`MAVLink_routing::handle_heartbeat`): a program with both ids of the driver would not be heard.
+    ArduPilot forwards no heartbeat to a link with the same system and component
+    (`MAVLink_routing::handle_heartbeat`), so a program with both ids of the driver would be
+    invisible.
     """
     return mavlink.MAVLink(None, system, random.choice(_COMPONENTS))
 
 
 def open_connection(url: str, system: int, component: int, baud: int = 57600) -> Any:
-    """Return pymavlink's connection, which speaks MAVLink 2."""
+    """Return pymavlink's connection, with MAVLink 2."""
     if mavlink.WIRE_PROTOCOL_VERSION != '2.0':
         raise ValueError(
             'pymavlink was imported before maasi_drivers.links.mavlink and speaks MAVLink 1: set '
@@ -47,13 +48,13 @@ def open_connection(url: str, system: int, component: int, baud: int = 57600) ->
 
 
 class VehicleLink:
-    """A vehicle on a wire, which is opened again after a `failure`; `lock` guards `vehicle`."""
+    """A connected vehicle; reopens the connection after a `failure`; `lock` guards `vehicle`."""
 
     def __init__(self, settings: MavlinkSettings, start: list[float], memory: Path) -> None:
         self.settings = settings
         self.failure = ''
         self._connection: Any = None
-        # It writes to the wire, once that is there.
+        # Writes when the connection is open.
         self._sender = make_sender(settings.own_system)
         self.vehicle = Vehicle(settings, start, self._sender, memory)
         self.lock = threading.Lock()
@@ -61,12 +62,12 @@ class VehicleLink:
         self._thread = threading.Thread(target=self._run, name='mavlink', daemon=True)
 
     def open(self) -> None:
-        """Open the wire, and begin to work."""
+        """Open the connection and start the thread."""
         self._open()
         self._thread.start()
 
     def finish(self, ending: Ending, patience: float) -> bool:
-        """Have it hold or land; return whether it confirms within `patience` [s], or is down."""
+        """Let it hold or land; return whether it confirms within `patience` [s] or is down."""
         with self.lock:
             self.vehicle.finish(ending)
         deadline = time.monotonic() + patience
@@ -78,7 +79,7 @@ class VehicleLink:
         return False
 
     def close(self) -> None:
-        """Stop sending, and close the wire."""
+        """Stop sending and close the connection."""
         self._end.set()
         if self._thread.is_alive():
             self._thread.join(timeout=2.0)
@@ -98,7 +99,7 @@ class VehicleLink:
 
     def _shut(self) -> None:
         connection, self._connection = self._connection, None
-        # What a broken wire says as it is closed adds nothing to its failure.
+        # Errors while closing a broken connection add nothing.
         with suppress(Exception):
             if connection is not None:
                 connection.close()
@@ -116,8 +117,8 @@ class VehicleLink:
                         self.vehicle.handle(message, time.monotonic())
                     self.vehicle.tick(time.monotonic())
             except Exception as error:
-                # A device that was pulled out may come back; a message that cannot be handled must
-                # not end the thread, which nobody would notice: the link is lost meanwhile.
+                # A removed device may return; an invalid message must not end the thread: the link
+                # is lost meanwhile.
                 words = str(error) if isinstance(error, OSError) else repr(error)
                 self.failure = f'mavlink.url: {self.settings.url}: {words}'
                 self._shut()

@@ -1,4 +1,4 @@
-"""A vehicle that speaks MAVLink as a driver's robot."""
+"""A MAVLink vehicle as a driver's robot."""
 
 import math
 import os
@@ -23,28 +23,29 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.operating_volume import MARGIN
 from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.wording import number, point
 
 POLL_PERIOD = 0.02
 _VEHICLE, _GEOFENCE, _SETPOINT = 'vehicle', 'geofence', 'set-point'  # kinds of faults
-_STOP_TIME = 1.0  # at the end: longest wait until the autopilot confirms that it holds or lands [s]
-# Between a localiser's pose and the autopilot's for the same instant, at most [ns].
+_STOP_TIME = 1.0  # at the end: longest wait until the autopilot confirms holding or landing [s]
+# Largest time between a localiser's pose and the autopilot's [ns].
 _LONGEST_LAG = 300_000_000
 _TURNING = 0.3  # closer than this to its target, the vehicle keeps its heading [m]
-_STILL = 0.5  # without a goal it stops first, and holds its position below this speed [m/s]
+_STILL = 0.5  # without a goal it stops first and holds its position below this speed [m/s]
 
 
 class MavlinkRobotLink(RobotLink):
-    """A vehicle with an autopilot, which flies to set-points.
+    """A vehicle with an autopilot that flies to set-points.
 
     Services
     --------
-    `arm` (std_srvs/Trigger): it takes off once, or is taken over in the air
+    `arm` (std_srvs/Trigger): permits one take-off, or takes control in the air
     """
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
         settings = driver.settings
-        # Whether poses of a localiser define where the autopilot's frame is in the map.
+        # Whether poses of a localiser define the autopilot's frame in the map.
         self._localised = settings.poses != 'odometry'
         self._mavlink = settings.mavlink or MavlinkSettings()
         if self._localised:
@@ -53,7 +54,7 @@ class MavlinkRobotLink(RobotLink):
             driver.pose_name = 'LOCAL_POSITION_NED'
         self._local_poses = PoseHistory()
         self._charge_reports = 0
-        # Not the one of the driver: telemetry and images have different delays.
+        # Separate from the driver's: telemetry and images have different delays.
         place = [*settings.start[:2], self._mavlink.ground]
         self._map_from_local = Pose.from_yaw(place, -self._mavlink.map_yaw)
         self._local_origin = np.zeros(3)
@@ -67,7 +68,7 @@ class MavlinkRobotLink(RobotLink):
         driver.volume = flight_volume(driver.volume.area, settings, self._mavlink)
 
     def prepare(self) -> None:
-        """Make the link; it remembers the origin of a flight."""
+        """Create the link, which remembers the origin of a flight."""
         folder = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
         name = f'{self.driver.namespace.replace("/", "_")}_flight_origin.json'
         memory = folder / 'maasi' / name
@@ -77,7 +78,7 @@ class MavlinkRobotLink(RobotLink):
         vehicle.speed, vehicle.braking = motion.speed, motion.acceleration
 
     def connect(self) -> None:
-        """Open the connection; the vehicle is armed only once the driver is active."""
+        """Open the connection; the vehicle is armed only while the driver is active."""
         driver, vehicle = self.driver, self._link.vehicle
         self._link.open()
         driver.create_wall_timer(POLL_PERIOD, self._update)
@@ -98,14 +99,15 @@ class MavlinkRobotLink(RobotLink):
         return problem
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
-        """Send the position that the command leads to, or its target if that is nearer.
+        """Send the position that the command leads to, or its target if that is closer.
 
-        Out of a zone it goes straight to the exit: the autopilot rejects set-points inside.
+        From inside a zone it flies straight to the exit, as the autopilot rejects set-
+        points inside.
         """
         follower, position, yaw = self.driver.follower, placed.pose.position, placed.pose.yaw
         moving = follower.status == GoalStatus.MOVING
         if self._rejected and not moving:
-            return  # it stays where the autopilot has it
+            return  # it stays at the autopilot's position
         way = follower.exit_from(position)
         if way is not None:
             way = way - position if moving else None
@@ -124,7 +126,7 @@ class MavlinkRobotLink(RobotLink):
         self._send_target(position + way, self._heading)
 
     def _rests(self, placed: StampedPose) -> bool:
-        """Return whether a vehicle without a goal has stopped, or is at its last goal."""
+        """Return whether a vehicle without a goal has stopped or is at its last goal."""
         follower = self.driver.follower
         if follower.status != GoalStatus.REACHED and float(np.hypot(*placed.velocity[:2])) > _STILL:
             follower.stay()
@@ -132,7 +134,7 @@ class MavlinkRobotLink(RobotLink):
         return True
 
     def _ahead(self, placed: StampedPose, command: Sequence[float]) -> FloatArray:
-        """Return the way (3,) to a set-point at which it flies as commanded, in free space."""
+        """Return the offset (3,) of a set-point for flying as commanded, in free space."""
         position, yaw = placed.pose.position, placed.pose.yaw
         cosine, sine = math.cos(yaw), math.sin(yaw)
         along, aside, up = command[:3]
@@ -147,16 +149,16 @@ class MavlinkRobotLink(RobotLink):
         away = float(np.linalg.norm(to_target))
         if away <= min(lead, least):
             return to_target
-        # If nothing comes after it, the vehicle goes on to there.
+        # Without another command the vehicle continues to this point.
         lead = max(self._free(position, velocity / speed, min(lead, away)), min(least, lead))
         return to_target if away <= lead else velocity * (lead / speed)
 
     def _free(self, position: FloatArray, direction: FloatArray, lead: float) -> float:
-        """Return how much of a straight way, at most `lead` [m], is clear of all zones."""
+        """Return the length of a straight path, at most `lead` [m], that is clear of all zones."""
         keep_out = self.driver.follower.motion.keep_out
         if not len(keep_out):
             return lead
-        # No zone is thinner, as the robot's radius is around it.
+        # No zone is thinner, as the robot's radius surrounds it.
         step = lead / math.ceil(lead / max(keep_out.radius, 0.1))
         free = 0.0
         while free < lead - 1e-6 and keep_out.is_free(position + (free + step) * direction):
@@ -164,7 +166,7 @@ class MavlinkRobotLink(RobotLink):
         return free
 
     def hold(self) -> None:
-        """Have the vehicle stop now; with the next pose it holds where it has stopped."""
+        """Stop the vehicle now; with the next pose it holds its position."""
         self._brake()
 
     def _brake(self) -> None:
@@ -173,26 +175,26 @@ class MavlinkRobotLink(RobotLink):
             self._link.vehicle.brake()
 
     def goal_taken(self, goal: Goal) -> None:
-        """Take set-points for positions again."""
+        """Resume position set-points."""
         self._rejected = False
         self._landing.leave()
 
     def stop(self) -> None:
-        """Have the vehicle hold its position or land, and wait until it confirms."""
+        """Let the vehicle hold its position or land, and wait for confirmation."""
         self._ending = True
         if not self._link.finish(self._mavlink.at_end, _STOP_TIME):
             self.driver.get_logger().error(
-                f'at_end: {self._mavlink.at_end}: not confirmed by the autopilot; only its own '
-                'failsafe is left'
+                f'at_end: {self._mavlink.at_end}: not confirmed by the autopilot; relying on its '
+                'failsafe'
             )
         self._log_reports()
 
     def reset(self) -> None:
-        """Discard the autopilot's poses of another time."""
+        """Discard the autopilot's poses from another time."""
         self._local_poses.clear()
 
     def latch_stop(self) -> None:
-        """End the permission to take off, and a take-off."""
+        """End the permission to take off, and abort a take-off."""
         with self._link.lock:
             self._link.vehicle.stop()
 
@@ -248,7 +250,7 @@ class MavlinkRobotLink(RobotLink):
             self._charge_reports = reports
             driver.take_charge(charge)
         if BATTERY in driver.health:
-            # Again and again: a vehicle that the pilot has meanwhile may be given back.
+            # Repeatedly, as a pilot may return the vehicle.
             self._ending = True
             link.finish(self._mavlink.on_low_battery, 0.0)
         elif in_air and (reason := self._at_home(charge)):
@@ -259,18 +261,17 @@ class MavlinkRobotLink(RobotLink):
             self._handle_telemetry(telemetry)
 
     def _judge_setpoint(self, rejected: FloatArray | None) -> None:
-        """Begin or end the fault of a set-point (3,), local, that the autopilot rejects."""
+        """Begin or end the fault of a rejected set-point (3,), local."""
         health = self.driver.health
         if rejected is None:
-            health.end(_SETPOINT, 'the autopilot takes set-points again')
+            health.end(_SETPOINT, 'the autopilot accepts set-points again')
         elif _SETPOINT not in health:
             self._rejected = True
             there = compose(self._map_from_local, Pose(rejected - self._local_origin)).position
-            x, y, z = there.tolist()
             health.begin(
                 _SETPOINT,
-                f'set-point rejected: the autopilot does not go to ({x:.1f}, {y:.1f}, {z:.1f}) m, '
-                'as where that is outside of its own fence',
+                f'the autopilot rejected the set-point {point(there)} m, for example because it '
+                'is outside of its own fence',
             )
 
     def _at_home(self, charge: float) -> str:
@@ -294,7 +295,7 @@ class MavlinkRobotLink(RobotLink):
         with self._link.lock:
             reports = self._link.vehicle.log.take()
         logger = self.driver.get_logger()
-        # The logger tells severities by the line that it is called from.
+        # The logger ties severities to calling lines.
         for severity, text in reports:
             if severity <= ERROR:
                 logger.error(text)
@@ -309,7 +310,7 @@ class MavlinkRobotLink(RobotLink):
         driver = self.driver
         stamp = driver.arrivals.stamp(telemetry.arrival - self._mavlink.latency)
         if stamp is None:
-            # A simulated time has not begun: nothing is late.
+            # Before the begin of a simulated time nothing is late.
             driver.silence.end()
             return
         if not self._localised:
@@ -334,8 +335,7 @@ class MavlinkRobotLink(RobotLink):
         position, health = placed.pose.position, self.driver.health
         outside = self.driver.volume.distance_outside(position)
         if outside > MARGIN and _VEHICLE not in health:
-            there = np.round(position, 2).tolist()
-            text = f'{outside:.1f} m outside the geofence, at {there} m: it returns'
+            text = f'{number(outside)} m outside the geofence, at {point(position)} m: returning'
             health.begin(_GEOFENCE, text)
         elif not outside and health.end(_GEOFENCE, 'inside the geofence again'):
             self.driver.follower.stay()

@@ -7,11 +7,11 @@ from pymavlink import mavutil
 mavlink = mavutil.mavlink
 
 ERROR, WARNING, INFO, DEBUG = 3, 4, 6, 7  # of MAV_SEVERITY
-_TEXT_AGE = 6.0  # texts of the autopilot that are younger explain a refusal [s]
+_TEXT_AGE = 6.0  # more recent texts of the autopilot explain a refusal [s]
 
 
 class ReportLog:
-    """Reports until the driver takes them; severities as in MAVLink, times of the steady clock."""
+    """Queue of reports for the driver; severities as in MAVLink, times: steady clock."""
 
     def __init__(self) -> None:
         self._reports: deque[tuple[int, str]] = deque(maxlen=200)
@@ -33,6 +33,6 @@ class ReportLog:
         return reports
 
     def recent_text(self, now: float, most: int = 8) -> str:
-        """Return the last recent texts of the autopilot, each once."""
+        """Return the last recent texts of the autopilot, without repetitions."""
         texts = list(dict.fromkeys(text for time, text in self._texts if now - time < _TEXT_AGE))
         return '; '.join(texts[-most:])

@@ -1,4 +1,4 @@
-"""Set-points: how far ahead they lie, and whether the autopilot takes them."""
+"""Set-points: lead distance, and detection of rejections."""
 
 import math
 from collections import deque
@@ -8,20 +8,20 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 
-_NO_POSITION = 0b111  # bits of a mask that leave a position out
-# A target that the autopilot reports is one that was sent in this time, within this [s, m].
+_NO_POSITION = 0b111  # mask bits that omit the position
+# A reported target matches one sent within this time and distance [s, m].
 _MEMORY, _SAME = 2.0, 0.3
-# For so long the reports differ, and a vehicle stands, before a set-point counts as rejected [s].
+# Duration of a difference at standstill until a set-point counts as rejected [s].
 _PATIENCE, _STANDS = 1.0, 5.0
-# What counts as standing, and as away from its set-point [m/s, m].
+# Largest speed of standstill, and smallest distance from the set-point [m/s, m].
 _STILL, _AWAY = 0.1, 1.0
 
 
 def braking_lead(speed: float, acceleration: float, jerk: float) -> float:
-    """Return how far ahead a position lies towards which ArduCopter flies with a speed [m].
+    """Return the lead of a position for which ArduCopter flies with a speed [m].
 
     The inverse of `shape_pos_vel_accel_xy` (ArduPilot, AP_Math/control.cpp) in steady flight,
-    where the position moves along with the vehicle.
+    with a position that moves along with the vehicle.
     """
     gain = jerk / acceleration
     slow = acceleration / gain
@@ -32,32 +32,32 @@ def braking_lead(speed: float, acceleration: float, jerk: float) -> float:
 
 
 class SetpointCheck:
-    """Finds set-points that an autopilot rejects without a word.
+    """Detects set-points that an autopilot rejects silently.
 
-    ArduPilot does so outside of its fence. It reports the target that it has; where no report
-    comes, a vehicle that stands away from its set-point shows it. Times are of the steady clock
-    [s], positions are in the local frame, ENU [m].
+    ArduPilot rejects those outside of its fence. It reports its current target; without
+    reports, a vehicle that stands away from its set-point shows it. Times: steady clock [s];
+    positions: local frame, ENU [m].
     """
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all set-points, as after another kind of them."""
+        """Discard all set-points, after another kind of them."""
         self._sent: deque[tuple[float, FloatArray]] = deque()
         self._since = self._other_since = self._standing_since = math.inf
-        #: Position (3,) that the autopilot has instead; None: not known, or it has a velocity.
+        # : Position (3,) that the autopilot has instead; None: unknown, or a velocity.
         self.other: FloatArray | None = None
 
     def note(self, position: FloatArray, now: float) -> None:
-        """Note a set-point that is sent."""
+        """Note a sent set-point."""
         self._since = min(self._since, now)
         self._sent.append((now, position))
         while self._sent[0][0] < now - _MEMORY:
             self._sent.popleft()
 
     def observe(self, position: FloatArray, velocity: FloatArray, now: float) -> None:
-        """Note where the vehicle is, and how fast."""
+        """Note position and velocity of the vehicle."""
         away = self._sent and float(np.linalg.norm(self._sent[-1][1] - position)) > _AWAY
         if away and float(np.linalg.norm(velocity)) < _STILL:
             self._standing_since = min(self._standing_since, now)
@@ -65,7 +65,7 @@ class SetpointCheck:
             self._standing_since = math.inf
 
     def update(self, message: Any, position: FloatArray, now: float) -> None:
-        """Take POSITION_TARGET_LOCAL_NED, the present target: its position, unless left out."""
+        """Handle POSITION_TARGET_LOCAL_NED, the current target."""
         if now - self._since < _PATIENCE:
             return
         has_position = not message.type_mask & _NO_POSITION
@@ -76,7 +76,7 @@ class SetpointCheck:
         self._other_since = math.inf if here else min(self._other_since, now)
 
     def rejected(self, now: float) -> FloatArray | None:
-        """Return the set-point (3,) that is rejected, or None."""
+        """Return the rejected set-point (3,), or None."""
         other = now - self._other_since > _PATIENCE
         stands = now - max(self._standing_since, self._since) > _STANDS
         return self._sent[-1][1] if self._sent and (other or stands) else None

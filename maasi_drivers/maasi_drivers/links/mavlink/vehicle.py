@@ -1,4 +1,4 @@
-"""One vehicle from its first heartbeat to the end: phases of a flight. No wire, no thread."""
+"""Phases of a vehicle's flight from its first heartbeat to the end. Without I/O and threads."""
 
 import math
 from enum import Enum
@@ -15,22 +15,23 @@ from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, mavlink
 from maasi_drivers.links.mavlink.setpoints import braking_lead
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 from maasi_filter.arrays import FloatArray
+from maasi_filter.wording import number
 
 
 class VehiclePhase(Enum):
-    """How far the driver is with a vehicle; the value says why it does not continue from there."""
+    """Phase of a vehicle; the value is the reason why it does not continue."""
 
-    CONNECTING = 'nothing heard yet'
+    CONNECTING = 'no heartbeat yet'
     PREPARING = 'no position estimate yet'
     WAITING = 'not armed'
-    STARTING = 'takes the mode'
-    ARMING = 'is being armed'
-    RISING = 'is on its way to its height'
+    STARTING = 'changing mode'
+    ARMING = 'arming'
+    RISING = 'climbing'
     FLYING = ''
     RELEASED = 'the pilot has taken over'
     ENDING = 'ends'
-    STOPPED = 'is disarmed'
-    REFUSED = 'is left alone'
+    STOPPED = 'disarmed'
+    REFUSED = 'released'
 
 
 #: Phases in which the driver commands the vehicle.
@@ -45,14 +46,14 @@ COMMANDED = (
 
 _MODE, _TAKE_OFF = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_NAV_TAKEOFF
 _SPEED, _GROUND_SPEED = mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.SPEED_TYPE_GROUNDSPEED
-_REJECTED = 2.0  # a rejected set-point is a fault for so long; meanwhile it stands [s]
-_SAME_TIME = 5.0  # a breach of the fence and another mode belong together within this [s]
-# Modes that an autopilot takes by itself.
+_REJECTED = 2.0  # duration of a rejected set-point's fault, at standstill [s]
+_SAME_TIME = 5.0  # a fence breach and a mode change within this time belong together [s]
+# Modes that an autopilot enters by itself.
 _FAILSAFE_MODES = frozenset({'RTL', 'LAND', 'BRAKE', 'SMART_RTL', 'AUTO_RTL', 'SURFACE'})
 _ENDING_PERIOD = 0.3  # period of requests for the final mode [s]
-_ARMING_PERIOD = 2.0  # period of attempts to arm; the autopilot reports refusals [s]
-_STREAM_AHEAD = 1.2  # time for which set-points are sent before a mode that needs them [s]
-# The height is reached within this; a smaller change is no progress [m].
+_ARMING_PERIOD = 2.0  # period of arming attempts; the autopilot reports refusals [s]
+_STREAM_AHEAD = 1.2  # duration of set-points before a mode that needs them [s]
+# Height tolerance, and smallest change that counts as progress [m].
 _REACHED, _PROGRESS = 0.2, 0.1
 # Phases in which the service `arm` is refused with the fault.
 _UNABLE = (
@@ -64,60 +65,60 @@ _UNABLE = (
 
 
 class Vehicle(Autopilot):
-    """One vehicle, from the first heartbeat to the end; times are of the steady clock [s]."""
+    """A vehicle from its first heartbeat to the end; times: steady clock [s]."""
 
     def __init__(
         self, settings: MavlinkSettings, start: list[float], sender: Any, memory: Path | None = None
     ) -> None:
         super().__init__(settings, start, sender, memory)
-        # Over its origin; a copter's is on the ground [m].
+        # Height over its origin; a copter's on the ground [m].
         self.height = start[2] - settings.ground
         self.phase = VehiclePhase.CONNECTING
         self.active = False
         self._permission = ArmPermission(settings.arm_timeout)
-        # Where it is to be, and its yaw there; none: it stops, and it keeps its own.
+        # Target position and yaw; none: it stops, and keeps its yaw.
         self._target: FloatArray | None = None
         self._yaw: float | None = None
-        #: What it is to fly at, at most [m/s]; none: as the autopilot has it.
+        # : Largest speed [m/s]; none: the autopilot's.
         self.speed: float | None = None
-        #: What it is planned to brake with [m/s^2]; none: any.
+        # : Planned deceleration [m/s^2]; none: any.
         self.braking: float | None = None
         self._speed_due = True
-        #: The set-point (3,) that the autopilot has just rejected, or None.
+        # : The set-point (3,) that the autopilot has just rejected, or None.
         self.rejected: FloatArray | None = None
         self._rejected_at = self._released_at = -math.inf
-        # Smallest distance to its height so far [m], and the time at which it became less.
+        # Smallest distance to its height so far [m], and its time.
         self._least_left, self._nearer_at = math.inf, -math.inf
         self._detail = ''
         self._phase_at = self._tried_at = -math.inf
         self._fix_needed = False
         self._ending: Ending | None = None
         self._reason = ''  # why it lands by itself
-        self._displaced = False  # restarted after a flight: its local frame may be anywhere
+        self._displaced = False  # restarted after a flight: its local frame is undefined
 
     @property
     def flying(self) -> bool:
-        """Whether it follows set-points, with a link that works."""
+        """Whether it follows set-points, with a working link."""
         return self.phase is VehiclePhase.FLYING and not self.lost
 
     @property
     def in_air(self) -> bool:
-        """Whether it is armed, and not on the ground."""
+        """Whether it is armed and not on the ground."""
         landed = self.estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND
         return self.armed and not landed
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing is left to command when the driver ends."""
+        """Whether the driver can end without a command."""
         if self.phase not in COMMANDED or not self.armed:
             return True
         return self.phase is VehiclePhase.ENDING and _MODE in self.accepted
 
     @property
     def fault(self) -> str:
-        """Why it cannot go anywhere; empty where it can."""
+        """Why it cannot fly to goals, or an empty text."""
         if self.lost:
-            return f'link: nothing heard from system {self.settings.system}'
+            return f'link: no message from system {self.settings.system}'
         if self.place.problem:
             return f'vehicle: {self.place.problem}'
         flying = self.phase is VehiclePhase.FLYING
@@ -128,11 +129,11 @@ class Vehicle(Autopilot):
 
     @property
     def _taken_over(self) -> str:
-        """By whom it was taken from the driver."""
+        """Who took control from the driver."""
         if abs(self.breached_at - self._released_at) < _SAME_TIME:
-            return 'its fence was breached, and the autopilot has taken over by itself'
+            return 'fence breached: the autopilot has taken control'
         if self._firmware.mode_name(self.mode) in _FAILSAFE_MODES:
-            return 'the pilot or a failsafe has taken over'
+            return 'the pilot or a failsafe has taken control'
         return VehiclePhase.RELEASED.value
 
     @property
@@ -153,7 +154,7 @@ class Vehicle(Autopilot):
         return np.zeros(3) if telemetry is None else telemetry.position.copy()
 
     def set_target(self, position: ArrayLike, yaw: float) -> None:
-        """Have it go to a position (3,) [m], with a yaw [rad], and stay there."""
+        """Fly to a position (3,) [m] with a yaw [rad] and stay there."""
         target = np.array(position, dtype=float)
         if not np.isfinite([*target, yaw]).all():
             raise ValueError(
@@ -163,50 +164,50 @@ class Vehicle(Autopilot):
             self._target, self._yaw = target, float(yaw)
 
     def brake(self) -> None:
-        """Have it stop, and stay there."""
+        """Stop and stay there."""
         if self.phase is VehiclePhase.FLYING:
             self._target, self._yaw = None, None
 
     def lead(self, speed: float) -> float:
-        """Return how far ahead set-points lie for a speed [m/s], so that it is flown [m]."""
+        """Return the lead of set-points for a speed [m/s] [m]."""
         lead, failsafes = self.settings.lead * speed, self.failsafes
         if failsafes is None or not self._firmware.limits:
             return lead
         braking = braking_lead(speed, failsafes.limit('acceleration'), failsafes.limit('jerk'))
         if self.speed is None or _SPEED not in self.accepted:
             return braking
-        # Farther than for the speed only where the autopilot itself limits that.
+        # Farther than for the speed only if the autopilot limits the speed.
         return braking + lead * min(speed / self.speed, 1.0) ** 2
 
     def permit(self, now: float) -> str:
-        """Let it take off once, or be taken over where it flies; return why not, or nothing."""
+        """Permit one take-off, or take control in the air; return why not, or nothing."""
         problem = self._permission.ask(now, self._objection(now))
         if not problem and self.phase is VehiclePhase.STOPPED:
             self._enter(VehiclePhase.PREPARING)
         return problem
 
     def forbid(self) -> None:
-        """End the permission: arming is given up, a flight continues."""
+        """End the permission: arming is aborted, a flight continues."""
         self._permission.end()
         if self.phase in (VehiclePhase.STARTING, VehiclePhase.ARMING):
             self.commands.clear()
             self._enter(VehiclePhase.WAITING)
 
     def stop(self) -> None:
-        """End the permission; a take-off is given up, and it lands; a flight continues."""
+        """End the permission; abort a take-off and land; a flight continues."""
         if self.phase is VehiclePhase.RISING:
-            self.finish('land', 'its take-off was stopped')
+            self.finish('land', 'take-off stopped')
         self.forbid()
 
     def _objection(self, now: float) -> str:
         if self.phase in (VehiclePhase.RISING, VehiclePhase.FLYING):
             return 'it is in the air already'
         if self._displaced:
-            return 'the autopilot has restarted: start the driver again'
+            return 'the autopilot has restarted: restart the driver'
         if self.lost or self.place.problem or self.phase in _UNABLE:
             return self.fault
         if self.armed and self.firmware is not None and not self.in_external_mode:
-            return f'it is flown in {self.firmware.mode_name(self.mode)}'
+            return f'it is flying in {self.firmware.mode_name(self.mode)}'
         if not (self.settings.arm or self.armed):
             return 'mavlink.arm is false'
         if self.phase is VehiclePhase.WAITING and self.failsafes is not None:
@@ -214,7 +215,7 @@ class Vehicle(Autopilot):
         return ''
 
     def finish(self, ending: Ending, reason: str = '') -> None:
-        """Have it hold or land, if it is the driver's to fly; neither arm nor move it any more."""
+        """Hold or land if the driver controls it; afterwards never arm or move it."""
         self._permission.end()
         if self.phase is VehiclePhase.ENDING and self._ending == ending:
             return
@@ -222,7 +223,7 @@ class Vehicle(Autopilot):
             self._ending = ending
             self._reason = f', {reason}' if reason else ''
             self.commands.clear()
-            what = 'it lands' if ending == 'land' else 'it holds its position'
+            what = 'landing' if ending == 'land' else 'holding its position'
             self._enter(VehiclePhase.ENDING, what + self._reason)
         self.forbid()
 
@@ -235,7 +236,7 @@ class Vehicle(Autopilot):
             self._enter(VehiclePhase.REFUSED, self.refusal)
 
     def _judge_mode(self, was_armed: bool, before: int, now: float) -> None:
-        """Give the vehicle up where the pilot, a failsafe or a disarming has taken it."""
+        """Give up control if the pilot, a failsafe or a disarming took it."""
         firmware, mode, armed = self._firmware, self.mode, self.armed
         if self.phase is VehiclePhase.CONNECTING:
             self._enter(VehiclePhase.PREPARING)
@@ -243,7 +244,9 @@ class Vehicle(Autopilot):
             self._on_disarmed(now)
         elif mode not in self._own_modes(before):
             name, self._released_at = firmware.mode_name(mode), now
-            self.log.add(WARNING, f'{self._taken_over}: mode {name}; the driver lets go')
+            self.log.add(
+                WARNING, f'{self._taken_over}: mode {name}; the driver releases the vehicle'
+            )
             self.commands.clear()
             self._permission.end()
             self._target = None
@@ -256,7 +259,7 @@ class Vehicle(Autopilot):
         elif self.phase is VehiclePhase.RELEASED:
             name = firmware.mode_name(mode)
             if mode == firmware.external and armed and not firmware.px4:
-                self.log.add(WARNING, f'the pilot gives {name} back')
+                self.log.add(WARNING, f'the pilot returned control in {name}')
                 self._begin_flying()
             elif mode == firmware.external and not armed:
                 self.log.add(INFO, f'{name} is back: {UNTIL_ARM}')
@@ -278,15 +281,15 @@ class Vehicle(Autopilot):
         self.commands.clear()
         self._permission.end()
         if self.phase is VehiclePhase.ENDING:
-            self._enter(VehiclePhase.STOPPED, f'it has landed{self._reason}, {UNTIL_ARM}')
+            self._enter(VehiclePhase.STOPPED, f'landed{self._reason}, {UNTIL_ARM}')
         elif self.phase not in (VehiclePhase.PREPARING, VehiclePhase.WAITING):
             text = self.log.recent_text(now, 2)
             why = f'by the autopilot or the pilot{f" ({text})" if text else ""}'
-            self.log.add(WARNING, f'it has been disarmed {why}')
+            self.log.add(WARNING, f'disarmed {why}')
             self._enter(VehiclePhase.STOPPED, f'{why}, {UNTIL_ARM}')
 
     def on_restart(self) -> None:
-        """Begin anew with an autopilot that was restarted: its local frame is another one."""
+        """Start again with a restarted autopilot, whose local frame is new."""
         text = 'the autopilot has restarted'
         self.log.add(WARNING, text)
         self.commands.clear()
@@ -296,10 +299,10 @@ class Vehicle(Autopilot):
             self._enter(VehiclePhase.PREPARING)
         else:
             self._displaced = True
-            self._enter(VehiclePhase.STOPPED, f'{text}: start the driver again')
+            self._enter(VehiclePhase.STOPPED, f'{text}: restart the driver')
 
     def tick(self, now: float) -> None:
-        """Send what is due; at least 50 times a second."""
+        """Send due messages; to be called at least 50 times per second."""
         self.send_heartbeat(now)
         if self.firmware is None:
             return
@@ -325,7 +328,7 @@ class Vehicle(Autopilot):
         if self._target is None:
             self._speed_due = True
         elif flying and self._speed_due and self.speed is not None and self._firmware.limits:
-            # Valid from the first position on, until a velocity is sent.
+            # Valid from the first position until a velocity is sent.
             self._speed_due = False
             self.command(_SPEED, (_GROUND_SPEED, self.speed, -1.0))
 
@@ -353,7 +356,7 @@ class Vehicle(Autopilot):
         if self._phase_at == -math.inf:
             self._phase_at = now
         if self._permission.expired(now):
-            # The client that requested it may not expect it any more.
+            # The client that requested it may no longer expect it.
             text = self.log.recent_text(now)
             why = f' ({text})' if text else ''
             limit = f'{self.settings.arm_timeout:g} s'
@@ -387,14 +390,14 @@ class Vehicle(Autopilot):
             self._wait(now)
 
     def _compare_limits(self, failsafes: FailsafeCheck) -> None:
-        """Warn of a vehicle that is planned to be faster than its autopilot lets it be."""
+        """Warn if the vehicle is planned to be faster than its autopilot allows."""
         most = failsafes.limit('acceleration') if self._firmware.limits else math.inf
         if self.braking is not None and most < self.braking:
             name = next(iter(self._firmware.limits['acceleration']))
             self.log.add(
                 WARNING,
-                f'{name}: the autopilot speeds up and brakes with {most:g} m/s^2, less than '
-                f'motion.acceleration, {self.braking:g}: it comes later than planned',
+                f'{name}: the autopilot accelerates with {most:g} m/s^2, less than '
+                f'motion.acceleration, {self.braking:g}: it will arrive later than planned',
             )
 
     def _wait(self, now: float) -> None:
@@ -403,16 +406,16 @@ class Vehicle(Autopilot):
         permitted = self.active and self._permission.holds(now)
         if self.armed and not self.in_external_mode:
             self._permission.end()
-            self._detail = f'it is flown in {name}'
+            self._detail = f'it is flying in {name}'
         elif self.armed and permitted:
-            self.log.add(INFO, f'it is armed, in {name}: taken over')
+            self.log.add(INFO, f'armed in {name}: taking control')
             self._permission.end()
             if self.in_air:
                 self._begin_flying()
             else:
                 self._begin_rising(now)
         elif self.armed:
-            self._detail = f'it is armed in {name}, not by this driver, {UNTIL_ARM}'
+            self._detail = f'armed in {name} by another program, {UNTIL_ARM}'
         elif not self.settings.arm:
             self._detail = 'arm is false'
         elif not self.active:
@@ -444,11 +447,11 @@ class Vehicle(Autopilot):
             self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 
     def _begin_rising(self, now: float) -> None:
-        # A request to arm without an answer would arm it again after a pilot disarmed it.
+        # An unanswered arming request could arm it again after a pilot disarmed it.
         self.commands.clear()
         self._target = self._position()
         if self._firmware.kind == 'copter':
-            # On the ground; the barometer may have drifted since the estimator started.
+            # On the ground; the barometer may have drifted since the estimator's start.
             self.estimate.origin[2] = self._target[2]
             self.place.keep(self.estimate.origin, self.estimate.booted)
         self._least_left, self._nearer_at = math.inf, now
@@ -462,14 +465,14 @@ class Vehicle(Autopilot):
         if left < self._least_left - _PROGRESS:
             self._least_left, self._nearer_at = left, now
         by_command = self._firmware.rise == 'command'
-        # The autopilot's home may be elsewhere: the rest after its take-off is flown by set-point.
+        # The autopilot's home may differ: set-points complete the climb after its take-off.
         taken_off = by_command and estimate.landed == mavlink.MAV_LANDED_STATE_IN_AIR
         if left <= _REACHED or taken_off:
             self._begin_flying()
         elif now - self._nearer_at > timeout:
-            way = f'at {height:.1f} m of {top:.1f} m'
-            reason = f'it came no nearer to its height in {timeout:g} s: {way}'
-            self.log.add(ERROR, f'{reason}: it lands')
+            way = f'at {number(round(height, 1))} m of {number(round(top, 1))} m'
+            reason = f'no climb for {timeout:g} s: {way}'
+            self.log.add(ERROR, f'{reason}: landing')
             self.finish('land', reason)
         elif not by_command:
             self._target[2] = top
@@ -490,7 +493,7 @@ class Vehicle(Autopilot):
         self._enter(VehiclePhase.FLYING)
 
     def _end(self, now: float) -> None:
-        # Not again once accepted: a pilot may have taken another mode since the last heartbeat.
+        # Not again once accepted: a pilot may have changed the mode since the last heartbeat.
         if _MODE not in self.accepted and self._is_due(now, _ENDING_PERIOD):
             self.request_mode(self._ending_mode)
 
