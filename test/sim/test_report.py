@@ -220,6 +220,7 @@ def test_a_map_program_gets_ways_and_what_was_explored(tmp_path):
     run.update(0.5)
     write(run.record('time_limit', 200.0), tmp_path)
     explored, line = json.loads((tmp_path / 'ways.geojson').read_text())['features']
+    assert '<name>Path of mambo' in (tmp_path / 'map_files' / 'search.kml').read_text()
 
     def placed(degrees):
         lon, lat = np.array(degrees)[:, :2].T
