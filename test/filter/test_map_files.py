@@ -200,7 +200,7 @@ def test_points_named_by_a_role_are_starts_and_chargers(tmp_path):
         ('a.kmz', 'PK', 'is not a KMZ archive'),
         ('a.plan', '{"fileType": "Parameters"}', 'fileType: read Parameters, allowed is Plan'),
         ('a.plan', '{', 'is not JSON in line 1'),
-        ('a.plan', plan(mission={'items': [1, 2]}), 'mission.items: 2 not read'),
+        ('a.plan', plan(mission={'items': [1, 2]}), 'mission.items: 2 items not read'),
         ('a.plan', plan([{'polygon': []}]), 'geoFence.polygons[0]: read'),
         ('a.plan', plan([zone([(1, 'x')], True)]), 'geoFence.polygons[0]: longitude: read x'),
         (
@@ -212,7 +212,7 @@ def test_points_named_by_a_role_are_starts_and_chargers(tmp_path):
         ('a.poly', '#\n46.1 9.2 7\n', 'line 2: read 46.1 9.2 7, allowed are latitude and long'),
         ('a.poly', '46.1 9.2\n', 'rings of at least 3 positions'),
         ('a.waypoints', '46.1 9.2\n', 'line 1: read 46.1 9.2, allowed is QGC WPL 110'),
-        ('a.waypoints', waypoints((16, 0, 1, 2)), '1 items with command 16: not read'),
+        ('a.waypoints', waypoints((16, 0, 1, 2)), '1 item with command 16: not read'),
         ('a.waypoints', waypoints(*fence(5001, FIELD)[:3]), 'line 5: ends after 3 of 4 vertices'),
         (
             'a.waypoints',

@@ -24,6 +24,7 @@ import numpy as np
 
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.geometry.polygons import short
+from maasi_filter.wording import counted
 
 Row = dict[str, Any]
 LABEL = 'maasi:label'  # member of a feature: the element it was read from, for messages
@@ -317,7 +318,7 @@ def _plan(data: bytes) -> Iterator[Row]:
     others['rallyPoints.points'] = _part(_part(plan, 'rallyPoints', dict), 'points', list)
     for label, items in others.items():
         if items:
-            yield _row(label, f'{len(items)} not read, draw zones as a fence')
+            yield _row(label, f'{counted(len(items), "item")} not read, {_FENCE}')
 
 
 def _part(data: Mapping[str, Any], key: str, kind: type, where: str = '') -> Any:
@@ -381,10 +382,11 @@ def _waypoints(data: bytes) -> Iterator[Row]:
     if ring:
         raise ValueError(f'{lines[-1][0]}: ends after {len(ring)} of {begun[1]} vertices: {_FEW}')
     for command, number in others.items():
-        yield _row(f'{number} items with command {command}', 'not read, draw zones as a fence')
+        yield _row(f'{counted(number, "item")} with command {command}', f'not read, {_FENCE}')
 
 
 _FEW = 'the polygon before is not complete'
+_FENCE = 'draw zones as a fence'
 
 #: By ending of the name.
 READERS: dict[str, Callable[[bytes], Iterator[Row]]] = {
