@@ -50,10 +50,10 @@ class Change:
 
 
 def merge(own: FoundTargets, others: Mapping[str, Sequence[FoundTarget]]) -> Change:
-    """Merge the found targets of a filter with those of others, given by robot.
+    """Merge the found targets of a filter with all those of others, given by robot.
 
-    A target found by two robots belongs to the robot that found it first (ties: first by name),
-    and follows the estimate of that robot. `others` is complete: what is not in it is removed.
+    A target found by two robots belongs to the first finder (ties: first by name), and follows the
+    estimate of that robot.
     """
     change = Change(FoundTargets([*own.targets], own.last_id))
     for robot, targets in others.items():

@@ -161,10 +161,7 @@ class SearchFilter(ABC):
         return bool(change)
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets found before this filter was created; return those that are new.
-
-        An id in use is replaced by the next free one; ValueError as in `merge`.
-        """
+        """Add targets found before this filter existed; return new ones. ValueError as `merge`."""
         check_shared('kept', targets, self.dimension)
         change = restore(self.register(), targets)
         self.adopt(change)

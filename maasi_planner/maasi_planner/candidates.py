@@ -103,10 +103,7 @@ class CandidateSet:
 
 @dataclass
 class Unseen:
-    """Parts of the area that no robot can see from its candidates.
-
-    fraction: share of the area; boxes (d, 2): bounds of each connected part [m], the largest first.
-    """
+    """Share of the area that no robot can see, and bounds (d, 2) [m] of its largest parts."""
 
     fraction: float
     boxes: list[FloatArray]

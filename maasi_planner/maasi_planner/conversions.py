@@ -198,10 +198,7 @@ def checked_state(name: str, message: AgentState, settings: PlannerNodeSettings)
 def checked_update(
     message: FilterUpdate, names: Collection[str], settings: PlannerNodeSettings, batch: int
 ) -> tuple[list[Cluster], dict[str, Pose]]:
-    """Return the clusters of an update, and the poses of its members by name.
-
-    ValueError for members outside of `names`, and for ids that cannot follow `batch`.
-    """
+    """Return clusters and poses of an update; ValueError for unknown members and impossible ids."""
     _check_frame(message.header, settings.frame)
     dimension = settings.environment.dimension
     clusters = [cluster_from_ros(item, dimension) for item in message.clusters]

@@ -34,10 +34,7 @@ _ROUNDING = 1e-9  # of shares
 
 
 class Coordinator:
-    """Plans for a team of robots step by step.
-
-    exploration and clusters: after the last measurements; finished: why the search ends, or None.
-    """
+    """Plans for a team step by step; `finished` is why the search ends, or None."""
 
     def __init__(self, settings: PlannerNodeSettings, area: Area | None = None) -> None:
         self.settings = settings
@@ -144,12 +141,9 @@ class Coordinator:
     ) -> Decision | None:
         """Return the joint decision for a step; None without any.
 
-        A robot that nears its waypoint without a next one is not in it: it continues, and plans
-        again when it has arrived. Robots that leave a closed zone or go home are in it. At the end
-        of the search, a decision without robots has the reason.
-
-        present: available robots; taken: final positions (3,) [m] and radii of robots of other
-        planners.
+        It contains robots that leave a closed zone or go home, but none that nears its waypoint
+        without a next one. At the end of the search, a decision without robots has the reason.
+        taken: final positions (3,) [m] and radii of robots of other planners.
         """
         # Update batteries.
         self.homing.update(step, present)
@@ -305,9 +299,9 @@ class Coordinator:
 def arrival_radius(motion: MotionModel, sensor: Sensor, settings: PlannerSettings) -> float:
     """Return the distance from its waypoint at which a robot takes its next decision [m].
 
-    It is the setting `arrival_radius`, or 0, as in 000, for the papers' objective and for planners
-    that measure only at waypoints. For others it is the braking distance, at most the reach of the
-    sensor to each side, so that the robot still sees from its path what it would have seen from the
+    It is the setting `arrival_radius`, or 0, as in 000, for the papers' objective and planners that
+    measure only at waypoints. For others it is the braking distance, at most the reach of the
+    sensor to each side, so that the robot sees from its path what it would have seen at the
     waypoint.
     """
     given = motion.settings.arrival_radius

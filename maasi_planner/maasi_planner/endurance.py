@@ -71,10 +71,7 @@ class Phase(Enum):
 
 
 class HomePaths:
-    """Predicted time and length of paths from rest at a position to the chargers.
-
-    A position near a predicted one gets its path plus the distance between them.
-    """
+    """Cached time and length of paths from rest to the chargers; nearby positions share a path."""
 
     def __init__(self, motion: MotionModel, chargers: FloatArray, step: float) -> None:
         self._motion, self._chargers, self._step = motion, chargers, step
@@ -142,9 +139,7 @@ class Ratio:
 class Endurance:
     """The battery of one robot, and its paths home.
 
-    At each step the coordinator calls `update`, and `begin` with the phase that it has decided.
-
-    start (3,): charger if none is named [m]; step: of the predictions [s].
+    At each step the coordinator calls `update`, and `begin` with the decided phase.
     """
 
     def __init__(
@@ -296,10 +291,7 @@ class Endurance:
         return best
 
     def _margin(self, home: float) -> float:
-        """Return the margin of a planned leg beyond the reserve, by the use of the path home.
-
-        It covers turning at speed, and what is learned on the path.
-        """
+        """Return the margin of a planned leg beyond the reserve, by the use of the path home."""
         seconds = 2.0 / self.motion.rate
         metres = seconds * self.motion.settings.speed
         return self.use(seconds, metres) + _MARGIN * home

@@ -23,8 +23,8 @@ CUT_OFF = 'closed zones cut it off from every charger'
 class Homing:
     """Decides which robots leave a closed zone, go home or charge.
 
-    alarms: present problems by robot; news: decisions about batteries that the caller has not
-    cleared; exhausted: batteries leave no robot anything to do, and each was asked again.
+    alarms: present problems by robot; news: decisions that the caller has not cleared; exhausted:
+    batteries leave no robot anything to do.
     """
 
     def __init__(self, robots: Mapping[str, PlannedRobot]) -> None:

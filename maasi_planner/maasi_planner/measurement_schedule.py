@@ -31,8 +31,6 @@ def expected_use(
 class MeasurementSchedule:
     """Measurement times of one robot: at waypoints and, if of use, at each period between them.
 
-    With the trigger `relative` the use is compared with its mean along the predicted trajectory.
-
     due: whether the robot measures as soon as it can; number: of measurements so far.
     """
 

@@ -54,11 +54,7 @@ class Member:
 
 @dataclass(frozen=True)
 class RobotFacts:
-    """Constant properties of a robot.
-
-    period: steps from one possible measurement to the next; arrival_radius: distance from a
-    waypoint at which the next one is decided [m], 0: the robot stops at each.
-    """
+    """Constant properties of a robot; period in steps, radii in metres."""
 
     motion: MotionModel
     sensor: Sensor
@@ -127,10 +123,7 @@ class RobotPlan:
 
 @dataclass
 class PlannedRobot:
-    """One robot of a team: facts, plan, measuring schedule, and an optional battery.
-
-    exploration: e after its own measurements, if it differs from that of the team.
-    """
+    """One robot of a team; `exploration` is e of its own measurements, or None."""
 
     facts: RobotFacts
     candidates: CandidateSet
@@ -142,11 +135,7 @@ class PlannedRobot:
     # ---- queries -----------------------------------------------------------------------------
 
     def is_due(self, step: int, present: PresentRobot) -> bool:
-        """Return whether the robot needs a decision now.
-
-        It has arrived, or is near enough to pass its waypoint without a stop; a staying robot
-        replans at its next possible measurement.
-        """
+        """Return whether the robot has arrived, passes its waypoint, or stayed for a period."""
         plan = self.plan
         if present.free:
             waited = plan.decided_at is None or step - plan.decided_at >= self.facts.period

@@ -83,10 +83,9 @@ def read_image(path: str, band: str | None = None) -> FloatArray:
 
 
 def read_map(path: str) -> BaseGeometry:
-    """Return the occupied cells of a Nav2 map as polygons [m, map].
+    """Return the occupied cells of a Nav2 map as polygons [m, map], as its map server reads them.
 
-    Cells are occupied as for Nav2's map server in each of its modes (trinary, scale, raw); unknown
-    cells are free. ValueError names the wrong key.
+    Unknown cells are free; ValueError names a wrong key.
     """
     import yaml
 

@@ -14,10 +14,7 @@ MARGIN = 0.5  # drift outside at which the driver acts [m]
 
 @dataclass(eq=False)
 class OperatingVolume:
-    """Volume of one robot: an area, and limits (3, 2) of its goals, the geofence [m, map].
-
-    radius: how far the robot may be beyond the sides of the bounds [m].
-    """
+    """Volume of one robot: an area, and limits (3, 2) of its goals, the geofence [m, map]."""
 
     area: Area
     radius: float

@@ -195,10 +195,7 @@ def _by_name(annotation: Any) -> type[BaseModel] | None:
 
 
 def parameters_of(node: type) -> Iterator[ParameterField]:
-    """Yield the parameters of a class of nodes by its type argument, with NAME for robots.
-
-    If values choose a model, the parameters of all models are yielded.
-    """
+    """Yield the parameters of a class of nodes, with NAME for robots, for all selectable models."""
     model = next(
         argument
         for kind in node.__mro__

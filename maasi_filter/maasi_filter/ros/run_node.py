@@ -30,10 +30,7 @@ class _NoNode:
 
 
 def executor_of(node: Node, context: Context | None = None) -> Executor:
-    """Return an executor for one node: rclpy's fast events executor if it exists.
-
-    An exception in a callback ends the spin; after its `shutdown` an executor must not spin.
-    """
+    """Return an executor for one node: rclpy's fast events executor if it exists."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:

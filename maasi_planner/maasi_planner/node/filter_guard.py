@@ -13,10 +13,7 @@ from maasi_planner.node_settings import PlannerNodeSettings
 
 
 class FilterWatch:
-    """Detects a silent filter by its heartbeat and the oldest batch without update; 0 disables it.
-
-    A filter without any heartbeat counts as present while no batch is open.
-    """
+    """Detects a silent filter by its heartbeat and by batches without update; 0 disables it."""
 
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
@@ -98,10 +95,9 @@ class FilterGuard:
 
 
 class FoundKeeper:
-    """Republishes found targets, latched, until a new search, also if the filter has lost them.
+    """Republishes found targets, latched, until a new search, also those of a restarted filter.
 
-    A target that a filter no longer publishes is withdrawn; one that a restarted filter has not
-    published yet is retained.
+    A target that a filter no longer publishes is withdrawn.
     """
 
     def __init__(self, node: Node) -> None:

@@ -17,10 +17,7 @@ Result: TypeAlias = SearchTargets.Result
 
 
 class SearchAction:
-    """Server of `search`, which starts a search or takes over a running one.
-
-    A new goal aborts the previous one while the robots continue, so that dead clients do not block.
-    """
+    """Server of `search`, which starts a search or takes over a running one from its last goal."""
 
     def __init__(
         self,

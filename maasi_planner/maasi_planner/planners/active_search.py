@@ -127,11 +127,7 @@ class Sequences:
 
 
 class ActiveSearch(Planner):
-    """Waypoints from a ring at a fixed distance, with one measurement at each.
-
-    Sequences of `horizon` waypoints use the displacements of the candidates; only the first
-    waypoint is executed (receding horizon).
-    """
+    """Waypoints from a ring with one measurement at each (receding horizon)."""
 
     measures_underway = False
     keys = ActiveSearchSettings

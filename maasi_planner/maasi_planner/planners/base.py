@@ -50,10 +50,7 @@ class Planner(ABC):
 
     @abstractmethod
     def decide(self, team: TeamView) -> Decision:
-        """Return a decision for every planning robot of the team.
-
-        A robot without an admissible waypoint stays, with the reason.
-        """
+        """Return a decision for every planning robot; one without an admissible waypoint stays."""
 
     def finished(self, team: TeamView) -> str | None:
         """Return why the search has ended, or None.

@@ -23,10 +23,7 @@ def others_move(team: TeamView, name: str, decision: Decision) -> bool:
 def past_standing(
     team: TeamView, name: str, waypoint: FloatArray, decision: Decision
 ) -> tuple[FloatArray, Trajectories] | None:
-    """Return the next point (1, 3) of a path past other robots to a waypoint, with its prediction.
-
-    None if they stand at the waypoint, or leave no path.
-    """
+    """Return the next point (1, 3) past other robots to a waypoint and its prediction, or None."""
     view = team.robots[name]
     here, motion = view.state.pose.position, view.motion
     positions = list(team.taken) + [

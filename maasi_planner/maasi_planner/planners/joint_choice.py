@@ -20,8 +20,7 @@ def search_jointly(
 ) -> tuple[dict[str, int], float, bool, int]:
     """Return the best joint choice, its value, whether it is exact, and choices evaluated.
 
-    Above the limit robots choose in turn and improve in rounds. A better choice exceeds the best by
-    more than `margin`; -1: no candidate is admissible.
+    Above the limit robots choose in turn and improve in rounds; -1: no candidate is admissible.
     """
     best: dict[str, int] = dict.fromkeys(indices, -1)
     best_value, evaluated = -math.inf, 0

@@ -80,10 +80,7 @@ def lanes(
 
 
 class Lawnmower(Planner):
-    """Lanes in order; the candidates are not used.
-
-    A robot takes its next lane when it has finished one, so that faster robots cover more lanes.
-    """
+    """Lanes in order, without the candidates; faster robots cover more lanes."""
 
     keys = LawnmowerSettings
     settings: LawnmowerSettings

@@ -102,10 +102,7 @@ def usable_options(
     extra: Callable[[str], FloatArray | None] = lambda _: None,
     kept: Callable[[str, Trajectories], Trajectories] = lambda _, exact: exact,
 ) -> dict[str, UsableCandidates]:
-    """Return the candidates of the robots that have some; `decision` lets the others stay.
-
-    extra: further waypoints (n, 3) of a robot; kept: reduces its predicted trajectories.
-    """
+    """Return the candidates of the robots that have some; `decision` lets the others stay."""
     standing = waiting_places(team)
     options = {}
     for name in team.planning():

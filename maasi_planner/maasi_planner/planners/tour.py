@@ -40,11 +40,11 @@ MOST_DRAWN = 200
 
 
 class Tour(Planner):
-    """A tour for each robot over cells of a lattice, and over clusters.
+    """A tour for each robot over cells of a lattice and clusters; the candidates are not used.
 
     The prize of a cell is the expected number of targets detected in passing it, that of a cluster
-    its mass. All tours are planned again if the prizes on them have changed, a cluster has
-    appeared, or a robot has none left. The candidates are not used.
+    its mass. All tours are planned again if prizes on them have changed, a cluster has appeared, or
+    a robot has none left.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -268,10 +268,7 @@ class Tour(Planner):
     def _leg(
         self, team: TeamView, view: RobotView, position: FloatArray
     ) -> tuple[FloatArray, bool]:
-        """Return the waypoint of a leg, and whether it leads all the distance to a position.
-
-        It is a quarter of the arrival radius too far, so that the robot cuts corners less.
-        """
+        """Return the waypoint of a leg, slightly beyond its end, and whether it is complete."""
         here, turning = view.state.pose.position, view.arrival_radius
         gap = max(float(np.linalg.norm(position - here)), 1e-9)
         longest = max(self._lattice_of(team).pitch, LEG * turning)
