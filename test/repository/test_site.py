@@ -93,8 +93,11 @@ def test_page_of_keys_is_that_of_the_settings(monkeypatch: pytest.MonkeyPatch) -
         assert len(asked) > 50 and asked <= written, asked - written
 
 
-def test_page_of_commands_has_every_command() -> None:
-    page = (ROOT / 'docs' / 'commands.md').read_text()
+def test_page_of_commands_is_that_of_the_parsers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(SITE)
+    module = runpy.run_path(str(SITE / 'commands.py'))
+    page = module['PAGE'].read_text(encoding='utf-8')
+    assert module['page']() == page, 'call ./scripts/docs --write'
     for command in (ROOT / 'scripts').iterdir():
         if command.is_file() and not command.suffix:
             assert f'`./scripts/{command.name}`' in page, command
