@@ -144,7 +144,7 @@ def test_installed_planner(folder):
         ('a = (', 'mine:A', r'SyntaxError: .*\({folder}/mine.py:1\)'),
         ('raise SystemExit(3)', 'mine:A', 'mine cannot be imported: SystemExit'),
         ('class B:\n    pass', 'mine:A', 'module mine has no A, its classes are B'),
-        ('class A:\n    pass', 'mine:A', 'is no subclass of maasi_planner.planners.base.Planner'),
+        ('class A:\n    pass', 'mine:A', 'subclass of maasi_planner.planners.base.Planner'),
         (
             'from maasi_planner.planners import Planner\nclass A(Planner):\n    pass',
             'mine:A',
@@ -166,7 +166,7 @@ def test_bad_plugin_is_named(folder, file, name, message):
         ('stride: 3', 'stride: 0', 'stride: read 0, allowed is greater than or equal to 1'),
         ('stride: 3', "stride: '3'", "stride: read '3', allowed is a whole number"),
         ('stride: 3', 'strid: 3', "strid: unknown key 'strid' .*known are stride"),
-        ('one_by_one:OneByOne', 'lawnmower', "planner 'lawnmower' has no settings of"),
+        ('one_by_one:OneByOne', 'lawnmower', "planner 'lawnmower' has no settings"),
     ],
 )
 def test_bad_settings_have_file_and_line(folder, before, after, message):
