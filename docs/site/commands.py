@@ -106,6 +106,8 @@ def _written(action: argparse.Action) -> str:
         value = ', '.join(map(str, action.choices))
     else:
         value = action.metavar or action.dest.upper()
+    if action.nargs == '+':
+        value += ' ...'
     if not action.option_strings:
         return f'[{value}]' if action.nargs in ('?', '*') else value
     return action.option_strings[-1] + ('' if action.nargs == 0 else f' {value}')
