@@ -239,7 +239,7 @@ def test_boxes_of_other_classes_are_reported_with_the_classes_seen(searching, ca
     for labels, said in (
         ([('0', 0.9), ('Person', 0.8)], "'person'; received are '0', 'Person', 'dog'"),
         ([('0', 0.9)], ''),  # said already
-        ([('2', 0.9)], "seen are '0', '2', 'Person', 'dog'"),
+        ([('2', 0.9)], "received are '0', '2', 'Person', 'dog'"),
         ([('person', 0.9)], ''),
         ([('3', 0.9)], ''),  # the classes are right, others may be there
     ):
@@ -247,7 +247,7 @@ def test_boxes_of_other_classes_are_reported_with_the_classes_seen(searching, ca
         message = boxes(*(box((80, 60), (20, 20), label) for label in labels))
         driver.sensor_input._on_boxes(stamped(message, team.step * NANOSECONDS))
         warned = capfd.readouterr().err
-        assert (said in warned) if said else ('seen are' not in warned)
+        assert (said in warned) if said else ('received are' not in warned)
 
 
 def test_boxes_in_the_frame_of_the_body_are_refused(searching, capfd):

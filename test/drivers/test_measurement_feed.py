@@ -255,7 +255,7 @@ def test_a_source_that_is_not_there_is_said_and_a_device_is_tried_again(tmp_path
             VideoSource(source)
     device = VideoSource('/dev/video77')
     wait_until(lambda: device.error)
-    assert 'cannot open' in device.error
+    assert 'cannot be opened' in device.error
     assert device.take() is None and not device.ended
     device.close()
 

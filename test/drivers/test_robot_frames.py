@@ -244,7 +244,7 @@ def test_a_goal_in_another_frame_is_reached_where_that_is(play):
     # Beyond `odometry_timeout`, short of a jump of time.
     team.step += round(35.0 / STEP)
     team.move()
-    assert 'too old' in team.refused([0.0, 0.0, 0.0], frame='cart')
+    assert '(odometry_timeout)' in team.refused([0.0, 0.0, 0.0], frame='cart')
 
 
 def test_without_tf2_msgs_there_is_no_tf_and_all_else_works(play, monkeypatch, capfd):

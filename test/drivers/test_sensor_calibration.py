@@ -84,7 +84,7 @@ def test_misses_and_other_things_are_counted_and_not_part_of_r():
     assert noise.probability == pytest.approx(0.9)
     assert noise.used + noise.near == 360
     for few in (9, 0):
-        with pytest.raises(ValueError, match=r'seen . times.* allowed is at least 10'):
+        with pytest.raises(ValueError, match=r'detected . times.* allowed is at least 10'):
             sensor_noise(observations[:few], sensor)
 
 
@@ -206,7 +206,7 @@ def test_a_wrong_stamp_offset_and_a_target_at_the_wrong_place_show(recording, wh
         (['--poses', '/nowhere'], ['poses: /nowhere is not recorded']),
         (['--poses', '/mambo/camera/image_raw/compressed'], ['allowed are AgentState']),
         (['--target', '1', 'nan'], ['target: got [1.0, nan]', '2 finite numbers']),
-        (['--least-range', '5'], ['seen 0 times', 'at least 10']),
+        (['--least-range', '5'], ['detected 0 times', 'at least 10']),
         ('- 1\n', ['not a parameter file']),
         ('/**: {ros__parameters: {camera.widht: 5}}\n', ['widht: ']),
         ('/**: {ros__parameters: {camera.width: 5}}\n', ['camera.width: read 5', 'allowed is']),

@@ -89,7 +89,7 @@ def test_the_command_measures_through_pyparrot_and_lands():
 
 def test_the_command_says_what_it_would_do_and_what_cannot_be(capsys):
     assert main([]) == 0
-    assert 'add --fly' in capsys.readouterr().out
+    assert 'With --fly' in capsys.readouterr().out
     for option, value in (('--tilt', '0.01'), ('--way', '0.1'), ('--legs', '1'), ('--port', '80')):
         assert main(['--fly', option, value]) == 2
         assert f'{option}: read {value}, allowed is' in capsys.readouterr().err

@@ -67,7 +67,7 @@ def test_points_of_the_area_are_starts_and_chargers(tmp_path):
     robots = {'one': deepcopy(DRONE), 'two': {**deepcopy(DRONE), 'start': [5.0, 6.0, 0.0]}}
     with pytest.warns(InputWarning) as told:
         made = scenario(tmp_path, robots, *points).robots
-    left = [str(item.message) for item in told if 'left out: a point' in str(item.message)]
+    left = [str(item.message) for item in told if 'environment.area: ignoring' in str(item.message)]
     assert [text.partition('role ')[2] for text in left] == [
         'start, as its robot is three; allowed as its robot: one, two',
         'charger, as its robot is on; allowed as its robot: one, two',

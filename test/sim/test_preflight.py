@@ -51,7 +51,7 @@ def field(drones=None, **changes):
 def test_25_hectares_in_10_minutes_are_too_many():
     report = preflight(field())
     assert report.lines[0] == 'area: 25 ha'
-    alone = 'sees 16 m wide; one pass alone is 15.6 km, 33 min at 8 m/s, 1.6 batteries'
+    alone = 'swath 16 m; one pass alone takes 15.6 km, 33 min at 8 m/s, 1.6 batteries'
     assert report.lines[1:3] == [f'east: {alone}', f'west: {alone}']
     assert report.lines[3] == (
         'team: one pass takes 16 min; no charging needed; the time limit is 10 min'
@@ -59,11 +59,11 @@ def test_25_hectares_in_10_minutes_are_too_many():
     assert report.lines[-1] == 'west: starts at 20 20 20 m'
     # 2 x 16 m x 8 m/s x 600 s of 250,000 m2.
     assert len(report.warnings) == 1 and report.warnings[0].startswith(
-        'limits.time: one pass takes the team 16 min without turns, and in 10 min about 61 % of'
+        'limits.time: one pass of the team takes 16 min without turns; in 10 min about 61 % of'
     )
     hour = {'limits': {'time': 3600.0}}
     (warning,) = {text.partition(': ')[2] for text in preflight(field(**hour)).warnings}
-    assert warning.startswith('its battery lasts for 20 min of 60 min, and it has no endurance')
+    assert warning.startswith('its battery lasts for 20 min of 60 min, ')
     home = {'endurance': {'per_second': 1.0 / 1200.0, 'reserve': 0.25}}
     report = preflight(field(home, **hour))
     # A flight of 15 minutes, then 21 minutes at the charger.
@@ -76,11 +76,11 @@ def test_robots_that_cannot_be_charged_have_one_flight():
     once = {'endurance': {'per_second': 1.0 / 1200.0}}
     once['battery'] = DRONE['battery'] | {'charging_power': 0.0}
     report = preflight(field(once))
-    assert 'cannot be charged, and goes home for good after 15 min' in report.lines[-1]
+    assert 'cannot be charged and returns home after 15 min' in report.lines[-1]
     # Two flights of 15 minutes.
-    assert report.warnings[0].startswith('one pass is more than all batteries hold: 92 % of the')
+    assert report.warnings[0].startswith('one pass needs more than all batteries: at most 92 % ')
     assert 'in 10 min about 61 %' in report.warnings[1]
-    assert report.lines[3].startswith('team: one pass is more than all batteries hold')
+    assert report.lines[3].startswith('team: one pass needs more than all batteries')
 
 
 def test_cells_that_are_wider_than_the_swath_are_named():
@@ -96,15 +96,15 @@ def test_parts_that_no_robot_gets_to_are_named_with_their_size():
     environment = FIELD['environment'] | wall
     drones = {'west': FIELD['robots']['west']}
     report = preflight(field(environment=environment, robots=drones))
-    assert report.lines[0] == 'area: 24.5 ha, without 0.5 ha of keep-outs and obstacles'
-    (text,) = (text for text in report.warnings if 'no robot gets to' in text)
+    assert report.lines[0] == 'area: 24.5 ha, without 0.5 ha of keep-out zones and obstacles'
+    (text,) = (text for text in report.warnings if 'no robot can see' in text)
     # It sees 8 m across, from 1.5 m beside the wall: not all of the part is out of sight.
     where = r'8 ha \(x 340 to 500 m, y 0 to 500 m\)'
-    assert re.search(f'no robot gets to 33 % of the area: {where}', text), text
+    assert re.search(f'no robot can see 33 % of the area: {where}', text), text
     # With a drone on each side all is searched.
     report = preflight(field(environment=environment))
-    assert not any('no robot gets to' in text for text in report.warnings)
-    assert 'it gets to see 67 % of the area' in report.lines[2]
+    assert not any('no robot can see' in text for text in report.warnings)
+    assert 'it can see 67 % of the area' in report.lines[2]
 
 
 def test_the_time_of_work_is_that_of_flights_and_charges_in_turn():
@@ -189,7 +189,7 @@ def test_one_robot_sees_what_the_team_sees():
         limit = {'limits': {'time': 1e5}}
         report = preflight(field(environment=environment, robots=drone, **limit))
         assert report.lines[2].startswith('team: one pass takes ')
-        assert all('no robot gets to' in text for text in report.warnings)
+        assert all('no robot can see' in text for text in report.warnings)
 
 
 def test_the_command_prints_what_a_search_takes_and_starts_nothing(tmp_path, capsys, monkeypatch):
@@ -199,7 +199,7 @@ def test_the_command_prints_what_a_search_takes_and_starts_nothing(tmp_path, cap
         assert run_scenario.main(['--check', 'field.yaml']) == DONE
         output = capsys.readouterr().out
         assert output.startswith('area: ') and 'team: one pass ' in output, name
-    assert 'area: 0.765 ha, without 452 m2 of keep-outs and obstacles' in output
+    assert 'area: 0.765 ha, without 452 m2 of keep-out zones and obstacles' in output
     # What wins over the file counts.
     (tmp_path / 'field.yaml').write_text(yaml.safe_dump(FIELD))
     assert run_scenario.main(['--check', 'field.yaml', '--time-limit', '1800']) == DONE
@@ -242,4 +242,4 @@ def test_a_search_that_gives_up_is_not_complete():
     for explored in (0.0, 0.49):
         ending = end_of_planners('no place is worth a visit', explored, meant=True)
         assert ending.code == NOT_ALL_FOUND and ending.reason == 'planner_done'
-        assert f'no place is worth a visit; {100.0 * explored:.1f} % explored, less' in ending.text
+        assert f' only {100.0 * explored:.1f} % explored' in ending.text

@@ -163,9 +163,9 @@ WRONG = [
      'robots.mambo.sensor.detection', ['2 or 3 numbers each']),
     ([('robots.mambo.driver', 'ranging_driver')], 'robots.mambo.camera', ['has none']),
     ([('targets.walk', 0.1)], 'robots.mambo.camera', ['targets.walk is 0.1']),
-    ([(f'{TRUE}.clutter_per_scan', 1.0)], f'{TRUE}.clutter_per_scan', ['of a ranging sensor']),
+    ([(f'{TRUE}.clutter_per_scan', 1.0)], f'{TRUE}.clutter_per_scan', ['of ranging sensors']),
     ([('events', [LEAVES | {'robot': 'mamba'}])], 'events[0].robot', ["'mambo'"]),
-    ([('events', [LEAVES | {'do': 'back'}])], 'events[0].do', ['is there']),
+    ([('events', [LEAVES | {'do': 'back'}])], 'events[0].do', ['is present']),
     ([('events', 2 * [LEAVES])], 'events[1].do', ['mambo has left']),
     *(
         ([(f'robots.{name}', PLAIN['robots']['mambo'] | {'start': [1.5, 1.5, 1.0]})],
@@ -197,13 +197,13 @@ DOCS = Path(__file__).parents[2] / 'docs'
 LINKED = {'link': 'mavlink', 'mavlink': {'arm': True, 'url': 'udpin:127.0.0.1:14550'}}
 WRONG_LINKS = [
     ('drone', {'mavlink': None}, 'drone.mavlink', 'is missing'),
-    ('drone', {'mavlink': {'arm': False}}, 'drone.mavlink.arm', 'never take off'),
+    ('drone', {'mavlink': {'arm': False}}, 'drone.mavlink.arm', 'never takes off'),
     ('drone', {'mavlink': {'arm': True, 'url': 'tcp:a:1'}}, 'drone.mavlink.url', 'udpin'),
     ('drone', {'mavlink': {'arm': True, 'map_yaw': 0.1}}, 'drone.mavlink.map_yaw', 'is 0'),
     ('drone', {'autopilot': {'firmware': 'ardusub'}}, 'drone.mavlink.vehicle', "'ardusub'"),
     ('drone', {'start': [1.0, 1.0, 0.0]}, 'drone.start', 'above mavlink.ground'),
     ('rov', {'start': [1.0, 1.0, 1.0]}, 'rov.start', 'below mavlink.ground'),
-    ('drone', {'guard': True}, 'drone.guard', 'time limit of its own'),
+    ('drone', {'guard': True}, 'drone.guard', 'timeout'),
     ('rov', {'mavlink': {'arm': True, 'url': 'udpin:127.0.0.1:14550'}}, 'rov.mavlink.url', 'drone'),
     ('drone', {'driver': 'ranging_driver'}, 'drone.link', 'does not have it'),
     ('mambo', {'mambo': {'arm': False}}, 'mambo.mambo.arm', 'read false, allowed is true'),
@@ -243,16 +243,14 @@ def test_a_robot_may_be_moved_by_another_program(load):
     assert load_scenario(DOCS / 'drone_sitl.yaml').robots['drone'].external
     content['events'] = [{'at': 5.0, 'robot': 'drone', 'do': 'leave'}]
     content['robots']['drone']['simulated'] = {'noise_factor': 2.0}
-    with pytest.raises(
-        ScenarioError, match=r"events\[0\]\.robot: read 'drone', which is external"
-    ) as caught:
+    with pytest.raises(ScenarioError, match=r"events\[0\]\.robot: read 'drone'") as caught:
         load(content)
-    assert 'robots.drone.simulated: is given for a robot that is external' in str(caught.value)
+    assert 'robots.drone.simulated: ' in str(caught.value)
     scenario = load(changed(('robots.mambo.body', 'external')))
     mambo = scenario.robots['mambo']
     assert mambo.external and not mambo.takes_off and scenario.external_clock
     scenario.check_pace(False, None)
-    with pytest.raises(ScenarioError, match=r'robots\.mambo\.body: read .external., and lock'):
+    with pytest.raises(ScenarioError, match=r'robots\.mambo\.body: read .external., but lock'):
         scenario.check_pace(True, None)
 
 
@@ -359,7 +357,7 @@ def test_what_wins_over_a_file_hides_none_of_its_errors(load):
 
 def test_planners_of_another_kind_of_search_are_refused_in_one_line():
     for scenario, planner, kind in (
-        ('mambo', 'cuboid_mpc', 'search for targets'),
+        ('mambo', 'cuboid_mpc', 'target search'),
         ('buildings_one', 'maasi', 'search of buildings'),
     ):
         with pytest.raises(ScenarioError) as caught:
@@ -417,16 +415,16 @@ def test_waypoints_on_one_side_get_a_warning_that_names_the_unseen_part(load):
                 ('robots.mambo.endurance', {'per_second': 0.001}),
                 ('robots.mambo.battery', {'charging_power': 0.0}),
             ],
-            r'robots\.mambo\.battery\.charging_power: read 0, and the robot has endurance',
+            r'robots\.mambo\.battery\.charging_power: read 0',
         ),
-        ([('robots.mambo.endurance', {})], r'robots\.mambo\.endurance: .* the way home costs noth'),
+        ([('robots.mambo.endurance', {})], r'robots\.mambo\.endurance: .*per_second and per_metre'),
         ([('simulated', {'wind': [0.3, 0.3]})], r'simulated\.wind: .* mambo, 0\.4 m/s: .* away'),
         (
             [
                 ('environment.keep_outs', [{'centre': [0.7, 0.5], 'radius': 0.15}]),
                 ('environment.bounds', [[0.0, 2.0], [0.0, 2.0]]),
             ],
-            r'robots\.mambo\.start: .* 0\.05 m from the border or a keep-out, nearer than the rad',
+            r'robots\.mambo\.start: .* 0\.05 m from the border',
         ),
     ],
 )

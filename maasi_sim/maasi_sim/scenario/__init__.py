@@ -1,4 +1,4 @@
-"""Scenario files: what is searched, by which robots, how, and when it ends."""
+"""Scenario files: area, robots, planner, filter, and the end of a run."""
 
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import find_scenario, load_scenario

@@ -1,4 +1,4 @@
-"""The picture under the map of a search: a GeoTIFF, or an image with a world file or an extent."""
+"""The background picture of a map: a GeoTIFF, or an image with a world file or an extent."""
 
 import base64
 import warnings
@@ -14,11 +14,11 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import geodetic
 
-# Longest side of what is shown [px], its quality, and the margin around the bounds.
+# Longest side of the shown picture [px], its quality, and the margin around the bounds.
 _SIZE, _QUALITY, _MARGIN = 1100, 70, 0.06
-# Pixels of an image, 400 MB while it is read; and of the longer side of a GeoTIFF that is read.
+# Most pixels of an image (400 MB while reading), and longest side of a GeoTIFF as read.
 _MOST_PIXELS, _LARGEST = 100_000_000, 4000
-_LATTICE = 33  # points along an axis at which coordinates are exact
+_LATTICE = 33  # points per axis with exact coordinates
 _NEEDS = (
     'allowed are a GeoTIFF, an image with a world file (.pgw, .jgw, .wld), or '
     'background: {file: FILE, extent: [[west, east], [south, north]]} [m, map]'
@@ -33,7 +33,7 @@ class Background(NamedTuple):
 
 
 class _Picture(NamedTuple):
-    """Pixels (rows, columns, 4), red to opacity, and what finds the pixel of a position [m]."""
+    """Pixels (rows, columns, 4), red to opacity, and a function from position [m] to pixel."""
 
     pixels: Any
     cells: Callable[[FloatArray], FloatArray]
@@ -43,7 +43,7 @@ class _Picture(NamedTuple):
 def read_background(environment_json: str) -> Background | None:
     """Return the picture of an environment, given as JSON; None without one.
 
-    ValueError if it cannot be read, or shows nothing of the environment.
+    Raises ValueError if it is unreadable or outside of the environment.
     """
     environment = EnvironmentSettings.model_validate_json(environment_json)
     given = environment.background
@@ -66,7 +66,7 @@ def background_of(environment: EnvironmentSettings) -> Background | None:
 
 
 def background_problems(environment: EnvironmentSettings) -> Iterator[str]:
-    """Yield why the picture of an environment cannot be used."""
+    """Yield the problems of an environment's picture."""
     try:
         background_of(environment)
     except ValueError as error:
@@ -83,7 +83,7 @@ def _over(bounds: FloatArray, picture: _Picture) -> Background:
     x = low[0] + (np.linspace(0.0, 1.0, _LATTICE)) * (high[0] - low[0])
     y = high[1] - (np.linspace(0.0, 1.0, _LATTICE)) * (high[1] - low[1])
     lattice = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    # Of the corners of pixels; between the points of the lattice coordinates are linear.
+    # Coordinates of pixel corners; linear between the lattice points.
     coarse = picture.cells(lattice).reshape(_LATTICE, _LATTICE, 2)
     across, down = (_between((np.arange(number) + 0.5) / number) for number in (width, height))
     exact = np.stack([down @ coarse[:, :, k] @ across.T for k in range(2)], axis=-1) - 0.5
@@ -92,10 +92,10 @@ def _over(bounds: FloatArray, picture: _Picture) -> Background:
     if not inside.all(axis=-1).any():
         centre = picture.cells(bounds[:2].mean(axis=1)[None])[0]
         raise ValueError(
-            f'shows nothing of the area, whose centre would be at column {centre[0]:.0f} and row '
-            f'{centre[1]:.0f} of {columns} x {rows} pixels: is it of another coordinate system?'
+            f'does not overlap the area, whose centre is at column {centre[0]:.0f} and row '
+            f'{centre[1]:.0f} of {columns} x {rows} pixels; check the coordinate system'
         )
-    # As often as it is made smaller, so that no pixel is left out.
+    # Averaged as often as it is reduced, so that all pixels count.
     step = np.abs(np.diff(exact[height // 2, :, :], axis=0)).max(initial=0.0)
     blurred = picture.pixels
     if step > 1.5:
@@ -112,7 +112,7 @@ def _over(bounds: FloatArray, picture: _Picture) -> Background:
 
 
 def _between(shares: FloatArray) -> FloatArray:
-    """Return the weights of the points of the lattice for shares of an axis, (n, lattice)."""
+    """Return the weights of the lattice points for shares of an axis, (n, lattice)."""
     points = np.linspace(0.0, 1.0, _LATTICE)
     return np.stack([np.interp(shares, points, row) for row in np.eye(_LATTICE)], axis=1)
 
@@ -120,8 +120,8 @@ def _between(shares: FloatArray) -> FloatArray:
 def _check_size(rows: int, columns: int) -> None:
     if rows * columns > _MOST_PIXELS:
         raise ValueError(
-            f'got {columns} x {rows} pixels, allowed are at most {_MOST_PIXELS} in all: '
-            'scale it down'
+            f'read {columns} x {rows} pixels, allowed are at most {_MOST_PIXELS} in total; scale '
+            'the image down'
         )
 
 
@@ -148,7 +148,7 @@ def _of_image(path: str, environment: EnvironmentSettings) -> _Picture:
     def cells(places: FloatArray) -> FloatArray:
         return (_earth(places, environment) - (c, f)) @ inverse.T + 0.5
 
-    # Degrees have small pixels and are near the origin; else it is in metres of the map.
+    # Degrees have small pixels near the origin; else metres of the map.
     degrees = max(abs(a), abs(b), abs(d), abs(e)) < 0.01 and environment.origin is not None
     if not degrees:
         return _Picture(pixels, lambda places: (places - (c, f)) @ inverse.T + 0.5)
@@ -163,7 +163,7 @@ def _earth(places: FloatArray, environment: EnvironmentSettings) -> FloatArray:
 
 
 def _world_file(path: str) -> list[float] | None:
-    """Return the six numbers of the world file of an image, or None if it has none."""
+    """Return the six numbers of an image's world file, or None."""
     image, suffix = Path(path), Path(path).suffix
     names = [f'.{suffix[1]}{suffix[-1]}w', f'{suffix}w', '.wld']
     for name in [*names, *map(str.upper, names)]:
@@ -175,7 +175,7 @@ def _world_file(path: str) -> list[float] | None:
                 numbers = []
             a, d, b, e, *_ = [*numbers, 0.0, 0.0, 0.0, 0.0]
             if len(numbers) != 6 or not np.isfinite(numbers).all() or a * e == b * d:
-                raise ValueError(f'{file}: is no world file, which has six numbers in six lines')
+                raise ValueError(f'{file}: is not a world file with six numbers in six lines')
             return numbers
     return None
 
@@ -187,7 +187,7 @@ def _of_geotiff(path: str, environment: EnvironmentSettings) -> _Picture:
         from rasterio.warp import transform
     except ImportError:
         raise ValueError(
-            'a GeoTIFF needs rasterio, the extra geo: pip install "rasterio>=1.4"'
+            'a GeoTIFF needs rasterio (extra geo): pip install "rasterio>=1.4"'
         ) from None
     with warnings.catch_warnings():
         warnings.simplefilter('ignore', rasterio.errors.NotGeoreferencedWarning)
@@ -196,7 +196,7 @@ def _of_geotiff(path: str, environment: EnvironmentSettings) -> _Picture:
         if file.crs is None:
             return _of_image(path, environment)
         crs, grid = file.crs, np.array(~file.transform).reshape(3, 3)[:2]
-        # Of a large one every so many pixels.
+        # Subsampled if large.
         size = tuple(-(-number // (1 + max(file.shape) // _LARGEST)) for number in file.shape)
         grid = np.diag(np.divide(size[::-1], file.shape[::-1])) @ grid
         chosen = list(range(1, min(file.count, 3) + 1))
@@ -210,7 +210,7 @@ def _of_geotiff(path: str, environment: EnvironmentSettings) -> _Picture:
     if bands.shape[0] < 3:
         bands = np.repeat(bands[:1], 3, axis=0)
     if bands.max(initial=0.0) > 255.0 or bands.min(initial=0.0) < 0.0:
-        # Of more than 8 bits: without the darkest and brightest.
+        # More than 8 bits: cut the darkest and brightest pixels.
         low, high = np.percentile(bands[:3][:, opaque > 0] if opaque.any() else bands, (2, 98))
         bands = 255.0 * np.clip((bands - low) / max(high - low, 1e-9), 0.0, 1.0)
     pixels = np.dstack([*bands[:3], opaque]).astype(np.uint8)

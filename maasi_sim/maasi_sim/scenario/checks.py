@@ -1,4 +1,4 @@
-"""Checks between the settings of a scenario, and of what its waypoints let robots see."""
+"""Checks between the settings of a scenario, and of the area seen from its waypoints."""
 
 import math
 import re
@@ -13,6 +13,7 @@ from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.plugins import unknown
+from maasi_filter.wording import number
 from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_parts
 from maasi_planner.planners import takes_tour
 from maasi_planner.settings import CandidateSettings
@@ -28,7 +29,7 @@ Problems = Iterator[str]  # each is `key: text`
 _ROBOT_NAME = re.compile(r'^[a-z][a-z0-9]*(_[a-z0-9]+)*$')
 _RESERVED = ('exploration', 'ground_truth', 'lockstep', 'scenario')
 _STEP_TOLERANCE = 1e-6  # largest deviation of a time from a whole number of steps
-_RANGING = ('ranging_driver', 'mavlink_driver')  # drivers of robots that have no camera
+_RANGING = ('ranging_driver', 'mavlink_driver')  # drivers of robots without a camera
 _MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')  # URL of the driver of a simulated vehicle
 
 
@@ -57,19 +58,19 @@ def problems_of(scenario: Scenario) -> Problems:
             match = _MAVLINK_URL.match(robot.mavlink.url)
             if match is not None and (other := ports.setdefault(match[1], name)) != name:
                 yield (
-                    f'robots.{name}.mavlink.url: read port {match[1]}, which {other} has as well; '
-                    'allowed is any other'
+                    f'robots.{name}.mavlink.url: read port {match[1]}, which {other} also uses; '
+                    'allowed is another port'
                 )
     if scenario.stop == 'all_found' and scenario.targets.count == 0:
-        yield "stop: read 'all_found' but there are no targets, allowed is 'planner_done'"
+        yield "stop: read 'all_found' without targets, allowed is 'planner_done'"
 
 
 def _world_problems(scenario: Scenario) -> Problems:
     most, count = _room_for_targets(scenario), scenario.targets.count or 0
     if count > most:
         yield (
-            f'targets.separation: read {scenario.targets.separation}, with which about {most} '
-            f'targets can be drawn at most, not {count}'
+            f'targets.separation: read {scenario.targets.separation}, which allows at most about '
+            f'{most} targets, not {count}'
         )
         return
     try:
@@ -91,36 +92,36 @@ def _room_for_targets(scenario: Scenario) -> int:
 
 
 def _place_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> Problems:
-    """Yield problems of where it starts and may be sent."""
+    """Yield problems of a robot's start and candidates."""
     if not area.inside([robot.start])[0]:
         yield (
             f'start: read {place_text(robot.start, area.settings.origin)}'
-            f'{outside_text(robot.start, area)}; allowed is what lies inside environment.bounds, '
-            f'or the area, and outside of keep_outs; bounds are {area.bounds.tolist()}'
+            f'{outside_text(robot.start, area)}; allowed are positions inside of environment.'
+            f'bounds or the area, and outside of keep_outs; bounds are {area.bounds.tolist()}'
         )
     gap = area.distances(robot.start).min(initial=math.inf)
     if gap < robot.radius:
         yield (
-            f'start: read {robot.start}, {gap:.3g} m from one of environment.obstacles, allowed is '
-            f'at least the radius, {robot.radius:g} m'
+            f'start: read {robot.start}, {number(gap)} m from one of environment.obstacles, '
+            f'allowed is at least the radius, {robot.radius:g} m'
         )
     try:
         if not len(robot_candidates(robot, area).at(robot.start)):
-            yield 'candidates: leave no waypoint inside the environment'
+            yield 'candidates: no waypoint is inside the environment'
     except ValueError as error:
         yield f'candidates.{error}'.replace('candidates.candidates: ', 'candidates: ')
 
 
 def _room_problems(robot: RobotSettings, area: Area) -> Problems:
-    """Yield problems of the room that its body has in the area, and of its chargers."""
+    """Yield problems of a robot's free space in the area, and of its chargers."""
     space = FreeSpace(robot, area)
     if not space.parts:
         yield (
             f'radius: read {robot.radius:g}, with motion.clearance {robot.motion.clearance:g}; the '
-            'area is too narrow for it, allowed are values for which some of it is left'
+            'area is too narrow, allowed are values that leave free space'
         )
         return
-    # Of a start that is wrong, all else would be.
+    # With a wrong start all further problems would follow from it.
     if area.inside([robot.start])[0]:
         yield from charger_problems(space)
 
@@ -133,8 +134,8 @@ def problems_of_file(scenario: Scenario) -> Problems:
         gap, bodies = math.dist(one.start, robot.start), one.radius + robot.radius
         if gap < bodies:
             yield (
-                f'robots.{name}.start: read {robot.start}, {gap:.3g} m from the start of {first}; '
-                f'allowed is at least both radii, {bodies:g} m: their bodies overlap'
+                f'robots.{name}.start: read {robot.start}, {number(gap)} m from the start of '
+                f'{first}; allowed is at least both radii, {bodies:g} m: their bodies overlap'
             )
 
 
@@ -147,18 +148,18 @@ def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
             value = getattr(robot.simulated, field)
             if value != getattr(nothing, field):
                 yield (
-                    f'simulated.{field}: read {value}, which is of a ranging sensor; allowed '
+                    f'simulated.{field}: read {value}, a setting of ranging sensors; allowed '
                     'without a camera'
                 )
         for field in ('walk', 'identified', 'classes'):
             value = getattr(scenario.targets, field)
             if value:
                 yield (
-                    f'camera: is there, and targets.{field} is {value}; allowed are targets '
-                    'without, or robots without a camera'
+                    f'camera: read one, but targets.{field} is {value}; allowed are targets '
+                    'without it, or robots without a camera'
                 )
     if robot.external and robot.simulated != nothing:
-        yield 'simulated: is given for a robot that is external; allowed are simulated robots'
+        yield 'simulated: read settings for an external robot; allowed are simulated robots'
 
 
 def name_problems(scenario: BaseScenario) -> Problems:
@@ -198,7 +199,7 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
             time > 0.0 and round(steps) == 0
         ):
             yield (
-                f'{key}: is every {time:g} s, allowed are whole multiples of step, {scenario.step}'
+                f'{key}: has a period of {time:g} s, allowed are multiples of step, {scenario.step}'
             )
     if robot.driver in _RANGING and robot.camera is not None:
         yield f"camera: read one, but driver '{robot.driver}' has none; allowed is null"
@@ -221,24 +222,25 @@ def _link_problems(robot: RobotSettings) -> Problems:
         )
     if robot.guard:
         yield (
-            f'guard: read true, allowed with link {robot.link} is false: the link has a time limit '
-            'of its own'
+            f'guard: read true, allowed with link {robot.link} is false: the link has its own '
+            'timeout'
         )
     if link is None:
         least = '{arm: true}' if key == 'mavlink' else '{arm: true, full_speed: ...}'
         yield f'{key}: is missing, link {robot.link} needs it: at least {least}'
         return
     if not link.arm:
-        yield f'{key}.arm: read false, allowed is true: it would never take off'
+        yield f'{key}.arm: read false, allowed is true: otherwise it never takes off'
     height, submarine = robot.start[2], getattr(link, 'vehicle', '') == 'submarine'
     if (height >= link.ground) if submarine else (height <= link.ground):
         allowed = f'{"below" if submarine else "above"} {key}.ground, {link.ground}'
-        yield f'start: read height {height}, allowed is what lies {allowed}'
+        yield f'start: read height {height}, allowed are heights {allowed}'
     if isinstance(link, MamboSettings):
         if robot.motion.model != 'mambo':
             yield f"motion.model: read '{robot.motion.model}', allowed with its link is 'mambo'"
         if link.full_speed is None:
-            yield 'mambo.full_speed: is missing, it would never take off; measure_mambo measures it'
+            yield 'mambo.full_speed: is missing, without it there is no take-off; measure_mambo '
+            'measures it'
         if link.pose != 'events':
             yield f"mambo.pose: read '{link.pose}', allowed in simulation is 'events'"
     elif not robot.external:
@@ -255,7 +257,7 @@ def _link_problems(robot: RobotSettings) -> Problems:
 
 
 def doubts_about(scenario: BaseScenario) -> Problems:
-    """Yield valid but probably unintended values."""
+    """Yield valid but improbable values."""
     robots, limit = scenario.robots, scenario.limits.time
     for index, event in enumerate(scenario.events):
         if event.at > limit:
@@ -263,7 +265,7 @@ def doubts_about(scenario: BaseScenario) -> Problems:
     for name, robot in robots.items():
         if abs(robot.yaw) > 2.0 * math.pi:
             yield (
-                f'robots.{name}.yaw: read {robot.yaw:g}, more than a turn: it is in radians, and '
+                f'robots.{name}.yaw: read {robot.yaw:g}, more than one turn; the unit is radians: '
                 f'{robot.yaw:g} degrees are {math.radians(robot.yaw):.4g}'
             )
     area = Area(scenario.environment)
@@ -273,7 +275,7 @@ def doubts_about(scenario: BaseScenario) -> Problems:
         return
     for (first, one), (name, robot) in combinations(robots.items(), 2):
         if one.start == robot.start:
-            yield f'robots.{name}.start: read {robot.start}, which is the start of {first} as well'
+            yield f'robots.{name}.start: read {robot.start}, which is also the start of {first}'
 
 
 def _robot_doubts(scenario: Scenario, area: Area) -> Problems:
@@ -282,7 +284,7 @@ def _robot_doubts(scenario: Scenario, area: Area) -> Problems:
         if robot.flies and math.hypot(*wind) >= robot.motion.speed:
             yield (
                 f'simulated.wind: read {wind}, at least the speed of {name}, '
-                f'{robot.motion.speed:g} m/s: it is blown away'
+                f'{robot.motion.speed:g} m/s: the wind carries it away'
             )
         doubts = [*endurance_doubts(robot), *_start_doubts(robot, area)]
         yield from (f'robots.{name}.{doubt}' for doubt in doubts)
@@ -292,8 +294,8 @@ def _start_doubts(robot: RobotSettings, area: Area) -> Problems:
     gap = FreeSpace(robot, area).gap(robot.start)
     if gap < robot.radius:
         yield (
-            f'start: read {robot.start}, {gap:.3g} m from the border or a keep-out, nearer than '
-            f'the radius, {robot.radius:g} m: first of all it moves away'
+            f'start: read {robot.start}, {number(gap)} m from the border or a keep-out zone, '
+            f'less than the radius, {robot.radius:g} m: it moves away first'
         )
 
 
@@ -307,17 +309,17 @@ def event_problems(scenario: BaseScenario) -> Problems:
             continue
         if scenario.robots[event.robot].external:
             yield (
-                f"{key}.robot: read '{event.robot}', which is external; allowed are simulated "
+                f"{key}.robot: read '{event.robot}', an external robot; allowed are simulated "
                 'robots'
             )
         if (event.do == 'back') != (event.robot in away):
-            state = 'is there' if event.do == 'back' else 'has left'
+            state = 'is present' if event.do == 'back' else 'has left'
             yield f"{key}.do: read '{event.do}', but {event.robot} {state} at that time"
         (away.add if event.do == 'leave' else away.discard)(event.robot)
 
 
-_FAR = 1e9  # farther than any way between two waypoints [m]
-_MOST_CANDIDATES = 400  # of a grid that is chosen for a robot without candidates
+_FAR = 1e9  # longer than any path between two waypoints [m]
+_MOST_CANDIDATES = 400  # of the grid that a robot without candidates gets
 
 
 def robot_candidates(robot: RobotSettings, area: Area | EnvironmentSettings) -> CandidateSet:
@@ -326,14 +328,14 @@ def robot_candidates(robot: RobotSettings, area: Area | EnvironmentSettings) -> 
 
 
 def never_seen(scenario: Scenario) -> str:
-    """Return a warning about parts that can never be seen from the candidates, or ''."""
+    """Return a warning about parts that are invisible from all candidates, or ''."""
     if any(robot.candidates.ring is not None for robot in scenario.robots.values()):
-        return ''  # candidates that move with the robot can reach every place
+        return ''  # candidates that move with the robot can reach every position
     area = Area(scenario.environment)
     if not _uses_candidates(scenario, area):
         return ''
     margin = scenario.targets.margin if scenario.targets.positions is None else 0.0
-    # What is seen from the waypoints need not be checked on the paths between them.
+    # Areas seen from the waypoints need no check of the paths between them.
     standing = [_viewer(scenario, name, _FAR) for name in scenario.names()]
     steady = [viewer for viewer in standing if viewer.yaw is not None]
     if steady and not unseen_parts(area, steady, margin):
@@ -346,7 +348,7 @@ def never_seen(scenario: Scenario) -> str:
 
 
 def _uses_candidates(scenario: Scenario, area: Area) -> bool:
-    """Return whether the planner chooses among the candidates, rather than making its own path."""
+    """Return whether the planner chooses among candidates instead of making its own path."""
     name = scenario.planner.name
     if name != 'auto':
         return name not in ('tour', 'lawnmower')
@@ -359,8 +361,8 @@ def covering_grid(
 ) -> dict[str, Any]:
     """Return a grid of candidates over the bounds from which a robot sees everything.
 
-    Its spacing is at most the width of what the sensor sees; where that takes too many waypoints,
-    it is a coarser grid, and `never_seen` warns.
+    Its spacing is at most the width of the sensor's view; if that needs too many waypoints, the
+    grid is coarser and `never_seen` warns.
     """
     area = Area(environment)
     bounds = area.bounds
@@ -374,7 +376,7 @@ def covering_grid(
     while True:
         numbers = np.ceil(sides / width - 1e-9).astype(int)
         if first and numbers.prod() > _MOST_CANDIDATES:
-            # A finer grid would be too large; `never_seen` reports what stays unseen.
+            # A finer grid would be too large; `never_seen` reports unseen parts.
             return first
         spacing = sides / numbers
         grid = {

@@ -1,4 +1,4 @@
-"""Where a robot may be: the connected parts of its area, and whether it gets to a charger."""
+"""Free space of a robot: connected parts of its area, and reachability of chargers."""
 
 import math
 from functools import cached_property, lru_cache
@@ -15,17 +15,17 @@ from maasi_planner.keep_out import KeepOut
 from maasi_sim.scenario.schema import RobotSettings
 
 _ROUNDING = 1e-6  # [m]
-# Share of the clearance that a robot keeps at least, as its motion model does.
+# Smallest share of the clearance that a robot keeps, as its motion model does.
 _LEAST = 0.1
-# Parts smaller than this share of its own are passed over, and all beyond so many.
+# Smaller parts, relative to its own, and those beyond this number are ignored.
 _SMALL, _MOST_PARTS = 1e-3, 50
 
 
 class FreeSpace:
-    """The level parts of an area in which the centre of a robot may be.
+    """The level parts of an area that the centre of a robot can be in.
 
-    It keeps its radius and its clearance from the border, keep-outs and obstacles; only the sides
-    of plain bounds need no distance. Spheres are passed above or below, and are no part of it.
+    It keeps radius and clearance to the border, keep-out zones and obstacles, but no distance
+    to plain bounds. Robots pass above or below spheres, which are ignored.
     """
 
     def __init__(self, robot: RobotSettings, area: Area) -> None:
@@ -33,13 +33,13 @@ class FreeSpace:
 
     @cached_property
     def parts(self) -> list[BaseGeometry]:
-        """Connected parts of what it can be sent to, the largest first."""
+        """Connected parts of its possible targets, the largest first."""
         parts = _parts(self.area, self._reach, self._reach)
         return sorted((part for part in parts if part.area > 0.0), key=lambda part: -part.area)
 
     @cached_property
     def reachable(self) -> list[BaseGeometry]:
-        """Parts that it gets to from its start."""
+        """Parts that are reachable from its start."""
         own, others = self._parts_of(self.robot.start)
         if not others:
             return own
@@ -51,7 +51,7 @@ class FreeSpace:
         return sorted([*own, *reached], key=lambda part: -part.area)
 
     def gap(self, position: ArrayLike) -> float:
-        """Return how far a robot at a position (3,) is from border, keep-outs and obstacles [m]."""
+        """Return the distance of a position (3,) to border, keep-out zones and obstacles [m]."""
         x, y, z = np.asarray(position, dtype=float).tolist()
         point, reach = shapely.Point(x, y), self._reach
         space = self.area.free_space(reach)
@@ -63,11 +63,11 @@ class FreeSpace:
         return max(min(gaps), 0.0)
 
     def gets_to(self, position: ArrayLike) -> bool:
-        """Return whether a robot gets to a position (3,) from its start."""
+        """Return whether a position (3,) is reachable from the robot's start."""
         here, goal = (shapely.Point(np.asarray(at)[:2]) for at in (self.robot.start, position))
         least = self.robot.radius + _LEAST * self.robot.motion.clearance
         widest = _parts(self.area, least, self._reach)
-        # A robot that starts too near to a wall moves away from it first.
+        # A robot that starts too close to a wall moves away from it first.
         one, other = _part_at(widest, here, self._reach), _part_at(widest, goal)
         if one is None or other is not one:
             return False
@@ -75,7 +75,7 @@ class FreeSpace:
         inner = _part_at(self.parts, here)
         if inner is not None and inner is _part_at(self.parts, goal):
             return True
-        # Joined by a passage that is narrower than its clearance: its own paths tell.
+        # Joined by a passage narrower than its clearance: decided by its path planner.
         start = [*first, self.robot.start[2]]
         return math.isfinite(self._keep_out.path_length(start, position))
 
@@ -88,7 +88,7 @@ class FreeSpace:
         return self.robot.radius + self.robot.motion.clearance
 
     def _parts_of(self, position: ArrayLike) -> tuple[list[BaseGeometry], list[BaseGeometry]]:
-        """Return the part that a position is in, or nearest to, and the others."""
+        """Return the part that contains a position or is closest to it, and the others."""
         point = shapely.Point(np.asarray(position)[:2])
         if not self.parts:
             return [], []
@@ -96,10 +96,10 @@ class FreeSpace:
         return [self.parts[nearest]], [*self.parts[:nearest], *self.parts[nearest + 1 :]]
 
 
-# Robots of one size share it.
+# Robots of the same size share it.
 @lru_cache(maxsize=16)
 def _parts(area: Area, apart: float, reach: float) -> list[BaseGeometry]:
-    """Return the parts in which a centre keeps its distance from everything."""
+    """Return the parts in which a centre keeps its distance to everything."""
     space, region = area.free_space(reach), area.border
     if space is not None:
         region = space.buffer(-apart, join_style='mitre').intersection(region)

@@ -1,4 +1,4 @@
-"""Scenario files: found by name, laid over robot types, and checked."""
+"""Scenario files: found by name, merged with robot types, and checked."""
 
 import os
 import warnings
@@ -50,10 +50,10 @@ def config_folder() -> Path:
                 places.append(Path(os.path.normpath(item.locate())).parent)
     places.append(Path(__file__).resolve().parents[3] / 'config')
     for folder in places:
-        # Of links to the files of a repository, messages name those.
+        # If these are links to files of a repository, messages name those files.
         for file in (folder / 'robots').glob('*.yaml'):
             return file.resolve().parent.parent
-    raise ScenarioError(f'robots: no such folder in {", ".join(map(str, places))}')
+    raise ScenarioError(f'robots: folder not found in {", ".join(map(str, places))}')
 
 
 def find_scenario(name: str | Path) -> Path:
@@ -73,7 +73,7 @@ def load_scenario(
 ) -> Scenario:
     """Read a scenario file with its layers: all robots, then the type, then the robot itself.
 
-    Types are looked for in `robots/` beside the scenario file and beside its folder, then in
+    Types are searched in `robots/` next to the scenario file and next to its folder, then in
     `config/robots`.
 
     Parameters
@@ -81,13 +81,13 @@ def load_scenario(
     path : str or Path
         Scenario file, or the name of one in `config/scenarios`.
     overrides : mapping, optional
-        Values that win over the file's: where each comes from (for messages), key and value.
+        Values that override the file's: origin (for messages), key and value.
     """
     return check_scenario(read_scenario(path), overrides)
 
 
 def read_scenario(path: str | Path) -> Layer:
-    """Return the values of a scenario file with its layers, not checked yet."""
+    """Return the merged but unchecked values of a scenario file."""
     path = find_scenario(path)
     layer = _with_folders(_with_types(read_layer(path), path))
     environment = layer.data.get('environment')
@@ -97,7 +97,7 @@ def read_scenario(path: str | Path) -> Layer:
 
 
 def _with_files(value: Any, folder: Path) -> Any:
-    """Return values of an environment in which names of files are absolute."""
+    """Return values of an environment with absolute file names."""
     if isinstance(value, dict):
         return {key: _with_files(item, folder) for key, item in value.items()}
     if isinstance(value, list):
@@ -107,7 +107,7 @@ def _with_files(value: Any, folder: Path) -> Any:
 
 
 def _with_folders(layer: Layer) -> Layer:
-    """Return a layer that names folders of modules, where a plugin is given as module:Class."""
+    """Return a layer with the folders of plugin modules, if it names a plugin as module:Class."""
     key, folder = ('plugin_path',), layer.folder or Path.cwd()
     given = layer.data.get('plugin_path', [])
     if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
@@ -126,9 +126,9 @@ def _names_module(data: Any) -> bool:
 
 
 def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
-    """Return the scenario of values as a scenario file has them, or of `Scenario.content`.
+    """Return the scenario of values as in a scenario file or from `Scenario.content`.
 
-    Types come from config/robots. What a program made gets no warnings.
+    Types come from config/robots. Values from programs get no warnings.
     """
     layer = Layer(deepcopy(values), {(): origin})
     return check_scenario(_with_types(layer, config_folder() / 'scenarios' / origin))
@@ -150,12 +150,12 @@ def checked(
     overrides: Mapping[str, tuple[Key, Any]] | None,
     problems: Callable[[AnyScenario], Problems],
 ) -> AnyScenario:
-    """Return the scenario of a tree of values, with what wins over them, or raise its problems."""
+    """Return the scenario of merged values with overrides, or raise its problems."""
     if overrides:
-        # What wins over the file hides none of its errors.
+        # Errors of the file are reported even if they are overridden.
         validate(model, layer)
         for origin, (key, value) in overrides.items():
-            # Of the planner or filter that this one replaces.
+            # Settings of the planner or filter that is replaced.
             if key == ('filter', 'method'):
                 layer.data.get('filter', {}).pop('settings', None)
             elif key == ('planner', 'name') and model is Scenario:
@@ -176,7 +176,7 @@ def _give_candidates(layer: Layer) -> None:
     for name, values in _robots(layer).items():
         if values.get('candidates') is None:
             values['candidates'] = {'ring': 4, 'distance': 1.0}
-            # Errors are reported when all is validated.
+            # Validation reports errors later.
             with suppress(ValueError):
                 robot = RobotSettings.model_validate(values)
                 environment = EnvironmentSettings.model_validate(layer.data.get('environment'))
@@ -184,7 +184,7 @@ def _give_candidates(layer: Layer) -> None:
 
 
 def _with_types(layer: Layer, path: Path) -> Layer:
-    """Return the layer of a scenario file over those of the types of its robots."""
+    """Return the layer of a scenario file merged with the types of its robots."""
     folders = [path.parent / 'robots', path.parent.parent / 'robots', config_folder() / 'robots']
     files = {file.stem: file for folder in reversed(folders) for file in folder.glob('*.yaml')}
     known = sorted(files.keys() - {'all'})
@@ -193,7 +193,7 @@ def _with_types(layer: Layer, path: Path) -> Layer:
     types = [Layer({'robots': {name: {} for name in robots}})]
     for name, own in robots.items():
         if own.keys() >= RobotSettings.model_fields.keys():
-            # Of a run: with all layers merged, where the files of types may be missing.
+            # From a run: with all layers merged, without files of types.
             continue
         kind = own.get('type')
         if kind not in known:
@@ -205,7 +205,7 @@ def _with_types(layer: Layer, path: Path) -> Layer:
 
 
 def _robots(layer: Layer) -> dict[str, dict[str, Any]]:
-    """Return the settings of the robots that have any, which may be wrong."""
+    """Return the settings of robots that have any, unchecked."""
     robots = layer.data.get('robots')
     if not isinstance(robots, dict):
         return {}
@@ -213,7 +213,7 @@ def _robots(layer: Layer) -> dict[str, dict[str, Any]]:
 
 
 def robot_type(name: str) -> RobotSettings:
-    """Return a robot of a type in `config/robots`, on its own."""
+    """Return a robot of a type in `config/robots`."""
     candidates = {'ring': 4, 'distance': 1.0}
     content = {'type': name, 'start': [0.0, 0.0, 0.0], 'candidates': candidates}
     layer = Layer({'robots': {name: content}}, {(): f'robot type {name}'})

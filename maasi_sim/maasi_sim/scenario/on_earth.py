@@ -1,4 +1,4 @@
-"""Positions of robots as latitude and longitude, or as points of the file of the area."""
+"""Robot positions as latitude and longitude, or as points in the file of the area."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DEGREES = {'latitude': 90.0, 'longitude': 180.0}
 
 
 def place_text(position: list[float], origin: OriginSettings | None) -> str:
-    """Return a position [m, map] as text, with latitude and longitude where there is an origin."""
+    """Return a position [m, map] as text, with latitude and longitude if there is an origin."""
     text = ' '.join(f'{value + 0.0:.4g}' for value in position)
     if origin is None:
         return f'{text} m'
@@ -29,17 +29,17 @@ def place_text(position: list[float], origin: OriginSettings | None) -> str:
 
 
 def outside_text(position: list[float], area: Area) -> str:
-    """Return in words how far a position is outside of an area, and whether it is exchanged."""
+    """Return how far a position is outside of an area, and whether x and y seem swapped."""
     gap = area.outside_by(position)
     exchanged = area.exchanged(position, gap)
     return f', {how_far(gap)} outside of the area{exchanged}' if gap > 0.0 else ''
 
 
 def put_on_map(layer: Layer, robots: Mapping[str, dict[str, Any]]) -> None:
-    """Replace starts and chargers of robots on the earth by positions on the map.
+    """Replace geodetic starts and chargers of robots by map positions.
 
-    They are `{latitude, longitude, height}`, or points of the area's GeoJSON with the role start,
-    home or charger; a start's property robot, or its name, says whose it is.
+    They are `{latitude, longitude, height}`, or points in the area's GeoJSON with the role
+    start, home or charger and the property robot, or the robot's name.
     """
     given = layer.data.get('environment')
     area = given.get('area') if isinstance(given, Mapping) else None
@@ -49,11 +49,11 @@ def put_on_map(layer: Layer, robots: Mapping[str, dict[str, Any]]) -> None:
         return
     try:
         with warnings.catch_warnings():
-            # They come again when the scenario is checked.
+            # The scenario check reports them again.
             warnings.simplefilter('ignore', InputWarning)
             origin = EnvironmentSettings.model_validate(given).origin
     except ValidationError:
-        return  # its errors are told when all is checked
+        return  # validation reports its errors later
     for name, values in robots.items():
         for key, value, put in _places(name, values):
             put(_on_map(layer, key, value, origin))
@@ -65,11 +65,11 @@ def _points(area: Any) -> list[tuple[str, str, list[float]]]:
     try:
         return points_of(area)
     except ValueError:
-        return []  # its errors are told when all is checked
+        return []  # validation reports its errors later
 
 
 def _places(name: str, values: dict[str, Any]) -> list[tuple[str, Any, Callable[[Any], None]]]:
-    """Return key, value and setter of what a robot has in degrees."""
+    """Return key, value and setter of a robot's geodetic positions."""
     found: list[tuple[str, Any, Callable[[Any], None]]] = []
     if isinstance(values.get('start'), Mapping):
         found.append((f'robots.{name}.start', values['start'], _setter(values, 'start')))
@@ -131,7 +131,7 @@ def _give_points(
         else:
             whose = f'its robot is {owner}' if owner else 'it names no robot'
             warnings.warn(
-                f'environment.area: left out: a point with role {role}, as {whose}; allowed as '
+                f'environment.area: ignoring a point with role {role}, as {whose}; allowed as '
                 f'its robot: {", ".join(robots)}',
                 InputWarning,
                 stacklevel=2,

@@ -1,6 +1,6 @@
-"""What a search will take, before it starts: area, passes, batteries, time, and what it misses.
+"""Estimate of a search before its start: area, passes, batteries, time, and unseen parts.
 
-All is by settings alone: flights at full speed without turns, so that a search takes longer.
+Computed from the settings only, for flights at full speed without turns: a search takes longer.
 """
 
 import math
@@ -14,23 +14,24 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.geometry.area import Area, level_shape
 from maasi_filter.geometry.geodesy import OriginSettings
+from maasi_filter.wording import number
 from maasi_planner.candidates import half_view, map_spacing, swath_of
 from maasi_sim.scenario.free_space import FreeSpace
 from maasi_sim.scenario.on_earth import place_text
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
-# Of the area: parts out of reach that are smaller than this are rounding, or corners.
+# Smaller unreachable parts, relative to the area, are rounding or corners.
 _SMALL_PART = 0.002
-_MOST_PARTS = 5  # that are named
+_MOST_PARTS = 5  # most named parts
 _LONGEST = 1e9  # time that counts as never [s]
-# A search with turns, and second looks, may take as many times the time of one pass.
+# Factor from the time of one pass to that of a search with turns and repeated measurements.
 _PASSES = 3.0
 _HECTARE = 1e4  # [m2]
 
 
 @dataclass(frozen=True)
 class Preflight:
-    """What a search will take, in lines, and what is wrong with that."""
+    """The estimate of a search, as lines and warnings."""
 
     lines: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -38,12 +39,12 @@ class Preflight:
 
 @dataclass(frozen=True)
 class Effort:
-    """What one robot can do.
+    """Capacity of one robot.
 
-    swath: width that it sees on passing [m]; speed: at which it searches [m/s]; use: share of its
-    battery in a second, 0: unknown; first, later: shares that it can use on the first flight and on
-    those after; charging: time between two flights, infinite: it has only one [s]; covered: volume
-    (2D: area) that it can get to see [m^d]; pass_length: of its path over all of that [m].
+    swath: width that it sees in passing [m]; speed: search speed [m/s]; use: battery share per
+    second, 0: unknown; first, later: usable shares of the first and later flights; charging:
+    time between flights, infinite if there is only one [s]; covered: volume (2D: area) that it
+    can see [m^d]; pass_length: path length over all of that [m].
     """
 
     swath: float
@@ -57,7 +58,7 @@ class Effort:
 
     @property
     def pass_time(self) -> float:
-        """Time of flight for one pass over all that it can see [s]."""
+        """Flight time of one pass over all that it can see [s]."""
         return self.pass_length / self.speed
 
     @property
@@ -66,7 +67,7 @@ class Effort:
         return self.first / self.use if self.use > 0.0 else math.inf
 
     def working(self, time: float) -> tuple[float, int]:
-        """Return for how long it searches within a time [s], and how often it is charged."""
+        """Return the search time within a time [s] and the number of charges."""
         if time <= self.endurance:
             return time, 0
         left, done, charges = time - self.endurance, self.endurance, 0
@@ -80,7 +81,7 @@ class Effort:
 
 
 def preflight(scenario: Scenario) -> Preflight:
-    """Return what a search of a scenario will take."""
+    """Return the estimate for a scenario."""
     area = Area(scenario.environment)
     spaces = {name: FreeSpace(robot, area) for name, robot in scenario.robots.items()}
     solid = shapely.union_all(list(map(level_shape, scenario.environment.obstacles)))
@@ -96,14 +97,14 @@ def preflight(scenario: Scenario) -> Preflight:
     whole = area.border.area
     closed = whole - ground.area
     told = closed >= 1e-6 * whole  # less is rounding
-    without = f', without {_area(closed)} of keep-outs and obstacles' if told else ''
-    depth = f', {height:.3g} m high' if area.dimension == 3 else ''
+    without = f', without {_area(closed)} of keep-out zones and obstacles' if told else ''
+    depth = f', {number(height)} m high' if area.dimension == 3 else ''
     report.lines.append(f'area: {_area(ground.area)}{without}{depth}')
     for name, effort in efforts.items():
         report.lines.append(f'{name}: {_pass_of(effort, ground.area * height)}')
     team = _add_team(report, efforts, together.area * height, scenario.limits.time)
     _add_cells(report, scenario, area)
-    # A strip beside a wall is no part.
+    # A strip along a wall is not a part.
     strip = 0.1 * min(effort.swath for effort in efforts.values())
     missed = ground.difference(together).buffer(-strip, join_style='mitre')
     _add_parts(report, missed.buffer(strip, join_style='mitre').intersection(ground), ground.area)
@@ -118,14 +119,14 @@ def preflight(scenario: Scenario) -> Preflight:
 
 
 def _visible(scenario: Scenario, space: FreeSpace, ground: BaseGeometry) -> BaseGeometry:
-    """Return what a robot can see of the ground, from all that it gets to."""
+    """Return the part of the ground that a robot can see from all reachable positions."""
     low, high = space.area.bounds[:2].T
     sensor = space.robot.sensor.build('robot', scenario.dimension)
     view = min(half_view(sensor), float(np.linalg.norm(high - low)))
     return _seen_from(tuple(space.reachable), view, ground)
 
 
-# Robots of one kind share it.
+# Robots of the same kind share it.
 @lru_cache(maxsize=16)
 def _seen_from(parts: tuple[BaseGeometry, ...], view: float, ground: BaseGeometry) -> BaseGeometry:
     reached = shapely.union_all(parts)
@@ -137,7 +138,7 @@ def _effort(scenario: Scenario, name: str, covered: float) -> Effort:
     bounds = scenario.environment.array()
     sensor = robot.sensor.build(name, scenario.dimension)
     swath = min(swath_of(sensor), float((bounds[:, 1] - bounds[:, 0]).max()))
-    # No faster than that what it sees at two measurements meets.
+    # At most the speed at which the views of successive measurements meet.
     speed = min(robot.motion.speed, swath / max(robot.sensor.period, scenario.step))
     home, charging, first, later = robot.endurance, math.inf, battery.charge, 0.0
     use = 0.0
@@ -155,24 +156,24 @@ def _effort(scenario: Scenario, name: str, covered: float) -> Effort:
 
 
 def _pass_of(effort: Effort, whole: float) -> str:
-    """Return in words what one pass costs a robot."""
+    """Return the cost of one pass for a robot, as text."""
     text = (
-        f'sees {_metres(effort.swath)} wide; one pass alone is {_metres(effort.pass_length)}, '
-        f'{_time(effort.pass_time)} at {effort.speed:.3g} m/s'
+        f'swath {_metres(effort.swath)}; one pass alone takes {_metres(effort.pass_length)}, '
+        f'{_time(effort.pass_time)} at {number(effort.speed)} m/s'
     )
     if effort.use > 0.0:
         share = effort.use * effort.pass_time
         percent = f'{100.0 * share:.0f} % of a battery'
         text += f', {percent if share < 1.0 else f"{share:.1f} batteries"}'
     if effort.covered < 0.99 * whole:
-        text += f'; it gets to see {100.0 * effort.covered / whole:.0f} % of the area'
+        text += f'; it can see {100.0 * effort.covered / whole:.0f} % of the area'
     return text
 
 
 def _add_team(
     report: Preflight, efforts: Mapping[str, Effort], whole: float, limit: float
 ) -> float:
-    """Add what one pass costs the team, and what the time limit allows; return its time [s]."""
+    """Add the team's cost of one pass and the share within the time limit; return its time [s]."""
     time = _time_of_pass(efforts, whole)
     endless = time >= _LONGEST
     charges = {name: effort.working(time)[1] for name, effort in efforts.items()}
@@ -180,23 +181,23 @@ def _add_team(
     charging = f'charges: {needed}' if needed else 'no charging needed'
     takes = f'takes {_time(time)}; {charging}'
     if endless:
-        takes = 'is more than all batteries hold'
+        takes = 'needs more than all batteries'
         report.warnings.append(
-            f'one pass is more than all batteries hold: {_share(efforts, _LONGEST, whole)} of the '
-            'area can be seen at most; add robots, or endurance with chargers'
+            f'one pass needs more than all batteries: at most {_share(efforts, _LONGEST, whole)} '
+            'of the area can be seen; add robots, or endurance with chargers'
         )
     report.lines.append(f'team: one pass {takes}; the time limit is {_time(limit)}')
     if time > limit:
-        needs = '' if endless else f'one pass takes the team {_time(time)} without turns, and '
+        needs = '' if endless else f'one pass of the team takes {_time(time)} without turns; '
         report.warnings.append(
             f'limits.time: {needs}in {_time(limit)} about {_share(efforts, limit, whole)} of the '
-            'area can be seen; raise it, or add robots'
+            'area can be seen; raise it or add robots'
         )
     return time
 
 
 def _share(efforts: Mapping[str, Effort], time: float, whole: float) -> str:
-    """Return in words how much of a volume the robots see within a time [s]."""
+    """Return the share of a volume that the robots see within a time [s], as text."""
     return f'{100.0 * min(_covered(efforts, time) / max(whole, 1e-9), 1.0):.0f} %'
 
 
@@ -210,8 +211,8 @@ def _covered(efforts: Mapping[str, Effort], time: float) -> float:
 
 
 def _time_of_pass(efforts: Mapping[str, Effort], whole: float) -> float:
-    """Return the time in which the robots see a volume once, sharing it as they can [s]."""
-    whole *= 1.0 - 1e-6  # rounding of shapes that are united
+    """Return the time in which the robots together see a volume once [s]."""
+    whole *= 1.0 - 1e-6  # rounding of united shapes
     if _covered(efforts, _LONGEST) < whole:
         return _LONGEST
     low, high = 0.0, _LONGEST
@@ -222,7 +223,7 @@ def _time_of_pass(efforts: Mapping[str, Effort], whole: float) -> float:
 
 
 def _add_cells(report: Preflight, scenario: Scenario, area: Area) -> None:
-    """Add the cells of the exploration map, against what is seen."""
+    """Add the cells of the exploration map, compared with the sensors' swaths."""
     sensors = [robot.sensor.build(n, scenario.dimension) for n, robot in scenario.robots.items()]
     spacing, warning = map_spacing(area.bounds, sensors)
     given, swath = scenario.filter.exploration_spacing, min(map(swath_of, sensors))
@@ -230,8 +231,8 @@ def _add_cells(report: Preflight, scenario: Scenario, area: Area) -> None:
         spacing, warning = given, ''
         if given > swath:
             warning = (
-                f'filter.exploration_spacing: read {given:g}, wider than what a sensor sees, '
-                f'{swath:.3g} m: what is explored is counted too low'
+                f'filter.exploration_spacing: read {given:g}, wider than the swath of a sensor, '
+                f'{number(swath)} m: the explored share will be too low'
             )
     cells = np.maximum(np.ceil((area.bounds[:, 1] - area.bounds[:, 0]) / spacing), 1.0).astype(int)
     report.lines.append(
@@ -242,7 +243,7 @@ def _add_cells(report: Preflight, scenario: Scenario, area: Area) -> None:
 
 
 def _add_parts(report: Preflight, missed: BaseGeometry, whole: float) -> None:
-    """Add a warning about the parts of the area that no robot gets to see."""
+    """Add a warning about the parts of the area that no robot can see."""
     parts = sorted(
         (part for part in shapely.get_parts(missed) if part.area > _SMALL_PART * whole),
         key=lambda part: -float(part.area),
@@ -257,17 +258,17 @@ def _add_parts(report: Preflight, missed: BaseGeometry, whole: float) -> None:
         )
     more = f' and {len(parts) - _MOST_PARTS} more' if len(parts) > _MOST_PARTS else ''
     share = 100.0 * sum(part.area for part in parts) / whole
-    report.warnings.append(f'no robot gets to {share:.2g} % of the area: {"; ".join(named)}{more}')
+    report.warnings.append(f'no robot can see {share:.2g} % of the area: {"; ".join(named)}{more}')
 
 
 def _places_of(robot: RobotSettings, effort: Effort, origin: OriginSettings | None) -> str:
-    """Return in words where a robot starts and is charged."""
+    """Return the start and chargers of a robot, as text."""
     text = f'starts at {place_text(robot.start, origin)}'
     if robot.endurance is None:
         return text
     if not robot.battery.chargeable:
         return (
-            f'{text}, its home; it cannot be charged, and goes home for good after '
+            f'{text}, its home; it cannot be charged and returns home after '
             f'{_time(effort.endurance)}'
         )
     if not robot.endurance.chargers:
@@ -277,12 +278,12 @@ def _places_of(robot: RobotSettings, effort: Effort, origin: OriginSettings | No
 
 
 def _battery_warnings(robot: RobotSettings, effort: Effort, limit: float, team: float) -> list[str]:
-    """Return what is wrong with a robot's battery, by the time limit and that of one pass [s]."""
+    """Return problems of a robot's battery, for a time limit and the time of one pass [s]."""
     found = []
     if robot.endurance is None and effort.endurance < min(limit, _PASSES * team):
         found.append(
-            f'its battery lasts for {_time(effort.endurance)} of {_time(limit)}, and it has no '
-            'endurance: it will be empty on its way'
+            f'its battery lasts for {_time(effort.endurance)} of {_time(limit)}, and without '
+            'endurance settings it will run empty during the search'
         )
     return found
 

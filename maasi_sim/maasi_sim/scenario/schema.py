@@ -32,13 +32,13 @@ from maasi_sim.simulation.world import TargetSettings, World
 
 
 class SimulatedSettings(Settings):
-    """True parameters of a robot, where they differ from its other settings.
+    """True parameters of a robot, if they differ from its other settings.
 
-    The sensor's part is for ranging sensors; a camera has its own true settings.
+    Sensor parameters are for ranging sensors; a camera has its own true settings.
     """
 
     noise: NoiseSettings | None = Field(
-        None, description="True noise of its sensor; none: the sensor's"
+        None, description="True noise of its sensor; default: the sensor's"
     )
     noise_factor: float = Field(
         1.0, gt=0.0, le=1000.0, description='Factor on the true deviations [1]'
@@ -53,17 +53,17 @@ class SimulatedSettings(Settings):
         None,
         ge=0.0,
         le=1e4,
-        description='True mean number of false detections in a scan; none: as in the sensor [1]',
+        description='True mean number of false detections per scan; default: as in the sensor [1]',
     )
     clutter_in: Literal['measurements', 'area'] | None = Field(
         None,
-        description='Where they are uniform, with `clutter_per_scan`: in range and angles, or in '
-        'the area; none: as in the sensor',
+        description='Distribution of false detections, with `clutter_per_scan`: uniform in range '
+        'and angles or in the area; default: as in the sensor',
     )
     odometry: OdometrySettings | None = Field(
         None,
-        description='True noise, drift and offset of its odometry, while the covariance it reports '
-        'is that of `odometry`; none: they are the same',
+        description='True noise, drift and offset of its odometry, while it reports the '
+        'covariance of `odometry`; default: as in `odometry`',
     )
 
     def sensor(self, believed: SensorSettings, name: str, bounds: FloatArray) -> Sensor:
@@ -91,80 +91,80 @@ class BatterySettings(Settings):
 
     capacity: Positive = Field(7200.0, description='Energy of a full battery [J]')
     charge: float = Field(1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
-    idle_power: NotNegative = Field(2.0, description='Drain at rest or hovering [W]')
+    idle_power: NotNegative = Field(2.0, description='Power at rest or hovering [W]')
     charging_time: Positive = Field(
-        1800.0, description='Time of a full charge at a charger, or of a change of batteries [s]'
+        1800.0, description='Duration of a full charge or a battery change [s]'
     )
     charging_power: float | None = Field(
         None,
         ge=0.0,
-        description='Power at a charger, in place of charging_time; 0: it cannot be charged [W]',
+        description='Charging power, instead of charging_time; 0 disables charging [W]',
     )
     motion_power: NotNegative = Field(
-        4.0, description='Drain for each metre per second on top of it [W/(m/s)]'
+        4.0, description='Additional power per metre per second [W/(m/s)]'
     )
 
     @property
     def power_at_charger(self) -> float:
-        """Power with which it is charged [W]; 0: it cannot be."""
+        """Charging power [W]; 0: it cannot be charged."""
         if self.charging_power is not None:
             return self.charging_power
         return self.capacity / self.charging_time
 
     @property
     def chargeable(self) -> bool:
-        """Whether a charger charges it."""
+        """Whether a charger can charge it."""
         return self.power_at_charger > 0.0
 
 
 class WeatherSettings(Settings):
-    """What disturbs all robots of the simulation, and no filter or planner knows."""
+    """Disturbances of all robots in the simulation, unknown to filters and planners."""
 
     wind: Vector2 = Field(
         [0.0, 0.0],
-        description='Steady velocity of the air, which carries flying robots [m/s, map]; their '
-        '`motion.speed` is that through the air, and what they use is by that speed',
+        description='Steady wind, which carries flying robots [m/s, map]; `motion.speed` and power '
+        'refer to their speed through the air',
     )
 
 
 class RobotSettings(DrivenRobot, PlannedRobotSettings):
-    """One robot: its type's settings with the scenario's own on top."""
+    """A robot: the settings of its type, overridden by the scenario's."""
 
     type: str = Field(description='Name of the type: a file in config/robots')
-    description: str = Field('', description='What it is, in words')
+    description: str = Field('', description='Description')
     driver: Annotated[str, DRIVERS, AfterValidator(DRIVERS.check_known)] = Field(
-        description='Executable of maasi_drivers that drives it, or module:Class of your own'
+        description='Its driver: an executable of maasi_drivers, or your own module:Class'
     )
     guard: bool | None = Field(
         None,
-        description='Whether a guard stops it when its driver dies or hangs; none: where it is '
-        'reached by topics, as another link has a time limit of its own',
+        description='Whether a guard stops it when its driver dies or hangs; default: with link '
+        'topics, as other links have their own timeout',
     )
     body: Literal['simulated', 'external'] = Field(
         'simulated',
-        description='With link topics: whether the sim moves it, or another program, as Gazebo, '
-        'that publishes its odometry and the time (/clock)',
+        description='With link topics: simulated, or external: moved by another program such as '
+        'Gazebo, which publishes its odometry and /clock',
     )
     link: Literal['topics', 'mambo_wifi', 'mavlink'] = Field(
-        'topics', description='How its driver reaches it; the other end is simulated'
+        'topics', description='Connection of its driver; the robot side is simulated'
     )
     autopilot: AutopilotSettings = Field(
         default_factory=AutopilotSettings,
-        description='With link mavlink: its autopilot, simulated; or external: another program',
+        description='With link mavlink: its simulated autopilot; or external: another program',
     )
     start: Vector3 = Field(description='Position at the start, x y z [m, map]')
-    motion: MotionSettings = Field(description='How it moves')
+    motion: MotionSettings = Field(description='Motion of the robot')
     sensor: SensorSettings = Field(description='Its sensor, as assumed by the filter')
     laser: LaserSettings | None = Field(None, description='Its laser scanner, if any')
     odometry: OdometrySettings = Field(
         default_factory=OdometrySettings, description='Errors of its simulated odometry'
     )
     battery: BatterySettings = Field(
-        default_factory=BatterySettings, description='Its battery, simulated'
+        default_factory=BatterySettings, description='Its simulated battery'
     )
     simulated: SimulatedSettings = Field(
         default_factory=SimulatedSettings,
-        description='True parameters in the simulation, where they differ from those assumed',
+        description='True parameters in the simulation, if they differ from the assumed ones',
     )
 
     @property
@@ -176,36 +176,36 @@ class RobotSettings(DrivenRobot, PlannedRobotSettings):
 
     @property
     def measuring_period(self) -> float:
-        """Of its camera, or of its ranging sensor [s]."""
+        """Measuring period of its camera or ranging sensor [s]."""
         return self.sensor.period if self.camera is None else 1.0 / self.camera.rate
 
     @property
     def flies(self) -> bool:
-        """Whether it starts in the air: not on the ground, and not under water."""
+        """Whether it starts in the air."""
         return self.motion.model != 'unicycle' and self.start[2] > 0.0
 
     @property
     def takes_off(self) -> bool:
-        """Whether it is simulated, and takes off when its driver's service `arm` is called."""
+        """Whether it is simulated and takes off by its driver's service `arm`."""
         return self.link != 'topics' and not self.external
 
 
 class ScoringSettings(Settings):
-    """How found targets are compared with the truth."""
+    """Comparison of found targets with the truth."""
 
     radius: float | None = Field(
         None,
         gt=0.0,
-        description='Distance within which a found target is true; none: 3 T_z, at most half the '
-        'smallest distance of two targets [m]',
+        description='Distance within which a found target is true; default: 3 T_z, at most half '
+        'the smallest distance of two targets [m]',
     )
     order: float = Field(2.0, ge=1.0, description='p of GOSPA [1]')
 
 
 class Scenario(BaseScenario):
-    """A scenario file of a search for targets, all layers merged."""
+    """A scenario of a search for targets, all layers merged."""
 
-    targets: TargetSettings = Field(description='The truth, for the simulation and the report')
+    targets: TargetSettings = Field(description='True targets, for the simulation and the report')
     robots: dict[str, RobotSettings] = Field(min_length=1, description='Robots by name')
     filter: FilterSettings = Field(default_factory=FilterSettings, description='Search filter')
     planner: AnyPlanner = Field(default_factory=default_planner, description='Planner')
@@ -214,12 +214,12 @@ class Scenario(BaseScenario):
         description='Images of simulated cameras',
     )
     simulated: WeatherSettings = Field(
-        default_factory=WeatherSettings, description='What disturbs robots in the simulation'
+        default_factory=WeatherSettings, description='Disturbances of robots in the simulation'
     )
     scoring: ScoringSettings = Field(default_factory=ScoringSettings, description='Scores')
 
     def namespaces(self) -> dict[str, list[str]]:
-        """Return the robots that share filter and planner by namespace; all together have ''."""
+        """Return the robots that share filter and planner, by namespace ('': the team)."""
         if self.planner.coordination == 'independent':
             return {name: [name] for name in self.names()}
         return {'': self.names()}
@@ -233,22 +233,22 @@ class Scenario(BaseScenario):
             robot = self.robots[name]
             if robot.link != 'topics':
                 raise ScenarioError(
-                    f'robots.{name}.link: read {robot.link!r}, which runs in real time, and '
-                    f'{asked}; allowed is topics, or rate 1 without lockstep'
+                    f'robots.{name}.link: read {robot.link!r}, which needs real time, but '
+                    f'{asked} is set; allowed is topics, or rate 1 without lockstep'
                 )
             if robot.body == 'external':
                 raise ScenarioError(
-                    f"robots.{name}.body: read 'external', and {asked}; allowed is simulated, or "
-                    'neither --lockstep nor --rate: the time is that of /clock'
+                    f"robots.{name}.body: read 'external', but {asked} is set; allowed is "
+                    'simulated, or neither --lockstep nor --rate: /clock gives the time'
                 )
 
     @property
     def external_clock(self) -> bool:
-        """Whether the time is that of the program that moves a robot."""
+        """Whether time comes from the program that moves a robot."""
         return any(robot.body == 'external' for robot in self.robots.values())
 
     def removal_distance(self) -> float:
-        """Return T_z [m]: the filter's, or four deviations of the coarsest range without."""
+        """Return T_z [m]: the filter's, else four deviations of the coarsest range."""
         distance = self.filter.resolved().removal_distance
         if distance is not None:
             return distance
@@ -265,16 +265,16 @@ class Scenario(BaseScenario):
 def planner_settings(
     scenario: Scenario, names: Sequence[str], common: Mapping[str, Any]
 ) -> PlannerNodeSettings:
-    """Return the settings of the planner of some robots; the others plan for themselves.
+    """Return the settings of the planner of some robots; others plan for themselves.
 
-    `common` are settings that all nodes share.
+    `common`: settings that all nodes share.
     """
     return PlannerNodeSettings.model_validate(
         {
             **common,
             'environment': scenario.environment,
             'planner': scenario.planner,
-            # As the filter has it.
+            # As in the filter.
             'exploration_spacing': scenario.filter.exploration_spacing,
             'robots': {name: PlannedRobotSettings.part_of(scenario.robots[name]) for name in names},
             'others': {
@@ -287,5 +287,5 @@ def planner_settings(
 
 
 def steps_of(time: float, step: float) -> int:
-    """Return how many steps a time takes, at least one."""
+    """Return the number of steps of a time, at least one."""
     return max(1, math.floor(time / step + 0.5))
