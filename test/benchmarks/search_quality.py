@@ -276,7 +276,7 @@ def main():
     parser.add_argument('--document', type=Path, metavar='FILE', help='write the tables into it')
     brief = 'one table: seconds until half, 90 %% and all are found'
     parser.add_argument('--short', action='store_true', help=brief)
-    why = 'one table: where the time until 90 % are found goes, instead'
+    why = 'one table: where the time until 90 %% are found goes, instead'
     parser.add_argument('--explain', action='store_true', help=why)
     options, regimes, seeds = wanted(parser, REGIMES, runs=16, jobs=os.cpu_count() or 1)
     if options.explain:
