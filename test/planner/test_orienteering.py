@@ -167,7 +167,7 @@ def test_a_new_plan_never_collects_less_than_the_rest_of_the_old_one():
         budgets = rng.uniform(0.2, 0.8, robots) * len(points) / robots
         ends = starts if seed % 2 else None
         homes = starts if seed % 2 else [None] * robots
-        paths = plan_ways(points, prizes, starts, budgets, ends)
+        paths = plan_ways(points, prizes, starts, budgets, ends, effort=0.1)
         for share in (0.2, 0.4, 0.6):
             here, left, rest = starts.copy(), budgets.copy(), []
             for k, path in enumerate(paths):
@@ -178,7 +178,7 @@ def test_a_new_plan_never_collects_less_than_the_rest_of_the_old_one():
                 rest.append(path[done:])
             now = prizes.copy()
             now[[node for path, old in zip(paths, rest) for node in path if node not in old]] = 0.0
-            again = plan_ways(points, now, here, left, ends, known=rest)
+            again = plan_ways(points, now, here, left, ends, known=rest, effort=0.1)
             visited = np.concatenate(again)
             assert len(visited) == len(set(visited.tolist()))
             for k, path in enumerate(again):

@@ -1,61 +1,51 @@
-"""Ways of a team that collect prizes within budgets, or all of them early, by local search.
+"""Paths of a team that collect prizes within budgets, or all of them early.
 
-Each route begins at a start and ends at an end; the last route holds the nodes that nobody visits.
-Moves connect near nodes: by turning a part of a route round, by moving up to three nodes, or by
-exchanging parts of two routes. Sums along the routes give the cost of a move in constant time.
+A local search (`routes.py`) improves paths. To leave its optima, each try removes stretches of
+nodes near a random one, or forces nodes in and drops what has the least prize for its metres; then
+what fits is added. A worse result is accepted less and less often (simulated annealing).
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_planner.planners.routes import (
+    Places,
+    Routes,
+    best_entry,
+    cost_now,
+    draw,
+    entry_cost,
+    gap_between,
+    improve,
+    insert,
+    make_routes,
+    remove,
+    restore,
+)
 
-# Nearest nodes that moves connect, most nodes that move together, and rounds of prices.
+# Nearest nodes that moves connect.
 NEIGHBOURS = 8
-LONGEST = 3
-ROUNDS = 6
-# Within budgets the best nodes are looked at, so many times those that can be visited; and never
-# more than so many: for 2,000 nodes ways take 0.2 s.
+# Within budgets the best nodes are considered: so many times those that can be visited, and never
+# more than so many.
 CHOICE, MOST = 1.2, 2000
-_NONE = (0, 1, 0, 0)
-
-
-class _Places(NamedTuple):
-    """Nodes, starts and ends (m, d), those that are free, prizes (m,), nearest nodes of each."""
-
-    points: FloatArray
-    free: BoolArray
-    prizes: FloatArray
-    near: IntArray
-
-
-class _Routes(NamedTuple):
-    """Places in order (r + 1, n + 3), numbers of nodes (r + 1,), and where each place is (m, 2).
-
-    ways, sums, moments (r + 1, n + 3): way to each place, and sums of prizes, and of prizes times
-    way, before it.
-    """
-
-    order: IntArray
-    counts: IntArray
-    where: IntArray
-    ways: FloatArray
-    sums: FloatArray
-    moments: FloatArray
-
-    def lengths(self) -> FloatArray:
-        """Return the way of each robot, (r,) [m]."""
-        return self.ways[np.arange(len(self.counts)), self.counts + 1][:-1]
-
-    def visited(self) -> list[IntArray]:
-        """Return the nodes of each robot."""
-        return [row[1 : count + 1] for row, count in zip(self.order, self.counts)][:-1]
+# Tries for each node and at most: within budgets, and without.
+TRIES, TRIES_EARLY = (20, 2000), (1, 800)
+# A try removes up to so many stretches of so many nodes; or, with this chance, forces nodes in.
+STRETCHES, STRETCH, FORCED = 3, 10, 0.4
+# Temperature at first and at last, in mean prizes or in mean costs of a node.
+HOT, COLD, HOT_EARLY, COLD_EARLY = 1.0, 0.1, 0.3, 0.003
+# Of the mean prize of a metre: the price of a metre, and the worth of one that is saved.
+PRICE, CREDIT = 0.05, 0.5
+# Price of a metre beyond the limit, in mean prizes of a metre.
+OVER = 1e4
+# Random part of scores, and places of a route at which a stretch to drop may begin.
+NOISE, WINDOW = 0.3, 200
 
 
 def plan_ways(
@@ -66,6 +56,7 @@ def plan_ways(
     ends: FloatArray | None = None,
     speeds: FloatArray | None = None,
     known: list[IntArray] | None = None,
+    effort: float = 1.0,
 ) -> list[IntArray]:
     """Return the nodes that each robot visits, in order.
 
@@ -75,20 +66,22 @@ def plan_ways(
     Parameters
     ----------
     nodes : (n, d) array
-        Places to visit, metres.
+        Positions to visit, metres.
     prizes : (n,) array
         What a visit is worth, from 0.
     starts : (r, d) array or None
         Where robots are, metres; None: each may start at any node.
     budgets : (r,) array
-        Longest way of each robot, metres; may be infinite; at least straight to its end.
+        Longest path of each robot, metres; may be infinite; at least straight to its end.
     ends : (r, d) array, optional
-        Where the way of each robot has to end, metres; not a number: anywhere.
+        Where the path of each robot has to end, metres; not a number: anywhere.
     speeds : (r,) array, optional
         Of the robots, on any common scale; none: all alike.
     known : list of (m,) arrays, optional
         Paths to improve, in addition to new ones; nodes that are not on them are added. Where they
         keep to the budgets, the result never collects less than they do.
+    effort : float, optional
+        Factor on the number of tries of the search.
     """
     used, robots = np.flatnonzero(np.asarray(prizes) > 0.0), len(budgets)
     endless = bool(np.isinf(budgets).any())
@@ -106,54 +99,94 @@ def plan_ways(
     n, d = len(used), np.shape(nodes)[1]
     if n == 0:
         return [used] * robots
-    points, free = np.zeros((n + 2 * robots + 2, d)), np.ones(n + 2 * robots + 2, np.bool_)
-    points[:n], free[:n] = nodes[used], False
-    for first, given in ((n, starts), (n + robots + 1, ends)):
+    points, free = np.zeros((n + 2 * robots, 3)), np.ones(n + 2 * robots, np.bool_)
+    points[:n, :d], free[:n] = nodes[used], False
+    for first, given in ((n, starts), (n + robots, ends)):
         if given is not None:
             fixed = np.asarray(np.isfinite(given).all(axis=1))
-            points[first : first + robots] = np.where(fixed[:, None], given, 0.0)
+            points[first : first + robots, :d] = np.where(fixed[:, None], given, 0.0)
             free[first : first + robots] = ~fixed
     prize = np.zeros(len(points))
     prize[:n] = prizes[used]
-    places = _Places(points, free, prize, _nearest(points, free, n, min(NEIGHBOURS, n)))
+    places = Places(points, free, prize, _nearest(points, free, n, n + robots))
     rates = np.ones(robots) if speeds is None else 1.0 / np.asarray(speeds, dtype=float)
-    # The way to the end is gone in any case.
-    direct = [_gap(points, free, n + k, n + robots + 1 + k) for k in range(robots)]
-    limits = np.maximum(budgets, direct)
-    early = _terms(limits, rate=rates)
+    # A robot moves to its end in any case.
+    direct = [gap_between(points, free, n + k, n + robots + k) for k in range(robots)]
+    limits = np.maximum(budgets, direct) * (1.0 + 1e-12)
+    early = _terms(limits, 0.0, rates, 0.0, OVER * prize.sum() * rates.max())
     begun, old = [], [used[:0]] * robots
     if known is not None and any(map(len, known)):
         old = [np.searchsorted(used, way[np.isin(way, used)]) for way in known]
-        begun.append(_completed(places, old))
+        begun.append(make_routes(places, old))
     for axes in (np.arange(d), np.array([1, 0, *range(2, d)])):
-        begun.append(_shared(places, _lanes(points[:n][:, axes]), robots))
-    routes, least = _routes(places, begun[0]), math.inf
-    for rows in begun:
-        found = _routes(places, rows)
-        _improve(places, found, early)
-        cost = sum(_now(found, early, k) for k in range(robots))
-        # Of equal ones the first: known ways, or straight ones.
-        if cost < (1.0 - 1e-6) * least:
-            routes, least = found, cost
-    if (routes.lengths() > limits).any():
-        routes = _within(places, routes, _routes(places, old), limits, rates)
+        begun.append(make_routes(places, _shared(places, _lanes(points[:n][:, axes]), robots)))
+    # A node has two legs, each at least as long as to the nearest node.
+    legs = np.zeros(n)
+    if n > 1:
+        legs = np.sort(np.linalg.norm(points[:n] - points[places.near[:n, 0]], axis=1))
+    whole = bool(legs[: max(n - robots, 0)].sum() <= limits.sum())
+    if whole:
+        for found in begun:
+            _put(places, found, early, np.arange(n))
+            improve(places, found, early, True)
+        costs = [sum(cost_now(found, early, k) for k in range(robots)) for found in begun]
+        # Of equal ones the first: known paths, or straight ones.
+        first = next(i for i, cost in enumerate(costs) if cost <= min(costs) * (1.0 + 1e-6))
+        routes = begun[first]
+    if not whole or (routes.lengths() > limits).any():
+        routes = _within(places, begun, make_routes(places, old), limits, rates, effort)
+    if routes.counts.sum() == n:
+        heat = max(sum(cost_now(routes, early, k) for k in range(robots)) / n, 1e-300)
+        tries = int(effort * min(TRIES_EARLY[0] * n, TRIES_EARLY[1]))
+        _search(places, routes, early, tries, HOT_EARLY * heat, COLD_EARLY * heat)
     return [used[row] for row in routes.visited()]
 
 
 def _terms(
-    limits: FloatArray,
-    price: float | FloatArray = 0.0,
-    rate: float | FloatArray = 0.0,
-    worth: float = 0.0,
-    over: float = 0.0,
+    limits: FloatArray, price: float, rate: float | FloatArray, worth: float, over: float
 ) -> FloatArray:
-    """Return what counts in the cost of each route (r + 1, 5); of the last one nothing.
+    """Return what counts in the cost of each route (r, 5).
 
-    price of a metre, rate of prize times way, worth of prize, limit of the way, price beyond it.
+    Columns: price of a metre, rate of prize times distance to it, worth of prize, limit of the
+    length, price of a metre beyond it.
     """
-    terms = np.zeros((len(limits) + 1, 5))
-    terms[:-1] = np.stack(np.broadcast_arrays(price, rate, worth, limits, over), axis=1)
-    return terms
+    return np.stack(np.broadcast_arrays(price, rate, worth, limits, over), axis=1)
+
+
+def _within(
+    places: Places,
+    begun: list[Routes],
+    known: Routes,
+    limits: FloatArray,
+    rates: FloatArray,
+    effort: float,
+) -> Routes:
+    """Return routes within limits [m]: the best of begun and known ones, after a search."""
+    robots, n = len(limits), len(places.near) - len(limits)
+    longest = max(max(found.lengths().max() for found in begun), 1e-9)
+    usual = places.prizes.sum() / max(begun[-1].lengths().sum(), 1e-9)
+    terms = _terms(limits, PRICE * usual, 0.0, 1.0, OVER * usual)
+    start, least = known, math.inf
+    empty = make_routes(places, [np.zeros(0, np.int64)] * robots)
+    for rows in (known, *begun, empty):
+        found = make_routes(places, rows.visited())
+        _drop(places, found, terms, 0.0)
+        _collect(places, found, terms, np.flatnonzero(found.where[:n, 0] < 0))
+        improve(places, found, terms, True)
+        cost = sum(cost_now(found, terms, k) for k in range(robots))
+        if cost < least:
+            start, least = found, cost
+    mean = float(np.sort(places.prizes)[-max(int(start.counts.sum()), 1) :].mean())
+    tries = int(effort * min(TRIES[0] * n, TRIES[1]))
+    _search(places, start, terms, tries, HOT * mean, COLD * mean)
+    if (known.lengths() <= limits).all():
+        prizes = [sum(places.prizes[row].sum() for row in r.visited()) for r in (start, known)]
+        if prizes[0] <= prizes[1]:
+            return known
+    # In an order in which they are collected early.
+    rate = 0.01 / longest * rates / rates.max()
+    improve(places, start, _terms(limits, 0.01 * usual, rate, 1.0, OVER * usual), True)
+    return start
 
 
 def _lanes(points: FloatArray) -> IntArray:
@@ -171,12 +204,12 @@ def _lanes(points: FloatArray) -> IntArray:
     return np.lexsort((np.where(lane % 2, -points[:, 0], points[:, 0]), lane))
 
 
-def _shared(places: _Places, order: IntArray, robots: int) -> list[IntArray]:
+def _shared(places: Places, order: IntArray, robots: int) -> list[IntArray]:
     """Return equal parts of an order of nodes, each robot that which begins or ends nearest."""
     parts, rows = np.array_split(order, robots), []
     for start in range(len(order), len(order) + robots):
         gaps = [
-            [_gap(places.points, places.free, start, end) for end in part[[0, -1]]]
+            [gap_between(places.points, places.free, start, end) for end in part[[0, -1]]]
             if len(part)
             else [math.inf] * 2
             for part in parts
@@ -187,261 +220,156 @@ def _shared(places: _Places, order: IntArray, robots: int) -> list[IntArray]:
     return rows
 
 
-def _completed(places: _Places, rows: list[IntArray]) -> list[IntArray]:
-    """Return rows with the nodes that are on none, each behind its nearest one that is on one."""
-    ways = [row.tolist() for row in rows]
-    on = {node: way for way in ways for node in way}
-    for node in range(len(places.near) - len(rows) - 1):
-        if node not in on:
-            near = next((other for other in places.near[node].tolist() if other in on), None)
-            on[node] = on[near] if near is not None else min(ways, key=len)
-            on[node].insert(on[node].index(near) + 1 if near is not None else 0, node)
-    return [np.array(way, np.int64) for way in ways]
-
-
-def _routes(places: _Places, rows: list[IntArray]) -> _Routes:
-    """Return routes with the nodes of each robot; the other nodes are in the last one."""
-    n, number = len(places.near) - len(rows) - 1, len(rows) + 1
-    left = np.setdiff1d(np.arange(n), np.concatenate(rows))
-    sums = np.zeros((3, number, n + 3))
-    where = np.zeros((len(places.points), 2), np.int64)
-    routes = _Routes(np.zeros((number, n + 3), np.int64), np.zeros(number, int), where, *sums)
-    for k, row in enumerate([*rows, left]):
-        _take(places, routes, k, np.array([n + k, *row, n + number + k], np.int64))
-    return routes
-
-
-def _within(
-    places: _Places, routes: _Routes, known: _Routes, limits: FloatArray, rates: FloatArray
-) -> _Routes:
-    """Return routes within limits [m]: a price of each robot's metres is adapted to them.
-
-    After each round what does not fit is dropped, and what fits is added. Known routes that fit are
-    the first candidate, as they are and improved.
-    """
-    usual = places.prizes.sum() / max(routes.lengths().sum(), 1e-9)
-    size = 0.01 / max(routes.lengths().max(), 1e-9)
-    fit = _terms(limits, 0.01 * usual, size * rates / rates.max(), 1.0, 1e4 * usual)
-    price, low = np.full(len(limits), usual), np.zeros(len(limits))
-    high = np.full(len(limits), np.inf)
-    # First the part of ways that collect all early which fits.
-    rows = [row[: _reach(places, routes, k, limits[k])] for k, row in enumerate(routes.visited())]
-    best, most = _routes(places, rows), -1.0
-    for k in range(-2, ROUNDS):
-        fitted = _routes(places, known.visited() if k < 0 else rows)
-        if k > -2:
-            _improve(places, fitted, fit)
-        collected = sum(places.prizes[row].sum() for row in fitted.visited())
-        if collected > most and (fitted.lengths() <= limits).all():
-            best, most = fitted, collected
-        if k < 0:
-            continue
-        _improve(places, routes, _terms(limits, price, worth=1.0))
-        rows, over = routes.visited(), routes.lengths() > limits
-        low, high = np.where(over, price, low), np.where(over, high, price)
-        middle = np.sqrt(low * np.minimum(high, 1e300))
-        price = np.where(high == np.inf, 2.0 * price, np.where(low, middle, 0.5 * price))
-    return best
-
-
-def _reach(places: _Places, routes: _Routes, k: int, limit: float) -> int:
-    """Return how many nodes of a route can be visited within a limit [m]."""
-    number = int(routes.counts[k])
-    end = int(routes.order[k, number + 1])
-    while number and limit < routes.ways[k, number] + _gap(
-        places.points, places.free, routes.order[k, number], end
-    ):
-        number -= 1
-    return number
-
-
-@njit(cache=True)
-def _gap(points, free, a, b):  # type: ignore[no-untyped-def]
-    if free[a] or free[b]:
-        return 0.0
-    total = 0.0
-    for axis in range(points.shape[1]):
-        total += (points[a, axis] - points[b, axis]) ** 2
-    return math.sqrt(total)
-
-
-@njit(cache=True)
-def _nearest(points, free, n, number):  # type: ignore[no-untyped-def]
-    """Return the nearest nodes of each node and start; -1: none."""
-    near = np.full(((len(points) + n) // 2, number), -1)
-    gaps = np.empty(number)
-    for a in range(len(near)):
-        gaps[:] = np.inf
-        for b in range(n):
-            gap = _gap(points, free, a, b)
-            if free[a] or b == a or gap >= gaps[number - 1]:
-                continue
-            i = number - 1
-            while i > 0 and gaps[i - 1] > gap:
-                gaps[i], near[a, i] = gaps[i - 1], near[a, i - 1]
-                i -= 1
-            gaps[i], near[a, i] = gap, b
+def _nearest(points: FloatArray, free: BoolArray, n: int, number: int) -> IntArray:
+    """Return the nearest nodes of each of a number of places; -1: none."""
+    near = np.full((number, min(NEIGHBOURS, n)), -1)
+    rows = np.flatnonzero(~free[:number])
+    found = cKDTree(points[:n]).query(points[rows], [*range(1, min(NEIGHBOURS + 1, n) + 1)])[1]
+    for row, nodes in zip(rows, found):
+        others = nodes[nodes != row][:NEIGHBOURS]
+        near[row, : len(others)] = others
     return near
 
 
 @njit(cache=True)
-def _take(places, routes, k, row):  # type: ignore[no-untyped-def]
-    """Replace a route, and add up along it."""
-    routes.counts[k] = len(row) - 2
-    way = total = late = 0.0
-    for i in range(len(row)):
-        if i > 0:
-            way += _gap(places.points, places.free, row[i - 1], row[i])
-        routes.order[k, i] = row[i]
-        routes.where[row[i], 0], routes.where[row[i], 1] = k, i
-        routes.ways[k, i], routes.sums[k, i], routes.moments[k, i] = way, total, late
-        total += places.prizes[row[i]]
-        late += places.prizes[row[i]] * way
-    # Ends have no prize: the sums before the end are those of the whole route.
+def _put(places, routes, terms, nodes):  # type: ignore[no-untyped-def]
+    """Insert each node that is on no route where that is cheapest, whatever the limits are."""
+    for v in nodes:
+        if routes.where[v, 0] < 0:
+            _, k, i = best_entry(places, routes, terms, v, False)
+            insert(places, routes, k, i, v)
 
 
 @njit(cache=True)
-def _weighed(term, length, late, prize):  # type: ignore[no-untyped-def]
-    over = max(length - term[3], 0.0)
-    return term[0] * length + term[1] * late - term[2] * prize + term[4] * over
-
-
-@njit(cache=True)
-def _now(routes, terms, k):  # type: ignore[no-untyped-def]
-    """Return the cost of a route."""
-    end = routes.counts[k] + 1
-    return _weighed(terms[k], routes.ways[k, end], routes.moments[k, end], routes.sums[k, end])
-
-
-@njit(cache=True)
-def _cost(places, routes, parts, term):  # type: ignore[no-untyped-def]
-    """Return the cost of a route of parts (route, first, last, backwards) of the present ones."""
-    order, counts, ways = routes.order, routes.counts, routes.ways
-    length = late = prize = 0.0
-    end = -1
-    for k, i, j, back in parts:
-        if i > j:
-            continue
-        # Ends have no prize.
-        after = min(j + 1, counts[k] + 1)
-        weight = routes.sums[k, after] - routes.sums[k, i]
-        moment = routes.moments[k, after] - routes.moments[k, i]
-        first, last = (order[k, j], order[k, i]) if back else (order[k, i], order[k, j])
-        if end >= 0:
-            length += _gap(places.points, places.free, end, first)
-        late += weight * length
-        late += ways[k, j] * weight - moment if back else moment - ways[k, i] * weight
-        length += ways[k, j] - ways[k, i]
-        prize += weight
-        end = last
-    return _weighed(term, length, late, prize)
-
-
-@njit(cache=True)
-def _move(number, counts, k, i, h, j):  # type: ignore[no-untyped-def]
-    """Return the parts of routes k and h after a move that connects place i of k with j of h.
-
-    Without a part where it cannot be made.
-    """
-    nothing = (_NONE, _NONE, _NONE, _NONE)
-    m, o = counts[k] + 1, counts[h] + 1
-    if number < 4 * LONGEST:
-        # Nodes x to y move behind place q: j beside i, before or behind it, forwards or backwards.
-        size, kind = number // 4, number % 4
-        x, y = (j - size, j) if kind in (1, 2) else (j, j + size)
-        q, back = i - kind // 2, kind % 2
-        if x < 1 or y >= o or q < 0 or q >= m or (k == h and x - 1 <= q <= y):
-            return nothing, nothing
-        if k != h:
-            longer = ((k, 0, q, 0), (h, x, y, back), (k, q + 1, m, 0), _NONE)
-            return longer, ((h, 0, x - 1, 0), (h, y + 1, o, 0), _NONE, _NONE)
-        if q < x:
-            here = ((k, 0, q, 0), (k, x, y, back), (k, q + 1, x - 1, 0), (k, y + 1, m, 0))
-        else:
-            here = ((k, 0, x - 1, 0), (k, y + 1, q, 0), (k, x, y, back), (k, q + 1, m, 0))
-        return here, nothing
-    back = number - 4 * LONGEST
-    if k == h:
-        # The part between them is turned round.
-        x, y = min(i, j) + 1 - back, max(i, j) - back
-        if x < 1 or y >= m:
-            return nothing, nothing
-        return ((k, 0, x - 1, 0), (k, x, y, 1), (k, y + 1, m, 0), _NONE), nothing
-    # Parts of both routes are exchanged: up to the ends, or against the beginning.
-    if j < 1 or j >= o or i >= m:
-        return nothing, nothing
-    if back:
-        mine = ((k, 0, i, 0), (h, 1, j, 1), (k, m, m, 0), _NONE)
-        return mine, ((h, 0, 0, 0), (k, i + 1, m - 1, 1), (h, j + 1, o, 0), _NONE)
-    mine = ((k, 0, i, 0), (h, j, o - 1, 0), (k, m, m, 0), _NONE)
-    return mine, ((h, 0, j - 1, 0), (k, i + 1, m - 1, 0), (h, o, o, 0), _NONE)
-
-
-@njit(cache=True)
-def _joined(routes, parts, active):  # type: ignore[no-untyped-def]
-    """Return the places of parts in order, and mark where they begin and end as active."""
-    row = np.empty(routes.order.shape[1], np.int64)
-    length = 0
-    for k, i, j, back in parts:
-        for step in range(j - i + 1):
-            row[length] = routes.order[k, j - step if back else i + step]
-            active[row[length]] |= step == 0 or step == j - i
-            length += 1
-    return row[:length]
-
-
-@njit(cache=True)
-def _improve(places, routes, terms):  # type: ignore[no-untyped-def]
-    """Make the best move at each place until none makes the routes cheaper."""
-    # Less is the rounding of sums that cancel.
-    least = 1e-9 * np.abs(terms[:, 2]).max() * places.prizes.sum()
+def _drop(places, routes, terms, credit):  # type: ignore[no-untyped-def]
+    """Remove stretches of least prize for their metres until the routes are within limits."""
     for k in range(len(terms)):
-        end = routes.counts[k] + 1
-        least += 1e-9 * terms[k, 0] * routes.ways[k, end]
-        least += 1e-9 * terms[k, 1] * routes.moments[k, end]
-    active = np.ones(len(places.points), np.bool_)
-    while active[: len(places.near)].any():
-        for a in range(len(places.near)):
-            while active[a]:
-                active[a] = False
-                kind, k, i, h, j = _best_move(places, routes, terms, least, a)
-                if kind >= 0:
-                    first, second = _move(kind, routes.counts, k, i, h, j)
-                    one, other = _joined(routes, first, active), _joined(routes, second, active)
-                    _take(places, routes, k, one)
-                    if k != h:
-                        _take(places, routes, h, other)
-                    active[a] = True
+        ways, sums = routes.ways[k], routes.sums[k]
+        while routes.counts[k] and ways[routes.counts[k] + 1] > terms[k, 3]:
+            count, best, first, length = routes.counts[k], math.inf, 1, routes.counts[k]
+            over = ways[count + 1] - terms[k, 3]
+            low = int(draw(routes) * count) if count > WINDOW else 0
+            for step in range(min(count, WINDOW)):
+                i, number, saved = 1 + (low + step) % count, 1, 0.0
+                while i + number <= count + 1 and saved <= 2.0 * over:
+                    a, b = routes.order[k, i - 1], routes.order[k, i + number]
+                    saved = ways[i + number] - ways[i - 1]
+                    saved -= gap_between(places.points, places.free, a, b)
+                    if saved > 1e-12:
+                        score = sums[i + number] - sums[i] - credit * max(saved - over, 0.0)
+                        score *= (1.0 + NOISE * draw(routes)) / min(saved, over)
+                        if score < best:
+                            best, first, length = score, i, number
+                    number += 1 + number // 2
+            remove(places, routes, k, first, length)
 
 
 @njit(cache=True)
-def _best_move(places, routes, terms, least, a):  # type: ignore[no-untyped-def]
-    """Return the best move that connects a place with a near node, or drops it; -1: none."""
-    best, chosen = least, (-1, 0, 0, 0, 0)
-    unused = len(terms) - 1
-    # Where prizes are worth nothing, all nodes are visited.
-    for rank in range(places.near.shape[1] + (terms[0, 2] > 0.0)):
-        k, i = routes.where[a]
-        if rank < places.near.shape[1]:
-            b = places.near[a, rank]
-            if b < 0:
+def _collect(places, routes, terms, nodes):  # type: ignore[no-untyped-def]
+    """Insert nodes one by one, that of most prize for its cost first, as long as one fits."""
+    m, power = len(nodes), 0.5 + draw(routes)
+    worth, score, behind = np.empty(m), np.full(m, -1.0), np.empty(m, np.int64)
+    k, i, fresh = -1, 0, True
+    while m:
+        for u, v in enumerate(nodes):
+            if fresh:
+                worth[u] = (places.prizes[v] * (1.0 - NOISE * draw(routes))) ** power
+            elif score[u] < 0.0 or k < 0:
                 continue
-            h, j = routes.where[b]
+            if fresh or behind[u] == routes.order[k, i]:
+                # The route has changed where the node was cheapest.
+                cost, h, j = best_entry(places, routes, terms, v, True)
+                score[u] = worth[u] / cost if h >= 0 else -1.0
+                behind[u] = routes.order[h, j]
+            else:
+                for j in (i, i + 1):
+                    cost = entry_cost(places, routes, terms[k], k, j, v, True)
+                    if worth[u] > score[u] * cost:
+                        score[u], behind[u] = worth[u] / cost, routes.order[k, j]
+        fresh, u = False, int(np.argmax(score))
+        if score[u] < 0.0:
+            break
+        k, i = routes.where[behind[u]]
+        if entry_cost(places, routes, terms[k], k, i, nodes[u], True) == math.inf:
+            _, k, i = best_entry(places, routes, terms, nodes[u], True)
+        score[u] = -1.0
+        if k >= 0:
+            insert(places, routes, k, i, nodes[u])
+
+
+@njit(cache=True)
+def _spread(places, routes, seen, stamp, rings, most):  # type: ignore[no-untyped-def]
+    """Return the loose nodes, and those on no route up to so many neighbours away from them."""
+    nodes, size, at = np.empty(len(seen), np.int64), routes.loose[-1], 0
+    nodes[:size] = routes.loose[:size]
+    seen[nodes[:size]] = stamp
+    for _ in range(rings):
+        for u in range(at, size):
+            at += 1
+            for b in places.near[nodes[u]]:
+                if b >= 0 and size < most and seen[b] != stamp and routes.where[b, 0] < 0:
+                    seen[b] = stamp
+                    nodes[size] = b
+                    size += 1
+    return nodes[:size]
+
+
+@njit(cache=True)
+def _search(places, routes, terms, tries, hot, cold):  # type: ignore[no-untyped-def]
+    """Replace routes by the best ones of a number of tries."""
+    near, robots, soft = places.near, len(terms), terms.copy()
+    n, every = len(near) - robots, terms[0, 2] == 0.0
+    soft[:, 4] /= OVER
+    seen, cost, way, prize = np.zeros(n, np.int64), 0.0, 0.0, 0.0
+    for k in range(robots):
+        cost += cost_now(routes, terms, k)
+        way += routes.ways[k, routes.counts[k] + 1]
+        prize += routes.sums[k, routes.counts[k] + 1]
+    credit, least = CREDIT * prize / max(way, 1e-9), 1e-7 * abs(cost)
+    best, order, counts = cost, routes.order.copy(), routes.counts.copy()
+    for attempt in range(tries):
+        routes.touched[:] = False
+        routes.loose[-1] = 0
+        centre = int(draw(routes) * n)
+        if not every and draw(routes) < FORCED:
+            # A chain of nodes is forced in.
+            routes.loose[0], routes.loose[-1] = centre, 1
+            most = 1 + int((0.2 * n + 2.0) ** (draw(routes) ** 2))
+            chain = _spread(places, routes, seen, 2 * attempt + 1, most, most)
+            _put(places, routes, terms, chain)
+            improve(places, routes, soft, False)
+            routes.loose[-1] = 0
+            _drop(places, routes, terms, credit)
         else:
-            h, j = k, i
-            k, i = unused, 0
-        if (k == h and k == unused) or j < 1:
-            continue
-        before = _now(routes, terms, k)
-        if k != h:
-            before += _now(routes, terms, h)
-        for kind in range(4 * LONGEST + 2):
-            first, second = _move(kind, routes.counts, k, i, h, j)
-            if first[0][1] > first[0][2]:
-                continue
-            after = _cost(places, routes, first, terms[k])
-            if k != h:
-                after += _cost(places, routes, second, terms[h])
-            if before - after > best:
-                best, chosen = before - after, (kind, k, i, h, j)
-    return chosen
+            left, longest = 1 + int(draw(routes) * STRETCHES), 1 + int(draw(routes) * STRETCH)
+            for rank in range(-1, near.shape[1]):
+                v = centre if rank < 0 else near[centre, rank]
+                if v < 0 or left == 0 or routes.where[v, 0] < 0:
+                    continue
+                k, i = routes.where[v]
+                number = min(1 + int(draw(routes) * longest), routes.counts[k])
+                low, high = max(1, i - number + 1), min(i, routes.counts[k] - number + 1)
+                remove(places, routes, k, low + int(draw(routes) * (high - low + 1)), number)
+                left -= 1
+            if routes.loose[-1] == 0:
+                routes.loose[0], routes.loose[-1] = centre, 1
+        nodes = _spread(places, routes, seen, 2 * attempt + 2, 1, n)
+        if every:
+            keys = np.empty(len(nodes))
+            for u in range(len(nodes)):
+                keys[u] = draw(routes)
+            _put(places, routes, terms, nodes[np.argsort(keys)])
+        else:
+            _collect(places, routes, terms, nodes)
+        improve(places, routes, terms, False)
+        before, cost, heat = cost, 0.0, hot * (cold / hot) ** (attempt / tries)
+        for k in range(robots):
+            cost += cost_now(routes, terms, k)
+        if cost - before > -heat * math.log(1.0 - draw(routes)):
+            cost = before
+            restore(places, routes, routes.kept, routes.numbers)
+        elif cost < best - least:
+            best = cost
+            order[:], counts[:] = routes.order, routes.counts
+    routes.touched[:] = True
+    restore(places, routes, order, counts)
