@@ -125,8 +125,10 @@ def test_pages_from_files_fit_a_phone_are_dark_at_night_and_found(site: Path) ->
         assert page.locator('.doors a').count() == 4
         page.fill('input[name=q]', 'nearest_widest')
         page.press('input[name=q]', 'Enter')
+        found = '#search-results a:has-text("Planners and robot models")'
+        page.wait_for_selector(found)
         scores = "['api/a', 'planners'].map((name) => Scorer.score([name, '', '', '', 20, '']))"
         of_api, of_page = page.evaluate(scores)
         assert of_api < 0 < of_page
-        page.click('#search-results a:has-text("Planners and robot models")')
+        page.click(found)
         page.wait_for_selector('h1:has-text("Planners and robot models")')
