@@ -6,8 +6,7 @@ from typing import Any
 
 from numba.core.event import Listener, install_listener
 
-# Time of compilation before the first line, which one or two functions do not reach, and between
-# lines [s].
+# Compile time before the first line, above that of a few functions, and between lines [s].
 PATIENCE, PERIOD = 1.0, 10.0
 
 
@@ -19,7 +18,7 @@ class _Compiling(Listener):
         self._done, self._before, self._next, self._printed = 0, 0.0, PATIENCE, False
 
     def on_start(self, event: Any) -> None:
-        """Print a line if one is due; kernels that this one calls are compiled inside it."""
+        """Print a line if due; kernels that this one calls are compiled inside of it."""
         self._begun.append(perf_counter())
         passed = self._before + self._begun[-1] - self._begun[0]
         if passed >= self._next:
@@ -37,5 +36,5 @@ class _Compiling(Listener):
 
 
 def compiling_said() -> Any:
-    """Return a context in which the progress of compilation is printed on stderr."""
+    """Return a context that prints the compile progress on stderr."""
     return install_listener('numba:compile', _Compiling())

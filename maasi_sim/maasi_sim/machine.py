@@ -1,4 +1,4 @@
-"""On what a run was made, as far as it changes the last bits (docs/repeatability.md)."""
+"""The machine of a run, as far as it changes the last bits (docs/repeatability.md)."""
 
 import hashlib
 import platform
@@ -8,7 +8,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-# By key: what a difference is called, where not by the key.
+# Names of differences, if not the key.
 _NAMES = {
     'features': 'processor features',
     'python': 'Python',
@@ -17,7 +17,7 @@ _NAMES = {
     'numba': 'Numba',
     'cv2': 'OpenCV',
 }
-# What a search in one process consists of.
+# Packages of a search in one process.
 _SEARCH = (
     'maasi_filter',
     'maasi_planner',
@@ -37,7 +37,7 @@ _LIBRARIES = ('numpy', 'scipy', 'numba', 'llvmlite', 'cv2')
 def _facts() -> dict[str, str]:
     from numba.core.registry import cpu_target
 
-    # What kernels are compiled for, NUMBA_CPU_NAME and NUMBA_CPU_FEATURES included.
+    # Target of compiled kernels, including NUMBA_CPU_NAME and NUMBA_CPU_FEATURES.
     _, processor, features = cpu_target.target_context.codegen().magic_tuple()
     return {
         'processor': processor,
@@ -48,12 +48,12 @@ def _facts() -> dict[str, str]:
 
 
 def this_machine() -> dict[str, str]:
-    """Return the processor that kernels are compiled for, a hash of its features, and versions."""
+    """Return processor, hash of its features, and versions."""
     return dict(_facts())
 
 
 def machine_difference(first: Mapping[str, str], second: Mapping[str, str]) -> str:
-    """Return in words in what two results of `this_machine` differ, '' if in nothing."""
+    """Return the differences of two results of `this_machine` as text, '' if none."""
     keys = dict.fromkeys([*first, *second])
     return ', '.join(
         f'{_NAMES.get(key, key)} {second.get(key, "unknown")} instead of '
@@ -65,7 +65,7 @@ def machine_difference(first: Mapping[str, str], second: Mapping[str, str]) -> s
 
 @cache
 def code_digest() -> str:
-    """Return a short hash of the code of a search: searches of other code are not mixed."""
+    """Return a short hash of the code of a search."""
     total = hashlib.sha256()
     for name in _SEARCH:
         spec = find_spec(name)

@@ -1,4 +1,4 @@
-"""The search in one process, without ROS, with the filter, planner and library of the nodes."""
+"""A search in one process, without ROS, with the filter, planner and libraries of the nodes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
 from maasi_sim.search_result import SearchResult
 from maasi_sim.simulation.robots import SimulatedRobot, Simulation
 
-# From the settings, and a function that returns the true targets that are not found yet.
+# From the settings and a function that returns the undetected true targets.
 MakePlanner = Callable[[PlannerSettings, Callable[[], FloatArray]], Planner]
 
 
@@ -46,11 +46,11 @@ def search(
     Parameters
     ----------
     scenario : Scenario
-        To run. Of its events, only leaving robots are simulated.
+        Scenario to run. Robots may leave but not return.
     seed : int
-        Of all random numbers.
+        Seed of all random numbers.
     most_measurements : int, optional
-        End after so many measurements of all robots.
+        End after this many measurements of all robots.
     planner : str, class or function, optional
         Instead of the scenario's: the name of a planner, also as `module:Class`; a subclass of
         Planner; or a function that returns the planner of each group, from its settings and a
@@ -61,7 +61,7 @@ def search(
     Raises
     ------
     ValueError
-        If a robot is to come back, or there is no planner of that name.
+        If a robot is to return, or the planner is unknown.
     """
     if isinstance(planner, type):
         planner = f'{planner.__module__}:{planner.__qualname__}'
@@ -69,7 +69,7 @@ def search(
         try:
             renamed = scenario.planner.renamed(planner)
         except ValidationError as error:
-            # One line, without the type of error and the address that pydantic adds.
+            # One line, without error type and address that pydantic adds.
             reasons = '; '.join(map(reason, error.errors()))
             raise ValueError(f'planner: {reasons}') from None
         scenario = scenario.model_copy(update={'planner': renamed})
@@ -89,7 +89,7 @@ def search(
 
 
 class _Search:
-    """A search while it runs, step by step."""
+    """A running search, step by step."""
 
     def __init__(self, scenario: Scenario, seed: int, make_planner: MakePlanner | None) -> None:
         check_events(scenario)
@@ -149,7 +149,7 @@ class _Search:
         return self.log
 
     def _plan(self, group: _Group) -> dict[str, PresentRobot]:
-        """Plan for the free robots of a group, and send them to their waypoints."""
+        """Plan for the free robots of a group and send them to their waypoints."""
         coordinator, robots, here = group.coordinator, group.coordinator.robots, self._here
         present = {}
         for name in [name for name in group.names if name in here]:
@@ -182,7 +182,7 @@ class _Search:
         return present
 
     def _measure(self, group: _Group, present: Mapping[str, PresentRobot]) -> None:
-        """Measure with the robots of a group that are due, update its filter, and score."""
+        """Measure with the due robots of a group, update its filter, and score."""
         able = {name for name in present if self.simulation.images_due(name)}
         members = group.coordinator.measure(self.step, present, able)
         if not members:
@@ -218,7 +218,7 @@ class _Search:
         self.log.add_map(self.time, group.space, group.coordinator.exploration, now=False)
 
     def _move(self, commands: Mapping[str, FloatArray]) -> None:
-        """Advance by a step, under the commands of the robots that are here."""
+        """Advance by a step with the commands of the present robots."""
         robots = self.simulation.robots
         places = {name: robots[name].state.pose.position for name in commands}
         for name, command in commands.items():
@@ -239,7 +239,7 @@ class _Search:
         return None
 
     def _missing(self) -> FloatArray:
-        """Return the true targets that are not found yet, (n, 3) [m]."""
+        """Return the undetected true targets, (n, 3) [m]."""
         truth = np.asarray(self.world.targets_at(self.step), dtype=float)
         matched = [j for _, j in self.log.scores_against(truth).match.pairs]
         return np.delete(self.world.targets_3d_at(self.step), matched, axis=0)
@@ -247,13 +247,13 @@ class _Search:
 
 @dataclass
 class _Group:
-    """Robots that share filter and planner: all, or a single one (002, section 4)."""
+    """Robots that share filter and planner: all, or a single one (paper 002, section 4)."""
 
     space: str
     names: list[str]
     coordinator: Coordinator
     filter: SearchFilter
-    # Step of the last batch, and found targets at the end of the previous step, for other groups.
+    # Step of the last batch, and earlier found targets for other groups.
     last_batch: int | None = None
     shared: list[FoundTarget] = field(default_factory=list)
 
@@ -276,7 +276,7 @@ class _Robot:
         self.state: RobotState
 
     def observe(self, stamp: int) -> None:
-        """Take the odometry of a step."""
+        """Handle the odometry of a step."""
         reading = self.body.odometry
         motion = reading.velocity, reading.angular_velocity
         self.pose = self.odometry.apply(stamp, reading.pose, reading.covariance, *motion)
@@ -301,9 +301,9 @@ class _Robot:
 
 
 def check_events(scenario: Scenario) -> None:
-    """Raise ValueError if a robot is to come back."""
+    """Raise ValueError if a robot is to return."""
     for event in scenario.events:
         if event.do != 'leave':
             raise ValueError(
-                f"events: read '{event.do}' of {event.robot}, in one process robots only leave"
+                f"events: read '{event.do}' of {event.robot}, allowed in one process is 'leave'"
             )

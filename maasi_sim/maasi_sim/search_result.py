@@ -1,4 +1,4 @@
-"""The record of a search in one process, and what is written of it."""
+"""The result of a search in one process, and its outputs."""
 
 from importlib import import_module
 from pathlib import Path
@@ -9,10 +9,10 @@ from maasi_sim.run.targets.tables import columns, found_rows
 
 
 class SearchResult(RunLog):
-    """The log of a search, see `RunLog`."""
+    """The log of a search; see `RunLog`."""
 
     def save_replay(self, path: str | Path) -> None:
-        """Write a page that shows the search, one HTML file.
+        """Write a page that shows the search, as one HTML file.
 
         Raises
         ------
@@ -32,15 +32,15 @@ class SearchResult(RunLog):
         Parameters
         ----------
         table : str
-            'found_targets': a row for each, with the columns of `found_targets.csv`. 'progress': a
-            row for each update, with the fields of `Count` and the places of robots.
+            'found_targets': one row per target, with the columns of `found_targets.csv`.
+            'progress': one row per update, with the fields of `Count` and robot positions.
 
         Raises
         ------
         ImportError
             If pandas is not installed.
         ValueError
-            If there is no such table.
+            If the table is unknown.
         """
         if table not in ('found_targets', 'progress'):
             raise ValueError(f"table: got {table!r}, allowed are 'found_targets', 'progress'")

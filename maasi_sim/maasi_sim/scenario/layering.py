@@ -26,10 +26,10 @@ class ScenarioError(ValueError):
 
 
 class ScenarioWarning(InputWarning):
-    """Valid input that is hardly meant: names file, key and value."""
+    """Valid but improbable input: names file, key and value."""
 
 
-# Compiled, where PyYAML was built so: writing takes a third of a second without it.
+# The compiled dumper, if available, saves a third of a second.
 _Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
@@ -41,12 +41,12 @@ def to_yaml(content: Any) -> str:
     return text
 
 
-_MOST_ENTRIES = 100_000  # far more than any scenario has
+_MOST_ENTRIES = 100_000  # far above any scenario
 
 
 @dataclass
 class Layer:
-    """A tree of plain values, and for each key the place that it was read from."""
+    """A tree of plain values with the file and line of each key."""
 
     data: Any
     origins: dict[Key, str] = field(default_factory=dict)
@@ -60,14 +60,14 @@ class Layer:
         return ''
 
     def located(self, problem: str) -> str:
-        """Return a problem, `key: text`, with the place of its key before it."""
+        """Return a problem, `key: text`, preceded by file and line of its key."""
         parts = re.findall(r'[^.[\]]+', problem.partition(': ')[0])
         key = tuple(int(part) if part.isdigit() else part for part in parts)
         return f'{self.origin(key)}: {problem}'
 
 
 class _Loader(yaml.SafeLoader):
-    """A safe loader: `1e-3` is a number; keys that stand twice and endless aliases are refused."""
+    """A safe loader: `1e-3` is a number; repeated keys and endless aliases are refused."""
 
     def __init__(self, text: str, path: Path) -> None:
         super().__init__(text)
@@ -79,13 +79,13 @@ class _Loader(yaml.SafeLoader):
         return f'{self.path}:{node.start_mark.line + 1}'
 
     def values(self, node: yaml.Node, key: Key, above: tuple[yaml.Node, ...] = ()) -> Any:
-        """Return the values of a node, and note where each key stands."""
+        """Return the values of a node, and store the line of each key."""
         if node in above:
-            raise ScenarioError(f'{self.place(node)}: an alias stands inside its own anchor')
+            raise ScenarioError(f'{self.place(node)}: an alias refers to its own anchor')
         if len(self.origins) >= _MOST_ENTRIES:
             raise ScenarioError(
-                f'{self.place(node)}: read more than {_MOST_ENTRIES} entries, aliases counted as '
-                'often as they stand there'
+                f'{self.place(node)}: read more than {_MOST_ENTRIES} entries, counting '
+                'repeated aliases'
             )
         self.origins.setdefault(key, self.place(node))
         above = (*above, node)
@@ -104,7 +104,7 @@ class _Loader(yaml.SafeLoader):
                     f'{place}: {dotted(key)}: read {shown(name)} as a key, allowed is text'
                 )
             if name in mapping:
-                raise ScenarioError(f'{place}: {dotted(inner)}: stands there twice')
+                raise ScenarioError(f'{place}: {dotted(inner)}: is repeated')
             self.origins[inner] = place
             mapping[name] = self.values(value_node, inner, above)
         return mapping
@@ -118,7 +118,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_layer(path: Path, key: Key = ()) -> Layer:
-    """Read a YAML file whose top is a mapping, as the values under a key."""
+    """Read a YAML file with a mapping at the top, as the values under a key."""
     try:
         text = path.read_text(encoding='utf-8')
         loader = _Loader(text, path)

@@ -1,1 +1,1 @@
-"""The simulation: world, robots and sensors on one clock, emulated vehicles, the sim node."""
+"""The simulation: world, robots and sensors on one clock, emulated vehicles, and its node."""

@@ -1,4 +1,4 @@
-"""A simulated camera: images (h, w) of the floor [m, map] and its markers, linear in light."""
+"""A simulated camera: images (h, w) of the floor [m, map] and markers, in linear light."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -32,18 +32,18 @@ class Shot(NamedTuple):
 
 
 class Exposure(NamedTuple):
-    """How light becomes grey levels."""
+    """Conversion of light to grey levels."""
 
-    lens: FloatArray  # share of the light that passes, (h, w)
+    lens: FloatArray  # share of transmitted light, (h, w)
     light: FloatArray  # amplitude, wave vector [turns/m] and phase [turns], (4,)
     gains: FloatArray  # of R, G, B
     read_noise: float  # deviation in the dark
-    shot_noise: float  # variance for each grey level of signal
+    shot_noise: float  # variance per grey level of signal
 
 
 @njit(cache=True, error_model='numpy')
 def floor_points(rays, turn, centre, floor_x, floor_y):  # type: ignore[no-untyped-def]
-    """Where each pixel's ray meets the floor; NaN above the horizon."""
+    """Intersect each pixel's ray with the floor; nan above the horizon."""
     above = centre[2] > 0.0
     for row in range(floor_x.shape[0]):
         us, vs, xs, ys = rays[0, row], rays[1, row], floor_x[row], floor_y[row]
@@ -58,7 +58,7 @@ def floor_points(rays, turn, centre, floor_x, floor_y):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def _project(points, shot):  # type: ignore[no-untyped-def]
-    """Pixels (n, 2) of points (n, 3), as `Camera.project`; in a kernel, for small images."""
+    """Project points (n, 3) to pixels (n, 2), as `Camera.project`, in a kernel for small images."""
     centre, turn, matrix, k = shot.centre, shot.turn, shot.matrix, shot.distortion
     pixels = np.full((points.shape[0], 2), np.nan)
     for i in range(points.shape[0]):
@@ -78,7 +78,7 @@ def _project(points, shot):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def place(shapes, rims, floor_x, floor_y, shot, margin, boxes, drift):  # type: ignore[no-untyped-def]
-    """Find the pixels that each shape may touch, and how far it moves during the exposure.
+    """Find the pixels that each shape may touch, and its motion during the exposure.
 
     boxes (n, 4): left, top, right, bottom; empty out of view. drift (n, 2): on the floor [m].
     """
@@ -112,7 +112,7 @@ def place(shapes, rims, floor_x, floor_y, shot, margin, boxes, drift):  # type: 
             continue
         spread = 0.0
         if exposure_time > 0.0 and centre[2] > 0.0:
-            # The floor's point under a pixel moves with the camera, the shape against it.
+            # The floor point of a pixel moves with the camera, the shape in the opposite direction.
             ax, ay, az = x - origin[0], y - origin[1], -origin[2]
             moved_x = velocity[0] + rotation_rate[1] * az - rotation_rate[2] * ay
             moved_y = velocity[1] + rotation_rate[2] * ax - rotation_rate[0] * az
@@ -143,7 +143,7 @@ def place(shapes, rims, floor_x, floor_y, shot, margin, boxes, drift):  # type: 
 
 @njit(cache=True)
 def _signed_distance(kind, a, b, cosine, sine, dx, dy):  # type: ignore[no-untyped-def]
-    """Distance to the edge, negative inside, and its gradient by x and y."""
+    """Return the distance to the edge, negative inside, and its gradient by x and y."""
     if kind == DISC:
         distance = np.sqrt(dx * dx + dy * dy)
         if distance < 1e-9:
@@ -161,7 +161,7 @@ def _signed_distance(kind, a, b, cosine, sine, dx, dy):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def paint(albedo, floor_x, floor_y, shapes, boxes, drift, blur):  # type: ignore[no-untyped-def]
-    """Blend shapes (n, 10) into the albedo inside their pixel boxes, edges softened, blurred."""
+    """Blend shapes (n, 10) into the albedo in their pixel boxes, with soft, blurred edges."""
     height, width = floor_x.shape
     soft = np.sqrt(1.0 + 6.28318530718 * blur * blur)
     for index in range(shapes.shape[0]):
@@ -174,7 +174,7 @@ def paint(albedo, floor_x, floor_y, shapes, boxes, drift, blur):  # type: ignore
                 x, y = floor_x[row, column], floor_y[row, column]
                 if np.isnan(x):
                     continue
-                # The footprint of the pixel on the floor, from its neighbours.
+                # The pixel's footprint on the floor, from its neighbours.
                 c0, c1 = max(column - 1, 0), min(column + 1, width - 1)
                 r0, r1 = max(row - 1, 0), min(row + 1, height - 1)
                 per_column = 1.0 / (c1 - c0)
@@ -210,7 +210,7 @@ def paint(albedo, floor_x, floor_y, shapes, boxes, drift, blur):  # type: ignore
 
 @njit(cache=True)
 def floor_albedo(floor_x, floor_y, colour, texture, albedo):  # type: ignore[no-untyped-def]
-    """Fill albedo (3, h, w) with the floor's colour, speckled by an integer hash of its place."""
+    """Fill albedo (3, h, w) with the floor's colour, with speckle hashed from its position."""
     height, width = floor_x.shape
     for channel in range(3):
         albedo[channel] = colour[channel]
@@ -235,7 +235,7 @@ def floor_albedo(floor_x, floor_y, colour, texture, albedo):  # type: ignore[no-
 
 @njit(cache=True)
 def expose(albedo, floor_x, floor_y, exposure, noise, offsets, image):  # type: ignore[no-untyped-def]
-    """Turn albedo (3, h, w) into grey levels (h, w, 3); parabolas stand for the light's sine."""
+    """Convert albedo (3, h, w) to grey levels (h, w, 3); parabolas approximate the light's sine."""
     lens, light, gains = exposure.lens, exposure.light, exposure.gains
     read, shot = exposure.read_noise, exposure.shot_noise
     height, width = floor_x.shape
@@ -269,7 +269,7 @@ def expose(albedo, floor_x, floor_y, exposure, noise, offsets, image):  # type: 
 
 
 class CameraRenderer:
-    """Renders what one robot's camera sees."""
+    """Renders the images of one robot's camera."""
 
     def __init__(
         self,
@@ -295,7 +295,7 @@ class CameraRenderer:
             row[5], row[6] = np.cos(shape.angle), np.sin(shape.angle)
             row[7:10] = shape.colour
         self._rims = self._shape_rims()
-        # Uneven light is common to all cameras; exposure and white balance drift in each one.
+        # Uneven light is common to all cameras; exposure and white balance drift separately.
         room = noise_stream(seed, purpose='light')
         direction, phase = room.uniform(0.0, 2.0 * np.pi), room.uniform(0.0, 1.0)
         wave = np.array([np.cos(direction), np.sin(direction)]) / settings.light_wavelength
@@ -303,7 +303,7 @@ class CameraRenderer:
         drift = noise_stream(seed, robot, purpose='camera drift')
         self._drift_phases = drift.uniform(0.0, 2.0 * np.pi, size=4)
         self._drift_rates = 2.0 * np.pi / settings.drift_period * drift.uniform(0.7, 1.4, size=4)
-        # Normal numbers, the same for all cameras, read at offsets drawn for each row.
+        # Normal numbers shared by all cameras, read at random offsets per row.
         table = np.random.Generator(np.random.PCG64(20240601))
         self._noise = table.standard_normal(1 << 16, dtype=np.float32)
         self._floor_x = np.empty((camera.height, camera.width))
@@ -314,10 +314,10 @@ class CameraRenderer:
         self._floor_colour = np.array(settings.floor_colour, dtype=float)
 
     def _shape_rims(self) -> FloatArray:
-        """Points (n, 16, 3) around each shape, a little outside it."""
+        """Return points (n, 16, 3) slightly outside of each shape."""
         angles = np.arange(16) * (np.pi / 8.0)
         circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        # A square around the rectangle's own axes: circle points pushed out to the sides.
+        # A square along the rectangle's axes: circle points moved outwards to the sides.
         square = circle / np.abs(circle).max(axis=1, keepdims=True)
         rims = np.zeros((len(self._shapes), 16, 3))
         for rim, shape in zip(rims, self._shapes):
@@ -328,7 +328,7 @@ class CameraRenderer:
         return rims
 
     def gains(self, time: float) -> FloatArray:
-        """Return exposure times white balance of R, G, B at a time [s], shape (3,)."""
+        """Return exposure times white balance of R, G, B at a time [s], (3,)."""
         waves = np.sin(self._drift_phases + self._drift_rates * time)
         exposure = 1.0 + self.settings.exposure_drift * waves[0]
         return exposure * (1.0 + self.settings.white_balance_drift * waves[1:])
@@ -354,7 +354,7 @@ class CameraRenderer:
             turn,
             camera.matrix,
             camera.distortion,
-            # The kernel knows this model only: shapes in view of others may be anywhere.
+            # The kernel supports only this model; otherwise shapes may be anywhere.
             float(camera.largest_radius) if camera.model == 'plumb_bob' else 0.0,
             pose.position,
             np.array(velocity, dtype=float),

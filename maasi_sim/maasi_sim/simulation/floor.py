@@ -1,4 +1,4 @@
-"""The floor in view of simulated cameras: how it is rendered, and the objects on it."""
+"""Rendering settings of simulated cameras, and objects on the floor."""
 
 from __future__ import annotations
 
@@ -14,13 +14,19 @@ from maasi_sim.simulation.world import World, noise_stream
 
 
 class DistractorSettings(Settings):
-    """Things on the floor that are not markers; drawn at random over the bounds."""
+    """Objects on the floor that are not markers, at random positions in the bounds."""
 
-    sheets: int = Field(0, ge=0, description='Pale blue sheets of 10 to 25 cm [1]')
-    lines: int = Field(0, ge=0, description='Blue lines of 20 to 80 cm, 3 to 8 mm wide [1]')
-    purple: int = Field(0, ge=0, description="Purple discs of the markers' size [1]")
-    cyan: int = Field(0, ge=0, description="Pale greenish-blue discs of the markers' size [1]")
-    large: int = Field(0, ge=0, description='Blue discs of three times the size of markers [1]')
+    sheets: int = Field(0, ge=0, description='Number of pale blue sheets of 10 to 25 cm [1]')
+    lines: int = Field(
+        0, ge=0, description='Number of blue lines of 20 to 80 cm, 3 to 8 mm wide [1]'
+    )
+    purple: int = Field(0, ge=0, description="Number of purple discs of the markers' size [1]")
+    cyan: int = Field(
+        0, ge=0, description="Number of pale greenish-blue discs of the markers' size [1]"
+    )
+    large: int = Field(
+        0, ge=0, description='Number of blue discs of three times the size of markers [1]'
+    )
 
 
 class RenderSettings(Settings):
@@ -37,13 +43,13 @@ class RenderSettings(Settings):
         0.03, ge=0, le=1, description='Relative amplitude of the speckle of the floor [-]'
     )
     light_variation: float = Field(
-        0.15, ge=0, lt=1, description='Relative amplitude of the light over the floor [-]'
+        0.15, ge=0, lt=1, description='Relative amplitude of uneven light over the floor [-]'
     )
     light_wavelength: Positive = Field(
-        3.0, gt=0, description='Wavelength of the light over the floor [m]'
+        3.0, gt=0, description='Wavelength of uneven light over the floor [m]'
     )
     vignetting: float = Field(
-        0.1, ge=0, lt=1, description='Part of the light lost in the corners of the image [-]'
+        0.1, ge=0, lt=1, description='Share of light lost in the corners of the image [-]'
     )
     exposure_drift: float = Field(
         0.08, ge=0, lt=1, description='Relative amplitude of the drift of exposure [-]'
@@ -51,22 +57,22 @@ class RenderSettings(Settings):
     white_balance_drift: float = Field(
         0.03, ge=0, lt=1, description="Relative amplitude of the drift of each channel's gain [-]"
     )
-    drift_period: Positive = Field(20.0, gt=0, description='Period of the drifts, about [s]')
+    drift_period: Positive = Field(20.0, gt=0, description='Approximate period of the drifts [s]')
     shot_noise: NotNegative = Field(
-        0.06, ge=0, description='Variance of the noise for each grey level of signal [grey level]'
+        0.06, ge=0, description='Variance of the noise per grey level of signal [grey level]'
     )
     read_noise: NotNegative = Field(
         1.5, ge=0, description='Deviation of the noise in the dark [grey level]'
     )
     exposure_time: NotNegative = Field(
-        0.006, ge=0, description='Time over which motion blurs the image [s]'
+        0.006, ge=0, description='Exposure time, which causes motion blur [s]'
     )
     blur: NotNegative = Field(0.5, ge=0, description='Deviation of the blur of the lens [px]')
     jpeg_quality: int | None = Field(
-        None, ge=1, le=100, description='Quality of JPEG compression; none: no JPEG [1]'
+        None, ge=1, le=100, description='Quality of JPEG compression; default: no JPEG [1]'
     )
     distractors: DistractorSettings = Field(
-        default_factory=DistractorSettings, description='Objects like markers'
+        default_factory=DistractorSettings, description='Objects similar to markers'
     )
 
     @model_validator(mode='after')
@@ -83,7 +89,7 @@ class Shape:
     """A flat object on the floor."""
 
     centre: tuple[float, float]  # [m, map]
-    half_size: tuple[float, float]  # the radius twice, or half the sides [m]
+    half_size: tuple[float, float]  # twice the radius, or half the sides [m]
     colour: Sequence[float]  # reflectance, 0 to 1
     rectangle: bool = False
     angle: float = 0.0  # of the first side from the x axis [rad]
@@ -98,14 +104,14 @@ def disc(centre: ArrayLike, radius: float, colour: Sequence[float]) -> Shape:
 def draw_distractors(
     settings: RenderSettings, world: World, generator: np.random.Generator
 ) -> list[Shape]:
-    """Draw distractors. Only sheets may touch a marker: one partly covered is not detected."""
+    """Draw distractors. Only sheets may touch a marker: a partly covered one is not detected."""
     counts = settings.distractors
     low, high = world.bounds[:2, 0], world.bounds[:2, 1]
     radius = 0.5 * settings.marker_diameter
     shapes: list[Shape] = []
 
     def draw(clear: float, along: ArrayLike = (0.0, 0.0)) -> tuple[float, float] | None:
-        """Return a centre whose markers are farther than `clear` from it, or from a line."""
+        """Return a centre at more than `clear` from all markers, or from a line."""
         half = float(np.hypot(*np.asarray(along)))
         axis = np.asarray(along) / (half or 1.0)
         for _ in range(1000):

@@ -1,4 +1,4 @@
-"""Simulated odometry: starts at zero, with noise, and drift that grows with the distance."""
+"""Simulated odometry: starts at zero, with noise and drift that grows with distance."""
 
 import math
 from dataclasses import dataclass
@@ -12,34 +12,35 @@ from maasi_filter.settings import NotNegative, Settings
 from maasi_planner.motion import RobotState
 from maasi_sim.simulation.world import noise_stream
 
-_LEAST_VARIANCE = 1e-12  # reported variances stay positive: consumers invert them
+_LEAST_VARIANCE = 1e-12  # keeps reported variances positive, as consumers invert them
 
 
 class OdometrySettings(Settings):
     """Errors of a robot's odometry; all zero: perfect."""
 
     position_noise: NotNegative = Field(
-        0.002, description='Deviation of each coordinate, independent each step [m]'
+        0.002, description='Deviation of each coordinate, independent at each step [m]'
     )
     heading_noise: NotNegative = Field(
-        0.002, description='Deviation of the heading, independent each step [rad]'
+        0.002, description='Deviation of the heading, independent at each step [rad]'
     )
     velocity_noise: NotNegative = Field(
-        0.005, description='Deviation of each part of the velocity [m/s]'
+        0.005, description='Deviation of each velocity component [m/s]'
     )
     position_drift: NotNegative = Field(
         0.0,
-        description='Deviation of the drift of x and y after one metre; grows with its root [m]',
+        description='Deviation of the drift of x and y after one metre; grows with the root of '
+        'the path length [m]',
     )
     heading_drift: NotNegative = Field(
         0.0,
-        description='Deviation of the drift of the heading after one metre; grows with its root '
-        '[rad]',
+        description='Deviation of the drift of the heading after one metre; grows with the root '
+        'of the path length [rad]',
     )
     position_offset: NotNegative = Field(
         0.0,
-        description='Length of a constant error of the position, in a direction drawn for each '
-        'run; level where the robot is on the floor [m]',
+        description='Length of a constant position error in a random direction of each run; '
+        'horizontal for robots on the floor [m]',
     )
 
 
@@ -54,10 +55,10 @@ class OdometryReading:
 
 
 class OdometryModel:
-    """A robot's odometry, which stands at zero at its start.
+    """A robot's odometry, zero at its start.
 
-    Height, roll and pitch have noise only; x, y and heading drift. The covariance describes the
-    errors of `reported`, by default those of `settings`.
+    Height, roll and pitch have noise only; x, y and heading also drift. The covariance
+    describes the errors of `reported`, by default those of `settings`.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class OdometryModel:
         self.settings = settings
         self.reported = reported or settings
         self.seed, self.robot = seed, robot
-        # Plain numbers: arrays of this size take several times as long.
+        # Plain numbers: small arrays are several times slower.
         to_start = inverse(Pose.from_yaw(start.position, start.yaw))
         self._shift = to_start.position.tolist()
         self._rotation = to_start.rotation().tolist()
@@ -91,7 +92,7 @@ class OdometryModel:
             + [_LEAST_VARIANCE] * 2
             + [self.reported.heading_noise**2 + _LEAST_VARIANCE]
         )
-        # Covariance of the drift of x, y of the estimate and heading h: xx, xy, yy, xh, yh, hh.
+        # Covariance of the drift of x, y and heading h: xx, xy, yy, xh, yh, hh.
         self._drift = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def step(self, state: RobotState, step: int) -> OdometryReading:
@@ -107,7 +108,7 @@ class OdometryModel:
             root = math.sqrt(way)
             before = self._place(x, y)
             self._turn += settings.heading_drift * root * dh
-            # The error of heading turns the estimate about the robot, not about the origin.
+            # A heading error rotates the estimate around the robot, not around the origin.
             after = self._place(x, y)
             drift = settings.position_drift * root
             self._offset = (
@@ -148,7 +149,7 @@ class OdometryModel:
         return (self._offset[0] + cosine * x - sine * y, self._offset[1] + sine * x + cosine * y)
 
     def _grow(self, move_x: float, move_y: float, way: float) -> None:
-        """Propagate the covariance of the drift over a move; an error of heading turns the move."""
+        """Propagate the covariance of the drift over a move, which a heading error rotates."""
         cosine, sine = math.cos(self._turn), math.sin(self._turn)
         # d(x, y) / d(heading).
         a = -(sine * move_x + cosine * move_y)

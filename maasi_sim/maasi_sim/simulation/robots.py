@@ -1,6 +1,6 @@
 """Simulated robots: a body under velocity commands, with battery, odometry and sensors.
 
-A team of them has one clock, and the events of the scenario.
+A team of them has one clock and the events of the scenario.
 """
 
 import math
@@ -26,7 +26,7 @@ from maasi_sim.simulation.world import World
 
 
 class Battery:
-    """A battery that idling and moving drain."""
+    """A battery, drained by idling and moving."""
 
     def __init__(self, settings: BatterySettings) -> None:
         self.settings = settings
@@ -60,8 +60,8 @@ class Leader(Protocol):
 class SimulatedRobot:
     """A simulated robot; its name keys its noise.
 
-    A command holds until the next one, as on a robot without a watchdog. A robot stops before it
-    hits an obstacle; with an empty battery it stops, or sinks to the floor.
+    A command holds until the next one, as without a watchdog. A robot stops before obstacles;
+    with an empty battery it stops or sinks to the floor.
     """
 
     def __init__(
@@ -75,13 +75,13 @@ class SimulatedRobot:
         self.state = self._body.robot_state()
         if self._hits(self.state.pose.position):
             raise ValueError(
-                f'{name}: got start {start.position.tolist()}, allowed is a place at least its '
+                f'{name}: got start {start.position.tolist()}, allowed are positions at least its '
                 f'radius ({settings.radius} m) from every obstacle'
             )
         self._command = np.zeros(4)
         self._flies = settings.flies
         self._resting = False
-        #: Velocity of the air (3,) [m/s, map], which carries a robot that flies.
+        # : Wind (3,) [m/s, map], which carries a flying robot.
         self.wind = np.zeros(3)
         self.battery = Battery(settings.battery)
         self._chargers = _chargers(settings)
@@ -111,7 +111,7 @@ class SimulatedRobot:
         self._command = check_command(velocity)
 
     def follow(self, leader: Leader) -> None:
-        """Take the state from `leader` from now on, instead of simulating the body."""
+        """Take the state from `leader` from now on."""
         self._leader = leader
         self.state = leader.state
 
@@ -150,7 +150,7 @@ class SimulatedRobot:
         self.odometry = self._odometry.step(self.state, step)
 
     def stand(self, step: int) -> None:
-        """Stand still until the discrete step `step`; the last command is void."""
+        """Stand still until the discrete step `step`, ignoring the last command."""
         if self._leader is not None:
             self.step(step, 0.0)
             return
@@ -160,7 +160,7 @@ class SimulatedRobot:
         self.odometry = self._odometry.step(self.state, step)
 
     def image(self, step: int, time: float) -> NDArray[np.uint8]:
-        """Return what the camera sees now, (h, w, 3) uint8 in R, G, B."""
+        """Return the camera image, (h, w, 3) uint8 in R, G, B."""
         assert self.camera is not None, 'no camera'
         state = self.state
         return self.camera.render(state.pose, step, time, state.velocity, state.angular_velocity)
@@ -184,7 +184,7 @@ class SimulatedRobot:
         )
 
     def warm_up(self) -> None:
-        """Compile, or load from the cache, what this robot uses; nothing changes."""
+        """Compile, or load from the cache, the kernels of this robot."""
         self._motion.body(self.state).step(np.zeros(4), 0.05)
         if self.camera is not None:
             self.image(0, 0.0)
@@ -198,10 +198,10 @@ class SimulatedRobot:
         return self._flies and not self._resting and bool(self.wind.any())
 
     def _move(self, command: FloatArray, dt: float) -> None:
-        """Move the body under a command: in the air, which the wind moves over the ground.
+        """Move the body by a command, in the air that the wind moves.
 
-        The body follows the commanded velocity over the ground as long as its speed through the air
-        allows it; gusts, and wind that changes with the height, are left out.
+        The body follows the commanded ground velocity within its air speed; gusts and wind
+        shear are not simulated.
         """
         if not self._carried:
             self._body.step(command, dt)
@@ -229,9 +229,9 @@ class SimulatedRobot:
 
 
 def _chargers(settings: RobotSettings) -> FloatArray:
-    """Return where a robot is charged, (n, 3): nowhere if it cannot be, or has no endurance.
+    """Return the chargers of a robot, (n, 3): empty if it cannot be charged or has no endurance.
 
-    A power that is given charges also a robot without endurance, at its start.
+    With `charging_power`, a robot without endurance is charged at its start, too.
     """
     given = settings.battery.charging_power is not None
     if not settings.battery.chargeable or not (settings.endurance or given):
@@ -243,7 +243,7 @@ def _chargers(settings: RobotSettings) -> FloatArray:
 class SimulatedTeam:
     """Robots of a scenario on one clock, from step 0, with events applied.
 
-    `away` are those that have left: they stand still and are silent.
+    `away`: robots that have left; they stand still and are silent.
     """
 
     def __init__(self, scenario: BaseScenario, robots: dict[str, Any]) -> None:
@@ -253,7 +253,7 @@ class SimulatedTeam:
         self.away: set[str] = set()
         self._events: dict[int, list[tuple[str, str]]] = {}
         for event in sorted(scenario.events, key=lambda event: event.at):
-            # The first step at or after it; a time as close as this to a step is the step's.
+            # The first step at or after it; times this close to a step belong to it.
             step = math.ceil(event.at / scenario.step - 1e-6)
             self._events.setdefault(step, []).append((event.robot, event.do))
         self._apply_events()
@@ -265,11 +265,11 @@ class SimulatedTeam:
 
     @property
     def present(self) -> list[str]:
-        """Robots that take part, in name order."""
+        """Present robots in name order."""
         return [name for name in self.robots if name not in self.away]
 
     def advance(self) -> None:
-        """Advance by one step, each robot under its last command."""
+        """Advance by one step, each robot by its last command."""
         self.step += 1
         for name, robot in self.robots.items():
             if name in self.away:
@@ -304,7 +304,7 @@ class Simulation(SimulatedTeam):
         super().__init__(scenario, robots)
 
     def warm_up(self) -> None:
-        """Compile, or load from the cache, what the robots use; nothing changes."""
+        """Compile, or load from the cache, the kernels of the robots."""
         for robot in self.robots.values():
             robot.warm_up()
 
@@ -322,7 +322,7 @@ class Simulation(SimulatedTeam):
         )
 
     def scan(self, name: str) -> NDArray[np.float32]:
-        """Return a laser scan (beams,) [m] that shows the other robots at its height as well."""
+        """Return a laser scan (beams,) [m] with the other robots at its height."""
         robot = self.robots[name]
         height, radius = robot.state.pose.position[2], robot.settings.radius
         others = [

@@ -1,4 +1,4 @@
-"""Simulated sensors of ranges: range, bearing and elevation of targets, and a laser scanner."""
+"""Simulated range sensors: range, bearing and elevation of targets, and a laser scanner."""
 
 from __future__ import annotations
 
@@ -93,12 +93,12 @@ class RangingSensor:
 
 
 class LaserSettings(Settings):
-    """A planar laser scanner; the defaults are those of the TurtleBot3's."""
+    """A planar laser scanner; defaults of the TurtleBot3's."""
 
-    beams: int = Field(360, ge=1, le=100_000, description='Beams of a full turn [1]')
-    minimum_range: NotNegative = Field(0.12, description='Nearest return [m]')
-    maximum_range: Positive = Field(3.5, description='Farthest return [m]')
-    noise: NotNegative = Field(0.01, description='Deviation of a range [m]')
+    beams: int = Field(360, ge=1, le=100_000, description='Beams per turn [1]')
+    minimum_range: NotNegative = Field(0.12, description='Smallest range [m]')
+    maximum_range: Positive = Field(3.5, description='Largest range [m]')
+    noise: NotNegative = Field(0.01, description='Deviation of ranges [m]')
     rate: Positive = Field(5.0, description='Turns per second [Hz]')
     wall_margin: NotNegative = Field(
         0.3, description='Distance of the walls outside the bounds [m]'
@@ -116,7 +116,7 @@ class LaserSettings(Settings):
 
 @njit(cache=True)
 def _cast(x, y, yaw, count, things, ranges):  # type: ignore[no-untyped-def]
-    """Ranges (count,) of beams from yaw on, anticlockwise, to circles, edges (n, 4), walls (4,)."""
+    """Compute ranges (count,) of beams from yaw, anticlockwise, to circles, edges (n, 4), walls."""
     circles, edges, walls = things
     for beam in range(count):
         angle = yaw + 2.0 * math.pi * beam / count
@@ -152,9 +152,9 @@ def _cast(x, y, yaw, count, things, ranges):  # type: ignore[no-untyped-def]
 
 
 class LaserScanner:
-    """One robot's laser scanner, at its origin, first beam straight ahead; walls around the bounds.
+    """A robot's laser scanner at its origin, first beam straight ahead; walls around the bounds.
 
-    It sees the area's solid things, and other robots.
+    It sees the area's solid objects and other robots.
     """
 
     def __init__(self, settings: LaserSettings, area: Area, seed: int, robot: str) -> None:
@@ -170,8 +170,8 @@ class LaserScanner:
     ) -> NDArray[np.float32]:
         """Return the ranges of one turn (beams,), anticlockwise from straight ahead [m].
 
-        Infinite without a return, minus infinite below the minimum range (REP 117). `centres` and
-        `radii` are those of further circles: the other robots.
+        Infinite without a return, minus infinite below the minimum range (REP 117).
+        `centres`, `radii`: further circles, the other robots.
         """
         settings = self.settings
         circles = np.concatenate([self._circles, _circles(centres, radii)])

@@ -1,4 +1,4 @@
-"""The simulation node: publishes the clock, and simulates every robot behind its topics."""
+"""The simulation node: publishes the clock and simulates every robot behind its topics."""
 
 import math
 import time
@@ -28,37 +28,37 @@ from maasi_sim.simulation.sim_topics import Connections, ExternalRobot, RobotTop
 
 RECORDER = 'recorder'
 
-_LOOK_PERIOD = 0.02  # period of the checks for nodes that are not ready yet [s]
+_LOOK_PERIOD = 0.02  # period of checks for nodes that are not ready [s]
 # Delay of the first warning about missing nodes, and period of its repetition [s].
 _PATIENCE, _REMINDER = 3.0, 15.0
-_CONNECTION_PATIENCE = 5.0  # longest wait for the subscriptions of a node that reports ready [s]
-# Most steps from the recorder to the simulation: a port of Fast DDS holds 512 messages, then they
-# have to be sent again.
+_CONNECTION_PATIENCE = 5.0  # longest wait for the subscriptions of a ready node [s]
+# Most steps between recorder and simulation: a port of Fast DDS holds 512 messages before
+# resending.
 _MOST_AHEAD = 20
 _CLOCK_PERIOD = 0.25  # period of the clock in lockstep [s]
-_FAREWELL = 1.0  # at shutdown: how long linked robots stay reachable for drivers that stop them [s]
+_FAREWELL = 1.0  # at shutdown: time that linked robots stay reachable for drivers [s]
 
 
 class SimNodeSettings(NodeSettings):
-    """Settings of the simulation node; all else is in the scenario file."""
+    """Settings of the simulation node; the rest is in the scenario file."""
 
     live: ClassVar[frozenset[str]] = frozenset({'command_age'})
 
     step: float = Field(
-        0.0, ge=0.0, le=10.0, description="Duration of a step; 0: the scenario's [s]"
+        0.0, ge=0.0, le=10.0, description='Duration of a step; 0: as in the scenario [s]'
     )
     scenario: str = Field(
         min_length=1, description='Scenario file, or the name of one in config/scenarios'
     )
     rate: NotNegative = Field(
         1.0,
-        description='Simulated over wall time, at most; 0: as fast as possible, in lockstep only',
+        description='Largest ratio of simulated to wall time; 0: unlimited, in lockstep only',
     )
-    recorder: bool = Field(False, description='Whether it waits for the recorder, too')
+    recorder: bool = Field(False, description='Whether it also waits for the recorder')
     command_age: Positive = Field(
         1.0,
-        description='Simulated time after which a command is too old; in lockstep each is for its '
-        'step [s]',
+        description='Simulated time after which a command is stale; in lockstep commands belong to '
+        'their step [s]',
     )
 
 
@@ -94,8 +94,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone)
     """
 
-    robot_node = 'driver'  #: name of the node of each robot that commands it
-    #: How the scenario is read, and its robots are made.
+    robot_node = 'driver'  # : name of the node that commands each robot
+    # : Reader of the scenario, and constructor of its robots.
     load: ClassVar[Any] = staticmethod(load_scenario)
     simulate: ClassVar[Any] = Simulation
 
@@ -123,16 +123,16 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         # First step, and last time of an external clock [ns].
         self._first = 0
         self._external_time: int | None = None
-        self._repeated = -1  # stamp of the last step that was republished
+        self._repeated = -1  # stamp of the last republished step
         # Topics that each expected node subscribes to.
         self._expected: dict[str, list[str]] = {}
         self._ready: set[str] = set()
         self._returned: dict[str, float] = {}
         self._ready_since: float | None = None
-        # In lockstep: nodes that are not done, and command topics without a message yet.
+        # In lockstep: nodes that are not done, and command topics without a message.
         self._waiting: set[str] = set()
-        self._recorded = 0  # last step that the recorder has taken
-        # Robots of the step before.
+        self._recorded = 0  # last step that the recorder has received
+        # Robots of the previous step.
         self._taking_part: list[str] = []
         self._last_command: dict[str, int] = {}
         self._due = 0.0
@@ -140,7 +140,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._wall_start = self._wall_step = time.monotonic()
 
     def connect(self) -> None:
-        """Make publishers and subscriptions beside those of all robots, and of the time."""
+        """Create publishers and subscriptions in addition to those of robots and time."""
 
     def on_new_step(self) -> None:
         """Handle a new step of the simulation."""
@@ -214,7 +214,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._step_timer.reset()
 
     def halt(self) -> None:
-        """Stop the time."""
+        """Stop time."""
         self._step_timer.cancel()
         self._look_timer.cancel()
 
@@ -225,7 +225,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._linked.clear()
 
     def destroy_node(self) -> None:
-        """Shut down, once linked robots have been stopped."""
+        """Shut down after linked robots have been stopped."""
         until = time.monotonic() + _FAREWELL
         while any(robot.obeys for robot in self._linked.values()) and time.monotonic() < until:
             time.sleep(_LOOK_PERIOD)
@@ -233,16 +233,16 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         super().destroy_node()
 
     def stamp_of_diagnostics(self) -> Time:
-        """Return the simulated time: the clock of the node is wall time."""
+        """Return the simulated time, as the node's clock is wall time."""
         return stamp_to_ros(self._stamp)
 
     def status(self) -> dict[str, Any]:
-        """Return where the simulation stands."""
+        """Return the state of the simulation."""
         wall = time.monotonic() - self._wall_start
         return {
             'step': self.step,
             'real time factor': f'{self.simulation.time / wall if wall > 0.0 else 0.0:.2f}',
-            'waits for': ', '.join(sorted(self._waiting)) if self.step >= 0 else self._missing(),
+            'waiting for': ', '.join(sorted(self._waiting)) if self.step >= 0 else self._missing(),
             'away': ', '.join(sorted(self.simulation.away)),
             'collisions': sum(robot.collisions for robot in self.simulation.robots.values()),
         }
@@ -256,7 +256,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         restarted = self.step >= 0 and self.settings.lockstep and node in self._ready
         if restarted and self._robot_of.get(node) not in self.simulation.away:
             self._await(node)
-            self.get_logger().info(f'{node} was restarted: step {self.step} is republished')
+            self.get_logger().info(f'{node} was restarted: republishing step {self.step}')
             self._returned[node] = time.monotonic()
             if self.active:
                 self._look_timer.reset()
@@ -277,9 +277,9 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         now = time.monotonic()
         missing = self._missing()
         if missing:
-            # A run with a recorder says so itself.
+            # A run with a recorder reports this itself.
             if now - self._wall_start > _PATIENCE and not self.settings.recorder:
-                self._say_waiting(f'waits for {missing}', now)
+                self._say_waiting(f'waiting for {missing}', now)
             return
         if self._ready_since is None:
             self._ready_since = now
@@ -291,7 +291,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self.get_logger().warning(f'continues without an expected subscription to {topic}')
         self._look_timer.cancel()
         self.get_logger().info(
-            f'all nodes are ready: {", ".join(sorted(self._expected))}; the time starts'
+            f'all nodes are ready: {", ".join(sorted(self._expected))}; starting time'
         )
         self._connections.remember()
         self._wall_start = self._due = now
@@ -316,14 +316,14 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._look_timer.cancel()
 
     def _watch(self) -> None:
-        """Warn about the nodes that a long step waits for."""
+        """Warn about nodes that delay a step."""
         now = time.monotonic()
         if self._waiting and self.active and now - self._wall_step > _PATIENCE:
             waiting = ', '.join(sorted(self._waiting))
-            self._say_waiting(f'step {self.step} waits for {waiting}', now)
+            self._say_waiting(f'step {self.step} is waiting for {waiting}', now)
 
     def _say_waiting(self, text: str, now: float) -> None:
-        """Warn when the text changes, else seldom: a node may compile for minutes."""
+        """Warn when the text changes, else rarely, as a node may compile for minutes."""
         if text != self._said or now - self._said_at >= _REMINDER:
             self._said, self._said_at = text, now
             self.get_logger().warning(text)
@@ -331,7 +331,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     # ---- the steps ---------------------------------------------------------------------------
 
     def _await(self, node: str) -> None:
-        """Wait for the answer of a node to this step: a robot's command, or that it is done."""
+        """Wait for the answer of a node to this step: a command or done."""
         robot = self._robot_of.get(node)
         if robot is not None and robot not in self.simulation.away:
             self._waiting.add(f'{robot}/cmd_vel')
@@ -352,9 +352,9 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._publish(self.simulation.present)
 
     def _publish(self, robots: list[str]) -> None:
-        """Publish the data of some robots, the clock, and the step.
+        """Publish the data of some robots, the clock and the step.
 
-        When a step is republished, images of the other robots are not taken again.
+        For a republished step, the other robots take no new images.
         """
         stamp = stamp_to_ros(self._stamp)
         present = self.simulation.present
@@ -364,7 +364,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._robots_publisher.publish(message)
         for name in present:
             self._robots[name].publish_odometry(stamp)
-        # In lockstep the step is the time of the nodes: a clock for each would cost a tenth more.
+        # In lockstep the step gives the time; a clock in addition would cost a tenth.
         every = max(round(_CLOCK_PERIOD / self._length), 1) if self.settings.lockstep else 1
         if self._clock_publisher is not None and self.step % every == 0:
             self._clock_publisher.publish(Clock(clock=stamp))
@@ -373,7 +373,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._step_publisher.publish(
             LockstepStep(step=self.step, stamp=stamp, robots=present, imaging=imaging)
         )
-        # Last: robots and planners work while images are made.
+        # Last: robots and planners work while images are rendered.
         for name in again:
             self._robots[name].publish_sensors(stamp)
 
@@ -388,7 +388,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         else:
             done = message.step == self.step
         if done and message.node in self._waiting:
-            # A restarted node is awaited until it has received the step.
+            # A restarted node is awaited after it has received the step.
             if message.node in self._returned:
                 return
             self._waiting.discard(message.node)
@@ -419,11 +419,11 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             if stamp == self._stamp:
                 return True
             if stamp == self._repeated:
-                return False  # duplicate: the other nodes answer a republished step again
+                return False  # duplicate: other nodes answer a republished step again
             # Nothing moves while a step waits: a stop command is already fulfilled.
             oldest = newest = self._stamp
         else:
-            # A command may be of the previous step; stamp 0 means now.
+            # A command may belong to the previous step; stamp 0 means now.
             stamp = stamp or self._stamp
             newest = self._stamp + round(self._length * 1e9)
             oldest = max(

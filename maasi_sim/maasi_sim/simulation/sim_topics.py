@@ -1,4 +1,4 @@
-"""What the simulation node publishes: topics of robots, the truth; and who receives it."""
+"""Topics of the simulation node: robots, truth, and checks of subscriptions."""
 
 import array
 import contextlib
@@ -44,7 +44,7 @@ _OF_ALL_NODES = ('/diagnostics', '/rosout', '/parameter_events')
 
 
 class RobotTopics:
-    """Publish the data of one robot; messages are reused, as creating them takes longer."""
+    """Publishes the data of one robot; reuses messages, as creating them is slower."""
 
     def __init__(self, node: Node, simulation: Simulation, name: str, qos: QoSProfile) -> None:
         self.name, self.simulation = name, simulation
@@ -72,7 +72,7 @@ class RobotTopics:
         )
         self._full = 100.0 if robot.battery_unit == 'percent' else 1.0
         self._battery.header.frame_id = f'{name}/base_link'
-        self.needed: list[str] = []  #: full names of the topics that its driver needs
+        self.needed: list[str] = []  # : full names of the topics that its driver needs
         if self._odometry_publisher is not None:
             self.needed.append(self._odometry_publisher.topic_name)
         if self.robot.camera is not None:
@@ -93,7 +93,7 @@ class RobotTopics:
             self._scan = scan_message(laser.settings, f'{name}/base_scan')
 
     def publish_sensors(self, stamp: Time) -> None:
-        """Publish what its sensors and its battery report in this step."""
+        """Publish the readings of its sensors and battery in this step."""
         simulation, robot, name = self.simulation, self.robot, self.name
         imaging = simulation.images_due(name)
         if imaging and robot.camera is not None:
@@ -134,7 +134,7 @@ class RobotTopics:
 
 
 def range_messages(sweep: Sweep) -> list[RangeMeasurement]:
-    """Return the returns of a ranging sensor."""
+    """Return the messages of a ranging sensor's returns."""
     labels = sweep.labels or (UNLABELLED,) * len(sweep.values)
     return [
         RangeMeasurement(
@@ -150,7 +150,7 @@ def range_messages(sweep: Sweep) -> list[RangeMeasurement]:
 
 
 def camera_messages(settings: CameraSettings, frame: str) -> tuple[Image, CameraInfo]:
-    """Return a camera's image without its data, and its calibration."""
+    """Return a camera's image message without data, and its calibration."""
     image = Image(
         height=settings.height,
         width=settings.width,
@@ -174,7 +174,7 @@ def camera_messages(settings: CameraSettings, frame: str) -> tuple[Image, Camera
 
 
 def scan_message(settings: LaserSettings, frame: str) -> LaserScan:
-    """Return a laser scan without its ranges: a turn in no time, from straight ahead."""
+    """Return a laser scan message without ranges."""
     increment = 2.0 * math.pi / settings.beams
     return LaserScan(
         header=Header(frame_id=frame),
@@ -217,14 +217,14 @@ def publish_truth(node: Node, world: World, frame: str) -> None:
 
 
 class Connections:
-    """Tells whether nodes would receive what is published now, by the topics expected of each."""
+    """Reports whether nodes would receive what is published now, by their expected topics."""
 
     def __init__(self, node: Node, expected: Mapping[str, Sequence[str]]) -> None:
         self._node, self._expected = node, expected
         self._endpoints: dict[tuple[str, str], set[bytes]] = {}
 
     def unheard(self, name: str) -> list[str]:
-        """Return the topics without a subscription of a node since `remember`."""
+        """Return the topics of a node without a subscription since `remember`."""
         return [
             topic
             for topic in self._expected[name]
@@ -232,7 +232,7 @@ class Connections:
         ]
 
     def unmatched(self) -> list[str]:
-        """Return the topics of publishers with a known subscription that is not connected yet."""
+        """Return the topics of publishers with a known but unconnected subscription."""
         known = self._node.get_subscriptions_info_by_topic
         return [
             item.topic_name
@@ -242,7 +242,7 @@ class Connections:
         ]
 
     def remember(self) -> None:
-        """Remember all subscriptions: a restarted node has others."""
+        """Remember all subscriptions; a restarted node has new ones."""
         for name, topics in self._expected.items():
             for topic in topics:
                 self._endpoints[name, topic] = self._subscriptions(name, topic)
@@ -256,17 +256,17 @@ class Connections:
 
 
 class ExternalRobot:
-    """A robot moved by another program: sensors measure where its driver says that it is."""
+    """A robot moved by another program, which measures at its driver's pose."""
 
-    obeys = False  #: the simulation does not wait for it at shutdown
+    obeys = False  # : the simulation does not wait for it at shutdown
 
     def __init__(self, start: Pose) -> None:
         self.state = RobotState(start)  #: in the map
 
     def take(self, message: AgentState) -> None:
-        """Store the newest state."""
+        """Store the latest state."""
         linear, angular = message.twist.linear, message.twist.angular
-        # One that is not finite leaves the last valid one.
+        # An invalid state keeps the last valid one.
         with contextlib.suppress(ValueError):
             self.state = RobotState(
                 pose_from_ros(message.pose.pose),

@@ -1,4 +1,4 @@
-"""The true world: area and targets; and the streams of random numbers in it."""
+"""The true world: area, targets, and streams of random numbers."""
 
 from __future__ import annotations
 
@@ -19,42 +19,44 @@ from maasi_filter.settings import Finite, NotNegative, Settings
 def noise_stream(
     seed: int, robot: str = '', step: int = 0, purpose: str = ''
 ) -> np.random.Generator:
-    """Return the generator of one robot's noise for one purpose, as 'camera', at one step.
+    """Return the generator of a robot's noise for one purpose, e.g. 'camera', at one step.
 
-    Independent of the streams of other keys, and equal for equal keys, in every process. Noise of
-    the world has no robot.
+    Independent for different keys and equal for equal keys, in every process. Noise of the
+    world has no robot.
     """
     key = (seed, crc32(robot.encode()), step, crc32(purpose.encode()))
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
 
 
-# Draws for one target, and of a whole set of targets, before the space counts as full.
+# Attempts for one target, and for a whole set, before the space counts as full.
 _ATTEMPTS, _RESTARTS = 1000, 10
 
 
 class TargetSettings(Settings):
-    """Where the targets are: drawn at random, or given."""
+    """True targets: random or given."""
 
-    count: int | None = Field(None, ge=0, le=100_000, description='How many are drawn [1]')
+    count: int | None = Field(None, ge=0, le=100_000, description='Number of random targets [1]')
     distribution: Literal['uniform', 'prior', 'clustered'] = Field(
         'uniform',
-        description="Drawn anywhere, as the environment's prior says, or around random centres",
+        description="Distribution of random targets: uniform, by the environment's prior, or "
+        'around random centres',
     )
     positions: list[list[Finite]] | None = Field(
-        None, description='Given positions, instead of drawn ones [m, map]'
+        None, description='Given positions instead of random ones [m, map]'
     )
-    separation: NotNegative = Field(0.0, description='Least distance between two targets [m]')
-    margin: NotNegative = Field(0.0, description='Least distance from the bounds [m]')
-    clusters: int = Field(3, ge=1, description='Clustered: how many centres [1]')
+    separation: NotNegative = Field(0.0, description='Smallest distance between two targets [m]')
+    margin: NotNegative = Field(0.0, description='Smallest distance from the bounds [m]')
+    clusters: int = Field(3, ge=1, description='Clustered: number of centres [1]')
     spread: float | None = Field(
         None,
         gt=0.0,
-        description="Clustered: deviation around the centres; none: 1/15 of the space's size [m]",
+        description="Clustered: deviation around the centres; default: 1/15 of the space's size "
+        '[m]',
     )
     walk: NotNegative = Field(
         0.0,
-        description='Deviation of a random walk on each axis after one second; ranging sensors '
-        'only [m/sqrt(s)]',
+        description='Deviation of a random walk per axis after one second; ranging sensors only '
+        '[m/sqrt(s)]',
     )
     identified: bool = Field(
         False,
@@ -63,7 +65,8 @@ class TargetSettings(Settings):
     )
     classes: list[Annotated[str, Field(min_length=1)]] = Field(
         default_factory=list,
-        description='Classes that sensors tell, of the targets in turn; ranging sensors only',
+        description='Classes that sensors report, assigned to the targets in turn; ranging '
+        'sensors only',
     )
 
     @model_validator(mode='after')
@@ -75,10 +78,10 @@ class TargetSettings(Settings):
 
 @dataclass(frozen=True)
 class World:
-    """The true world: its area, targets (n, d) [m, map].
+    """The true world: area and targets (n, d) [m, map].
 
-    `walk` is the deviation of the targets' random walk on each axis in one step [m], `seed` that of
-    the walk. `labels` are what sensors report for each target; empty: none.
+    `walk`: deviation of the targets' random walk per axis and step [m]; `seed`: of the walk;
+    `labels`: reported labels of the targets, empty: none.
     """
 
     area: Area
@@ -90,7 +93,7 @@ class World:
 
     @property
     def bounds(self) -> FloatArray:
-        """Around the area, (d, 2) [m]."""
+        """Bounds of the area, (d, 2) [m]."""
         return self.area.bounds
 
     @property
@@ -113,14 +116,14 @@ class World:
         return self._way[step]
 
     def targets_3d_at(self, step: int) -> FloatArray:
-        """Return the same with three coordinates, (n, 3); targets on a floor have z = 0."""
+        """Return the same with three coordinates, (n, 3); z = 0 on a floor."""
         return np.pad(self.targets_at(step), ((0, 0), (0, 3 - self.dimension)))
 
     @classmethod
     def from_settings(
         cls, environment: EnvironmentSettings, targets: TargetSettings, seed: int, step: float = 1.0
     ) -> World:
-        """Build the world of a run: the same for the same seed; `step` is its length [s]."""
+        """Create the world of a run, equal for equal seeds; `step`: its length [s]."""
         area = Area(environment)
         bounds = area.bounds
         if targets.positions is not None:
@@ -160,7 +163,7 @@ class World:
 def draw_targets(
     settings: TargetSettings, area: Area, generator: np.random.Generator
 ) -> FloatArray:
-    """Draw target positions (count, d) [m], each at least ``margin`` outside of all obstacles."""
+    """Draw target positions (count, d) [m], at least ``margin`` outside of all obstacles."""
     count, bounds = settings.count or 0, area.bounds
     low, high = bounds[:, 0] + settings.margin, bounds[:, 1] - settings.margin
     if np.any(low > high):
