@@ -23,9 +23,9 @@ def mend(text: str) -> str:
 def main() -> None:
     for path in pathlib.Path(sys.prefix, 'share').rglob('*.cmake'):
         text = path.read_text()
-        mended = mend(text)
-        if mended != text:
-            path.write_text(mended)
+        fixed = mend(text)
+        if fixed != text:
+            path.write_text(fixed)
 
 
 if __name__ == '__main__':

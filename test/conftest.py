@@ -60,7 +60,7 @@ def chromium():
 
 @pytest.fixture
 def context(domain):
-    """Return a context of rclpy in a domain of its own."""
+    """Return a context of rclpy in its own domain."""
     # rclpy starts threads when it is imported, and some tests fork.
     import rclpy
     from rclpy.context import Context
@@ -73,7 +73,7 @@ def context(domain):
 
 @pytest.fixture
 def ros(domain):
-    """Initialise rclpy's global context in a domain of its own."""
+    """Initialise rclpy's global context in its own domain."""
     import rclpy
 
     rclpy.init(domain_id=domain.number)

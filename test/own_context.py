@@ -1,4 +1,4 @@
-"""A context of rclpy in a domain of its own."""
+"""A context of rclpy in its own domain."""
 
 import gc
 from contextlib import contextmanager

@@ -71,7 +71,7 @@ ROBOTS = Path(__file__).resolve().parents[1] / 'examples' / 'robots'
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Return a folder with a scenario and a planner beside it; imports are undone."""
+    """Return a folder with a scenario and a planner next to it; imports are undone."""
     monkeypatch.setattr(sys, 'path', list(sys.path))
     monkeypatch.setattr(plugins, '_folders', [])
     known = set(sys.modules)

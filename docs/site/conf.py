@@ -72,7 +72,7 @@ def plain_words(app: Any, what: str, name: str, found: Any, options: Any, lines:
 
 
 def short_contents(app: Any, page: str, template: str, context: Any, doctree: Any) -> None:
-    """List the modules of the API beside its own pages only; beside all they take minutes."""
+    """List the modules of the API on its own pages only; on all pages they take minutes."""
     whole = context.get('toctree')
     if whole:
         short = {'collapse': True} if page.startswith('api/') else {'maxdepth': 2}

@@ -93,7 +93,7 @@ class Sections:
         if _is_model(kind):
             place = self._places[kind]
             return f'[{place}](#{re.sub(r"[^a-z0-9 _-]", "", place.lower()).replace(" ", "-")})'
-        return ONE_AND_MANY[kind][many] if kind in ONE_AND_MANY else 'keys of its own'
+        return ONE_AND_MANY[kind][many] if kind in ONE_AND_MANY else 'its own keys'
 
 
 def _is_model(kind: Any) -> bool:

@@ -106,7 +106,7 @@ class PluginGroup:
         return name
 
     def settings(self, name: str) -> type[BaseModel] | None:
-        """Return a plugin's attribute `Settings`, the model of its own settings, or None."""
+        """Return a plugin's attribute `Settings`, the model of its settings, or None."""
         if name in self.built_in:
             return None
         model = getattr(self.load(name), 'Settings', None)
@@ -160,7 +160,7 @@ class ChosenSettings:
 
 
 def own_settings(
-    info: FieldInfo, beside: Callable[[str], Any], values: Callable[[], Mapping[str, Any]]
+    info: FieldInfo, sibling: Callable[[str], Any], values: Callable[[], Mapping[str, Any]]
 ) -> Any:
     """Return the model of a marked field for its values, or None without a mark."""
     for mark in info.metadata:
@@ -168,7 +168,7 @@ def own_settings(
         with contextlib.suppress(ValueError):
             if isinstance(mark, ChosenSettings):
                 return mark.choose(values())
-            if isinstance(mark, OwnSettings) and isinstance(name := beside(mark.selector), str):
+            if isinstance(mark, OwnSettings) and isinstance(name := sibling(mark.selector), str):
                 return mark.group.settings(name)
     return None
 

@@ -12,7 +12,7 @@ from maasi_filter.ros.clocks import ArrivalClock
 
 
 class Simulated:
-    """A node's clock that follows a simulated time, and the steady clock beside it."""
+    """A node's clock that follows a simulated time, and the steady clock next to it."""
 
     def __init__(self, monkeypatch):
         self.steady = 0.0

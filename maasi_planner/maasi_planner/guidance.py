@@ -97,7 +97,7 @@ def _best_vertex(
 
 
 @njit(cache=True, forceinline=True)
-def _beside_sphere(
+def _lateral_sphere(
     position: Vector, target: Vector, sphere: int, around: Surroundings
 ) -> tuple[Vector, float]:
     """Return a target next to a sphere where the line passes its centre, and the distance to it."""
@@ -242,8 +242,8 @@ def head_for(
         if segment_distance(position, target, around.circles, i) < around.circles[i, 3]:
             first, nearest = i, away
     if first >= 0:
-        target, beside = _beside_sphere(position, target, first, around)
-        left = max(left, beside)
+        target, lateral = _lateral_sphere(position, target, first, around)
+        left = max(left, lateral)
     return Heading(target, left, _WITHIN, vertex)
 
 

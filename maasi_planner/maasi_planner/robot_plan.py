@@ -123,7 +123,7 @@ class RobotPlan:
 
 @dataclass
 class PlannedRobot:
-    """One robot of a team; `exploration` is e of its own measurements, or None."""
+    """One robot of a team; `exploration` is e of only its measurements, or None."""
 
     facts: RobotFacts
     candidates: CandidateSet

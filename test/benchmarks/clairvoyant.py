@@ -14,7 +14,7 @@ from maasi_planner.team import Decision, single_choice, stay
 
 # A robot moves to its next target when the present one is found with this probability.
 SURE = 0.8
-# Weight of the mean time to find a target beside the time to find all.
+# Weight of the mean time to find a target, relative to the time to find all.
 MEAN_WEIGHT = 1.0
 # Longest simulated search [measurement periods], and rounds of local search.
 TICKS, ROUNDS = 4000, 80

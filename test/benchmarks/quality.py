@@ -140,7 +140,7 @@ def main():
         '--settings', type=json.loads, metavar='JSON', help='settings of the filter, in all runs'
     )
     parser.add_argument(
-        '--stone-soup', action='store_true', help="GOSPA beside Stone Soup's JPDA tracker instead"
+        '--stone-soup', action='store_true', help="GOSPA next to Stone Soup's JPDA tracker instead"
     )
     other = OTHERS.get(sys.argv[1]) if len(sys.argv) > 1 else None
     if other is not None:

@@ -69,7 +69,7 @@ def pairs(content, seed):
 
 
 def copies(robot, name, *layers):
-    """Robots like one of the scenario in its place, each with a layer of its own."""
+    """Robots like one of the scenario in its place, each with its own layer."""
 
     def change(content, seed):
         first = content['robots'][robot]

@@ -135,7 +135,8 @@ def large(squares, detection, number, prior='', **wrong):
 
 
 CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
-# Both see 20 m beside a way of 5 m/s, with a measurement each second: the box all, the other half.
+# Both see a width of 20 m at 5 m/s, with a measurement each second: the box all of it, the other
+# one half.
 DETECTIONS = {
     'box': {'kind': 'box', 'lower': [-10.0] * 2, 'upper': [10.0] * 2, 'frame': 'world'},
     'exponential': {'size': [3.0, 3.0]},

@@ -1,4 +1,4 @@
-"""The multi-Bernoulli filter beside Stone Soup's JPDA tracker, on the same recorded detections."""
+"""The multi-Bernoulli filter next to Stone Soup's JPDA tracker, on the same recorded detections."""
 
 import datetime
 import time

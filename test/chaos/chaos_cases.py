@@ -128,7 +128,7 @@ class Case:
             limits['heartbeat'] = 9.0 if self.kind == 'search' else 14.0
         content = {'search': _SEARCH, 'mavlink': _MAVLINK, 'buildings': _BUILDINGS}[self.kind]
         if self.kind == 'mavlink':
-            # Each run has a port of its own.
+            # Each run has its own port.
             drone = content['robots']['drone']
             link = drone['mavlink'] | {'url': f'udpin:127.0.0.1:{free_port()}'}
             content = {**content, 'robots': {'drone': {**drone, 'mavlink': link}}}

@@ -101,7 +101,7 @@ def end_process(process):
 
 @pytest.fixture
 def process(context, tmp_path):
-    """Return a function that starts a driver as a process of its own."""
+    """Return a function that starts a driver as a separate process."""
     with ExitStack() as stack:
 
         def start(environment=None, program=('turtlebot_driver',), settings=TURTLEBOT, **changes):

@@ -66,7 +66,7 @@ class LinkedFlight:
         self.call = partial(team.call, until=self.until)
 
     def begin(self, process=None):
-        """Run the driver here, or in a process of its own by the fixture `process`."""
+        """Run the driver here, or in its own process by the fixture `process`."""
         if process is not None:
             self.driver = process(program=(self.program,), settings=self.settings)
         else:
@@ -201,7 +201,7 @@ class MamboFlight(LinkedFlight):
 
 
 class OnboardFlight(LinkedFlight):
-    """A drone with a program of its own, on ground that is not at height 0."""
+    """A drone with its own program, on ground that is not at height 0."""
 
     make = MamboOnboardDriver
 

@@ -103,7 +103,7 @@ class Play:
         return self
 
     def beat(self, system, component):
-        """Be another ground station, on a link of its own."""
+        """Be another ground station, on its own link."""
         wire = Wire()
         mavlink.MAVLink(wire, system, component).heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4)
         for message in wire.take():

@@ -1,4 +1,4 @@
-"""A drone with a program of its own, as in 001, section 7: it takes waypoints by UDP."""
+"""A drone with its own program, as in 001, section 7: it takes waypoints by UDP."""
 
 import math
 import socket

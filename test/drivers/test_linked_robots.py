@@ -269,7 +269,7 @@ def test_markers_in_a_video_are_placed_where_the_drone_was(play, tmp_path):
     assert_allclose(team.seen_at(), target, atol=0.06)
 
 
-# ---- a drone with a program of its own -------------------------------------------------------
+# ---- a drone with its own program -----------------------------------------------------------
 
 
 def test_it_is_ordered_to_stay_on_the_ground_where_it_may_not_take_off(fly):

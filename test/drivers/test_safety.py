@@ -257,7 +257,7 @@ def test_a_robot_outside_of_its_bounds_is_stopped(play, kind):
     _, result = team.send_accepted([1.0, 1.0, height])
     team.move(5)
     put(3.4, 1.0)
-    assert '1.0 m outside of the area' in team.aborted(result)
+    assert '1 m outside of the area' in team.aborted(result)
     assert team.state.goal_status == AgentState.UNAVAILABLE
     put(2.3, 1.0)
     assert team.takes([1.0, 1.0, height])
@@ -285,7 +285,7 @@ def test_the_type_of_the_commands_is_found_out_or_given(play, options):
 
 
 def test_it_is_said_that_nobody_listens(make_team, process, capfd):
-    # A process of its own: one process cannot have two types under one name.
+    # A separate process: one process cannot have two types under one name.
     driver = process(command_type='stamped')
     team = make_team(TURTLEBOT, wants=Twist, deaf=True)
     wanted = 'the robot subscribes to geometry_msgs/msg/Twist'

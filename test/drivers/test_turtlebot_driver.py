@@ -93,7 +93,7 @@ def test_a_waypoint_that_cannot_be_reached_is_given_up(play):
 
 @pytest.fixture(scope='module')
 def with_nav2(request):
-    """Return an environment with nav2_msgs: Nav2's own, or the one beside this file, built once."""
+    """Return an environment with nav2_msgs: Nav2's own, or that of this folder, built once."""
     probe = [sys.executable, '-c', 'from nav2_msgs.action import NavigateToPose']
     if subprocess.run(probe, capture_output=True, check=False).returncode == 0:
         return os.environ.copy()
@@ -199,7 +199,7 @@ def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, hea
     assert result.result().result.reached
     # Given up by Nav2, and refused by it.
     assert 'Nav2 aborted it, error 208' in team.aborted(send(1.2)[1], stand)
-    assert 'Nav2 refuses' in team.aborted(send(1.8)[1], stand)
+    assert 'Nav2 rejected' in team.aborted(send(1.8)[1], stand)
     # On the way the commands are Nav2's. A new goal preempts; cancelled, it is told so.
     replaced = send(0.7)[1]
     hear('goal')
@@ -225,7 +225,7 @@ def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, hea
     hear('goal')
     result = send(1.8)[1]
     assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.7)
-    assert 'Nav2 refuses' in team.aborted(result, stand)
+    assert 'Nav2 rejected' in team.aborted(result, stand)
     # A pose that hangs while the odometry's velocity says that it should not.
     result = send(0.7)[1]
     hear('goal')

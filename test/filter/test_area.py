@@ -61,8 +61,8 @@ def test_the_forms_of_an_area_are_the_same_area(tmp_path):
         assert region.area == pytest.approx(1050.0 - 36.0 - 36.0, rel=1e-6)
         assert region.symmetric_difference(Area(rings).region).area < 0.1
     assert of_file.prior.polygons[0].weight == 3.0
-    amid = environment(area=str(file)).origin
-    assert amid.latitude == pytest.approx(46.6, abs=1e-3)
+    centre = environment(area=str(file)).origin
+    assert centre.latitude == pytest.approx(46.6, abs=1e-3)
     # As it is drawn on the page of a run: where its map is, or in metres.
     drawn = environment(area=feature(RING, HOLE, origin=ORIGIN.model_dump()))
     shape = {'type': 'Polygon', 'coordinates': [[*ring, ring[0]] for ring in (RING, HOLE)]}

@@ -133,7 +133,7 @@ def test_a_target_seen_again_and_again_is_found_with_class_and_identity(team):
     assert [item.robot for item in team.updates[0].members] == ['a', 'b']
     assert {item.pose.position.x for item in team.updates[-1].members} == {1.0}
     assert not team.tested.dropped
-    # A missing robot is named, and its late answer is a batch of its own.
+    # A missing robot is named, and its late answer is a separate batch.
     assert list(team.step(9, {'a': []}, ['a', 'b']).missing) == ['b']
     late = DetectionArray(batch_id=9, step=9, robot='b', measurement=team.counts['b'])
     late.header = team.updates[-1].header

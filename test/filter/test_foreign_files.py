@@ -21,7 +21,7 @@ from maasi_filter.geometry.polygons import InputWarning
 
 FACTS = {'image': 'room.pgm', 'resolution': 0.05, 'origin': [-3.2, -1.7, 0.0], 'negate': 0}
 THRESHOLDS = {'occupied_thresh': 0.65, 'free_thresh': 0.25}
-# A square of 200 m, with a north side of its own.
+# A square of 200 m, with another north side.
 RING = [[9.8987, 46.5991], [9.9013, 46.5991], [9.9013, 46.6009], [9.8987, 46.6009]]
 ZONE = [[9.9002, 46.5995], [9.901, 46.5995], [9.901, 46.6005], [9.9002, 46.6005]]
 

@@ -164,7 +164,7 @@ def test_missing_and_wrong_parameters_are_named_with_what_was_read(process):
 
 
 def test_a_node_started_alone_says_that_the_loopback_interface_is_down(process):
-    # A network namespace of its own has a loopback interface that is down.
+    # A new network namespace has a loopback interface that is down.
     alone = [shutil.which('unshare') or 'unshare', '--map-root-user', '--net']
     if subprocess.run([*alone, 'true'], capture_output=True).returncode:
         pytest.skip('a network namespace needs root, or user namespaces in the kernel')

@@ -103,7 +103,7 @@ def step(search, sensor, number):
 
 @pytest.mark.parametrize('method', ['pmb', 'ic_phd'])
 def test_a_saved_filter_goes_on_in_another_process(method, monkeypatch, tmp_path):
-    """Addresses of functions hold in one process only: they are looked up anew."""
+    """Addresses of functions hold in one process only: they are looked up again."""
     settings = FilterSettings(method=method, found_radius=1e-6)
     search = make_filter(settings, BOUNDS[2], np.random.default_rng(1))
     sensor = Sensor('a', Compiled(Width(width=4.0), 0.9, 2), np.diag([0.01, 0.01]))

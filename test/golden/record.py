@@ -1,4 +1,4 @@
-"""Run the golden runs and print what moved; store them anew with --write."""
+"""Run the golden runs and print what moved; store them again with --write."""
 
 import argparse
 import json

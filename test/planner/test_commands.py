@@ -343,7 +343,7 @@ def test_a_robot_is_shown_sent_and_stopped(world):
 @pytest.mark.parametrize('words', ['go nobody 1 2', 'start'])
 def test_a_command_that_waits_for_a_node_ends_at_once(context, words):
     node = Node('observer', context=context)
-    # As the console script runs it, which has no handler of its own for SIGINT.
+    # As the console script runs it, which has no own handler for SIGINT.
     code = 'import sys, maasi_drivers_entry as entry; sys.exit(entry.team_command())'
     command = [sys.executable, '-c', code, *words.split(), '--timeout', '1000']
     with subprocess.Popen(command, stdout=-1, stderr=-1, text=True) as process:

@@ -153,7 +153,7 @@ def test_choice_in_turn_is_within_two_percent_of_the_optimum(kind):
 
 @pytest.mark.parametrize('kind', ['paper', 'information'])
 def test_large_teams_choose_what_all_values_lead_to(kind):
-    """The choice in turn with the others summed up is that with every value computed anew."""
+    """The choice in turn with the others summed up is that with every value computed again."""
     settings = planner_settings(objective=kind, enumeration_limit=1)
     for seed in range(6):
         rng = np.random.default_rng(4000 + seed)

@@ -264,7 +264,7 @@ def test_a_step_that_comes_again_brings_the_batch_again_and_no_other():
         team.answer()
         team.until(lambda: team.done)
         assert [(item.node, item.step) for item in team.done] == [('/planner_node', 0)]
-        # Who knows nothing of its goal, as a driver that was started again, is sent anew.
+        # A driver that does not know its goal, as after a restart, receives it again.
         moving = state_of('a', 20, goal_id=1, goal_status=AgentState.MOVING)
         team.states['a'].publish(moving)
         team.states['b'].publish(state_of('b', 20, goal_id=0))

@@ -88,4 +88,6 @@ def test_each_waypoint_has_a_reason_with_numbers_also_in_nodes(name, seed):
         assert np.linalg.norm([float(word) for word in place.groups()] - item.waypoint[:2]) < 3.0
         first = tour.points[tour.routes[robot][0]]
         assert f'; then ({first[0]:.4g}, {first[1]:.4g}) m' in text
-        assert re.search(r'; the alternative \(.*\) m, .* m away, is (later|assigned to \w+)$', text)
+        assert re.search(
+            r'; the alternative \(.*\) m, .* m away, is (later|assigned to \w+)$', text
+        )

@@ -195,7 +195,7 @@ def check_script(script, arguments):
     elif module:
         check_module(module[1], arguments)
     elif file:
-        # Options that several commands have are added in a module beside them.
+        # Options that several commands have are added in a module next to them.
         texts = [path.read_text() for path in (ROOT / file[1]).parent.glob('*.py')]
         check_options(arguments, re.findall(r"'(--[\w-]+)'", '\n'.join(texts)))
 

@@ -224,7 +224,7 @@ def test_a_domain_is_locked_without_a_file_until_its_process_ends(tmp_path):
 
 def test_a_run_says_that_the_loopback_interface_is_down():
     code = 'from maasi_sim.run.run_scenario import main; raise SystemExit(main(["mambo"]))'
-    # A network namespace of its own has a loopback interface that is down.
+    # A new network namespace has a loopback interface that is down.
     alone = ['unshare', '--map-root-user', '--net']
     if subprocess.run([*alone, 'true'], capture_output=True).returncode:
         pytest.skip('a network namespace needs root, or user namespaces in the kernel')

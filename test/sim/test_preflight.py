@@ -98,7 +98,7 @@ def test_parts_that_no_robot_gets_to_are_named_with_their_size():
     report = preflight(field(environment=environment, robots=drones))
     assert report.lines[0] == 'area: 24.5 ha, without 0.5 ha of keep-out zones and obstacles'
     (text,) = (text for text in report.warnings if 'no robot can see' in text)
-    # It sees 8 m across, from 1.5 m beside the wall: not all of the part is out of sight.
+    # It sees 8 m across, from 1.5 m next to the wall: not all of the part is out of sight.
     where = r'8 ha \(x 340 to 500 m, y 0 to 500 m\)'
     assert re.search(f'no robot can see 33 % of the area: {where}', text), text
     # With a drone on each side all is searched.

@@ -249,7 +249,7 @@ def test_a_map_program_gets_ways_and_what_was_explored(tmp_path):
 
 @pytest.fixture
 def two_filters(tmp_path):
-    """Return a run of each robot, with one observer: each has a filter of its own."""
+    """Return a run of each robot, with one observer: each has its own filter."""
     planner = {'name': 'maas', 'coordination': 'independent'}
     scenario = scenario_of(tmp_path, TARGETS, planner=planner)
     first = Run(scenario, namespace='mambo')

@@ -68,7 +68,7 @@ def test_the_belief_is_a_heat_map_that_can_be_switched_on_from_above_and_in_spac
                 if turned:
                     shown.page.click('#space')
                     shown.settle()
-                # Beside the outline of the potential target, and far away.
+                # Next to the outline of the potential target, and far away.
                 places = [place(shown, 3.35, 1.35, 0.0), place(shown, 1.0, 3.3, 0.0)]
                 before = [colour_at(shown, *item) for item in places]
                 shown.page.click('button[data-layer=clusters]')
@@ -122,8 +122,8 @@ def test_the_dark_goes_as_the_field_of_view_moves_and_stays_away_where_it_was_me
         assert shares[2.0] == pytest.approx([1.0, 1.0, 0.2, 0.2, 1.0], abs=0.01)
         assert tip(shown, *place(shown, 2.0, 2.0)).startswith('explored 80 %')
         # As dark as what is left.
-        here, beside = (colour_at(shown, *place(shown, 1.87, y)) for y in (2.17, 2.87))
-        assert sum(here) > sum(beside) + 30
+        here, aside = (colour_at(shown, *place(shown, 1.87, y)) for y in (2.17, 2.87))
+        assert sum(here) > sum(aside) + 30
 
 
 def test_the_rest_of_a_tour_is_a_thin_line_in_the_colour_of_its_robot(chromium, opened):
@@ -201,10 +201,10 @@ def test_faces_of_buildings_fill_and_what_the_log_offers_is_there(chromium, open
         ahead = np.sign(middle - box)[face // 2] * np.eye(3)[face // 2]
         turn = math.atan2(-ahead[0], -ahead[1])
         shown.page.evaluate(f'maasi.camera.turn = {turn}; maasi.camera.update(); maasi.fit()')
-        beside = np.mean(scene['cells'][next(i for i in own if i != 5)][2], axis=1)
+        aside = np.mean(scene['cells'][next(i for i in own if i != 5)][2], axis=1)
         for time, share in ((1.0, 0), (2.0, 100 // len(own))):
             shown.seek(time)
-            colours = [colour_at(shown, *place(shown, *item)) for item in (middle, beside)]
+            colours = [colour_at(shown, *place(shown, *item)) for item in (middle, aside)]
             assert (np.abs(np.subtract(colours[0], PHOTOGRAPHED)).max() < 60) == (time == 2.0)
             assert np.abs(np.subtract(colours[1], PHOTOGRAPHED)).max() > 60
             centre = np.array([*box])

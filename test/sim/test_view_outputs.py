@@ -1,4 +1,4 @@
-"""What is made of a run beside the page: videos, and a layout for Foxglove."""
+"""Outputs of a run other than the page: videos, and a layout for Foxglove."""
 
 import base64
 import json
@@ -81,7 +81,7 @@ def test_a_video_has_30_frames_a_second_a_legend_and_says_how_far_it_is(
     # 3 s twice as fast, and 2 s of the last picture.
     assert shown.get(cv2.CAP_PROP_FRAME_COUNT) == 46 + 60
     read, picture = shown.read()
-    # Beside the map, whose frame is black, the robot, found and potential targets, in this order.
+    # Next to the map, whose frame is black, the robot, found and potential targets, in this order.
     frame = np.flatnonzero((picture[100:400] < 60).all(axis=2).mean(axis=0) > 0.9)[-1]
     rows = []
     for colour in (colours.robot_colours(['mambo'])['mambo'], colours.FOUND, colours.POTENTIAL):

@@ -1,4 +1,4 @@
-"""Runs of whole scenarios as processes, and a node beside one."""
+"""Runs of whole scenarios as processes, and a node next to one."""
 
 import json
 import os
@@ -93,7 +93,7 @@ def started(words, folder, environment=None, **options):
 
 
 def start(scenario, folder, *options, environment=None):
-    """Start a run of a scenario: its name, its file, or its content, which is written beside."""
+    """Start a run of a scenario: its name, its file, or its content, which is written to a file."""
     if isinstance(scenario, dict):
         file = folder.parent / 'search.yaml'
         file.write_text(yaml.safe_dump(scenario))

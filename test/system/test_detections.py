@@ -31,7 +31,7 @@ SEARCH = {
 
 
 class Detector(Operator):
-    """A detector that works beside a run, in a thread of its own."""
+    """A detector that works during a run, in its own thread."""
 
     def __init__(self, domain):
         super().__init__(domain)

@@ -159,7 +159,7 @@ def stamped(message, seconds, frame='map'):
 
 
 class World(Operator):
-    """All nodes, each in a namespace and process of its own, and who sends them messages."""
+    """All nodes, each in its own namespace and process, and who sends them messages."""
 
     def __init__(self, folder, domain):
         super().__init__(domain)

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture(scope='module')
 def repeated(tmp_path_factory):
-    """Return a search, and its first 12 s again: beside another run, with other threads."""
+    """Return a search, and its first 12 s again: during another run, with other threads."""
     folder = tmp_path_factory.mktemp('repeated')
     whole = run_scenario('mambo_turtlebot', folder / 'first', '--seed', 3, '--lockstep')
     threads = {'NUMBA_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}

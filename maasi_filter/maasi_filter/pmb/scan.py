@@ -87,7 +87,7 @@ def make_scan(
 
     `factor` is that of the variances. The position error of the robot is added to the noise.
     Covariances that a camera reports come from Cartesian ones: next to the robot, where the bearing
-    is unknown, they are used as such.
+    is unknown, they are used as Cartesian ones.
     """
     values, pose, detection = member.values, member.pose, member.sensor.detection
     (count, d), number = values.shape, settings.pmb.particles

@@ -46,10 +46,10 @@ def passing(
     spacing = view.motion.settings.speed * step_time * view.period_steps
     # All measurements within `far` along the path, for targets at four positions between two.
     far = min(8.0 * half, reach)
-    beside = np.linspace(-far, far, 641)
-    points = np.zeros((4, len(beside), 2))
+    lateral = np.linspace(-far, far, 641)
+    points = np.zeros((4, len(lateral), 2))
     points[..., 0] = spacing * np.arange(4)[:, None] / 4.0
-    points[..., 1] = beside
+    points[..., 1] = lateral
     points = points @ turned(heading, 2).T
     missed = np.ones(points.shape[:2])
     for number in range(-math.ceil(far / spacing), math.ceil(far / spacing) + 2):
@@ -58,7 +58,7 @@ def passing(
         found = view.sensor.detection.probability(points.reshape(-1, 2), pose)
         missed *= 1.0 - found.reshape(missed.shape)
     detected = 1.0 - missed.mean(axis=0)
-    return beside[320:], 0.5 * (detected[320:] + detected[320::-1])
+    return lateral[320:], 0.5 * (detected[320:] + detected[320::-1])
 
 
 def turned(heading: float, dimension: int) -> FloatArray:
@@ -69,10 +69,10 @@ def turned(heading: float, dimension: int) -> FloatArray:
     return turn
 
 
-def pitch_of(exploration: UnexploredMap, beside: FloatArray, detected: FloatArray) -> float:
+def pitch_of(exploration: UnexploredMap, lateral: FloatArray, detected: FloatArray) -> float:
     """Return the width of cells [m] by the result of `passing`."""
     sure, half = (
-        2.0 * float(beside[detected >= share * detected.max()].max()) for share in (0.9, 0.5)
+        2.0 * float(lateral[detected >= share * detected.max()].max()) for share in (0.9, 0.5)
     )
     return half if exploration.volume >= MANY * half**exploration.dimension else sure
 
@@ -109,12 +109,12 @@ class Lattice:
     def __init__(
         self,
         exploration: UnexploredMap,
-        beside: FloatArray,
+        lateral: FloatArray,
         detected: FloatArray,
         heading: float = 0.0,
     ) -> None:
         d, nodes = exploration.dimension, exploration.values.size
-        self.turn, self.pitch = turned(heading, d), pitch_of(exploration, beside, detected)
+        self.turn, self.pitch = turned(heading, d), pitch_of(exploration, lateral, detected)
         parts = PARTS if nodes * PARTS**d <= FINE else FEWER
         samples = _samples(exploration, parts)
         corners = np.array(list(itertools.product(*exploration.bounds))) @ self.turn
@@ -137,12 +137,12 @@ class Lattice:
         centres = (low + (np.indices(tuple(counts)).reshape(d, -1).T + 0.5) * widths) @ self.turn.T
         whole = np.abs(self._held / widths.prod() - 1.0) < 1.0 - WHOLE
         self._centres[whole] = centres[whole]
-        far = float(beside[detected >= 0.05].max(initial=0.0))
+        far = float(lateral[detected >= 0.05].max(initial=0.0))
         reach = [min(int(far / width), size) for width, size in zip(widths, self.shape)]
         reach += [0] * (3 - d)
         offsets = np.meshgrid(*(np.arange(-count, count + 1) for count in reach), indexing='ij')
         squared = sum((offset * width) ** 2 for offset, width in zip(offsets, widths))
-        self.kernel = np.interp(np.sqrt(squared), beside, detected, right=0.0)
+        self.kernel = np.interp(np.sqrt(squared), lateral, detected, right=0.0)
 
     def unseen(self, exploration: UnexploredMap) -> FloatArray:
         """Return the share of all targets that is unseen in each cell, (nx, ny, nz)."""

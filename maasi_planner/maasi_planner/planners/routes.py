@@ -197,7 +197,7 @@ def _move(number, counts, k, i, h, j):  # type: ignore[no-untyped-def]
     nothing = (_NONE, _NONE, _NONE, _NONE)
     m, o = counts[k] + 1, counts[h] + 1
     if number < 4 * LONGEST:
-        # Nodes x to y move behind place q: j beside i, before or behind it, forwards or backwards.
+        # Nodes x to y move behind place q: j next to i, before or behind it, forwards or backwards.
         size, kind = number // 4, number % 4
         x, y = (j - size, j) if kind in (1, 2) else (j, j + size)
         q, back = i - kind // 2, kind % 2
