@@ -211,7 +211,7 @@ def draw_mission_times(figure: Figure, results: Results) -> None:
 
 
 def draw_decision_times(figure: Figure, results: Results) -> None:
-    """Draw the time of a decision of both controllers beside the paper's."""
+    """Draw the time of a decision of both controllers next to the paper's."""
     axes = figure.subplots()
     names = results.names()
     places = np.arange(len(names))

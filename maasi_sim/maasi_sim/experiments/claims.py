@@ -41,7 +41,7 @@ _WORDS = {'less': 'less', 'greater': 'more', 'alike': 'alike', 'number': ''}
 
 @dataclass(frozen=True)
 class Finding:
-    """What our runs say about a claim, stored beside the figure of its experiment."""
+    """What our runs say about a claim, stored with the figure of its experiment."""
 
     says: str
     expects: str
@@ -220,7 +220,7 @@ def claims_page(
     found: Mapping[str, Sequence[Finding]],
     page: str,
 ) -> str:
-    """Return the page of all claims; `page` is the file of the experiments beside it."""
+    """Return the page of all claims; `page` is the file of the experiments next to it."""
     intervals, level = corrected_level(found)
     text = introduction.format(intervals=intervals, level=f'{100.0 * level:.2f}', page=page)
     parts = [text, summary(experiments, found)]

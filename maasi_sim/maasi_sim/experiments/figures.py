@@ -73,7 +73,7 @@ def draw_curves(
 ) -> None:
     """Draw the mean number of targets found, of four or more runs with its 95 % confidence.
 
-    `styles` has a key of `STYLES` by case; the first run of the case `path` is drawn beside the
+    `styles` has a key of `STYLES` by case; the first run of the case `path` is drawn next to the
     curves. Over measurements, triangles mark where the paper's methods have found all.
     """
     if path is not None:

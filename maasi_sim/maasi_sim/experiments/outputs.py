@@ -1,4 +1,4 @@
-"""What an experiment leaves beside its runs, and the page of all experiments with its figures."""
+"""The files of an experiment other than its runs, and the page of all experiments."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def listed(choices: Sequence[OpenPoint]) -> str:
 
 @dataclass
 class Section:
-    """What the page shows of an experiment, in words and cells, stored beside its figure."""
+    """What the page shows of an experiment, in words and cells, stored with its figure."""
 
     rests: str
     duration: str
@@ -228,7 +228,7 @@ def write_document(
 ) -> list[str]:
     """Write the pages of the experiments and of the claims; return what has runs in `out`.
 
-    Figures and tables go to `reproduction/` beside the page; those without runs stay. The claims'
+    Figures and tables go to `reproduction/` next to the page; those without runs stay. The claims'
     summary goes to the README.md of the folder above, if that has its marks. With `rewrite`, the
     pages are written from the stored tables only, which are not marked as earlier ones.
     """
@@ -271,6 +271,6 @@ def write_document(
 
 
 def claims_text(found: Mapping[str, Sequence[Finding]], file: str = 'reproduction.md') -> str:
-    """Return the page of the claims beside that of the experiments."""
+    """Return the page of the claims, next to that of the experiments."""
     introduction = (FOLDER / 'claims.txt').read_text(encoding='utf-8')
     return wrapped(claims_page(introduction, experiments(), found, file))

@@ -1,4 +1,4 @@
-"""Tables: of our results beside the papers', and of comparisons of searches."""
+"""Tables: of our results next to the papers', and of comparisons of searches."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -64,12 +64,12 @@ def markdown_table(rows: Iterable[Sequence[str]]) -> str:
     return f'{head}|{"---|" * (head.count(" | ") + 1)}\n{"".join(lines)}'
 
 
-# Of an experiment, beside the paper.
+# Of an experiment, next to the paper.
 
 
 @dataclass(frozen=True)
 class Row:
-    """One number of ours beside the paper's."""
+    """One number of ours next to the paper's."""
 
     case: str
     preset: str
