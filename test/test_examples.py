@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from scenario_runs import PATIENCE, beside, run_scenario
+from scenario_runs import PATIENCE, alongside, run_scenario
 
 from maasi_drivers.settings.driver import DriverSettings, GuardSettings
 from maasi_filter import plugins
@@ -194,7 +194,7 @@ def test_the_nodes_of_the_field_become_active_with_their_file(tmp_path):
         assert all(process.poll() is None for process in processes)
         return all(heard.get(name, '').startswith('active') for name in names)
 
-    with beside() as operator, ExitStack() as started:
+    with alongside() as operator, ExitStack() as started:
         operator.node.create_subscription(DiagnosticArray, '/diagnostics', hear, 50)
         for file, (executable, *_) in OF_THE_FIELD.items():
             robot = file.partition('_')[0] if file.endswith(('_driver', '_guard')) else ''

@@ -9,7 +9,7 @@ _USAGE = """usage: plugin_driver [--check] NAME [FOLDER ...] [--ros-args ...]
 
 Run your own driver as a node: a subclass of maasi_drivers.agent.agent_driver.AgentDriver.
   NAME      module:Class, or the name of an installed plugin
-  FOLDER    further folder of modules, besides the current one
+  FOLDER    folder of modules, in addition to the current one
   --check   only check that it can be loaded"""
 
 

@@ -55,10 +55,10 @@ def run_one(key, settings=None):
     condition, method, seed = key
     scenario = prepared(condition, method, seed, settings)
     measure = RangingSensor.measure
-    besides = RETURNS.get(condition, lambda sensor, pose, step, *seen: seen)
+    with_further = RETURNS.get(condition, lambda sensor, pose, step, *seen: seen)
 
     def returned(sensor, pose, step, *rest):
-        return besides(sensor, pose, step, *measure(sensor, pose, step, *rest))
+        return with_further(sensor, pose, step, *measure(sensor, pose, step, *rest))
 
     with patch.object(RangingSensor, 'measure', returned):
         result = search(scenario, seed, CAP_OF_IMAGES if condition in SCENARIOS else CAP)

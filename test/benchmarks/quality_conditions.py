@@ -79,7 +79,7 @@ def copies(robot, name, *layers):
     return change
 
 
-# What sensors return besides: these are called with what `RangingSensor.measure` has returned.
+# Further returns of sensors: these are called with what `RangingSensor.measure` has returned.
 
 
 def duplicates(sensor, pose, step, values, causes):
@@ -178,7 +178,7 @@ CONDITIONS = {
         copies('turtlebot', 'turtlebot', {}, {'start': [2.1, 2.1, 0.0], 'yaw': 3.14})
     ],
 }
-# What the sensor returns besides, by condition.
+# Further returns of the sensor, by condition.
 RETURNS = {'one in five detections twice': duplicates, 'five reflections': reflections}
 # Conditions that are no changes of the cube, by the scenario that they change.
 SCENARIOS = {

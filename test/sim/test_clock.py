@@ -12,7 +12,7 @@ from node_kinds import KINDS
 from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient
 from rosgraph_msgs.msg import Clock
-from scenario_runs import PATIENCE, Operator, beside
+from scenario_runs import PATIENCE, Operator, alongside
 from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
@@ -87,7 +87,7 @@ def moves(command):
 
 @pytest.fixture
 def world():
-    with beside(World) as made:
+    with alongside(World) as made:
         yield made
 
 

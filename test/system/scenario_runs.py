@@ -186,7 +186,7 @@ def reserved_domain():
 
 
 @contextmanager
-def beside(kind=Operator):
+def alongside(kind=Operator):
     """Yield an operator in a domain that is reserved for runs with its options."""
     with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
         for name, value in domain.environment().items():

@@ -6,7 +6,7 @@ import signal
 import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from scenario_runs import Operator, beside, start
+from scenario_runs import Operator, alongside, start
 
 from maasi_msgs.msg import FilterUpdate
 
@@ -63,7 +63,7 @@ class Cycler(Operator):
 def test_nodes_survive_cycles_back_to_back_and_the_search_goes_on(tmp_path, scenario, cycles):
     options = ('--no-record', '--rate', 1, '--time-limit', 3000)
     with (
-        beside(Cycler) as cycler,
+        alongside(Cycler) as cycler,
         start(scenario, tmp_path / 'run', *cycler.options, *options) as run,
     ):
         cycler.run = run

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from blue_detector import BlueDetector
 from pymap3d import geodetic2enu
-from scenario_runs import Operator, beside, of_topic, start
+from scenario_runs import Operator, alongside, of_topic, start
 
 pytestmark = pytest.mark.system
 
@@ -46,7 +46,7 @@ class Detector(Operator):
 
 
 def test_boxes_of_another_package_lead_to_targets_on_a_map(tmp_path):
-    with beside(Detector) as detector:
+    with alongside(Detector) as detector:
         options = ('--seed', 906, *detector.options)
         with start(SEARCH, tmp_path / 'run', *options) as run:
             run.finish()

@@ -51,7 +51,7 @@ def wait(*_):
         time.sleep(0.05)
 
 scenario_run.store_report = wait
-scenario_run.beside = lambda *_: map(wait, [0])
+scenario_run.in_background = lambda *_: map(wait, [0])
 sys.exit(run_scenario.main(sys.argv[1:]))
 """
 # A recorder with a gap.

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from matplotlib.figure import Figure
 from rosgraph_msgs.msg import Clock
-from scenario_runs import PATIENCE, beside, start, wait_for, write_scenario
+from scenario_runs import PATIENCE, alongside, start, wait_for, write_scenario
 
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_sim.run.bag import Bag
@@ -84,7 +84,7 @@ def test_a_report_for_which_its_folder_has_no_room_is_elsewhere(tmp_path, monkey
 
 def test_a_run_that_is_killed_leaves_all_but_its_last_second(scenario, tmp_path):
     heard = [0]
-    with beside() as operator:
+    with alongside() as operator:
         operator.node.create_subscription(
             Clock, '/clock', lambda message: heard.append(stamp_from_ros(message.clock)), 10
         )

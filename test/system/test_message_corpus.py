@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry
 from node_kinds import KINDS
 from rclpy.action import ActionClient
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from scenario_runs import Operator, beside
+from scenario_runs import Operator, alongside
 from sensor_msgs.msg import BatteryState, CameraInfo
 from std_srvs.srv import Trigger
 from waiting import wait_until
@@ -263,7 +263,7 @@ class World(Operator):
 
 @pytest.fixture
 def world(tmp_path):
-    with beside(partial(World, tmp_path)) as made:
+    with alongside(partial(World, tmp_path)) as made:
         yield made
 
 

@@ -24,9 +24,9 @@ def repeated(tmp_path_factory):
     threads = {'NUMBA_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
     options = ('--seed', 3, '--lockstep', '--time-limit', 12)
     other = ('--seed', 4, '--lockstep', '--time-limit', 5, '--no-record')
-    with start('mambo_turtlebot', folder / 'other', *other) as beside:
+    with start('mambo_turtlebot', folder / 'other', *other) as other_run:
         again = run_scenario('mambo_turtlebot', folder / 'second', *options, environment=threads)
-        beside.finish()
+        other_run.finish()
     return whole, again
 
 

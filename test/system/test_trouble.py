@@ -5,7 +5,7 @@ import os
 import signal
 
 import pytest
-from scenario_runs import Operator, beside, of_topic, run_scenario, start
+from scenario_runs import Operator, alongside, of_topic, run_scenario, start
 from test_mavlink_scenario import short_search
 
 from maasi_filter.ros.qos import RELIABLE
@@ -70,7 +70,7 @@ def test_robots_whose_planner_is_killed_while_they_pass_waypoints_stop_at_the_la
     content = short_search()
     del content['robots']['rov']
     content['robots']['other']['link'] = 'topics'
-    with beside(Watcher) as watcher:
+    with alongside(Watcher) as watcher:
         states = watcher.states
         with start(content, tmp_path / 'run', *watcher.options, '--no-record') as run:
             watcher.until(lambda: all(map(watcher.passes, states)), 'the robots pass waypoints')

@@ -6,7 +6,7 @@ import pytest
 from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-from scenario_runs import Operator, beside, check_replay, start, write_scenario
+from scenario_runs import Operator, alongside, check_replay, start, write_scenario
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
 from maasi_filter.ros.qos import LATCHED_ALL, SENSOR
@@ -70,7 +70,7 @@ def write(path, target, start=(1.9, 1.9, 1.0), **changes):
 def teams(tmp_path_factory):
     """Return the runs of two teams, by namespace."""
     folder = tmp_path_factory.mktemp('teams')
-    with beside(Mover) as mover, ExitStack() as ends:
+    with alongside(Mover) as mover, ExitStack() as ends:
         runs = {}
         for team, target, begin in (
             ('team_a', [1.6, 1.8], (1.9, 1.9, 1.0)),
@@ -125,7 +125,7 @@ def test_a_recording_holds_its_own_team_from_its_first_measurement_on(teams, tea
 def test_a_run_ends_where_the_clock_of_another_program_stands_still(tmp_path):
     limits = {'time': 120.0, 'silence': 2.0}
     path = write(tmp_path / 'far.yaml', [0.0, 0.0], limits=limits)
-    with beside(Mover) as mover:
+    with alongside(Mover) as mover:
         mover.add('', path)
         with start(path, tmp_path / 'run', *mover.options) as run:
             file = run.bag / 'bag.mcap'

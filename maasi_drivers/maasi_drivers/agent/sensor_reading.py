@@ -34,9 +34,9 @@ def measured(
     angle.
     """
     # Straight above the derivative does not exist; use that at a distance of 1 nm.
-    beside = np.array(positions)
-    beside[(beside[:, :2] == pose.position[:2]).all(axis=1), 0] += 1e-9
-    slopes = model.jacobian(beside, pose)
+    shifted = np.array(positions)
+    shifted[(shifted[:, :2] == pose.position[:2]).all(axis=1), 0] += 1e-9
+    slopes = model.jacobian(shifted, pose)
     result = slopes @ covariances @ slopes.transpose(0, 2, 1)
     known = np.sqrt(_ANY_ANGLE / np.maximum(result[:, 1, 1], _ANY_ANGLE))[:, None]
     result[:, 1] *= known

@@ -18,7 +18,7 @@ Pixel = Annotated[Finite, Field(ge=-1e6, le=1e6)]
 Coefficient = Annotated[Finite, Field(ge=-1e4, le=1e4)]
 
 DistortionModel = Literal['plumb_bob', 'rational_polynomial', 'equidistant']
-# Allowed numbers of coefficients of each model, besides none.
+# Allowed numbers of coefficients of each model; none is allowed as well.
 COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}
 
 DETECTORS = PluginGroup(

@@ -318,7 +318,7 @@ def compared(
     filters: Sequence[str] = (),
     time_limit: float | None = None,
 ) -> Experiment:
-    """Return the comparison of planners and filters in a scenario, by default those of the scenario."""
+    """Return the comparison of planners and filters in a scenario, by default its own ones."""
     path = find_scenario(scenario)
     if is_cuboid_scenario(read_scenario(path)):
         raise ScenarioError(f'{path}: is a search of buildings, allowed are searches for targets')

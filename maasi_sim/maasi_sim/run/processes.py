@@ -113,7 +113,7 @@ def find_executable(package: str, executable: str) -> Path:
     return path
 
 
-def beside(function: Callable[..., None], *arguments: Any) -> Iterator[Any]:
+def in_background(function: Callable[..., None], *arguments: Any) -> Iterator[Any]:
     """Run a function in a fork of the server and yield what it sends through its last argument."""
     receives, sends = Pipe(duplex=False)
     words = (function, *arguments, sends.send)

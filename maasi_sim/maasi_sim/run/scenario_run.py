@@ -27,7 +27,7 @@ from maasi_sim.run.ending import (
 from maasi_sim.run.log import RunEnd
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.missions import checked_mission, send_warning
-from maasi_sim.run.processes import beside, stop, wait_for_server
+from maasi_sim.run.processes import in_background, stop, wait_for_server
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.report_files import store_report
@@ -189,7 +189,7 @@ class RunningRun:
         unwritten += self._close_bag()
         # The replay is written in parallel to the report, if the server of the nodes is running.
         ran = options.record and self._processes[0].pid is not None
-        replay = beside(send_replay, self.folder) if ran else iter(())
+        replay = in_background(send_replay, self.folder) if ran else iter(())
         end = RunEnd(ending.reason, recorder.elapsed, wall_time, self.supervisor.events)
         return EndedRun(self, ending, end, unwritten, replay)
 
@@ -227,7 +227,7 @@ class RunningRun:
             )
             self.recorder.publish_ready()
             # This takes a while.
-            news = beside(send_warning, self.mission)
+            news = in_background(send_warning, self.mission)
             threading.Thread(target=lambda: self.display.warn(*news), daemon=True).start()
         return ending
 

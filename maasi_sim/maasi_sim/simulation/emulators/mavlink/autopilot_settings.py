@@ -28,7 +28,7 @@ class AutopilotSettings(Settings):
     )
     more_batteries: list[Annotated[float, Field(ge=0.0, le=1.0)]] = Field(
         default_factory=list,
-        description='Charges of batteries beside the first, which do not change',
+        description='Charges of further batteries, which do not change',
     )
     endurance: Positive = Field(
         1200.0, description='Time for which a full battery lasts in the air [s]'
