@@ -54,7 +54,7 @@ maasi_make_venv() {
   rm -rf "$maasi_venv" "$maasi_workspace/build" "$maasi_workspace/install"
   mkdir -p "$maasi_workspace"
   if [ "$mode" = jazzy ]; then
-    echo "Setting up: Python packages beside the sourced ROS 2 Jazzy (downloads about 150 MB) ..." >&2
+    echo "Setting up: Python packages for the sourced ROS 2 Jazzy (downloads about 150 MB) ..." >&2
     "$python" -m venv --system-site-packages "$maasi_venv"
     # The messages of the sourced Jazzy are compiled against its NumPy: keep that version.
     "$python" -c 'import numpy; print("numpy==" + numpy.__version__)' \
@@ -151,7 +151,7 @@ maasi_needs_compiling() { [ ! -e "$1/complete" ] && [ -z "${NUMBA_DISABLE_JIT:-}
 
 # Compiles all kernels, so that no node waits for it; becomes the compiling process.
 maasi_compile() {
-  echo "Setting up: numerical kernels, by Numba (a minute or two, beside the build) ..." >&2
+  echo "Setting up: numerical kernels, by Numba (a minute or two, during the build) ..." >&2
   export NUMBA_CACHE_DIR="$1" PYTHONPATH="$(maasi_source_path)${PYTHONPATH:-}"
   exec "$maasi_venv/bin/python" "$maasi_root/scripts/compile_kernels.py" \
     > "$maasi_workspace/compile.log" 2>&1
@@ -196,7 +196,7 @@ maasi_use_venv() {
     unset PYTHONPATH
   fi
   export PATH="$maasi_venv/bin:$PATH"
-  # Beside the environment, none in the repository; without them each start takes seconds longer.
+  # Next to the environment, not in the repository; without them each start takes seconds longer.
   export PYTHONPYCACHEPREFIX="$maasi_workspace/pycache"
   unset PYTHONDONTWRITEBYTECODE
 }
