@@ -306,7 +306,7 @@ def test_images_that_cannot_be_used_are_counted_and_the_next_good_one_answers(pl
     team.images.publish(image_message(good, team.step * NANOSECONDS))
     team.ask(team.step * NANOSECONDS)
     assert not team.answer(2).detections
-    assert '3% of the pixels are clipped' in capfd.readouterr().err
+    assert '3 % of the pixels are clipped' in capfd.readouterr().err
     # A calibration replaces that of the parameters.
     info = CameraInfo(width=320, height=240, distortion_model='fisheye')
     info.k = [240.0, 0.0, 159.5, 0.0, 240.0, 119.5, 0.0, 0.0, 1.0]

@@ -167,7 +167,7 @@ def test_a_camera_that_hangs_stops_the_robot(play, fault):
 def test_a_guard_that_has_gone_is_reported(play, start_guard, capfd):
     driver, team = play()
     guard = start_guard()
-    team.until(lambda: team.move() or driver.link.status() == {'guard': 'is there'})
+    team.until(lambda: team.move() or driver.link.status() == {'guard': 'available'})
     assert 'guard' not in driver._logged
     guard.destroy_node()
     team.until(lambda: team.move() or 'guard' in driver._logged)

@@ -172,7 +172,7 @@ def charging(world, a, reason):
         (charging, True, ''),
         (stopped, True, STOPPED),
         (fault, False, 'vehicle: not armed: until the service arm is called'),
-        (fault, True, '3.0 m outside of the area'),
+        (fault, True, '3 m outside of the area'),
         (fault, True, 'link: no message from system 1'),
     ],
 )
