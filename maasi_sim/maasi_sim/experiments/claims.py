@@ -32,7 +32,7 @@ from maasi_sim.experiments.tables import (
 HOLDS, NOT_SHOWN, NOT_HERE, DIFFERS = 'holds', 'not shown', 'not here', 'differs'
 ONE_RUN, NOT_RUN = 'no interval', 'not run'
 ALIKE = 0.2  # what is within this share of the other is alike
-# The summary in README.md stands between these lines.
+# A table in a document stands between these lines.
 BEGIN, END = '<!-- claims: begin -->\n', '<!-- claims: end -->\n'
 _MEDIANS = re.compile(r' \(medians? [^)]*\)')
 _WIDTH = re.compile(r' ± \S+')

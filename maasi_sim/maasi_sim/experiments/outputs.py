@@ -14,7 +14,7 @@ import yaml
 
 from maasi_sim.experiments.brief import brief_tables
 from maasi_sim.experiments.campaign import Campaign, maps_in, plan
-from maasi_sim.experiments.claims import Finding, claims_page, findings, summary, with_summary
+from maasi_sim.experiments.claims import Finding, claims_page, findings
 from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
 from maasi_sim.experiments.figures import as_png
 from maasi_sim.experiments.papers import FOLDER, experiments, named, title_of
@@ -228,9 +228,9 @@ def write_document(
 ) -> list[str]:
     """Write the pages of the experiments and of the claims; return what has runs in `out`.
 
-    Figures and tables go to `reproduction/` next to the page; those without runs stay. The claims'
-    summary goes to the README.md of the folder above, if that has its marks. With `rewrite`, the
-    pages are written from the stored tables only, which are not marked as earlier ones.
+    Figures and tables go to `reproduction/` next to the page; those without runs stay. With
+    `rewrite`, the pages are written from the stored tables only, which are not marked as earlier
+    ones.
     """
     sections: dict[str, Section] = {}
     shown = []
@@ -261,12 +261,6 @@ def write_document(
     write_file(file, wrapped(page(sections)))
     found = {name: section.claims for name, section in sections.items()}
     write_file(file.with_name('claims.md'), claims_text(found, file.name))
-    readme = file.resolve().parents[1] / 'README.md'
-    if readme.exists():
-        before = readme.read_text(encoding='utf-8')
-        after = with_summary(before, summary(experiments(), found))
-        if after != before:
-            write_file(readme, after)
     return shown
 
 
