@@ -1,4 +1,4 @@
-"""An outside judge: SAREnv's evaluator, terrains and victims, its planners beside our ways."""
+"""Outside judges: SAREnv's evaluator, terrains and victims, its planners next to our ways."""
 
 import argparse
 import json
@@ -24,6 +24,13 @@ from maasi_sim.arguments import Parser, count, positive, whole
 from maasi_sim.experiments.campaign import DONE, SOME_FAILED, WRONG_INPUT
 from maasi_sim.experiments.claims import with_summary
 from maasi_sim.experiments.experiment import WrongInput
+from maasi_sim.experiments.judge_oplib import (
+    EFFORTS,
+    euclidean,
+    evaluate_instance,
+    instances,
+    oplib_page,
+)
 from maasi_sim.experiments.runs import NoRoom, write_file
 from maasi_sim.experiments.tables import markdown_table
 
@@ -251,20 +258,20 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = Parser(
         prog='judge',
-        description="Evaluate the tour planner's paths with SAREnv: its evaluator, terrains, "
-        'victims and baseline planners.',
-        epilog='Exit codes: 0 all terrains evaluated, 1 some refused, 2 wrong input.',
+        description="Evaluate the tour planner's paths with SAREnv (its evaluator, terrains, "
+        'victims and baseline planners) or on the instances of OPLib.',
+        epilog='Exit codes: 0 all evaluated, 1 some refused, 2 wrong input.',
     )
     add = parser.add_argument
-    add('judge', choices=['sarenv'], help='external benchmark')
+    add('judge', choices=['sarenv', 'oplib'], help='external benchmark')
     add(
         '--data',
         type=Path,
         required=True,
         metavar='FOLDER',
-        help="SAREnv's folder 'sarenv_dataset'",
+        help="SAREnv's folder 'sarenv_dataset', or a clone of OPLib",
     )
-    add('--terrains', nargs='+', metavar='NAME', help='folders in FOLDER (default: all)')
+    add('--terrains', nargs='+', metavar='NAME', help='folders or instances in it (default: all)')
     add(
         '--budget',
         nargs='+',
@@ -273,6 +280,8 @@ def build_parser() -> argparse.ArgumentParser:
         metavar='KM',
         help='total path length of all drones [km] (default: 100 and 300)',
     )
+    text = 'factors on the tries of the search, OPLib (default: 0.5 and 5)'
+    add('--effort', nargs='+', type=positive, default=[*EFFORTS], metavar='X', help=text)
     text = 'victims on each terrain (default: %(default)s)'
     add('--victims', type=count, default=1000, metavar='N', help=text)
     text = 'random seed of the victims (default: %(default)s)'
@@ -294,10 +303,16 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def judge(options: argparse.Namespace) -> int:
-    """Judge the terrains, write what is asked for, and return the exit code."""
-    toolkit()
-    folders = _folders(options.data, options.terrains)
-    one = partial(judge_terrain, budgets=options.budget, victims=options.victims, seed=options.seed)
+    """Judge terrains or instances, write what is asked for, and return the exit code."""
+    if options.judge == 'oplib':
+        folders = _instances(options.data, options.terrains)
+        one = partial(evaluate_instance, efforts=options.effort)
+    else:
+        toolkit()
+        folders = _folders(options.data, options.terrains)
+        one = partial(
+            judge_terrain, budgets=options.budget, victims=options.victims, seed=options.seed
+        )
     results = []
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context('spawn')) as pool:
         for result in pool.map(one, folders):
@@ -305,16 +320,28 @@ def judge(options: argparse.Namespace) -> int:
             results.append(result)
     refused = [result for result in results if 'refused' in result]
     if len(refused) == len(results):
-        raise WrongInput(f'{folders[0]}: {refused[0]["refused"]}; no terrain could be judged')
-    text = page(results, options.budget, options.seed)
+        raise WrongInput(f'{folders[0]}: {refused[0]["refused"]}; none could be judged')
+    if options.judge == 'oplib':
+        text, name, facts = oplib_page(results, options.effort), 'oplib', {'instances': results}
+    else:
+        text, name = page(results, options.budget, options.seed), 'judge'
+        facts = {'seed': options.seed, 'terrains': results}
     print(text)
     if options.out is not None:
-        facts = {'seed': options.seed, 'terrains': results}
         write_file(options.out / 'judge.json', json.dumps(facts, indent=1) + '\n')
     if options.document is not None:
         before = options.document.read_text(encoding='utf-8')
-        write_file(options.document, with_summary(before, text, 'judge'))
+        write_file(options.document, with_summary(before, text, name))
     return SOME_FAILED if refused else DONE
+
+
+def _instances(data: Path, names: list[str] | None) -> list[Path]:
+    known = instances(data)
+    wrong = [name for name in names or [] if name not in known]
+    if wrong or not known:
+        raise WrongInput(f'{data}: no {", ".join(wrong) or "instances of OPLib"} there')
+    # By default those whose distances are Euclidean, of a size that is evaluated.
+    return [known[name] for name in names] if names else euclidean(known)
 
 
 def _folders(data: Path, names: list[str] | None) -> list[Path]:
