@@ -140,7 +140,7 @@ def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run):
         rows = page.locator('#why tbody tr')
         assert rows.count() == len(first['candidates'])
         assert int(page.inner_text('#why tr.chosen td')) == first['chosen']
-        assert 'admissible' in page.inner_text('#why .reason')
+        assert 'largest J' in page.inner_text('#why .reason')
         assert page.inner_text('#why .formula') == 'J = (-1.00e-6 C + 0.5 T + 1 E) / K'
         # Sorted by the objective, and by another column where that is clicked.
         for heading, term in (('', 'objective'), ('E', 'exploration')):
