@@ -242,7 +242,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         return {
             'step': self.step,
             'real time factor': f'{self.simulation.time / wall if wall > 0.0 else 0.0:.2f}',
-            'waiting for': ', '.join(sorted(self._waiting)) if self.step >= 0 else self._missing(),
+            'waits for': ', '.join(sorted(self._waiting)) if self.step >= 0 else self._missing(),
             'away': ', '.join(sorted(self.simulation.away)),
             'collisions': sum(robot.collisions for robot in self.simulation.robots.values()),
         }
