@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from maasi_filter.wording import number
 from maasi_sim.experiments.experiment import Claim, Experiment, Quantity, Results
 from maasi_sim.experiments.statistics import (
     LEVEL,
@@ -24,7 +25,6 @@ from maasi_sim.experiments.tables import (
     interval,
     markdown_table,
     median,
-    number,
     paired,
     shown,
 )

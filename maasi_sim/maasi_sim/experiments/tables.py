@@ -9,6 +9,7 @@ import numpy as np
 from scipy import stats
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.wording import number
 from maasi_sim.experiments.experiment import Quantity, Results, plain
 from maasi_sim.experiments.runs import csv_text
 from maasi_sim.experiments.statistics import (
@@ -127,15 +128,6 @@ def pairs(results: Results) -> Iterator[tuple[str, str, Quantity, Interval]]:
         both = paired(results, item.first, item.second, quantity)
         if len(both[0]):
             yield item.first, item.second, quantity, paired_difference(*both)
-
-
-def number(value: float) -> str:
-    """Return a number with three significant digits."""
-    if not math.isfinite(value):
-        return '-'
-    if abs(value) >= 100.0:
-        return f'{value:.0f}'
-    return f'{value:.3g}' if value else '0'
 
 
 def close(text: str) -> str:
