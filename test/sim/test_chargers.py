@@ -12,7 +12,7 @@ from small_field import SMALL_FIELD
 
 from maasi_filter.geometry.area import Area, level_shape
 from maasi_planner.motion import RobotState, make_motion
-from maasi_sim.scenario.checks import doubts_about
+from maasi_sim.scenario.checks import warnings_about
 from maasi_sim.scenario.free_space import FreeSpace
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import find_scenario, scenario_from_values
@@ -132,7 +132,7 @@ def test_the_block_of_the_how_to_names_a_robot_that_is_charged():
     for name, given in yaml.safe_load(block)['robots'].items():
         values['robots'][name] |= given
     field = scenario_from_values(values, 'tutorial')
-    assert not list(doubts_about(field))
+    assert not list(warnings_about(field))
     west = Simulation(field, 1).robots['west']
     west.battery.charge = 0.4
     for step in range(1, 1001):

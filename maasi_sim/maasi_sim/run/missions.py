@@ -40,14 +40,14 @@ def load_mission(
 
 def checked_mission(options: Options, display: ProgressDisplay) -> Mission[Any]:
     """Return the mission of a run; print its estimate and the warnings about its file."""
-    with warnings.catch_warnings(record=True) as doubts:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter('always', InputWarning)
         mission = load_mission(options.scenario, options.overrides())
     forecast = mission.preflight()
     for line in forecast.lines:
         display.say(line)
     # A file with overrides is validated twice.
-    display.warn(*dict.fromkeys(str(doubt.message) for doubt in doubts), *forecast.warnings)
+    display.warn(*dict.fromkeys(str(warning.message) for warning in caught), *forecast.warnings)
     # A node in the namespace of a robot belongs to that robot.
     if options.namespace.rpartition('/')[2] in mission.scenario.names():
         raise ScenarioError(

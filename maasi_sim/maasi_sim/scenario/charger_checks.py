@@ -66,7 +66,7 @@ def _charger_problem(space: FreeSpace, place: list[float], slack: float) -> str:
     return ''
 
 
-def endurance_doubts(robot: RobotSettings) -> Iterator[str]:
+def endurance_warnings(robot: RobotSettings) -> Iterator[str]:
     """Yield improbable battery settings, `key: text`, as keys of the robot."""
     if robot.endurance is None:
         return

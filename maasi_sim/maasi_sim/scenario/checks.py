@@ -19,7 +19,7 @@ from maasi_planner.planners import takes_tour
 from maasi_planner.settings import CandidateSettings
 from maasi_sim.scenario.background import background_problems
 from maasi_sim.scenario.base import BaseScenario
-from maasi_sim.scenario.charger_checks import charger_problems, endurance_doubts
+from maasi_sim.scenario.charger_checks import charger_problems, endurance_warnings
 from maasi_sim.scenario.free_space import FreeSpace
 from maasi_sim.scenario.on_earth import outside_text, place_text
 from maasi_sim.scenario.schema import RobotSettings, Scenario, SimulatedSettings
@@ -256,7 +256,7 @@ def _link_problems(robot: RobotSettings) -> Problems:
             yield f"mavlink.vehicle: read '{link.vehicle}', {firmware}"
 
 
-def doubts_about(scenario: BaseScenario) -> Problems:
+def warnings_about(scenario: BaseScenario) -> Problems:
     """Yield valid but improbable values."""
     robots, limit = scenario.robots, scenario.limits.time
     for index, event in enumerate(scenario.events):
@@ -271,14 +271,14 @@ def doubts_about(scenario: BaseScenario) -> Problems:
     area = Area(scenario.environment)
     yield from area.warnings
     if isinstance(scenario, Scenario):
-        yield from _robot_doubts(scenario, area)
+        yield from _robot_warnings(scenario, area)
         return
     for (first, one), (name, robot) in combinations(robots.items(), 2):
         if one.start == robot.start:
             yield f'robots.{name}.start: read {robot.start}, which is also the start of {first}'
 
 
-def _robot_doubts(scenario: Scenario, area: Area) -> Problems:
+def _robot_warnings(scenario: Scenario, area: Area) -> Problems:
     for name, robot in scenario.robots.items():
         wind = scenario.simulated.wind
         if robot.flies and math.hypot(*wind) >= robot.motion.speed:
@@ -286,11 +286,11 @@ def _robot_doubts(scenario: Scenario, area: Area) -> Problems:
                 f'simulated.wind: read {wind}, at least the speed of {name}, '
                 f'{robot.motion.speed:g} m/s: the wind carries it away'
             )
-        doubts = [*endurance_doubts(robot), *_start_doubts(robot, area)]
-        yield from (f'robots.{name}.{doubt}' for doubt in doubts)
+        found = [*endurance_warnings(robot), *_start_warnings(robot, area)]
+        yield from (f'robots.{name}.{warning}' for warning in found)
 
 
-def _start_doubts(robot: RobotSettings, area: Area) -> Problems:
+def _start_warnings(robot: RobotSettings, area: Area) -> Problems:
     gap = FreeSpace(robot, area).gap(robot.start)
     if gap < robot.radius:
         yield (

@@ -17,9 +17,9 @@ from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.checks import (
     Problems,
     covering_grid,
-    doubts_about,
     problems_of,
     problems_of_file,
+    warnings_about,
 )
 from maasi_sim.scenario.layering import (
     Key,
@@ -166,8 +166,8 @@ def checked(
     lines = [layer.located(problem) for problem in problems(scenario)]
     if lines:
         raise ScenarioError('\n'.join(lines))
-    for doubt in doubts_about(scenario) if layer.folder else ():
-        warnings.warn(layer.located(doubt), ScenarioWarning, stacklevel=2)
+    for warning in warnings_about(scenario) if layer.folder else ():
+        warnings.warn(layer.located(warning), ScenarioWarning, stacklevel=2)
     return scenario
 
 
