@@ -28,7 +28,7 @@ _EXCESS = 1.5  # above this multiple of the planned distance it did not follow t
 _SILENCE, _PATIENCE = 1.5, 15.0
 _LEAST_BATTERY = 0.2
 # Largest residual of a fit [m], and relative uncertainty of the speed [1].
-_MOST_MISFIT, _MOST_DOUBT = 0.05, 0.35
+_MOST_MISFIT, _MOST_UNCERTAIN = 0.05, 0.35
 _LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)  # search range of drag [1/s] and delay [s]
 
 
@@ -42,7 +42,7 @@ class MeasuredSpeed:
 
     full_speed: float  # steady speed at the largest tilt [m/s]
     delay: float  # from a command until the position shows its effect [s]
-    doubt: float  # relative standard deviation of `full_speed` [1]
+    uncertainty: float  # relative standard deviation of `full_speed` [1]
 
 
 @dataclass
@@ -173,18 +173,18 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
     drag, delay = fit.x.tolist()
     misfit = math.sqrt(2.0 * fit.cost / len(fit.fun))
     covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * 2.0 * fit.cost / max(len(fit.fun) - 2, 1)
-    doubt = math.sqrt(covariance[0, 0]) / drag
+    uncertainty = math.sqrt(covariance[0, 0]) / drag
     if misfit > _MOST_MISFIT:
         raise MeasurementError(
             f'misfit: read {misfit:.3f} m, allowed is {_MOST_MISFIT} m: the flight does not match '
             'tilt commands (wind? floor without texture?)'
         )
-    if doubt > _MOST_DOUBT or not _LEAST[0] * 1.01 < drag < _MOST[0] / 1.01:
+    if uncertainty > _MOST_UNCERTAIN or not _LEAST[0] * 1.01 < drag < _MOST[0] / 1.01:
         raise MeasurementError(
-            f'speed: uncertain by {100.0 * doubt:.0f} %, allowed are {100.0 * _MOST_DOUBT:.0f} %: '
-            'fly more or longer legs'
+            f'speed: uncertain by {100.0 * uncertainty:.0f} %, '
+            f'allowed are {100.0 * _MOST_UNCERTAIN:.0f} %: fly more or longer legs'
         )
-    return MeasuredSpeed(9.81 * math.tan(tilt) / drag, delay, doubt)
+    return MeasuredSpeed(9.81 * math.tan(tilt) / drag, delay, uncertainty)
 
 
 def _way(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> float:
@@ -255,7 +255,7 @@ def _measure(link: MamboLink, options: argparse.Namespace, ended: threading.Even
     found = fit_speed(flight.legs, link.tilt)
     print(
         f'\nmotion.tilt: {link.tilt:g}\n'
-        f'mambo.full_speed: {found.full_speed:.3g}    # m/s, +- {100 * found.doubt:.1f} %\n'
+        f'mambo.full_speed: {found.full_speed:.3g}    # m/s, +- {100 * found.uncertainty:.1f} %\n'
         f'mambo.delay: {found.delay:.2f}    # s'
     )
 

@@ -65,7 +65,7 @@ def test_it_stays_inside_the_field_with_what_the_measuring_flight_says(drag, del
     assert_allclose(flown.measured.full_speed, full_speed(drag), rtol=0.1)
     # The time constant of the tilt is a delay, too.
     assert_allclose(flown.measured.delay, delay + 0.1, atol=0.05)
-    assert flown.measured.doubt < 0.1 and flown.far < 1.0
+    assert flown.measured.uncertainty < 0.1 and flown.far < 1.0
     assert flown.overshoot <= 0.03 and flown.outside < 0.0
     assert flown.way <= 1.1 * flown.straight
 

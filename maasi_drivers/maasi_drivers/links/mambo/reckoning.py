@@ -127,8 +127,8 @@ class DeadReckoning:
             for acts, shares in self._sent
             if abs(self._now - acts) <= settings.delay
         ]
-        doubt = self.model.tilt * float(np.abs(near).max(initial=0.0)) / math.sqrt(3.0)
-        tilt = attitude + doubt**2
+        uncertainty = self.model.tilt * float(np.abs(near).max(initial=0.0)) / math.sqrt(3.0)
+        tilt = attitude + uncertainty**2
         return np.diag([position] * 3 + [tilt, tilt, attitude])
 
     def _acting(self) -> FloatArray:
