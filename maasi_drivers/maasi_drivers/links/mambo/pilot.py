@@ -148,9 +148,9 @@ class MamboPilot:
         """Return a velocity in the map (2,) that can be stopped before the geofence."""
         brake = 2.0 * _BRAKE_SHARE * self.reckoning.model.thrust
         low, high = self.volume.limits[:2].T
-        room = np.abs([low - course.position[:2], high - course.position[:2]])
+        margin = np.abs([low - course.position[:2], high - course.position[:2]])
         inside = (course.position[:2] > low, course.position[:2] < high)
-        most = inside * np.minimum(np.sqrt(brake * room), _NEAR_RATE * room)
+        most = inside * np.minimum(np.sqrt(brake * margin), _NEAR_RATE * margin)
         return np.clip(desired, -most[0], most[1])
 
     def _send(self, command: FloatArray, shares: FloatArray) -> None:
