@@ -25,7 +25,7 @@ present = []
 
 
 # With x below 0.5 it is reached, below 1 it goes on until it is cancelled or, as by Nav2, aborted
-# for a new one, below 1.5 it is given up with an error; `judge` refuses one beyond.
+# for a new one, below 1.5 it is given up with an error; `accept_goal` refuses one beyond.
 def execute(handle):
     pose = handle.request.pose
     present[:] = [handle]
@@ -48,7 +48,7 @@ def execute(handle):
     return result
 
 
-def judge(goal):
+def accept_goal(goal):
     if goal.pose.pose.position.x == LATE:
         time.sleep(1.0)
     return GoalResponse.ACCEPT if goal.pose.pose.position.x < 1.5 else GoalResponse.REJECT
@@ -62,7 +62,7 @@ def main():
         NavigateToPose,
         'navigate_to_pose',
         execute,
-        goal_callback=judge,
+        goal_callback=accept_goal,
         cancel_callback=lambda handle: CancelResponse.ACCEPT,
     )
     executor = MultiThreadedExecutor(4)

@@ -64,7 +64,7 @@ class HomeLanding:
         self._sent = True
         self._since, self._least = math.inf, math.inf
 
-    def judge(self, position: FloatArray, charge: float, now: float) -> str:
+    def check(self, position: FloatArray, charge: float, now: float) -> str:
         """Return why a vehicle without a goal lands, or nothing; an unknown charge is negative."""
         gaps = np.linalg.norm(self._chargers[:, :2] - position[:2], axis=1)
         if not (self._sent and self._timeout and charge >= 0.0 and gaps.min() <= self._reach):

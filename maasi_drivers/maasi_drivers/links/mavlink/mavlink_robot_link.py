@@ -245,7 +245,7 @@ class MavlinkRobotLink(RobotLink):
             # The first text is logged with the fault.
             if before and fault != before:
                 driver.get_logger().info(fault)
-        self._judge_setpoint(rejected)
+        self._check_setpoint(rejected)
         if reports != self._charge_reports:
             self._charge_reports = reports
             driver.take_charge(charge)
@@ -260,7 +260,7 @@ class MavlinkRobotLink(RobotLink):
             self._telemetry = telemetry
             self._handle_telemetry(telemetry)
 
-    def _judge_setpoint(self, rejected: FloatArray | None) -> None:
+    def _check_setpoint(self, rejected: FloatArray | None) -> None:
         """Begin or end the fault of a rejected set-point (3,), local."""
         health = self.driver.health
         if rejected is None:
@@ -279,7 +279,7 @@ class MavlinkRobotLink(RobotLink):
         latest, follower = self.driver.history.latest, self.driver.follower
         if latest is None or follower.current is not None:
             return ''
-        return self._landing.judge(latest.pose.position, charge, time.monotonic())
+        return self._landing.check(latest.pose.position, charge, time.monotonic())
 
     def _upload_fence(self) -> None:
         volume, mavlink = self.driver.volume, self._mavlink

@@ -231,11 +231,11 @@ class Vehicle(Autopilot):
         """Take a message."""
         before = self.receive(message, now)
         if before is not None:
-            self._judge_mode(*before, now)
+            self._check_mode(*before, now)
         elif self.refusal and self.phase is not VehiclePhase.REFUSED:
             self._enter(VehiclePhase.REFUSED, self.refusal)
 
-    def _judge_mode(self, was_armed: bool, before: int, now: float) -> None:
+    def _check_mode(self, was_armed: bool, before: int, now: float) -> None:
         """Give up control if the pilot, a failsafe or a disarming took it."""
         firmware, mode, armed = self._firmware, self.mode, self.armed
         if self.phase is VehiclePhase.CONNECTING:
@@ -320,7 +320,7 @@ class Vehicle(Autopilot):
     def _stream(self, now: float) -> None:
         flying = self.phase is VehiclePhase.FLYING
         if flying:
-            self._judge_setpoint(now)
+            self._check_setpoint(now)
         if (self._target is None and not flying) or not self.send_setpoint(
             self._target, self._yaw, now
         ):
@@ -332,7 +332,7 @@ class Vehicle(Autopilot):
             self._speed_due = False
             self.command(_SPEED, (_GROUND_SPEED, self.speed, -1.0))
 
-    def _judge_setpoint(self, now: float) -> None:
+    def _check_setpoint(self, now: float) -> None:
         telemetry, check = self.estimate.telemetry, self.setpoints
         if telemetry is not None:
             check.observe(telemetry.position, telemetry.velocity, now)
