@@ -46,7 +46,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         super().__init__('guard', GuardSettings, in_robot=True, **options)
         self._last = b''
         # Whether it has ever detected a driver, and whether that is lost.
-        self._heard = self._lost = False
+        self._received = self._lost = False
         self._stop_timer: Any = None
 
     def set_up(self) -> None:
@@ -57,7 +57,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         self._lease = lease = self.settings.lease
         quality = liveliness_reader(lease)
         # Before that it would not notice the loss of the driver.
-        self.expect(lambda: self._heard)
+        self.expect(lambda: self._received)
         # Only the last message is used, after no other has arrived.
         self.permanent(
             lease,
@@ -97,7 +97,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             return  # from an earlier configuration
         self._lost = event.alive_count == 0
         if not self._lost:
-            self._heard = True
+            self._received = True
             if self._stop_timer is not None:
                 self.get_logger().info('driver available again')
             self.halt()

@@ -126,7 +126,7 @@ class MeasuringFlight:
         link, now = self.link, self.clock()
         link.keep_alive()
         event = link.position
-        if event is None or now - event.received > _SILENCE or now - link.heard_at > _SILENCE:
+        if event is None or now - event.received > _SILENCE or now - link.received_at > _SILENCE:
             raise MeasurementError(f'link: no position for {_SILENCE} s')
         if link.error:
             raise MeasurementError(link.error)

@@ -117,7 +117,7 @@ class LinkedFlight:
         return float(np.linalg.norm(self.where - point))
 
     def arm(self):
-        # Refused until the drone is heard.
+        # Refused until the driver receives from the drone.
         self.until(lambda: self.call('arm').success)
         return self
 
@@ -147,7 +147,7 @@ class LinkedFlight:
         assert self.away(since) < self.stopping * self.settings['motion']['speed']
 
     def gives_up(self, result, reason):
-        """Check that it stops, its goal ends, the planner hears why, and that it is not sent on."""
+        """Check that it stops, ends its goal and reports the reason, and that no goal follows."""
         self.until(lambda: self.status == AgentState.UNAVAILABLE and reason in self.reason)
         # Until it is noticed, which takes up to the timeout of the link, it flies on.
         before = self.where

@@ -47,21 +47,21 @@ class RoutingAutopilot(FakeAutopilot):
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
-        self.heard = set()
+        self.known = set()
 
     def handle(self, message, link=0):
         ids = message.get_srcSystem(), message.get_srcComponent()
         if link == 0:
-            self.heard.add(ids)
+            self.known.add(ids)
         elif getattr(message, 'target_system', 0) == 0 and not self.crashed:
             heartbeat = message.get_type() == 'HEARTBEAT'
-            if ids not in self.heard if heartbeat else self.heard:
+            if ids not in self.known if heartbeat else self.known:
                 self._sender.file.write(bytes(message.get_msgbuf()))
         super().handle(message)
 
     def restart(self):
         super().restart()
-        self.heard.clear()
+        self.known.clear()
 
 
 class Play:
@@ -124,9 +124,9 @@ class Play:
             self._permitted = False
             self.permit()
         self.autopilot.advance(PERIOD)
-        heard = self.to_driver.take()
+        received = self.to_driver.take()
         if self.driver_lives:
-            for message in heard:
+            for message in received:
                 self.vehicle.handle(message, self.now)
             self.vehicle.tick(self.now)
             self.reports += self.vehicle.log.take()
@@ -140,7 +140,7 @@ class Play:
         return self
 
     def unheard(self, seconds):
-        """Return itself, after a time in which the driver hears nothing."""
+        """Return itself, after a time in which the driver receives nothing."""
         self.to_driver.cut = True
         self.run(seconds).to_driver.cut = False
         return self

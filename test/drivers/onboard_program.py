@@ -25,14 +25,14 @@ class OnboardProgram:
         self.place, self.patience = place, 3.0
         self.charge = 1.0
         self.blobs, self.count = b'', 0  # of the next images, as the feed has them
-        # Orders that it has heard.
+        # Orders that it has received.
         self.kinds, self.take_offs = [], 0
         self.doing = GROUND
         # Up from where it stands, x forward, y left.
         self.model = FlightModel(np.zeros(3), speed=0.5)
         self._feed, self._silent = feed, False
         self._sequence = 0
-        self._order, self._last, self._heard_at = 0, None, -math.inf
+        self._order, self._last, self._received_at = 0, None, -math.inf
         self._goal = np.zeros(3)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((address, 0))
@@ -48,7 +48,7 @@ class OnboardProgram:
         return RobotState(pose, self.place.rotation() @ self.model.velocity)
 
     def cut(self, cut=True):
-        """Let nothing of it get through; it hears orders all the same."""
+        """Let nothing of it get through; it still receives orders."""
         self._silent = cut
 
     def close(self):
@@ -77,12 +77,12 @@ class OnboardProgram:
             good = data[28:] == struct.pack('<I', zlib.crc32(data[:28])) and version == 1
             if magic != b'MSWO' or not good or sequence == self._last:
                 continue
-            self._last, self._heard_at = sequence, now
+            self._last, self._received_at = sequence, now
             self._order, self._goal = kind, np.array(numbers[:3])
             self.kinds.append(kind)
 
     def _fly(self, now):
-        silence, order = now - self._heard_at, self._order
+        silence, order = now - self._received_at, self._order
         if silence > self.patience:
             order = 0
         elif silence > 0.5:

@@ -31,7 +31,7 @@ from maasi_msgs.msg import (
 )
 from maasi_planner.motion import RobotState, make_motion
 
-# After a fault a robot has been stopped, and the planner has heard why, by then [s].
+# After a fault a robot has been stopped, and the planner has received the reason, by then [s].
 LATEST = 1.5
 STEP = 0.05
 NANOSECONDS = round(STEP * 1e9)
@@ -117,7 +117,7 @@ class Team(Node):
 
     def until_done(self, steps):
         self.until(
-            lambda: all(len(heard) == steps for heard in (self.states, self.commands)),
+            lambda: all(len(messages) == steps for messages in (self.states, self.commands)),
             'a step has no end',
         )
 
@@ -170,7 +170,7 @@ class Team(Node):
             self.odometry.publish(self.odometry_message())
 
     def awaken(self):
-        """Send odometry until the driver hears it: whether it does is not known from here."""
+        """Send odometry until the driver receives it: whether it does is not known from here."""
         self.until(lambda: self.say() or (self.states and self.commands), 'no driver')
         self.until(lambda: self.state.step == self.step, 'no state')
 

@@ -47,7 +47,7 @@ class Flight:
         self.position = None
         self.cut_up = self.cut_down = False
         self.sent = 'true'
-        self.time = self.heard_at = 0.0
+        self.time = self.received_at = 0.0
         self.flying_state, self.battery = 'landed', battery
         self.motion = make_motion(MOTION)
         settings = MamboSettings(**{'full_speed': full_speed(drag), 'arm': True} | settings)
@@ -84,7 +84,7 @@ class Flight:
                 self.flying_state = self.firmware.flying_state.name.lower().replace('_', '')
                 self.battery = self.firmware.charge.charge
                 if round(self.time / STEP) % 10 == 0:
-                    self.heard_at = self.time
+                    self.received_at = self.time
                     self._send_position()
             self.pilot.update(self.time)
             if self.goal is not None and self.pilot.phase is MamboPhase.FLYING:

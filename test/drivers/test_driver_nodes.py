@@ -236,7 +236,7 @@ def test_a_jump_of_the_stamps_begins_anew(play):
     team.move()
     assert team.state.step == 3
     assert 'back' in team.aborted(result)
-    # Of a clock that jumps the driver hears without odometry: its pose is unknown until some comes.
+    # The driver notices a jump of the clock without odometry: its pose is unknown until some comes.
     driver.reset()
     assert 'no odometry' in team.refused([1.0, 1.0, 0.0])
     team.move()

@@ -441,7 +441,7 @@ def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
     endless, start = {'endurance': 1e9}, [1.0, 2.0, 3.0]
     begin = time.monotonic()
     flight = fly('vehicle', autopilot=endless, battery_minimum=0.2, start=start).up()
-    # One that stays the same has been heard all the same.
+    # An unchanged charge is received nevertheless.
     flight.until(lambda: time.monotonic() - begin > 5.0)
     assert 'battery_minimum' not in capfd.readouterr().err
     flight.far = [1.0, -6.0, 3.0]

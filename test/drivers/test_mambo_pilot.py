@@ -294,7 +294,7 @@ def test_a_permission_ends_with_the_link():
         flight.pilot.update_pose(flight.time, flight.firmware.state)
         flight.step()
     assert UNTIL_ARM in flight.pilot.problem and flight.firmware.take_offs == 0
-    # Nor is there one while it is not heard.
+    # Nor is there one while nothing is received from it.
     flight.is_silent(60)
     assert 'link lost' in flight.pilot.permit(flight.time)
     flight.connected = False

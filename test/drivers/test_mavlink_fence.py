@@ -168,13 +168,13 @@ def test_messages_that_are_lost_are_sent_again(seed):
     for wire in (play.to_driver, play.to_autopilot):
 
         def take(whole=wire.take):
-            heard = whole()
+            received = whole()
             kept = [
                 item
-                for item in heard
+                for item in received
                 if not item.get_type().startswith('MISSION') or generator.uniform() > 0.2
             ]
-            lost[0] += len(heard) - len(kept)
+            lost[0] += len(received) - len(kept)
             return kept
 
         wire.take = take

@@ -169,7 +169,7 @@ def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
     play.autopilot.parameters['FS_GCS_ENABLE'] = 5.0
     play.autopilot.restart()
     play.run(2.0)
-    # A permission is for the autopilot that was heard.
+    # A permission is for the autopilot from which data was received.
     play.permitted().autopilot.restart()
     play.stands(12.0)
 

@@ -28,7 +28,7 @@ DOCK = Pose.from_yaw([1.0, 1.2, 0.0], 2.0)
 
 
 class Listener:
-    """What any node hears on /tf and /tf_static."""
+    """What any node receives on /tf and /tf_static."""
 
     def __init__(self, team):
         self.moving, self.static = [], []
@@ -47,15 +47,15 @@ class Listener:
 
 def test_frames_agree_with_the_state_and_who_comes_late_hears_the_static_ones(play):
     driver, team = play(tf_rate=10.0)
-    heard = Listener(team)
+    listener = Listener(team)
     team.until(lambda: driver.count_subscribers('/tf') == 2)
     team.send_accepted([1.0, 1.0, 0.0])
     team.move(20)
-    team.until(lambda: len(heard.moving) == 10)
-    team.until(lambda: any(len(message.transforms) == 3 for message in heard.static))
-    buffer = heard.buffer()
+    team.until(lambda: len(listener.moving) == 10)
+    team.until(lambda: any(len(message.transforms) == 3 for message in listener.static))
+    buffer = listener.buffer()
     states = {stamp_from_ros(state.header.stamp): state for state in team.states}
-    for message in heard.moving:
+    for message in listener.moving:
         (item,) = message.transforms
         stamp = stamp_from_ros(item.header.stamp)
         # Ten times a second, of twenty states.
@@ -76,10 +76,10 @@ def test_frames_agree_with_the_state_and_who_comes_late_hears_the_static_ones(pl
     ]
     assert hashes == [expected]
     # The description, too.
-    heard, texts = Listener(team), []
+    listener, texts = Listener(team), []
     team.create_subscription(String, 'robot_description', texts.append, LATCHED)
-    team.until(lambda: heard.static and texts)
-    (message,) = heard.static
+    team.until(lambda: listener.static and texts)
+    (message,) = listener.static
     names = {(item.header.frame_id, item.child_frame_id) for item in message.transforms}
     fixed = {(BASE, 'rover/camera'), ('rover/camera', 'rover/camera_optical')}
     assert names == {('map', 'rover/odom'), *fixed}
@@ -87,7 +87,7 @@ def test_frames_agree_with_the_state_and_who_comes_late_hears_the_static_ones(pl
     assert root.tag == 'robot' and root.get('name') == 'rover'
     assert {link.get('name') for link in root.iter('link')} == {name for p in fixed for name in p}
     assert root.find('link/visual/geometry/cylinder').get('radius') == '0.11'
-    buffer = heard.buffer()
+    buffer = listener.buffer()
     for joint in root.iter('joint'):
         parent, child = joint.find('parent').get('link'), joint.find('child').get('link')
         origin = [float(number) for number in joint.find('origin').get('xyz').split()]

@@ -26,7 +26,7 @@ from maasi_planner.motion import RobotState
 
 
 def gives_up(team, result, reason):
-    """Check that the robot is stopped, the goal is ended, and that the planner hears why."""
+    """Check that the robot is stopped, and that the goal ends with the reason."""
     assert reason in team.aborted(result)
     assert team.state.goal_status == AgentState.UNAVAILABLE
     assert reason in team.state.reason
@@ -341,7 +341,7 @@ def drive_without_the_guard(team):
 
 def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(start_guard, process, team):
     guard = start_guard()
-    # Nobody relies on a guard before it has heard its driver.
+    # Nobody relies on a guard before it has received from its driver.
     end = time.monotonic() + 1.0
     team.until(lambda: time.monotonic() > end and team.count_publishers('/lockstep/ready'))
     assert not team.ready
@@ -351,15 +351,15 @@ def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(start_gua
     team.until(lambda: '/rover/guard' in [message.node for message in team.ready])
     # A driver stops the robot itself where odometry is missing: to its guard it is alive, for
     # longer than the lease and without any state.
-    heard = [time.monotonic()]
+    received = [time.monotonic()]
 
     def stays_alive():
         # On a busy machine a sign of life may be late.
         if guard.status()['stopping']:
-            heard[0] = time.monotonic()
-        return time.monotonic() > heard[0] + 1.5 * LIVELINESS_LEASE
+            received[0] = time.monotonic()
+        return time.monotonic() > received[0] + 1.5 * LIVELINESS_LEASE
 
-    team.until(stays_alive, 'its guard does not hear the driver')
+    team.until(stays_alive, 'its guard does not receive from the driver')
     team.send_accepted([1.5, 1.5, 0.0])
     drive_without_the_guard(team)
     assert np.any(team.command != 0.0)
@@ -400,7 +400,7 @@ def test_a_guard_that_ends_with_its_driver_gives_zeros_and_no_warning(
     guard, driver = start_guard(), process()
     team.connect()
     team.awaken()
-    team.until(lambda: guard._heard)
+    team.until(lambda: guard._received)
     guard.ending = True  # as by the signal that both receive
     driver.send_signal(signal.SIGINT)
     team.until(lambda: guard.status()['stopping'])

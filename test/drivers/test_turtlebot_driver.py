@@ -150,17 +150,17 @@ def stand(team):
 
 
 @pytest.fixture
-def hear(team, stand, nav2):
+def await_event(team, stand, nav2):
     """Wait until Nav2 says an event; return all that it said up to it."""
 
-    def hear(event):
+    def await_event(event):
         lines = []
         while not lines or lines[-1]['event'] != event:
             team.until(lambda: stand() or not nav2[0].empty(), f'Nav2 never said {event}')
             lines.append(nav2[0].get())
         return lines
 
-    return hear
+    return await_event
 
 
 def send_first(team, position, stand):
@@ -174,7 +174,7 @@ def send_first(team, position, stand):
         assert 'Nav2 not available' in result.result().result.reason
 
 
-def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, hear):
+def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, await_event):
     process(environment=with_nav2, navigation='nav2', pose_source='odometry', odometry_timeout=0.5)
     team.connect()
     team.awaken()
@@ -190,7 +190,7 @@ def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, hea
 
     # Reached.
     result = send_first(team, [0.3, 0.8, 0.0], stand)
-    line = hear('goal')[-1]
+    line = await_event('goal')[-1]
     assert line['frame'] == 'map'
     assert_allclose(line['position'], [0.3, 0.8, 0.0])
     offset = np.array([0.3, 0.8]) - team.start.position[:2]
@@ -202,41 +202,41 @@ def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, hea
     assert 'Nav2 rejected' in team.aborted(send(1.8)[1], stand)
     # On the way the commands are Nav2's. A new goal preempts; cancelled, it is told so.
     replaced = send(0.7)[1]
-    hear('goal')
+    await_event('goal')
     nothing_is_commanded()
     handle, result = send(0.9)
-    lines = hear('preempted')
+    lines = await_event('preempted')
     # Its own stop of the goal before would be one of the robot.
     assert 'cancelled' not in [line['event'] for line in lines]
     assert lines[-1]['position'][0] == pytest.approx(0.7)
     assert team.aborted(replaced, stand) == 'replaced'
     nothing_is_commanded()
     handle.cancel_goal_async()
-    assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.9)
+    assert await_event('cancelled')[-1]['position'][0] == pytest.approx(0.9)
     assert team.ended(result, stand)[0] == GoalStatus.STATUS_CANCELED
     assert_array_equal(team.command, np.zeros(4))
     # Cancelled before Nav2 has answered.
     handle, result = send(0.95)
     handle.cancel_goal_async()
-    assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.95)
+    assert await_event('cancelled')[-1]['position'][0] == pytest.approx(0.95)
     assert team.ended(result, stand)[0] == GoalStatus.STATUS_CANCELED
     # Refused by Nav2 on the way: it stops.
     send(0.7)
-    hear('goal')
+    await_event('goal')
     result = send(1.8)[1]
-    assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.7)
+    assert await_event('cancelled')[-1]['position'][0] == pytest.approx(0.7)
     assert 'Nav2 rejected' in team.aborted(result, stand)
     # A pose that hangs while the odometry's velocity says that it should not.
     result = send(0.7)[1]
-    hear('goal')
+    await_event('goal')
     team.body.step([0.2, 0.0, 0.0, 0.0], 1.0)
-    assert hear('cancelled')[-1]['position'][0] == pytest.approx(0.7)
+    assert await_event('cancelled')[-1]['position'][0] == pytest.approx(0.7)
     assert 'the pose has not changed for' in team.aborted(result, stand)
     team.body.step([0.0, 0.0, 0.0, 0.0], 2.0)
     team.until(lambda: stand() or team.state.goal_status == AgentState.ABORTED)
     # Nav2 dies on the way.
     result = send(0.7)[1]
-    hear('goal')
+    await_event('goal')
     nav2[1].kill()
     reason = team.aborted(result, stand)
     assert_array_equal(team.command, np.zeros(4))

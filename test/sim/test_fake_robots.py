@@ -100,18 +100,18 @@ def test_a_packet_that_is_repeated_is_not_believed(pair, last):
 
     link._drone.drone_connection.handle_data = keep
     wait_until(lambda: len(packets) > 20)
-    fake.position_sent, heard = last, link.heard_at
-    wait_until(lambda: link.heard_at > heard)
+    fake.position_sent, heard = last, link.received_at
+    wait_until(lambda: link.received_at > heard)
     fake.cut_down = True
     # Those on their way have come when nothing is heard for a while.
-    wait_until(lambda: time.monotonic() - link.heard_at > 1.0)
-    heard, received = link.heard_at, link.position.received
+    wait_until(lambda: time.monotonic() - link.received_at > 1.0)
+    heard, received = link.received_at, link.position.received
     repeated = packets[-4:]
     if last == 'none':
         repeated = [packet for packet in packets if packet[7:11] == struct.pack('<BBH', 2, 18, 0)]
     for packet in repeated[-4:]:
         handle(packet)
-    assert link.heard_at == heard and link.position.received == received
+    assert link.received_at == heard and link.position.received == received
     # What it did meanwhile is asked for when it is heard again.
     fake.firmware.emergency()
     end = fake.firmware.time + 2.0

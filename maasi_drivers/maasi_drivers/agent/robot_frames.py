@@ -130,8 +130,8 @@ class RobotFrames:
         self._publish_static()
         if not settings.lockstep:
             for topic, quality in (('tf', TRANSFORMS), ('tf_static', LATCHED_ALL)):
-                heard = partial(self._read, topic)
-                node.create_subscription(kind, node.team_topic(topic), heard, quality)
+                callback = partial(self._read, topic)
+                node.create_subscription(kind, node.team_topic(topic), callback, quality)
 
     def clear(self) -> None:
         """Discard transforms that are not static, after a jump of the clock."""

@@ -202,7 +202,7 @@ class FeedReceiver:
     ) -> None:
         self.sender, self._on_drop = sender, on_drop
         self._last: int | None = None
-        self._heard_at = -1e9
+        self._received_at = -1e9
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind((address, port))
@@ -238,7 +238,7 @@ class FeedReceiver:
                 self._on_drop('bad packet', str(error), 1)
                 continue
             last = self._last
-            if last is not None and now - self._heard_at < _SILENCE:
+            if last is not None and now - self._received_at < _SILENCE:
                 # As a signed difference, which may wrap.
                 ahead = (packet.sequence - last + 2**31) % 2**32 - 2**31
                 text = f'sequence: read {packet.sequence}, allowed are numbers after {last}'
@@ -247,6 +247,6 @@ class FeedReceiver:
                     continue
                 if 1 < ahead < _FAR_BEHIND:
                     self._on_drop('lost packet', text, ahead - 1)
-            self._last, self._heard_at = packet.sequence, now
+            self._last, self._received_at = packet.sequence, now
             packets.append((packet, now - packet.age))
         return packets

@@ -73,7 +73,7 @@ class MamboLink:
         self.flying_state = ''
         self.battery = -1.0  #: charge, 0 to 1; negative: not received yet
         #: Time of the last new data or acknowledgement, monotonic clock [s].
-        self.heard_at = -math.inf
+        self.received_at = -math.inf
         self.position: PositionEvent | None = None  #: the last position event
         # : Number of unusable position events.
         self.bad_events = 0
@@ -200,7 +200,7 @@ class MamboLink:
         def handle_answer(channel: str, value: bool, *sequence: int) -> None:
             received(channel, value, *sequence)
             if value:
-                link.heard_at = time.monotonic()
+                link.received_at = time.monotonic()
 
         drone.drone_connection._set_command_received = handle_answer
         if self.kind == 'wifi':
@@ -234,7 +234,7 @@ class MamboLink:
                 self._send_steering()
                 if self.kind == 'ble':
                     now = time.monotonic()
-                    if now - max(self.heard_at, self._probed_at) >= _PROBE_PERIOD:
+                    if now - max(self.received_at, self._probed_at) >= _PROBE_PERIOD:
                         self._probed_at = now
                         ask_for_answer(drone.drone_connection, self.tilt)
                     drone.smart_sleep(_ROUND)
@@ -263,7 +263,7 @@ class MamboLink:
                 self._steering = [0, 0, 0, 0]
 
     def _ask_again(self) -> None:
-        silent = math.isfinite(self.heard_at) and time.monotonic() - self.heard_at > _OUTDATED
+        silent = math.isfinite(self.received_at) and time.monotonic() - self.received_at > _OUTDATED
         if self._was_silent and not silent:
             self._drone.ask_for_state_update()
         self._was_silent = silent
@@ -286,7 +286,7 @@ class MamboLink:
                     self._wanted = ''
             else:
                 # Its last report may be outdated.
-                known = state == 'landed' or now - self.heard_at <= _OUTDATED
+                known = state == 'landed' or now - self.received_at <= _OUTDATED
                 obeyed = known and state in ('landed', 'landing', 'emergency')
             if not wanted or obeyed or now - self._asked_at < _REPEAT:
                 return
@@ -304,12 +304,12 @@ class MamboLink:
 
     def _receive(self, name: str, value: Any, sensors: Any) -> None:
         if self.kind == 'ble':
-            self.heard_at = time.monotonic()
-            self._fresh_until = self.heard_at + _TOGETHER
+            self.received_at = time.monotonic()
+            self._fresh_until = self.received_at + _TOGETHER
         if name in _STAMPS and self._stamps.get(name) != value:
             self._stamps[name] = value
-            self.heard_at = time.monotonic()
-            self._fresh_until = self.heard_at + _TOGETHER
+            self.received_at = time.monotonic()
+            self._fresh_until = self.received_at + _TOGETHER
         elif name == 'FlyingStateChanged_state':
             self.flying_state = str(sensors.flying_state)
         elif name == 'BatteryStateChanged_battery_percent':

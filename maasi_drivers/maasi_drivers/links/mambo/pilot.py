@@ -335,7 +335,7 @@ class MamboPilot:
 
     def _missing(self, now: float) -> str:
         for text, since in (
-            ('link lost: no data from the Mambo', self.link.heard_at),
+            ('link lost: no data from the Mambo', self.link.received_at),
             ('no position', self._placed_at),
             ('the position has not changed', self._moved_at),
         ):
@@ -345,4 +345,4 @@ class MamboPilot:
         return ''
 
     def _is_silent(self, now: float) -> bool:
-        return now - self.link.heard_at > self.settings.link_timeout
+        return now - self.link.received_at > self.settings.link_timeout

@@ -89,7 +89,7 @@ class Autopilot:
         kind, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         if self._shows_own_id(message):
             if self.failsafes is not None:
-                self.failsafes.hear_own_id(now)
+                self.failsafes.receive_own_id(now)
             return None
         if source != (self.settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1):
             return None

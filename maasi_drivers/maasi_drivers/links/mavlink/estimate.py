@@ -149,7 +149,7 @@ class Estimate:
 
     def _clear(self) -> None:
         self.telemetry: Telemetry | None = None
-        self.heard_at = -math.inf
+        self.received_at = -math.inf
         self.origin = np.zeros(3)
         self.booted = math.nan
         self.landed = mavlink.MAV_LANDED_STATE_UNDEFINED
@@ -173,7 +173,7 @@ class Estimate:
     def silent_since(self) -> float:
         """Time since which an earlier message type is missing [s, steady clock]."""
         fixes = max((self._status_at[name] for name in self._fixes), default=math.inf)
-        return min(self.heard_at, self._status_at.get(_EKF, math.inf), fixes)
+        return min(self.received_at, self._status_at.get(_EKF, math.inf), fixes)
 
     def _silence(self, name: str) -> str:
         silent = self._now - self._status_at.get(name, math.inf) > _STATUS_AGE
@@ -239,7 +239,7 @@ class Estimate:
             self._clear()
             self._on_restart()
         else:
-            self.heard_at = now
+            self.received_at = now
         self._boot_time = max(milliseconds, self._boot_time or 0)
 
     def _update_position(self, message: Any, now: float, armed: bool) -> None:

@@ -168,7 +168,7 @@ class FailsafeCheck:
         if name in self._names:
             self.values[name] = value
 
-    def hear_own_id(self, now: float) -> None:
+    def receive_own_id(self, now: float) -> None:
         """Note a message of another program that has the driver's system id."""
         if not self._foreign(now):
             self._foreign_at = now
