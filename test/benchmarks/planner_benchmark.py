@@ -31,7 +31,7 @@ from maasi_planner.endurance import Endurance, EnduranceSettings
 from maasi_planner.guidance import length_to
 from maasi_planner.keep_out import CORNERS, KeepOut
 from maasi_planner.planners.options import options_of
-from maasi_planner.planners.orienteering import plan_ways
+from maasi_planner.planners.orienteering import plan_routes
 from maasi_planner.visibility import VisibilityGraph, _last_legs
 
 CUBE = np.array([[0.0, 260.0]] * 3)
@@ -209,7 +209,7 @@ def prizes_within_budgets(share):
         prizes = 0.1 + np.exp(-((gaps / (0.1 * side)) ** 2)).sum(axis=1)
         starts = np.column_stack([rng.uniform(0.0, side, robots), np.zeros(robots)])
         budgets = np.full(robots, 0.4 * side**2 / robots)
-        plan = partial(plan_ways, points, prizes, starts, budgets, starts)
+        plan = partial(plan_routes, points, prizes, starts, budgets, starts)
         plan(effort=0.01)
         begun = perf_counter()
         visited = np.concatenate(plan(effort=4.0 * share))

@@ -5,15 +5,15 @@ import itertools
 import numpy as np
 import pytest
 
-from maasi_planner.planners.orienteering import MOST, plan_ways
+from maasi_planner.planners.orienteering import MOST, plan_routes
 
 
-def arrivals(points, start, way, end=None):
-    """Return the way to each node of a way [m], and its length."""
-    places = [*([] if start is None else [start]), *points[way], *([] if end is None else [end])]
+def arrivals(points, start, path, end=None):
+    """Return the distances to the nodes of a path, and its length [m]."""
+    places = [*([] if start is None else [start]), *points[path], *([] if end is None else [end])]
     gaps = np.linalg.norm(np.diff(places, axis=0), axis=1) if len(places) > 1 else np.zeros(0)
     passed = np.cumsum([*([0.0] if start is None else []), *gaps])
-    return passed[: len(way)], passed[-1] if len(passed) else 0.0
+    return passed[: len(path)], passed[-1] if len(passed) else 0.0
 
 
 def drawn(seed, number=6, dimension=2):
@@ -29,13 +29,13 @@ def test_without_budget_prizes_come_early(dimension):
         points, prizes, rng = drawn(seed, dimension=dimension)
         start = rng.uniform(0.0, 1.0, dimension)
 
-        def late(way, points=points, prizes=prizes, start=start):
-            return float(prizes[list(way)] @ arrivals(points, start, list(way))[0])
+        def late(path, points=points, prizes=prizes, start=start):
+            return float(prizes[list(path)] @ arrivals(points, start, list(path))[0])
 
-        least = min(late(way) for way in itertools.permutations(range(6)))
-        (way,) = plan_ways(points, prizes, start[None, :], np.array([np.inf]))
-        assert sorted(way) == list(range(6))
-        ratios.append(late(way) / least)
+        least = min(late(path) for path in itertools.permutations(range(6)))
+        (path,) = plan_routes(points, prizes, start[None, :], np.array([np.inf]))
+        assert sorted(path) == list(range(6))
+        ratios.append(late(path) / least)
     assert max(ratios) < 1.1 and np.median(ratios) == pytest.approx(1.0)
 
 
@@ -49,14 +49,14 @@ def test_budgets_are_kept_and_prizes_are_close_to_the_most(home, free):
         start, end = None if free else start, end if home else None
         most = 0.0
         for size in range(7):
-            for way in itertools.permutations(range(6), size):
-                if arrivals(points, start, list(way), end)[1] <= budget:
-                    most = max(most, prizes[list(way)].sum())
+            for path in itertools.permutations(range(6), size):
+                if arrivals(points, start, list(path), end)[1] <= budget:
+                    most = max(most, prizes[list(path)].sum())
         given = [None if place is None else place[None, :] for place in (start, end)]
-        (way,) = plan_ways(points, prizes, given[0], np.array([budget]), given[1])
-        if len(way):
-            assert arrivals(points, start, way, end)[1] <= budget + 1e-9
-        ratios.append(prizes[way].sum() / max(most, 1e-9) if most else 1.0)
+        (path,) = plan_routes(points, prizes, given[0], np.array([budget]), given[1])
+        if len(path):
+            assert arrivals(points, start, path, end)[1] <= budget + 1e-9
+        ratios.append(prizes[path].sum() / max(most, 1e-9) if most else 1.0)
     assert min(ratios) > 0.8 and np.median(ratios) == pytest.approx(1.0)
 
 
@@ -68,34 +68,34 @@ def lattice(rows, columns):
 def test_a_team_shares_a_field_in_lanes(robots):
     points = lattice(12, 15)
     starts = np.random.default_rng(3).uniform(0.0, 12.0, (robots, 2))
-    ways = plan_ways(points, np.ones(180), starts, np.full(robots, np.inf))
-    assert sorted(np.concatenate(ways)) == list(range(180))
-    mean = np.mean(np.concatenate([arrivals(points, s, way)[0] for s, way in zip(starts, ways)]))
+    paths = plan_routes(points, np.ones(180), starts, np.full(robots, np.inf))
+    assert sorted(np.concatenate(paths)) == list(range(180))
+    mean = np.mean(np.concatenate([arrivals(points, s, path)[0] for s, path in zip(starts, paths)]))
     assert mean < 1.06 * 90.0 / robots
-    again = plan_ways(points, np.ones(180), starts, np.full(robots, np.inf))
-    assert all(np.array_equal(*pair) for pair in zip(ways, again))
+    again = plan_routes(points, np.ones(180), starts, np.full(robots, np.inf))
+    assert all(np.array_equal(*pair) for pair in zip(paths, again))
 
 
 def test_a_budget_is_spent_where_the_prizes_are():
     points = lattice(20, 20)
     prizes = np.exp(-((points - [4.0, 14.0]) ** 2).sum(axis=1) / 20.0)
     starts, budgets = np.array([[10.0, 10.0], [0.0, 0.0]]), np.array([60.0, 40.0])
-    ways = plan_ways(points, prizes, starts, budgets, starts)
-    for start, way, budget in zip(starts, ways, budgets):
-        assert arrivals(points, start, way, start)[1] <= budget
+    paths = plan_routes(points, prizes, starts, budgets, starts)
+    for start, path, budget in zip(starts, paths, budgets):
+        assert arrivals(points, start, path, start)[1] <= budget
     best = np.sort(prizes)[::-1][:70].sum()
-    assert prizes[np.concatenate(ways)].sum() > 0.85 * best
+    assert prizes[np.concatenate(paths)].sum() > 0.85 * best
 
 
 def test_a_faster_robot_does_more_and_none_without_prizes():
     points, starts = lattice(10, 10), np.array([[0.0, 5.0], [10.0, 5.0]])
-    fast, slow = plan_ways(
+    fast, slow = plan_routes(
         points, np.ones(100), starts, np.full(2, np.inf), speeds=np.array([3.0, 1.0])
     )
     assert 65 < len(fast) < 85 and len(slow) == 100 - len(fast)
-    assert [len(way) for way in plan_ways(points, np.zeros(100), starts, np.ones(2))] == [0, 0]
-    one = plan_ways(points[:1], np.ones(1), starts, np.full(2, np.inf))
-    assert [len(way) for way in one] == [1, 0]
+    assert [len(path) for path in plan_routes(points, np.zeros(100), starts, np.ones(2))] == [0, 0]
+    one = plan_routes(points[:1], np.ones(1), starts, np.full(2, np.inf))
+    assert [len(path) for path in one] == [1, 0]
 
 
 def test_small_budgets_on_a_lattice_end_within_them():
@@ -104,22 +104,22 @@ def test_small_budgets_on_a_lattice_end_within_them():
         rng = np.random.default_rng(seed)
         start, budget = points[7:8] + 0.5, rng.uniform(20.0, 120.0)
         prizes = 0.1 * rng.random(len(points))
-        (way,) = plan_ways(points, prizes, start, np.array([budget]), points[:1])
-        # The way home is gone in any case.
+        (path,) = plan_routes(points, prizes, start, np.array([budget]), points[:1])
+        # The path home is gone in any case.
         most = max(budget, np.linalg.norm(points[0] - start[0]))
-        assert arrivals(points, start[0], way, points[0])[1] <= most + 1e-9
+        assert arrivals(points, start[0], path, points[0])[1] <= most + 1e-9
 
 
 def test_of_equal_ways_the_known_ones_are_kept():
     points, prizes, budget = lattice(6, 6), np.ones(36), np.array([np.inf])
     start = points[:1] - 0.5
-    (lanes,) = plan_ways(points, prizes, start, budget)
+    (lanes,) = plan_routes(points, prizes, start, budget)
     across = lanes % 6 * 6 + lanes // 6
     for known in (lanes, across):
-        (way,) = plan_ways(points, prizes, start, budget, known=[known])
-        assert way.tolist() == known.tolist()
-        (way,) = plan_ways(points, prizes, start, budget, known=[known[:20]])
-        assert sorted(way) == list(range(36))
+        (path,) = plan_routes(points, prizes, start, budget, known=[known])
+        assert path.tolist() == known.tolist()
+        (path,) = plan_routes(points, prizes, start, budget, known=[known[:20]])
+        assert sorted(path) == list(range(36))
 
 
 def test_only_some_robots_have_to_end_somewhere():
@@ -129,12 +129,12 @@ def test_only_some_robots_have_to_end_somewhere():
         starts, end = rng.uniform(0.0, 1.0, (2, 2)), rng.uniform(0.0, 1.0, 2)
         budget = 1.5 + np.linalg.norm(end - starts[0])
         ends = np.array([end, [np.nan, np.nan]])
-        mine, other = plan_ways(points, prizes, starts, np.array([budget, np.inf]), ends)
+        mine, other = plan_routes(points, prizes, starts, np.array([budget, np.inf]), ends)
         assert sorted([*mine, *other]) == list(range(30))
         assert arrivals(points, starts[0], mine, end)[1] <= budget + 1e-9
         # Alone with a limit, some are left.
         limits = np.array([budget, 1.0])
-        mine, other = plan_ways(points, prizes, starts, limits, ends)
+        mine, other = plan_routes(points, prizes, starts, limits, ends)
         assert arrivals(points, starts[0], mine, end)[1] <= budget + 1e-9
         assert arrivals(points, starts[1], other)[1] <= 1.0 + 1e-9
         assert 4 < len(mine) + len(other) < 30
@@ -145,8 +145,8 @@ def test_of_many_nodes_the_best_for_their_distance_are_planned():
     prizes = np.full(len(nodes), 0.01)
     prizes[nodes[:, 0] + nodes[:, 1] > 180.0] = 1.0
     starts = np.array([[0.0, 0.0], [0.0, 99.0]])
-    ways = plan_ways(nodes, prizes, starts, np.full(2, np.inf))
-    visited = np.concatenate(ways)
+    paths = plan_routes(nodes, prizes, starts, np.full(2, np.inf))
+    visited = np.concatenate(paths)
     assert len(visited) == len(set(visited.tolist())) == MOST
     assert set(np.flatnonzero(prizes == 1.0)) <= set(visited.tolist())
     # Of the others those that are near.
@@ -167,7 +167,7 @@ def test_a_new_plan_never_collects_less_than_the_rest_of_the_old_one():
         budgets = rng.uniform(0.2, 0.8, robots) * len(points) / robots
         ends = starts if seed % 2 else None
         homes = starts if seed % 2 else [None] * robots
-        paths = plan_ways(points, prizes, starts, budgets, ends, effort=0.1)
+        paths = plan_routes(points, prizes, starts, budgets, ends, effort=0.1)
         for share in (0.2, 0.4, 0.6):
             here, left, rest = starts.copy(), budgets.copy(), []
             for k, path in enumerate(paths):
@@ -178,7 +178,7 @@ def test_a_new_plan_never_collects_less_than_the_rest_of_the_old_one():
                 rest.append(path[done:])
             now = prizes.copy()
             now[[node for path, old in zip(paths, rest) for node in path if node not in old]] = 0.0
-            again = plan_ways(points, now, here, left, ends, known=rest, effort=0.1)
+            again = plan_routes(points, now, here, left, ends, known=rest, effort=0.1)
             visited = np.concatenate(again)
             assert len(visited) == len(set(visited.tolist()))
             for k, path in enumerate(again):

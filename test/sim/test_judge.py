@@ -53,7 +53,7 @@ def terrain(folder, heat=EAST, victims=EAST):
     return folder
 
 
-def test_ways_are_worth_what_the_heatmap_is(tmp_path):
+def test_routes_are_worth_what_the_heatmap_is(tmp_path):
     found = {}
     for name, victims in (('true', EAST), ('wrong', WEST)):
         folder = terrain(tmp_path / name, victims=victims)
@@ -69,20 +69,20 @@ def test_ways_are_worth_what_the_heatmap_is(tmp_path):
     assert found['wrong']['unpromised'] > 95.0
 
 
-def test_worse_ways_find_less_and_longer_ones_are_refused(tmp_path, monkeypatch):
-    folder, plan = terrain(tmp_path / 'one'), judge.plan_ways
+def test_worse_routes_find_less_and_longer_ones_are_refused(tmp_path, monkeypatch):
+    folder, plan = terrain(tmp_path / 'one'), judge.plan_routes
 
     def found(change):
-        monkeypatch.setattr(judge, 'plan_ways', lambda *given: change(*given))
+        monkeypatch.setattr(judge, 'plan_routes', lambda *given: change(*given))
         return judge_terrain(folder, [8.0], 300, seed=900)
 
     [whole, half] = (
-        found(lambda *given, part=part: [way[: len(way) // part] for way in plan(*given)])
+        found(lambda *given, part=part: [path[: len(path) // part] for path in plan(*given)])
         for part in (1, 2)
     )
     assert 0.0 < half['found']['8'][FREE] < 0.7 * whole['found']['8'][FREE]
     longer = found(lambda *given: plan(*given[:3], 2.0 * given[3]))
-    assert longer['refused'] == f'{FREE}, {CENTRE}: ways longer than 8 km'
+    assert longer['refused'] == f'{FREE}, {CENTRE}: routes longer than 8 km'
     monkeypatch.setattr(judge.Terrain, '_found', Mock(side_effect=GEOSException('no union')))
     assert judge_terrain(folder, [8.0], 300, seed=900)['refused'] == 'no union'
 

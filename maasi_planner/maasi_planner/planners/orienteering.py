@@ -48,7 +48,7 @@ OVER = 1e4
 NOISE, WINDOW = 0.3, 200
 
 
-def plan_ways(
+def plan_routes(
     nodes: FloatArray,
     prizes: FloatArray,
     starts: FloatArray | None,
@@ -116,7 +116,7 @@ def plan_ways(
     early = _terms(limits, 0.0, rates, 0.0, OVER * prize.sum() * rates.max())
     begun, old = [], [used[:0]] * robots
     if known is not None and any(map(len, known)):
-        old = [np.searchsorted(used, way[np.isin(way, used)]) for way in known]
+        old = [np.searchsorted(used, path[np.isin(path, used)]) for path in known]
         begun.append(make_routes(places, old))
     for axes in (np.arange(d), np.array([1, 0, *range(2, d)])):
         begun.append(make_routes(places, _shared(places, _lanes(points[:n][:, axes]), robots)))

@@ -10,7 +10,7 @@ from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.detour import PASSES, others_move, past_standing
 from maasi_planner.planners.lattice import Lattice, lanes_of
 from maasi_planner.planners.options import affordable, waiting_places
-from maasi_planner.planners.orienteering import plan_ways
+from maasi_planner.planners.orienteering import plan_routes
 from maasi_planner.planners.separation import crossed, free_of_robots
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import (
@@ -164,7 +164,7 @@ class Tour(Planner):
             np.array([rows[i] for i in before.get(name, []) if i in rows], np.int64)
             for name in names
         ]
-        routes = plan_ways(points, prizes, origins, np.array(budgets), homes, speeds, known)
+        routes = plan_routes(points, prizes, origins, np.array(budgets), homes, speeds, known)
         self.routes = {name: route.tolist() for name, route in zip(names, routes)}
         return self._planned
 

@@ -305,7 +305,7 @@ def _draw_differences(axes: Axes, table: SearchTable) -> None:
     for row, name in enumerate(names[1:]):
         colour = _COMPARED[(row + 1) % len(_COMPARED)]
         gaps = np.subtract(*table.results.pairs(name, names[0], TIME.name))
-        # Spread, always the same way, so that equal values can be seen.
+        # Spread, by the same seed, so that equal values can be seen.
         lift = np.random.default_rng(0).uniform(0.12, 0.3, len(gaps))
         axes.plot(gaps, row + lift, 'o', color=colour, ms=4, alpha=0.45, mew=0)
         mean = table.differences[name][TIME.name]

@@ -1,4 +1,4 @@
-"""Outside judges: SAREnv's evaluator, terrains and victims, its planners next to our ways."""
+"""Outside judges: SAREnv's evaluator, terrains and victims, its planners next to ours."""
 
 import argparse
 import json
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from shapely.errors import ShapelyError
 
-from maasi_planner.planners.orienteering import plan_ways
+from maasi_planner.planners.orienteering import plan_routes
 from maasi_sim.arguments import Parser, count, positive, whole
 from maasi_sim.experiments.campaign import DONE, SOME_FAILED, WRONG_INPUT
 from maasi_sim.experiments.claims import with_summary
@@ -89,11 +89,11 @@ def _axis(low: float, high: float, cells: int, side: float) -> tuple[Array, Arra
     return edges[:-1] + np.diff(edges) / 2.0, borders[:-1] + side / 2.0, shares
 
 
-def our_ways(swath: float, free: bool, **task: Any) -> list[Any]:
-    """Return our ways as one of SAREnv's path generators, of which `task` has the arguments.
+def our_routes(swath: float, free: bool, **task: Any) -> list[Any]:
+    """Return our routes as one of SAREnv's path generators, of which `task` has the arguments.
 
-    With `free` one way is cut into equal ones, else all begin at the middle of the disc. Nodes are
-    one swath [m] apart; nearer where the budget suffices, until a middle sees its whole square.
+    With `free` one route is cut into equal parts, else all begin at the middle of the disc. Nodes
+    are one swath [m] apart, or closer where the budget suffices to see each cell as a whole.
     """
     drones, budget, line = task['num_drones'], task['budget'], toolkit().LineString
     apart = np.pi * task['max_radius'] ** 2 / budget
@@ -102,11 +102,11 @@ def our_ways(swath: float, free: bool, **task: Any) -> list[Any]:
     # GEOS cannot unite swaths with edges that are equal but for rounding.
     nodes = nodes.round(3)
     if free:
-        [order] = plan_ways(nodes, prizes, None, np.array([budget]))
+        [order] = plan_routes(nodes, prizes, None, np.array([budget]))
         return list(toolkit().paths.split_path_for_drones(line(nodes[order]), drones))
     middle = np.reshape(task['bounds'], (2, 2)).mean(axis=0)
     starts = np.tile(middle, (drones, 1))
-    orders = plan_ways(nodes, prizes, starts, np.full(drones, budget / drones))
+    orders = plan_routes(nodes, prizes, starts, np.full(drones, budget / drones))
     return [line(np.vstack([middle, nodes[order]])) for order in orders if len(order)]
 
 
@@ -127,7 +127,7 @@ class Terrain:
         half_angle = np.radians(self._config.fov_degrees / 2.0)
         self._swath = float(2.0 * self._config.altitude_meters * np.tan(half_angle))
         known, make = evaluator.path_generators, tools.PathGenerator
-        ours = {name: partial(our_ways, self._swath, name == FREE) for name in (FREE, CENTRE)}
+        ours = {name: partial(our_routes, self._swath, name == FREE) for name in (FREE, CENTRE)}
         evaluator.path_generators = {name: known[name] for name in BASELINES} | {
             name: make(name, function, self._config) for name, function in ours.items()
         }
@@ -154,8 +154,8 @@ class Terrain:
             table, _ = self._evaluator.run_baseline_evaluations()
         names, lengths = table['Algorithm'], table['Total Path Length (km)']
         if longest := [name for name, km in zip(names, lengths) if km > 1.0001 * budget]:
-            raise ValueError(f'{", ".join(longest)}: ways longer than {budget:g} km')
-        # The area that is swept by straight ways, which no others exceed.
+            raise ValueError(f'{", ".join(longest)}: routes longer than {budget:g} km')
+        # The area that is swept by straight lines, which no other routes exceed.
         number = int(np.ceil(self._config.budget / self._swath + DRONES * np.pi / 4.0))
         best = np.argsort(-self._prior, kind='stable')[:number]
         share = 100.0 * float(np.isin(self._square_of_victim, best).mean())
@@ -209,7 +209,7 @@ def page(results: Sequence[Result], budgets: Sequence[float], seed: int) -> str:
     judged = [one for one in results if 'refused' not in one]
     kinds = [one['class'] for one in judged]
     numbers = '; '.join(f'{kinds.count(kind)} {kind}' for kind in sorted(set(kinds)))
-    rows = [['ways'], *([name] for name in (*BASELINES, FREE, CENTRE, BOUND))]
+    rows = [['routes'], *([name] for name in (*BASELINES, FREE, CENTRE, BOUND))]
     parts = []
     for budget in budgets:
         means = class_means(judged, budget)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_planner.planners.orienteering import plan_ways
+from maasi_planner.planners.orienteering import plan_routes
 from maasi_sim.experiments.tables import markdown_table
 
 Array = NDArray[Any]
@@ -83,10 +83,10 @@ def evaluate_instance(path: Path, efforts: Sequence[float]) -> Result:
         return result | {'refused': str(error) or 'wrong format'}
     result |= {'nodes': len(nodes), 'ea4op': theirs, 'gaps': {}, 'seconds': {}}
     # Compiles what is not compiled yet.
-    plan_ways(nodes[1:4], np.ones(len(nodes[1:4])), nodes[:1], np.array([limit]), nodes[:1])
+    plan_routes(nodes[1:4], np.ones(len(nodes[1:4])), nodes[:1], np.array([limit]), nodes[:1])
     for effort in efforts:
         begun = process_time()
-        [order] = plan_ways(
+        [order] = plan_routes(
             nodes[1:], scores[1:], nodes[:1], np.array([limit]), nodes[:1], effort=effort
         )
         result['seconds'][f'{effort:g}'] = process_time() - begun

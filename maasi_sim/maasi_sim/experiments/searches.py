@@ -127,7 +127,7 @@ def outcome_of(result: RunLog, most_measurements: int | None, time_limit: float)
 
 
 def lane_share(places: FloatArray, side: float) -> float:
-    """Return the share of a way (n, 3) that is straight along an axis over half of `side` [m]."""
+    """Return the share of a path (n, 3) that is straight along an axis over half of `side` [m]."""
     steps = np.diff(places, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     steps, lengths = steps[lengths > 0.0], lengths[lengths > 0.0]
@@ -139,7 +139,7 @@ def lane_share(places: FloatArray, side: float) -> float:
     heading = np.where(np.abs(along) >= _STRAIGHT * lengths, 2 * axis + 1 + (along > 0.0), 0)
     turns = np.flatnonzero(np.diff(heading)) + 1
     legs = zip(np.split(heading, turns), np.split(lengths, turns))
-    lanes = [leg.sum() for way, leg in legs if way[0] and leg.sum() >= _LANE * side]
+    lanes = [leg.sum() for axis, leg in legs if axis[0] and leg.sum() >= _LANE * side]
     return float(sum(lanes) / lengths.sum())
 
 
@@ -164,23 +164,23 @@ def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
         explored.append(exploration.explored_fraction())
     outcome.columns = {**columns, 'explored': explored}
     outcome.summary['explored'] = explored[-1] if explored else 0.0
-    ways = [np.stack([columns[f'{name}_{axis}'] for axis in 'xyz'], 1) for name in detections]
-    outcome.summary['lanes'] = float(np.mean([lane_share(way, side) for way in ways]))
+    paths = [np.stack([columns[f'{name}_{axis}'] for axis in 'xyz'], 1) for name in detections]
+    outcome.summary['lanes'] = float(np.mean([lane_share(path, side) for path in paths]))
     return outcome
 
 
 def run_among_obstacles(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a search and measure the least distance of a robot's centre to an obstacle on its way."""
+    """Run a search and measure the least distance of a robot's centre to an obstacle."""
     scenario = scenario_from_values(settings['scenario'], 'settings')
     result = search(scenario, seed, settings['most_measurements'])
     outcome = outcome_of(result, settings['most_measurements'], scenario.limits.time)
     area = Area(scenario.environment)
     share = np.linspace(0.0, 1.0, 5)[:, None, None]
-    ways = [
+    paths = [
         (path[:-1, 1:] + share * np.diff(path[:, 1:], axis=0)).reshape(-1, 3)
         for path in result.trajectories.values()
     ]
-    nearest = [area.distances(place).min(initial=np.inf) for way in ways for place in way]
+    nearest = [area.distances(place).min(initial=np.inf) for path in paths for place in path]
     outcome.summary['clearance'] = float(min(nearest)) if scenario.environment.obstacles else None
     return outcome
 

@@ -201,7 +201,7 @@ _COMPARED = (
     TIME,
     Quantity('mean_time', 'mean time to find', 's'),
     Quantity('measurements', 'measurements'),
-    Quantity('distance', 'way', 'm'),
+    Quantity('distance', 'distance', 'm'),
 )
 QUANTITIES = (
     *_COMPARED,

@@ -96,7 +96,7 @@ def draw_report(
     for view in views:
         draw_map(view)
         for name, colour in colours.items():
-            _draw_way(view, record.trajectories[name], colour, record.end_time, name)
+            _draw_path(view, record.trajectories[name], colour, record.end_time, name)
     for marker, label in (('s', 'start'), ('o', 'end')):
         views[0].axes.plot([], [], marker, color=PALE, ms=7, label=label)
     _add_legend(figure, views)
@@ -158,7 +158,7 @@ def _shades(colour: str) -> LinearSegmentedColormap:
     )
 
 
-def _draw_way(view: MapView, path: FloatArray, colour: str, end: float, label: str) -> None:
+def _draw_path(view: MapView, path: FloatArray, colour: str, end: float, label: str) -> None:
     if len(path):
         places = view.points(path[:, 1:]).T
         lines = LineCollection(

@@ -102,10 +102,10 @@ class OdometryModel:
         dx, dy, dh, nx, ny, nz, nh, *twist_noise = generator.standard_normal(13).tolist()
         x, y, z = self._from_start(*state.pose.position.tolist())
         move_x, move_y = x - self._last[0], y - self._last[1]
-        way = math.sqrt(move_x * move_x + move_y * move_y)
+        distance = math.sqrt(move_x * move_x + move_y * move_y)
         drifts = (settings, self.reported)
-        if way > 0.0 and any(item.position_drift + item.heading_drift > 0.0 for item in drifts):
-            root = math.sqrt(way)
+        if distance > 0.0 and any(one.position_drift + one.heading_drift > 0.0 for one in drifts):
+            root = math.sqrt(distance)
             before = self._place(x, y)
             self._turn += settings.heading_drift * root * dh
             # A heading error rotates the estimate around the robot, not around the origin.
@@ -115,7 +115,7 @@ class OdometryModel:
                 self._offset[0] + before[0] - after[0] + drift * dx,
                 self._offset[1] + before[1] - after[1] + drift * dy,
             )
-            self._grow(move_x, move_y, way)
+            self._grow(move_x, move_y, distance)
         self._last = (x, y, z)
         noise = settings.position_noise
         place = self._place(x, y)
@@ -148,21 +148,21 @@ class OdometryModel:
         cosine, sine = math.cos(self._turn), math.sin(self._turn)
         return (self._offset[0] + cosine * x - sine * y, self._offset[1] + sine * x + cosine * y)
 
-    def _grow(self, move_x: float, move_y: float, way: float) -> None:
+    def _grow(self, move_x: float, move_y: float, distance: float) -> None:
         """Propagate the covariance of the drift over a move, which a heading error rotates."""
         cosine, sine = math.cos(self._turn), math.sin(self._turn)
         # d(x, y) / d(heading).
         a = -(sine * move_x + cosine * move_y)
         b = cosine * move_x - sine * move_y
         xx, xy, yy, xh, yh, hh = self._drift
-        place = way * self.reported.position_drift**2
+        place = distance * self.reported.position_drift**2
         self._drift = (
             xx + 2.0 * a * xh + a * a * hh + place,
             xy + a * yh + b * xh + a * b * hh,
             yy + 2.0 * b * yh + b * b * hh + place,
             xh + a * hh,
             yh + b * hh,
-            hh + way * self.reported.heading_drift**2,
+            hh + distance * self.reported.heading_drift**2,
         )
 
     def _covariance(self) -> FloatArray:

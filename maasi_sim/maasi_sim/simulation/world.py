@@ -70,7 +70,7 @@ class TargetSettings(Settings):
     )
 
     @model_validator(mode='after')
-    def _one_way(self) -> TargetSettings:
+    def _one_of_count_and_positions(self) -> TargetSettings:
         if (self.count is None) == (self.positions is None):
             raise ValueError('targets: give either count or positions')
         return self
@@ -89,7 +89,7 @@ class World:
     walk: float = 0.0
     seed: int = 0
     labels: tuple[Label, ...] = ()
-    _way: list[FloatArray] = field(default_factory=list, compare=False, repr=False)
+    _trajectory: list[FloatArray] = field(default_factory=list, compare=False, repr=False)
 
     @property
     def bounds(self) -> FloatArray:
@@ -105,15 +105,15 @@ class World:
         """Return target positions at a discrete step, (n, d) [m], reflected at the bounds."""
         if self.walk == 0.0:
             return self.targets
-        if not self._way:
-            self._way.append(self.targets)
+        if not self._trajectory:
+            self._trajectory.append(self.targets)
         low, high = self.bounds[:, 0], self.bounds[:, 1]
-        while len(self._way) <= step:
-            generator = noise_stream(self.seed, step=len(self._way), purpose='walk')
-            moved = self._way[-1] + self.walk * generator.standard_normal(self.targets.shape)
+        while len(self._trajectory) <= step:
+            generator = noise_stream(self.seed, step=len(self._trajectory), purpose='walk')
+            moved = self._trajectory[-1] + self.walk * generator.standard_normal(self.targets.shape)
             moved = np.where(moved < low, 2.0 * low - moved, moved)
-            self._way.append(np.where(moved > high, 2.0 * high - moved, moved))
-        return self._way[step]
+            self._trajectory.append(np.where(moved > high, 2.0 * high - moved, moved))
+        return self._trajectory[step]
 
     def targets_3d_at(self, step: int) -> FloatArray:
         """Return the same with three coordinates, (n, 3); z = 0 on a floor."""

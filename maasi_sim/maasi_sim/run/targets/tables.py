@@ -88,7 +88,7 @@ def found_geojson(rows: Sequence[Row]) -> str:
 
 def searched(record: RunLog, explored: UnexploredMap, origin: OriginSettings) -> list[Row]:
     """Return the area, the explored ground and the paths of the robots as features."""
-    return [*_area(record, origin), _explored(explored, origin), *_ways(record, origin)]
+    return [*_area(record, origin), _explored(explored, origin), *_paths(record, origin)]
 
 
 def _area(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
@@ -121,16 +121,16 @@ def _polygon(polygon: BaseGeometry, origin: OriginSettings, properties: Row) -> 
     return _feature(mapping(placed), properties)
 
 
-def _ways(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
+def _paths(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
     spacing = 1e-3 * np.linalg.norm(np.ptp(record.scenario.environment.array(), axis=1))
     for robot, states in sorted(record.trajectories.items()):
-        way = states[np.isfinite(states).all(axis=1)]
-        if len(way) < 2:
+        path = states[np.isfinite(states).all(axis=1)]
+        if len(path) < 2:
             continue
-        lengths = np.linalg.norm(np.diff(way[:, 1:], axis=0), axis=1)
+        lengths = np.linalg.norm(np.diff(path[:, 1:], axis=0), axis=1)
         passed = np.append(0.0, lengths.cumsum())
-        way = way[np.union1d(np.unique(passed // spacing, return_index=True)[1], len(way) - 1)]
-        places, times = _coordinates(way[:, 1:], origin).tolist(), way[:, 0].tolist()
+        path = path[np.union1d(np.unique(passed // spacing, return_index=True)[1], len(path) - 1)]
+        places, times = _coordinates(path[:, 1:], origin).tolist(), path[:, 0].tolist()
         properties = {'kind': 'way', 'robot': robot, 'length': passed[-1], 'times': times}
         yield _feature({'type': 'LineString', 'coordinates': places}, properties)
 

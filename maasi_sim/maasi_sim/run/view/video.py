@@ -66,7 +66,7 @@ class Moments:
         self.last: dict[str, dict[str, Event]] = defaultdict(dict)
         self.seen: list[Event] = []
         # : By robot: path so far, tour, and waypoint (None: it stays).
-        self.ways: dict[str, list[list[float]]] = defaultdict(list)
+        self.paths: dict[str, list[list[float]]] = defaultdict(list)
         self.tours: dict[str, list[list[float]]] = {}
         self.waypoints: dict[str, list[float] | None] = {}
         #: Cuboids visited.
@@ -84,7 +84,7 @@ class Moments:
             _, kind, owner, *content = event
             self.last[kind][owner] = event
             if kind == 'robot':
-                self.ways[owner].append(content[0][:3])
+                self.paths[owner].append(content[0][:3])
             elif kind == 'seen':
                 self.seen.append(event)
             elif kind == 'plan':
@@ -300,7 +300,7 @@ class Sheet:
                 level = math.cos(elevation)
                 ray = level * math.cos(bearing), level * math.sin(bearing), math.sin(elevation)
                 self._line(np.add(place, np.multiply(reach, ray)), '+', color=SEEN, ms=6)
-        places = {name: way[-1] for name, way in now.ways.items()}
+        places = {name: path[-1] for name, path in now.paths.items()}
         for name, event in now.last['cuboid'].items():
             for other in places.keys() & {*event[6]} if name in places else ():
                 self._line([places[name], places[other]], ':', color='0.3', lw=1.0)
@@ -310,9 +310,9 @@ class Sheet:
         (*place, yaw), _, status = now.last['robot'][name][3:6]
         away = status in (UNAVAILABLE, LEFT, SILENT)
         if status != LEFT:
-            way = now.ways[name]
-            way = [*way[:: math.ceil(len(way) / _MOST_POINTS)], way[-1]]
-            self._line(way, '-', color=colour, lw=1.3)
+            path = now.paths[name]
+            path = [*path[:: math.ceil(len(path) / _MOST_POINTS)], path[-1]]
+            self._line(path, '-', color=colour, lw=1.3)
         colour = AWAY if away else colour
         if status == MOVING:
             self._line(now.last['way'].get(name, [[]])[-1], '--', color=colour, lw=1.3)

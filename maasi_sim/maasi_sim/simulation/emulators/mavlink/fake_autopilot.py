@@ -91,7 +91,7 @@ class FakeAutopilot:
         self.height_error = 0.0
         self.origin = np.zeros(3)
         self._sender, self._generator = sender, generator
-        self._way_home = ReturnFlight(self.body)
+        self._return_flight = ReturnFlight(self.body)
         self._home = 0.0  # true height at arming [m]
         # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
@@ -200,7 +200,7 @@ class FakeAutopilot:
                 if self._guided is not None:
                     self._guided.hold(target)
         elif self.mode_name == 'RTL':
-            if self._way_home.run(dt):
+            if self._return_flight.run(dt):
                 self.disarm('Landed')
         elif self._guided is not None and self.mode == self.firmware.external:
             self._guided.run(self.now, dt)
@@ -400,7 +400,7 @@ class FakeAutopilot:
             return int(_FAILED)
         if not self.armed:
             self.armed, self._armed_at = True, self.now
-            self._way_home = ReturnFlight(self.body)
+            self._return_flight = ReturnFlight(self.body)
             self._home = float(self.body.position[2])
             self._station_at = min(self._station_at, self.now)
             self.say(6, 'Arming motors')

@@ -7,7 +7,7 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 
-# Speed for each metre of way left, of the position controller [1/s]; largest yaw rate [rad/s].
+# Speed for each metre that remains, of the position controller [1/s]; largest yaw rate [rad/s].
 _GAIN, _YAW_RATE = 1.0, 1.0
 _FALL, _BUOYANCY = -3.0, 0.1  # speed without power: a submarine rises [m/s]
 

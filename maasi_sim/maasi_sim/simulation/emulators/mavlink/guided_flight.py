@@ -34,7 +34,7 @@ def square_root_speed(error: float, gain: float, acceleration: float, dt: float)
 
 
 def _speed_change(error: float, wish: float, closing: float, gain: float, most: float) -> float:
-    """Return the change of that speed on the way [m/s^2]; `sqrt_controller_accel`."""
+    """Return the change of that speed during the approach [m/s^2]; `sqrt_controller_accel`."""
     if not wish * closing > 0.0:
         return 0.0
     if error <= most / gain**2:
