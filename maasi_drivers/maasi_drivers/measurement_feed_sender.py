@@ -72,7 +72,7 @@ def main(arguments: list[str] | None = None) -> int:
             if source.error != said:
                 said = source.error
                 print(said or 'video: receiving frames', file=sys.stderr)
-            frame = source.take()
+            frame = source.pop_frame()
             if frame is None:
                 if done:
                     break

@@ -29,15 +29,15 @@ def test_in_lockstep_a_reading_counts_from_the_step_after_its_own(order):
     for index, message in zip(order, waiting):
         message.header.stamp.sec = index
     handle = SimpleNamespace(take_message=lambda *_: (waiting.pop(),) if waiting else None)
-    taken = []
+    charges = []
     topic = BatteryTopic(
         SimpleNamespace(
             settings=SimpleNamespace(lockstep=True, battery_unit='fraction'),
             create_subscription=lambda *_: SimpleNamespace(handle=handle),
-            take_charge=taken.append,
+            take_charge=charges.append,
         )
     )
     for second, expected in ((0.0, []), (1.0, [1.0]), (1.0, []), (2.5, [0.75, 0.5])):
-        taken.clear()
+        charges.clear()
         topic.receive_before(round(second * 1e9))
-        assert taken == expected
+        assert charges == expected

@@ -142,7 +142,7 @@ class GuidedPlay(Play):
         goal = Goal(1, 0, np.array(position, dtype=float))
         replaced = self.driver.follower.adopt(goal)
         assert replaced is None
-        self.link.goal_taken(goal)
+        self.link.on_new_goal(goal)
         return self
 
     def arrives(self, limit=120.0):

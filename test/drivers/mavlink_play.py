@@ -31,7 +31,7 @@ class Wire:
         if not self.cut:
             self.data += data
 
-    def take(self):
+    def read(self):
         data, self.data = bytes(self.data), bytearray()
         messages = self._parser.parse_buffer(data) or []
         self.messages += messages
@@ -106,7 +106,7 @@ class Play:
         """Be another ground station, on its own link."""
         wire = Wire()
         mavlink.MAVLink(wire, system, component).heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4)
-        for message in wire.take():
+        for message in wire.read():
             self.autopilot.handle(message, link=1)
 
     def stands(self, seconds=0.0):
@@ -124,13 +124,13 @@ class Play:
             self._permitted = False
             self.permit()
         self.autopilot.advance(PERIOD)
-        received = self.to_driver.take()
+        received = self.to_driver.read()
         if self.driver_lives:
             for message in received:
                 self.vehicle.handle(message, self.now)
             self.vehicle.tick(self.now)
-            self.reports += self.vehicle.log.take()
-        for message in self.to_autopilot.take():
+            self.reports += self.vehicle.log.pop_all()
+        for message in self.to_autopilot.read():
             self.autopilot.handle(message)
 
     def run(self, seconds, before=lambda: None):

@@ -220,7 +220,7 @@ class Team(Node):
         """Send a goal that is aborted at once; return the reason."""
         return self.aborted(self.send_accepted(*arguments, **options)[1])
 
-    def takes(self, *arguments, live=None):
+    def accepts(self, *arguments, live=None):
         """Return whether the robot sets out for a goal; it moves on meanwhile."""
         live, moving = live or ((lambda: None) if self.deaf else self.move), AgentState.MOVING
         _, result = self.send_accepted(*arguments)

@@ -195,7 +195,7 @@ def test_a_goal_that_makes_no_sense_is_refused(play, capfd):
     team.move()
     assert team.state.goal_status == AgentState.IDLE
     # On the border, within the robot's radius, is allowed.
-    assert team.takes([2.5, 0.5, 0.0])
+    assert team.accepts([2.5, 0.5, 0.0])
 
 
 def test_bad_odometry_is_counted_and_nothing_else(play):
@@ -240,7 +240,7 @@ def test_a_jump_of_the_stamps_begins_anew(play):
     driver.reset()
     assert 'no odometry' in team.refused([1.0, 1.0, 0.0])
     team.move()
-    assert team.takes([1.0, 1.0, 0.0])
+    assert team.accepts([1.0, 1.0, 0.0])
 
 
 def test_a_batch_is_answered_with_what_the_image_shows(play):

@@ -245,7 +245,7 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     # A new goal soon after a cancelled one keeps it up.
     pilot.goal_cancelled(flight.time)
     flight.step(20)
-    pilot.goal_taken()
+    pilot.on_new_goal()
     flight.step(200)
     assert pilot.phase is MamboPhase.FLYING
     flight.flown().goal = None
@@ -254,7 +254,7 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     assert hovers <= AT_MOST
     assert hovers + flight.until_it_is(FlyingState.LANDED) >= pilot.settings.cancel_landing
     flight.step(50)
-    pilot.goal_taken()
+    pilot.on_new_goal()
     flight.step(50)
     assert pilot.problem == f'on the ground, {UNTIL_ARM}' and firmware.take_offs == 1
     # On the ground it ends the permission.

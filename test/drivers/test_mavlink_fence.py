@@ -167,7 +167,7 @@ def test_messages_that_are_lost_are_sent_again(seed):
     generator, lost = np.random.default_rng(seed), [0]
     for wire in (play.to_driver, play.to_autopilot):
 
-        def take(whole=wire.take):
+        def read(whole=wire.read):
             received = whole()
             kept = [
                 item
@@ -177,6 +177,6 @@ def test_messages_that_are_lost_are_sent_again(seed):
             lost[0] += len(received) - len(kept)
             return kept
 
-        wire.take = take
+        wire.read = read
     play.until(lambda: 'fence: ' in play.said, limit=120.0)
     assert VERIFIED in play.said and has(play, items_of()) and lost[0] > 3

@@ -154,7 +154,7 @@ def test_what_cannot_be_sent_is_refused(sent, text):
 
 def received(receiver, number):
     packets = []
-    wait_until(lambda: packets.extend(receiver.take()) or len(packets) >= number)
+    wait_until(lambda: packets.extend(receiver.receive()) or len(packets) >= number)
     return packets
 
 
@@ -232,7 +232,7 @@ def test_a_video_is_played_at_its_rate(video):
     source, frames = VideoSource(str(video)), []
 
     def look():
-        frame = source.take()
+        frame = source.pop_frame()
         frames.extend([] if frame is None else [frame])
         time.sleep(0.001)
 
@@ -256,7 +256,7 @@ def test_a_source_that_is_not_there_is_said_and_a_device_is_tried_again(tmp_path
     device = VideoSource('/dev/video77')
     wait_until(lambda: device.error)
     assert 'cannot be opened' in device.error
-    assert device.take() is None and not device.ended
+    assert device.pop_frame() is None and not device.ended
     device.close()
 
 
@@ -269,7 +269,7 @@ def test_the_reference_sender_sends_what_it_sees(feed, video):
     packets = received(receiver, 1)
     output, _ = sender.communicate(timeout=PATIENCE)
     assert sender.returncode == 0 and 'images sent' in output
-    packets += receiver.take()
+    packets += receiver.receive()
     for sent, _ in packets:
         assert sent.age >= 0.03
         column = 30.0 + 5.0 * (sent.sequence - 1)

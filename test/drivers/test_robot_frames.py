@@ -155,7 +155,7 @@ def test_a_driver_follows_poses_on_tf_and_stops_when_they_go_stale(play):
     assert 'no pose on tf' in team.refused([1.8, 1.8, 0.0])
     # They are back.
     team.until(lambda: robot.move() or team.state.goal_status != AgentState.UNAVAILABLE)
-    assert team.takes([1.8, 1.8, 0.0], live=robot.move)
+    assert team.accepts([1.8, 1.8, 0.0], live=robot.move)
 
 
 def test_a_driver_takes_poses_of_a_localiser_from_a_topic(play):
@@ -240,7 +240,7 @@ def test_a_goal_in_another_frame_is_reached_where_that_is(play):
     cart = transform('map', 'cart', DOCK, team.step * NANOSECONDS)
     moving.publish(TFMessage(transforms=[cart, odd]))
     team.until(lambda: driver.dropped['transform'] == 2)
-    assert team.takes([0.0, 0.0, 0.0])
+    assert team.accepts([0.0, 0.0, 0.0])
     # Beyond `odometry_timeout`, short of a jump of time.
     team.step += round(35.0 / STEP)
     team.move()
@@ -254,7 +254,7 @@ def test_without_tf2_msgs_there_is_no_tf_and_all_else_works(play, monkeypatch, c
     assert not team.count_publishers('/tf') and team.count_publishers('robot_description') == 1
     assert capfd.readouterr().err.count('tf2_msgs is not installed') == 1
     assert 'allowed is' in team.refused([0.0, 0.0, 0.0], frame='dock')
-    assert team.takes([1.0, 1.0, 0.0])
+    assert team.accepts([1.0, 1.0, 0.0])
     for transition in ('deactivate', 'cleanup'):
         assert getattr(driver, f'trigger_{transition}')().name == 'SUCCESS'
     driver.set_parameters([Parameter('pose_source', value='tf')])

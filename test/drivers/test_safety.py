@@ -86,7 +86,7 @@ def test_without_odometry_the_robot_is_stopped(play, fault):
     team.say()
     team.until(lambda: team.state.step == team.step)
     assert team.state.goal_status == AgentState.ABORTED
-    assert team.takes([1.0, 1.0, 0.0])
+    assert team.accepts([1.0, 1.0, 0.0])
 
 
 def hanging(team):
@@ -129,7 +129,7 @@ def test_a_pose_that_hangs_under_a_command_to_move_stops_the_robot(play, kind):
     team.body.step([0.2, 0.0, 0.0, 0.3], 0.5)
     team.move()
     assert team.state.goal_status == AgentState.ABORTED
-    assert team.takes([1.0, 1.0, 1.0 if kind == 'mambo' else 0.0])
+    assert team.accepts([1.0, 1.0, 1.0 if kind == 'mambo' else 0.0])
 
 
 @pytest.mark.parametrize('fault', ['silent', 'repeats itself'])
@@ -161,7 +161,7 @@ def test_a_camera_that_hangs_stops_the_robot(play, fault):
     for _ in range(3):
         move()
     team.until(lambda: move() or team.state.goal_status == AgentState.ABORTED)
-    assert team.takes([1.0, 1.0, 0.0])
+    assert team.accepts([1.0, 1.0, 0.0])
 
 
 def test_a_guard_that_has_gone_is_reported(play, start_guard, capfd):
@@ -200,7 +200,7 @@ def test_a_battery_is_read_in_its_unit_and_a_low_one_ends_the_way(play, capfd, m
     read(math.nan, -1.0)
     assert 'battery at 15 %' in team.state.reason
     read(0.9 * full, 0.9)
-    assert team.takes([1.0, 1.0, 0.0])
+    assert team.accepts([1.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize('lockstep', [False, True])
@@ -235,7 +235,7 @@ def test_every_battery_has_a_floor(play):
     gives_up(team, result, 'battery at 4 %, below 5 %')
     team.battery.publish(BatteryState(percentage=0.3))
     team.until(lambda: team.move() or team.state.battery == pytest.approx(0.3))
-    assert team.takes([1.0, 1.0, 0.0])
+    assert team.accepts([1.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
@@ -260,7 +260,7 @@ def test_a_robot_outside_of_its_bounds_is_stopped(play, kind):
     assert '1 m outside of the area' in team.aborted(result)
     assert team.state.goal_status == AgentState.UNAVAILABLE
     put(2.3, 1.0)
-    assert team.takes([1.0, 1.0, height])
+    assert team.accepts([1.0, 1.0, height])
 
 
 def test_a_flying_robot_in_the_plane_is_not_sent_to_another_height(play):
@@ -271,7 +271,7 @@ def test_a_flying_robot_in_the_plane_is_not_sent_to_another_height(play):
     team.move(20)
     assert team.place[2] == pytest.approx(1.0, abs=0.01)
     # Its own height is that of the waypoints, and it may change it a little.
-    assert team.takes([1.2, 1.2, 1.3])
+    assert team.accepts([1.2, 1.2, 1.3])
 
 
 @pytest.mark.parametrize('options', [{'wants': Twist}, {'command_type': 'twist'}])
@@ -321,7 +321,7 @@ def test_a_stopped_robot_stands_and_refuses_goals_until_it_is_released(play, kin
     assert STOPPED in team.refused(goal)
     assert team.call('release').success
     team.until(lambda: team.move() or team.state.goal_status != AgentState.UNAVAILABLE)
-    assert team.takes(goal)
+    assert team.accepts(goal)
 
 
 # ---- the driver's process, and the guard of its robot ----------------------------------------

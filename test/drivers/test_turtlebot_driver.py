@@ -75,7 +75,7 @@ def test_without_a_scan_that_makes_sense_the_robot_is_stopped(play):
     assert_array_equal(team.command, np.zeros(4))
     assert 'no scan for' in team.aborted(result) and 'no scan for' in team.state.reason
     team.until(lambda: robot.move() or team.state.goal_status == AgentState.ABORTED)
-    assert team.takes([1.4, 1.5, 0.0], live=robot.move)
+    assert team.accepts([1.4, 1.5, 0.0], live=robot.move)
 
 
 def test_a_waypoint_that_cannot_be_reached_is_given_up(play):

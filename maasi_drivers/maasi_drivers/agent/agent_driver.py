@@ -61,7 +61,7 @@ class AgentDriver(RobotNode):
 
     Services
     --------
-    `stop`, `release` (std_srvs/Trigger): the robot stops, and takes no goals until `release`
+    `stop`, `release` (std_srvs/Trigger): the robot stops, and accepts no goals until `release`
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ class HomeLanding:
         self._sent = False
         self._since = self._least = math.inf
 
-    def leave(self) -> None:
+    def on_new_goal(self) -> None:
         """Note a goal."""
         self._sent = True
         self._since, self._least = math.inf, math.inf

@@ -110,7 +110,7 @@ class GoalServer:
             return
         replaced = self._driver.follower.adopt(goal)
         # Before the other goal ends: the link must not stop the robot in between.
-        self._link.goal_taken(goal)
+        self._link.on_new_goal(goal)
         if replaced is not None:
             self.finish(replaced)
 

@@ -94,7 +94,7 @@ class RobotFrames:
         self._static: dict[str, TransformStamped] = {}
         self._map_from_odom: Pose | None = None
         self._slot: int | None = None
-        self._taken: int | None = None
+        self._last_stamp: int | None = None
         self._publisher: Publisher | None = None
         self._static_publisher: Publisher | None = None
         settings = node.settings
@@ -136,7 +136,7 @@ class RobotFrames:
     def clear(self) -> None:
         """Discard transforms that are not static, after a jump of the clock."""
         self._buffer.clear()
-        self._slot = self._taken = None
+        self._slot = self._last_stamp = None
 
     def publish(self, placed: StampedPose, map_from_odom: Pose) -> None:
         """Publish the robot's pose, at most `tf_rate` times per second of its stamps."""
@@ -209,12 +209,12 @@ class RobotFrames:
         settings = self._settings
         try:
             stamp = self._buffer.latest(settings.frame, self._base)
-            if stamp is None or stamp == self._taken:
+            if stamp is None or stamp == self._last_stamp:
                 return
             pose = self._buffer.pose(settings.frame, self._base, stamp)
         except TransformError:
             return  # the driver reports the missing pose
-        self._taken = stamp
+        self._last_stamp = stamp
         age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)
         if age > settings.odometry_timeout:
             self._node.drop(

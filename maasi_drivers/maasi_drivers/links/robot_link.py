@@ -84,7 +84,7 @@ class RobotLink(LinkHooks, ABC):
     def observe(self, placed: StampedPose) -> None:
         """Handle a new pose, before it is used."""
 
-    def goal_taken(self, goal: Goal) -> None:
+    def on_new_goal(self, goal: Goal) -> None:
         """Handle a new goal."""
 
     def make_motion(self) -> MotionModel:

@@ -201,7 +201,7 @@ class Nav2Link(TurtlebotLink):
         there = self._client.server_is_ready()
         return None if there else 'navigate_to_pose: Nav2 not available'
 
-    def goal_taken(self, goal: Goal) -> None:
+    def on_new_goal(self, goal: Goal) -> None:
         """Send the goal to Nav2, which replaces the previous one without a stop."""
         latest, heading = self.driver.history.latest, self.driver.settings.yaw
         if latest is not None:

@@ -256,7 +256,7 @@ class CameraInput(SensorInput[Picture]):
     def _receive_video(self, source: VideoSource) -> None:
         if source.error:
             self.driver.warn_throttled('video', source.error)
-        frame = source.take()
+        frame = source.pop_frame()
         stamp = None if frame is None else self.driver.arrivals.stamp(frame.received)
         if frame is None or stamp is None:
             return
@@ -272,8 +272,8 @@ class CameraInput(SensorInput[Picture]):
 
     def _receive_feed(self, feed: FeedReceiver) -> None:
         peer = self.driver.feed_peer
-        for packet, taken in feed.take():
-            if (stamp := self.driver.arrivals.stamp(taken)) is None:
+        for packet, time in feed.receive():
+            if (stamp := self.driver.arrivals.stamp(time)) is None:
                 continue
             try:
                 self._detector.check_size(packet.width, packet.height)

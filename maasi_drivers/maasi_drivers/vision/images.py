@@ -114,7 +114,7 @@ class VideoSource:
         self.live = '://' in source or source.startswith('/dev/') or source.isdigit()
         self.error = ''  # : problem; empty while frames arrive
         self.ended = False  # : whether a file has ended
-        # The newest one until it is taken.
+        # The newest one until it is read.
         self._frames: deque[VideoFrame] = deque(maxlen=1)
         self._count = 0
         self._closing = threading.Event()
@@ -122,7 +122,7 @@ class VideoSource:
         self._thread = threading.Thread(target=self._read, name='video source', daemon=True)
         self._thread.start()
 
-    def take(self) -> VideoFrame | None:
+    def pop_frame(self) -> VideoFrame | None:
         """Return the newest frame, or None if it was returned before."""
         return self._frames.popleft() if self._frames else None
 

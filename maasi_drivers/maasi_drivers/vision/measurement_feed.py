@@ -219,7 +219,7 @@ class FeedReceiver:
         """Stop listening."""
         self._socket.close()
 
-    def take(self) -> list[tuple[FeedPacket, float]]:
+    def receive(self) -> list[tuple[FeedPacket, float]]:
         """Return the packets since the last call with image times (monotonic clock [s])."""
         packets = []
         for _ in range(64):

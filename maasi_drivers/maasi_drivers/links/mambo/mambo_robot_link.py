@@ -201,9 +201,9 @@ class MamboRobotLink(RobotLink):
         """Return whether pose and images must change; on the ground nothing moves."""
         return self._pilot.phase is MamboPhase.FLYING and super().is_moving(placed, command)
 
-    def goal_taken(self, goal: Goal) -> None:
+    def on_new_goal(self, goal: Goal) -> None:
         """Keep the drone in the air."""
-        self._pilot.goal_taken()
+        self._pilot.on_new_goal()
 
     def goal_cancelled(self) -> None:
         """Let the drone land if no other goal follows."""

@@ -184,7 +184,7 @@ class MamboPilot:
             )
         return ''
 
-    def goal_taken(self) -> None:
+    def on_new_goal(self) -> None:
         """Note that it has a goal."""
         self._cancelled_at = None
 

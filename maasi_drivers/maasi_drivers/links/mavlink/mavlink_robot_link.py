@@ -174,10 +174,10 @@ class MavlinkRobotLink(RobotLink):
         with self._link.lock:
             self._link.vehicle.brake()
 
-    def goal_taken(self, goal: Goal) -> None:
+    def on_new_goal(self, goal: Goal) -> None:
         """Resume position set-points."""
         self._rejected = False
-        self._landing.leave()
+        self._landing.on_new_goal()
 
     def stop(self) -> None:
         """Let the vehicle hold its position or land, and wait for confirmation."""
@@ -293,7 +293,7 @@ class MavlinkRobotLink(RobotLink):
 
     def _log_reports(self) -> None:
         with self._link.lock:
-            reports = self._link.vehicle.log.take()
+            reports = self._link.vehicle.log.pop_all()
         logger = self.driver.get_logger()
         # The logger ties severities to calling lines.
         for severity, text in reports:

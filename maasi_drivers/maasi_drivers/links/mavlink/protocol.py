@@ -26,7 +26,7 @@ class ReportLog:
         self._texts.append((now, text))
         self.add(severity, f'autopilot: {text}')
 
-    def take(self) -> list[tuple[int, str]]:
+    def pop_all(self) -> list[tuple[int, str]]:
         """Return the reports since the last call: severity and text."""
         reports = list(self._reports)
         self._reports.clear()
