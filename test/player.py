@@ -55,11 +55,11 @@ class Player:
     def until(self, condition, *what):
         wait_until(condition, self.turn, *what)
 
-    def hear(self, kind, topic, quality=RELIABLE):
+    def collect(self, kind, topic, quality=RELIABLE):
         """Return the list that receives the messages of a topic."""
-        heard = []
-        self.node.create_subscription(kind, topic, heard.append, quality)
-        return heard
+        received = []
+        self.node.create_subscription(kind, topic, received.append, quality)
+        return received
 
     def call(self, service):
         client = self.node.create_client(Trigger, service)

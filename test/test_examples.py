@@ -185,17 +185,17 @@ def test_the_parameters_of_the_field_are_those_of_its_simulation():
 
 
 def test_the_nodes_of_the_field_become_active_with_their_file(tmp_path):
-    heard, processes, names = {}, [], set()
+    latest, processes, names = {}, [], set()
 
-    def hear(message):
-        heard.update({item.name: item.message for item in message.status})
+    def on_diagnostics(message):
+        latest.update({item.name: item.message for item in message.status})
 
     def active():
         assert all(process.poll() is None for process in processes)
-        return all(heard.get(name, '').startswith('active') for name in names)
+        return all(latest.get(name, '').startswith('active') for name in names)
 
     with alongside() as operator, ExitStack() as started:
-        operator.node.create_subscription(DiagnosticArray, '/diagnostics', hear, 50)
+        operator.node.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, 50)
         for file, (executable, *_) in OF_THE_FIELD.items():
             robot = file.partition('_')[0] if file.endswith(('_driver', '_guard')) else ''
             names.add('/' + file.replace(f'{robot}_', f'{robot}/') if robot else f'/{file}')
@@ -207,4 +207,4 @@ def test_the_nodes_of_the_field_become_active_with_their_file(tmp_path):
             processes.append(process)
             started.callback(process.wait, PATIENCE)
             started.callback(process.terminate)
-        operator.until(active, lambda: heard)
+        operator.until(active, lambda: latest)

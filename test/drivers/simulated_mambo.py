@@ -78,7 +78,7 @@ class Flight:
         for _ in range(number):
             self.time += STEP
             if not self.cut_up:
-                self.firmware.hear()
+                self.firmware.note_message()
             self.firmware.advance(STEP)
             if not self.cut_down:
                 self.flying_state = self.firmware.flying_state.name.lower().replace('_', '')

@@ -217,7 +217,7 @@ def test_it_flies_without_sensor_stamps_and_notices_a_lost_link(
     flight.seen_from_outside(source)
     _, result = flight.up().on_its_way()
     # One piloting command after the other, and what has to be acknowledged.
-    assert drone.heard[2, 0, 2] >= 5 and drone.heard[2, 8, 1]
+    assert drone.received[2, 0, 2] >= 5 and drone.received[2, 8, 1]
     drone.cut()
     flight.gives_up(result, 'link lost: no data from the Mambo')
     flight.until_said('landing: link lost')

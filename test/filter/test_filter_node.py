@@ -51,8 +51,8 @@ class Team(Player):
 
     def __init__(self, context):
         super().__init__(context, 'team')
-        self.updates = self.hear(FilterUpdate, 'filter_update', UPDATES)
-        self.found = self.hear(FoundTargetArray, 'found_targets', LATCHED)
+        self.updates = self.collect(FilterUpdate, 'filter_update', UPDATES)
+        self.found = self.collect(FoundTargetArray, 'found_targets', LATCHED)
         self.batch = self.node.create_publisher(MeasurementBatch, 'measurement_batch', RELIABLE)
         self.detections = {
             name: self.node.create_publisher(DetectionArray, f'{name}/detections', RELIABLE)
@@ -151,9 +151,9 @@ def test_keep_outs_outlive_their_publisher_and_nothing_is_born_in_them(team):
     publisher.publish(KeepOuts(version=4, zones=[zone]))
     team.until(lambda: team.tested.area.region is not None)
     team.node.destroy_publisher(publisher)
-    heard = team.hear(KeepOuts, 'keep_outs', LATCHED_ALL)
-    team.until(lambda: heard)
-    assert (heard[-1].version, list(heard[-1].zones)) == (4, ['1.3 1.1 0.3'])
+    received = team.collect(KeepOuts, 'keep_outs', LATCHED_ALL)
+    team.until(lambda: received)
+    assert (received[-1].version, list(received[-1].zones)) == (4, ['1.3 1.1 0.3'])
     for number in range(1, 6):
         update = team.step(number, {'a': SEEN})
         assert update.expected_number < 1e-3 and not update.newly_found
@@ -167,7 +167,7 @@ def test_found_targets_are_on_the_earth_where_the_map_has_an_origin(team):
     with running(environment=environment) as team:
         team.see(*range(1, 9))
         team.until(lambda: team.found and len(team.found[-1].targets) == 2)
-        fixes = team.hear(FoundFixArray, 'found_targets/fixes', LATCHED)
+        fixes = team.collect(FoundFixArray, 'found_targets/fixes', LATCHED)
         team.until(lambda: fixes and list(fixes[-1].ids) == [1, 2])
         latest, found = fixes[-1], team.found[-1]
         assert (latest.header, latest.batch_id) == (found.header, found.batch_id)
@@ -186,7 +186,7 @@ def test_the_filter_of_the_papers_counts_detections_of_found_targets_which_are_n
         preset='paper_000', found_radius=0.05, removal_distance=0.1, jitter_deviation=0.003
     )
     with running(filter=settings) as team:
-        reports = team.hear(DiagnosticArray, '/diagnostics')
+        reports = team.collect(DiagnosticArray, '/diagnostics')
         for number in range(1, 20):
             team.step(number, {'a': SEEN, 'b': SEEN})
         status = team.tested.status()
@@ -199,8 +199,8 @@ def test_the_filter_of_the_papers_counts_detections_of_found_targets_which_are_n
 
 
 def test_detections_that_do_not_fit_are_said_in_log_and_diagnostics(team):
-    reports = team.hear(DiagnosticArray, '/diagnostics')
-    lines = team.hear(Log, '/rosout', LATCHED_ALL)
+    reports = team.collect(DiagnosticArray, '/diagnostics')
+    lines = team.collect(Log, '/rosout', LATCHED_ALL)
     team.until(lambda: team.node.count_publishers('/rosout') >= 2)
     generator = np.random.default_rng(1)
     for number in range(1, 41):
@@ -241,7 +241,7 @@ WRONG = [
 
 
 def test_what_is_wrong_is_dropped_and_counted_and_the_node_goes_on(team):
-    reports, dropped = team.hear(DiagnosticArray, '/diagnostics'), Counter()
+    reports, dropped = team.collect(DiagnosticArray, '/diagnostics'), Counter()
     for number, (changes, reason) in enumerate(WRONG, start=1):
         assert team.step(number, {'a': SEEN}, **changes).expected_number == 0.0
         dropped[reason] += 1

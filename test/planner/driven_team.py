@@ -86,8 +86,8 @@ class Robot:
         self.start = Pose.from_yaw(self.settings.start, 0.0)
         motion = make_motion(self.settings.motion, radius=self.settings.radius)
         self.body = motion.body(RobotState(self.start))
-        self.commands = world.hear(TwistStamped, f'{name}/cmd_vel')
-        self.states = world.hear(AgentState, f'{name}/state')
+        self.commands = world.collect(TwistStamped, f'{name}/cmd_vel')
+        self.states = world.collect(AgentState, f'{name}/state')
         self.odometry = world.node.create_publisher(Odometry, f'{name}/odom', RELIABLE)
         self.go_to = ActionClient(world.node, GoToWaypoint, f'{name}/go_to')
 
@@ -139,8 +139,8 @@ class World(Player):
         self.settings = settings
         node, self.step, self.status = self.node, 0, {}
         self.robots = {name: Robot(self, name) for name in ROBOTS}
-        self._logs = self.hear(Log, '/rosout', LATCHED_ALL)
-        self.decisions = self.hear(PlanDecision, 'decisions')
+        self._logs = self.collect(Log, '/rosout', LATCHED_ALL)
+        self.decisions = self.collect(PlanDecision, 'decisions')
         node.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, 10)
         self.updates = node.create_publisher(FilterUpdate, 'filter_update', LATCHED)
         self.search = ActionClient(node, SearchTargets, 'search')

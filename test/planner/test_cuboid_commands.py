@@ -27,10 +27,10 @@ class Flight(Player):
     def __init__(self, context):
         super().__init__(context, 'flight')
         self.start(CuboidPlannerNode, SETTINGS, namespace='/rover')
-        self.commands = self.hear(TwistStamped, 'rover/cmd_vel')
-        self.states = self.hear(AgentState, 'rover/state')
-        self.links = self.hear(SearchLink, 'rover/link/tx')
-        self.decisions = self.hear(CuboidDecision, 'rover/decision')
+        self.commands = self.collect(TwistStamped, 'rover/cmd_vel')
+        self.states = self.collect(AgentState, 'rover/state')
+        self.links = self.collect(SearchLink, 'rover/link/tx')
+        self.decisions = self.collect(CuboidDecision, 'rover/decision')
         self.odometry = self.node.create_publisher(Odometry, 'rover/odom', RELIABLE)
         self.heard = self.node.create_publisher(SearchLinkArray, 'rover/link/rx', RELIABLE)
         self.step, self.place = 0, STILL

@@ -105,11 +105,11 @@ class Team(Player):
             )
             for name in ROBOTS
         ]
-        self.decisions = self.hear(PlanDecision, 'decisions')
-        self.batches = self.hear(MeasurementBatch, 'measurement_batch')
-        self.done = self.hear(LockstepDone, 'lockstep/done')
-        self.logs = self.hear(Log, '/rosout', LATCHED_ALL)
-        self.diagnostics = self.hear(DiagnosticArray, '/diagnostics')
+        self.decisions = self.collect(PlanDecision, 'decisions')
+        self.batches = self.collect(MeasurementBatch, 'measurement_batch')
+        self.done = self.collect(LockstepDone, 'lockstep/done')
+        self.logs = self.collect(Log, '/rosout', LATCHED_ALL)
+        self.diagnostics = self.collect(DiagnosticArray, '/diagnostics')
         publishers = [*self.states.values(), self.updates]
         self.until(
             lambda: (
@@ -135,7 +135,7 @@ class Team(Player):
 
     def begin(self):
         """Return once both robots are sent on their way."""
-        # Who is heard first plans alone; the other one at the next step.
+        # The robot that is received first plans alone; the other one at the next step.
         self.tell(0)
         self.tell(10)
         self.until(lambda: all(self.goals.values()))
@@ -292,7 +292,7 @@ def test_other_robots_have_colours_of_the_team_and_wrong_destinations_are_droppe
             team.until(answer.done)
             assert not answer.result().accepted
         assert team.tested.dropped['bad goal'] == 2
-        arrays = team.hear(MarkerArray, 'markers')
+        arrays = team.collect(MarkerArray, 'markers')
         team.begin()
         for step in (20, 40):
             team.tell(step)
@@ -370,7 +370,7 @@ def test_robots_are_held_until_the_filter_answers_again(silent, planner):
 
 
 def test_keep_outs_are_taken_by_service_published_and_checked(team):
-    heard = team.hear(KeepOuts, 'keep_outs', LATCHED)
+    received = team.collect(KeepOuts, 'keep_outs', LATCHED)
     client = team.node.create_client(SetKeepOuts, 'search/keep_outs')
     team.until(client.service_is_ready)
 
@@ -382,16 +382,16 @@ def test_keep_outs_are_taken_by_service_published_and_checked(team):
     before = len(team.tested.coordinator.robots['a'].candidates.at([0.0, 0.0, 0.0]))
     wrong = ask('0.5 0.5')
     assert not wrong.success and "got '0.5 0.5', allowed are x y radius" in wrong.message
-    assert not heard
+    assert not received
     assert ask('POLYGON ((0 0, 1 0, 1 1, 0 1, 0 0))', '0.2 0.2 0.1').success
-    team.until(lambda: heard)
-    assert heard[-1].version == 1 and len(heard[-1].zones) == 2
+    team.until(lambda: received)
+    assert received[-1].version == 1 and len(received[-1].zones) == 2
     coordinator = team.tested.coordinator
     assert len(coordinator.robots['a'].candidates.at([0.0, 0.0, 0.0])) < before
     assert not coordinator.robots['a'].facts.motion.keep_out.is_free([0.5, 0.5, 0.0])
     assert ask().success
-    team.until(lambda: heard[-1].version == 2)
-    assert not heard[-1].zones and coordinator.area.region is None
+    team.until(lambda: received[-1].version == 2)
+    assert not received[-1].zones and coordinator.area.region is None
 
 
 def zones_of(team):
@@ -401,28 +401,28 @@ def zones_of(team):
 @pytest.mark.parametrize('version', [1, 5])
 def test_keep_outs_of_before_a_restart_do_not_win_over_newer_ones(team, version):
     """Of a planner that started again the versions begin again; the filter has the old ones."""
-    heard = team.hear(KeepOuts, 'keep_outs', LATCHED_ALL)
+    received = team.collect(KeepOuts, 'keep_outs', LATCHED_ALL)
     client = team.node.create_client(SetKeepOuts, 'search/keep_outs')
     team.until(client.service_is_ready)
     answer = client.call_async(SetKeepOuts.Request(zones=['0.2 0.2 0.1']))
     team.until(answer.done)
     filter_ = team.node.create_publisher(KeepOuts, 'keep_outs', LATCHED)
-    team.until(lambda: filter_.get_subscription_count() == 2 and heard)
+    team.until(lambda: filter_.get_subscription_count() == 2 and received)
     old = KeepOuts(version=version, zones=['0.9 0.9 0.1'])
     filter_.publish(old)
-    team.until(lambda: heard[-1].version == version + 1)
-    assert list(heard[-1].zones) == ['0.2 0.2 0.1'] == zones_of(team)
+    team.until(lambda: received[-1].version == version + 1)
+    assert list(received[-1].zones) == ['0.2 0.2 0.1'] == zones_of(team)
     # Another planner changes them later.
     new = KeepOuts(version=version + 2, zones=['0.8 0.8 0.1'])
-    new.header.stamp = heard[-1].header.stamp
+    new.header.stamp = received[-1].header.stamp
     new.header.stamp.sec += 1
     filter_.publish(new)
     team.until(lambda: zones_of(team) == ['0.8 0.8 0.1'])
-    team.until(lambda: heard[-1].version == version + 2)
+    team.until(lambda: received[-1].version == version + 2)
 
 
 def test_found_targets_are_kept_for_a_filter_that_starts_again(team):
-    kept = team.hear(FoundTargetArray, 'found_targets/kept', LATCHED)
+    kept = team.collect(FoundTargetArray, 'found_targets/kept', LATCHED)
     team.until(lambda: kept)
     assert kept[0].targets == []
     publisher = team.node.create_publisher(FoundTargetArray, 'found_targets', LATCHED)

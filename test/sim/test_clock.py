@@ -26,7 +26,7 @@ JUMPS = tuple(item * SECOND for item in (60, 5, 61, 0, 2))
 
 
 class World(Operator):
-    """Publishes `/clock`, and odometry of a rover; hears what nodes say."""
+    """Publishes `/clock`, and odometry of a rover; collects the messages of nodes."""
 
     def __init__(self, domain):
         super().__init__(domain)
@@ -34,11 +34,11 @@ class World(Operator):
         self.clock = node.create_publisher(Clock, '/clock', RELIABLE)
         self.stamps = {}
         self.names, self.commands, self.states, self.logs = [], [], [], []
-        hear = node.create_subscription
-        hear(DiagnosticArray, '/diagnostics', self.take, 10)
-        hear(Log, '/rosout', lambda item: self.logs.append(item.msg), LATCHED_ALL)
-        hear(TwistStamped, '/rover/cmd_vel', self.commands.append, RELIABLE)
-        hear(AgentState, '/rover/state', self.states.append, RELIABLE)
+        subscribe = node.create_subscription
+        subscribe(DiagnosticArray, '/diagnostics', self.take, 10)
+        subscribe(Log, '/rosout', lambda item: self.logs.append(item.msg), LATCHED_ALL)
+        subscribe(TwistStamped, '/rover/cmd_vel', self.commands.append, RELIABLE)
+        subscribe(AgentState, '/rover/state', self.states.append, RELIABLE)
         self.odometry = node.create_publisher(Odometry, '/rover/odom', RELIABLE)
 
     def take(self, message):
@@ -50,7 +50,7 @@ class World(Operator):
         wait_until(condition, self.listen, *what, limit=PATIENCE)
 
     def listen(self):
-        """Take all that comes for a moment: what is said more often is heard late."""
+        """Receive messages for a moment."""
         end = time.monotonic() + 0.02
         while (left := end - time.monotonic()) > 0.0:
             self.executor.spin_once(timeout_sec=left)
@@ -241,7 +241,7 @@ def test_a_second_clock_that_says_zero_does_not_start_the_search_again(world, st
     other = world.node.create_publisher(Clock, '/clock', RELIABLE)
     world.until(lambda: other.get_subscription_count() and world.clock.get_subscription_count())
 
-    def heard():
+    def warned():
         # Of each publisher only the last message waits for a node that is busy.
         other.publish(Clock())
         world.listen()
@@ -249,6 +249,6 @@ def test_a_second_clock_that_says_zero_does_not_start_the_search_again(world, st
         return any('it has 2 publishers (operator), allowed is one' in line for line in world.logs)
 
     world.seen_at(SECOND, nodes)
-    world.until(heard)
+    world.until(warned)
     world.seen_at(5 * SECOND, nodes)
     assert 'the search starts again' not in interrupted(process)

@@ -26,7 +26,7 @@ from std_msgs.msg import Empty
 rclpy.init()
 node = rclpy.create_node('node')
 publisher = node.create_publisher(Empty, 'beat', 10)
-subscription = node.create_subscription(Empty, 'beat', lambda _: print('heard', flush=True), 10)
+subscription = node.create_subscription(Empty, 'beat', lambda _: print('received', flush=True), 10)
 node.create_timer(0.05, lambda: publisher.publish(Empty()))
 rclpy.spin(node)
 """
@@ -46,13 +46,13 @@ def write(folder, *names, content=bytes(64)):
 
 @contextmanager
 def started():
-    """Start a node; yield its process and its files, once it hears itself."""
+    """Start a node; yield its process and its files, once it receives its own messages."""
     process = subprocess.Popen(
         [sys.executable, '-c', NODE], stdout=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
         # Fast DDS says so where a port has gone that it was about to open, and takes another one.
-        assert 'heard\n' in iter(process.stdout.readline, '')
+        assert 'received\n' in iter(process.stdout.readline, '')
         maps = Path(f'/proc/{process.pid}/maps').read_text().split()
         opened = map(os.readlink, Path(f'/proc/{process.pid}/fd').iterdir())
         yield process, {Path(file) for file in (*maps, *opened) if '/dev/shm/fastrtps' in file}
@@ -77,7 +77,7 @@ def test_files_of_a_killed_node_go_and_those_of_a_live_one_stay(domain):
     with started() as (live, used):
         remove_dead()
         assert made(used) and all(path.exists() for path in made(used))
-        assert 'heard\n' in iter(live.stdout.readline, '')
+        assert 'received\n' in iter(live.stdout.readline, '')
         # A port is known by its mark.
         ports = [path for path in used if re.fullmatch(r'fastrtps_port\d+', path.name)]
         assert ports

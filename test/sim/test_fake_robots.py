@@ -70,7 +70,7 @@ def test_pyparrot_flies_it(pair):
     fake.cut_up = False
     wait_until(lambda: link.flying_state == 'landed')
     # Acknowledged commands are not repeated.
-    assert fake.refused == 0 and fake.heard[(2, 0, 1)] == 1
+    assert fake.refused == 0 and fake.received[(2, 0, 1)] == 1
     wait_until(lambda: not fake._unacked)
 
 
@@ -100,19 +100,19 @@ def test_a_packet_that_is_repeated_is_not_believed(pair, last):
 
     link._drone.drone_connection.handle_data = keep
     wait_until(lambda: len(packets) > 20)
-    fake.position_sent, heard = last, link.received_at
-    wait_until(lambda: link.received_at > heard)
+    fake.position_sent, before = last, link.received_at
+    wait_until(lambda: link.received_at > before)
     fake.cut_down = True
-    # Those on their way have come when nothing is heard for a while.
+    # Datagrams in transit have arrived once nothing is received for a while.
     wait_until(lambda: time.monotonic() - link.received_at > 1.0)
-    heard, received = link.received_at, link.position.received
+    before, received = link.received_at, link.position.received
     repeated = packets[-4:]
     if last == 'none':
         repeated = [packet for packet in packets if packet[7:11] == struct.pack('<BBH', 2, 18, 0)]
     for packet in repeated[-4:]:
         handle(packet)
-    assert link.received_at == heard and link.position.received == received
-    # What it did meanwhile is asked for when it is heard again.
+    assert link.received_at == before and link.position.received == received
+    # Its state is requested again once it is received again.
     fake.firmware.emergency()
     end = fake.firmware.time + 2.0
     wait_until(lambda: fake.firmware.time > end and not fake._unacked)
@@ -135,7 +135,7 @@ BAD_FRAMES = [
 
 def test_datagrams_that_are_not_the_drones_or_are_cut_short_do_not_end_the_link(pair):
     fake, link = pair
-    # It is heard on the address that faces the drone alone.
+    # The link receives only on the address that faces the drone.
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(('127.0.0.9', link.port))
     dropped = link._drone.drone_connection.udp_receive_sock.dropped
@@ -198,7 +198,7 @@ def test_a_fake_mambo_is_found_by_a_link():
         assert 'landed' in fake.stdout.readline()
 
 
-def test_a_fake_vehicle_is_heard_in_mavlink_2():
+def test_a_fake_vehicle_sends_mavlink_2():
     url = f'127.0.0.1:{free_port()}'
     connection = open_connection(f'udpin:{url}', 255, 190)
     options = ('--system', '7', '--firmware', 'ardusub', '--url', f'udpout:{url}')

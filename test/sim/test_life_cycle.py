@@ -77,7 +77,7 @@ def test_after_some_cycles_a_node_has_the_same_entities(context, kind):
     wait_until_known(node)
     configured = made_by(node), in_graph(node)
     assert configured[0]['publishers'] > unconfigured['publishers']
-    # The recorder looks for topics after it has heard the last publisher of each node.
+    # The recorder looks for topics after it has discovered the last publisher of each node.
     *_, step, ready = [item.topic_name for item in node.publishers]
     assert ready.endswith('lockstep/ready')
     assert step.endswith('lockstep/step') or 'sim' not in kind

@@ -49,7 +49,7 @@ def world(context, request):
 
 @pytest.mark.parametrize('world', [{'kind': 'filter', 'batch_timeout': TIMEOUT}], indirect=True)
 def test_a_batch_is_given_up_in_simulated_time(world):
-    updates = world.hear(FilterUpdate, '/filter_update', UPDATES)
+    updates = world.collect(FilterUpdate, '/filter_update', UPDATES)
     world.until(lambda: world.node.count_publishers('/filter_update'))
     # Its robot never answers.
     members = [BatchMember(robot='rover', measurement=1)]

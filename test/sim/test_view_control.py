@@ -114,11 +114,11 @@ def test_buttons_that_change_nothing_are_off_and_states_and_answers_are_whole(ch
             assert on == useful, headline
             shown.until(f"document.querySelector('#headline').textContent.startsWith('{headline}')")
         shown.page.click('button[data-command=stop]')
-        heard = shown.page.locator('#controls [role=status]')
+        status = shown.page.locator('#controls [role=status]')
         shown.until("document.querySelector('#controls [role=status]').innerText.endsWith('read')")
-        assert heard.inner_text() == f'stop all: {answer}'
+        assert status.inner_text() == f'stop all: {answer}'
         # Nothing of it is cut.
-        assert heard.evaluate('(part) => part.scrollWidth <= part.clientWidth + 1')
+        assert status.evaluate('(part) => part.scrollWidth <= part.clientWidth + 1')
 
 
 def test_wrong_addresses_and_scenarios_are_refused(ros, capsys):

@@ -185,7 +185,7 @@ def test_a_replay_plays_by_itself_and_says_what_happens_to_its_end(chromium, sea
     with chromium(reduced_motion='no-preference') as shown:
         shown.open(searched[0].as_uri())
         shown.until('maasi.playing && maasi.time > 0.5')
-        # No headline is read aloud before the one before it was heard.
+        # No headline is read aloud before the previous one has ended.
         shown.page.evaluate(
             'window.changes = []; const heading = document.querySelector("#headline");'
             'new MutationObserver(() => changes.push(Number(heading.dataset.since)))'

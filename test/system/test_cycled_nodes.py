@@ -52,10 +52,10 @@ class Cycler(Operator):
                 self.until(future.done, f'{where}: no answer')
                 assert future.result().success, where
 
-    def hear(self, kind, topic):
-        heard = []
-        subscription = self.node.create_subscription(kind, topic, heard.append, 10)
-        self.until(lambda: heard, f'nothing on {topic}')
+    def collect(self, kind, topic):
+        received = []
+        subscription = self.node.create_subscription(kind, topic, received.append, 10)
+        self.until(lambda: received, f'nothing on {topic}')
         self.node.destroy_subscription(subscription)
 
 
@@ -69,11 +69,11 @@ def test_nodes_survive_cycles_back_to_back_and_the_search_goes_on(tmp_path, scen
         cycler.run = run
         searches = not scenario.startswith('buildings')
         if searches:
-            cycler.hear(FilterUpdate, 'filter_update')
+            cycler.collect(FilterUpdate, 'filter_update')
         for name, times in cycles.items():
             cycler.cycle(name, int(os.environ.get('MAASI_CYCLES', times)))
         if searches:
-            cycler.hear(FilterUpdate, 'filter_update')
+            cycler.collect(FilterUpdate, 'filter_update')
         run.process.send_signal(signal.SIGINT)
         # Interrupted; 3 if a node had died.
         assert run.finish().code == 130, run.output

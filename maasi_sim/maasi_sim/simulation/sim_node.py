@@ -283,11 +283,13 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             return
         if self._ready_since is None:
             self._ready_since = now
-        unheard = [topic for node in self._expected for topic in self._connections.unheard(node)]
-        unheard += self._connections.unmatched()
-        if unheard and now - self._ready_since < _CONNECTION_PATIENCE:
+        lacking = [
+            topic for node in self._expected for topic in self._connections.unsubscribed(node)
+        ]
+        lacking += self._connections.unmatched()
+        if lacking and now - self._ready_since < _CONNECTION_PATIENCE:
             return
-        for topic in unheard:
+        for topic in lacking:
             self.get_logger().warning(f'continues without an expected subscription to {topic}')
         self._look_timer.cancel()
         self.get_logger().info(
@@ -304,8 +306,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     def _look_for_returned(self) -> None:
         now = time.monotonic()
         for node, since in sorted(self._returned.items()):
-            unheard = self._connections.unheard(node)
-            connected = not unheard and not self._connections.unmatched()
+            lacking = self._connections.unsubscribed(node)
+            connected = not lacking and not self._connections.unmatched()
             if connected or now - since > _CONNECTION_PATIENCE:
                 del self._returned[node]
                 self._connections.remember()

@@ -223,7 +223,7 @@ class Connections:
         self._node, self._expected = node, expected
         self._endpoints: dict[tuple[str, str], set[bytes]] = {}
 
-    def unheard(self, name: str) -> list[str]:
+    def unsubscribed(self, name: str) -> list[str]:
         """Return the topics of a node without a subscription since `remember`."""
         return [
             topic

@@ -47,8 +47,8 @@ class CuboidSimNode(SimNode):
             publisher = self.create_publisher(SearchLinkArray, f'{name}/link/rx', RELIABLE)
             self._link_publishers[name] = publisher
             self._expected[self._driver_of[name]].append(publisher.topic_name)
-            heard = partial(self._on_sent, name)
-            self.create_subscription(SearchLink, f'{name}/link/tx', heard, RELIABLE)
+            on_sent = partial(self._on_sent, name)
+            self.create_subscription(SearchLink, f'{name}/link/tx', on_sent, RELIABLE)
         self._link_timer = self.create_wall_timer(1.0, self._deliver)
         self._link_timer.cancel()
 
@@ -84,7 +84,7 @@ class CuboidSimNode(SimNode):
             for name, message in self._sent.items()
             if not message.silent
         }
-        heard = within_range(places, self.scenario.planner.communication_range)
+        in_range = within_range(places, self.scenario.planner.communication_range)
         stamp = stamp_to_ros(stamp_of_step(self.step, self.scenario.step))
         header = Header(frame_id=self.settings.frame, stamp=stamp)
         for name in self.simulation.present:
@@ -95,7 +95,7 @@ class CuboidSimNode(SimNode):
                 SearchLinkArray(
                     header=header,
                     step=self.step,
-                    messages=[self._sent[other] for other in heard.get(name, [])],
+                    messages=[self._sent[other] for other in in_range.get(name, [])],
                 )
             )
 

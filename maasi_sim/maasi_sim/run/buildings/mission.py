@@ -150,11 +150,11 @@ class CuboidMission:
         times = []
         done: dict[str, Plan] = {}
         for name, agent in self.agents.items():
-            heard = [broadcasts[other] for other in reach.get(name, [])]
-            wanted = _not_planned(heard, done, agent) if self.scheme == 'sequential' else None
+            received = [broadcasts[other] for other in reach.get(name, [])]
+            wanted = _not_planned(received, done, agent) if self.scheme == 'sequential' else None
             rng = decision_stream(self.seed, name, self.step)
             begun = time.perf_counter()
-            done[name] = agent.decide(heard, rng, wanted)
+            done[name] = agent.decide(received, rng, wanted)
             times.append(time.perf_counter() - begun)
         self.choices = done
         return times
@@ -175,10 +175,10 @@ class CuboidMission:
         return spent
 
 
-def _not_planned(heard: list[Broadcast], done: dict[str, Plan], agent: SearchAgent) -> BoolArray:
+def _not_planned(received: list[Broadcast], done: dict[str, Plan], agent: SearchAgent) -> BoolArray:
     """Return the cuboids that no plan of another robot contains, preferring new plans."""
     wanted = np.ones(len(agent.visited), dtype=bool)
-    for message in heard:
+    for message in received:
         if message.robot in done:
             planned = [n for _, n in done[message.robot].visits]
         else:

@@ -140,7 +140,7 @@ class FakeMambo:
     """A Mambo on this host, in real time, which a client such as pyparrot connects to.
 
     For tests: `position_sent` is 'true', 'none' or 'nan'; `cut_up` and `cut_down` lose
-    datagrams; `refused` counts invalid ones, `heard` commands by (project, class, id).
+    datagrams; `refused` counts invalid ones, `received` counts commands by (project, class, id).
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class FakeMambo:
         self.position_sent = 'true'
         self.cut_up = self.cut_down = False
         self.refused = 0
-        self.heard: Counter[tuple[int, int, int]] = Counter()
+        self.received: Counter[tuple[int, int, int]] = Counter()
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._controller: tuple[str, int] | None = None
@@ -295,7 +295,7 @@ class FakeMambo:
             self._done.clear()
             self._sequences.clear()
             self._said = None
-            self.firmware.hear()
+            self.firmware.note_message()
             answer = {'status': 0, 'c2d_port': self.command_port}
             visitor.sendall(json.dumps(answer).encode() + b'\0')
 
@@ -310,7 +310,7 @@ class FakeMambo:
             self.refused += 1
 
     def _take(self, frame: Frame) -> None:
-        self.firmware.hear()
+        self.firmware.note_message()
         if frame.kind == ACK:
             if frame.payload and frame.buffer == ACKED_EVENTS + 128:
                 self._unacked.pop(frame.payload[0], None)
@@ -325,7 +325,7 @@ class FakeMambo:
         if len(frame.payload) < _ID.size:
             raise ValueError(f'command: got {len(frame.payload)} bytes, allowed are {_ID.size}')
         number = _ID.unpack_from(frame.payload)
-        self.heard[number] += 1
+        self.received[number] += 1
         if number == ALL_STATES:
             self._said = None
             self._tell_state()

@@ -177,7 +177,7 @@ class MamboFirmware:
         self._readings = 0
         # Piloting commands, and the time at which they take effect.
         self._piloted: deque[tuple[float, Piloting]] = deque([(-math.inf, Piloting())])
-        self._heard_at = -math.inf
+        self._received_at = -math.inf
 
     @property
     def percent(self) -> int:
@@ -199,9 +199,9 @@ class MamboFirmware:
         self._readings += 1
         return self._odometry.step(self.state, self._readings).pose
 
-    def hear(self) -> None:
+    def note_message(self) -> None:
         """Note the time of a message from the controller."""
-        self._heard_at = self.time
+        self._received_at = self.time
 
     def take_off(self) -> None:
         """Take off, if it stands on the floor with a battery that is not empty."""
@@ -253,7 +253,7 @@ class MamboFirmware:
         state, settings = self.flying_state, self.settings
         if state in (FlyingState.LANDED, FlyingState.LANDING, FlyingState.EMERGENCY):
             return
-        silent = self.time - self._heard_at > settings.landing_timeout
+        silent = self.time - self._received_at > settings.landing_timeout
         if (silent and settings.lost_link == 'land') or self._critical:
             self.flying_state = FlyingState.LANDING
         elif state != FlyingState.TAKING_OFF:
