@@ -32,7 +32,7 @@ class Run:
             scenario=load_scenario('mambo', overrides), plan_nodes=lambda *_: plans
         )
         self.recorder = SimpleNamespace(
-            elapsed=0.0, step=None, time=0, ready={PLANNER}, take_heartbeats=self.take
+            elapsed=0.0, step=None, time=0, ready={PLANNER}, pop_heartbeats=self.pop
         )
         self.recorder.observer = SimpleNamespace(log=SimpleNamespace(last_steps={}))
         self.supervisor = Supervisor(mission, Options(), folder, ProgressDisplay())
@@ -42,7 +42,7 @@ class Run:
         for pid, node in enumerate(self.nodes.values(), start=1):
             node._popen = SimpleNamespace(pid=pid, poll=lambda: None)
 
-    def take(self):
+    def pop(self):
         beats, self.beats = self.beats, {}
         return beats
 

@@ -125,7 +125,7 @@ def test_the_autopilot_that_acts_on_its_fence_is_not_taken_for_the_pilot(guided,
     assert len(play.sent('SET_POSITION_TARGET_LOCAL_NED')) == sent
     # A pilot is one.
     other = guided()
-    other.autopilot.take_mode('LOITER')
+    other.autopilot.set_mode('LOITER')
     other.run(2.0)
     assert other.fault == 'vehicle: the pilot has taken over: mode LOITER'
 

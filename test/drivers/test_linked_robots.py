@@ -379,7 +379,7 @@ def test_a_vehicle_in_the_air_is_taken_over_and_the_answer_says_so(fly):
         # A pilot has brought it there.
         flight.inside.armed = True
         flight.inside.body.position[2] = 1.0
-        flight.inside.take_mode('GUIDED')
+        flight.inside.set_mode('GUIDED')
     flight.until(lambda: flight.driver.link.status().get('in the air'))
     flight.until_said('armed in GUIDED by another program')
     assert flight.call('arm').message == 'in the air: taking control at its position'
@@ -454,12 +454,12 @@ def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
     assert flight.doing == 'landing'
     # It lands again once a pilot who took it over gives it back.
     with flight.lock:
-        flight.inside.take_mode('LOITER')
+        flight.inside.set_mode('LOITER')
     flight.until_said('the pilot has taken over')
     begin = time.monotonic()
     flight.until(lambda: time.monotonic() - begin > 0.5)
     assert flight.inside.mode_name == 'LOITER' and 'battery at 15 %' in flight.reason
     with flight.lock:
-        flight.inside.take_mode('GUIDED')
+        flight.inside.set_mode('GUIDED')
     flight.until(lambda: flight.doing == 'landing')
     flight.until(lambda: flight.grounded)

@@ -117,7 +117,7 @@ def test_a_driver_that_finds_its_vehicle_in_the_air_does_not_guess_where_it_is()
     assert 'position in the map is unknown' in play.fault
     assert play.vehicle.estimate.telemetry is None
     # After a landing it is not at its start either.
-    play.autopilot.take_mode('LAND')
+    play.autopilot.set_mode('LAND')
     play.until(lambda: not play.autopilot.armed).run(3.0)
     assert 'position in the map is unknown' in play.permit()
 

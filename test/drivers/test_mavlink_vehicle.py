@@ -143,13 +143,13 @@ def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver(strange
 def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on(phase):
     play = Play(autopilot={'charge': 0.01 if phase is VehiclePhase.ARMING else 1.0})
     play.until(lambda: play.phase is phase)
-    play.autopilot.take_mode('LOITER')
+    play.autopilot.set_mode('LOITER')
     play.run(3.0)
     assert play.phase is VehiclePhase.RELEASED and play.mode == 'LOITER'
     if phase is VehiclePhase.RISING:
         return
     play.autopilot.charge = 1.0
-    play.autopilot.take_mode('GUIDED')
+    play.autopilot.set_mode('GUIDED')
     play.stands(10.0)
     assert 'GUIDED is back' in play.said
 
@@ -299,7 +299,7 @@ PILOT = {'arducopter': 'ALT_HOLD', 'px4': 'POSCTL', 'ardusub': 'ALT_HOLD'}
 @firmwares
 def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
     play = Play(firmware).fly().go()
-    play.autopilot.take_mode(PILOT[firmware])
+    play.autopilot.set_mode(PILOT[firmware])
     play.run(AT_MOST)
     assert 'the pilot has taken over: mode' in play.fault
     assert 'the driver releases the vehicle' in play.said
@@ -316,7 +316,7 @@ def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
     here = play.body.position.copy()
     # Without set-points it would leave OFFBOARD before a heartbeat shows it.
     play.autopilot.parameters['COM_OF_LOSS_T'] = 60.0
-    play.autopilot.take_mode('OFFBOARD' if firmware == 'px4' else 'GUIDED')
+    play.autopilot.set_mode('OFFBOARD' if firmware == 'px4' else 'GUIDED')
     play.run(3.0)
     back = firmware != 'px4'
     assert play.vehicle.flying == ('the pilot returned control in GUIDED' in play.said) == back
@@ -350,7 +350,7 @@ def test_a_pilot_who_takes_the_mode_while_it_is_told_to_land_has_it(firmware, an
     else:
         play.until(lambda: play.vehicle.at_rest)
     asked = len(play.commands(MODE))
-    play.autopilot.take_mode(PILOT[firmware])
+    play.autopilot.set_mode(PILOT[firmware])
     play.run(3.0)
     assert play.phase is VehiclePhase.RELEASED and play.mode == PILOT[firmware]
     assert len(play.commands(MODE)) == asked
@@ -360,7 +360,7 @@ def test_an_accepted_landing_that_a_heartbeat_denies_is_asked_for_again():
     play = Play().fly()
     play.vehicle.finish('land')
     play.until(lambda: play.mode == 'LAND').turn()
-    play.autopilot.take_mode('GUIDED')
+    play.autopilot.set_mode('GUIDED')
     play.run(3.0)
     assert play.mode == 'LAND'
 

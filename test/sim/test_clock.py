@@ -35,13 +35,13 @@ class World(Operator):
         self.stamps = {}
         self.names, self.commands, self.states, self.logs = [], [], [], []
         subscribe = node.create_subscription
-        subscribe(DiagnosticArray, '/diagnostics', self.take, 10)
+        subscribe(DiagnosticArray, '/diagnostics', self.on_diagnostics, 10)
         subscribe(Log, '/rosout', lambda item: self.logs.append(item.msg), LATCHED_ALL)
         subscribe(TwistStamped, '/rover/cmd_vel', self.commands.append, RELIABLE)
         subscribe(AgentState, '/rover/state', self.states.append, RELIABLE)
         self.odometry = node.create_publisher(Odometry, '/rover/odom', RELIABLE)
 
-    def take(self, message):
+    def on_diagnostics(self, message):
         for status in message.status:
             self.names.append(status.name)
             self.stamps[status.name] = message.header.stamp

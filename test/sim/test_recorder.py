@@ -122,15 +122,15 @@ def test_the_share_explored_is_that_of_the_planners_diagnostics(session):
     for name, value in (('/planner_node', '0.25'), ('/planner_node', '?'), ('/camera', '0.9')):
         values = [KeyValue(key='explored', value=value)]
         publisher.publish(DiagnosticArray(status=[DiagnosticStatus(name=name, values=values)]))
-    session.until(lambda: '/camera' in session.recorder.take_heartbeats())
+    session.until(lambda: '/camera' in session.recorder.pop_heartbeats())
     assert session.recorder.explored == 0.25
     error, fine = DiagnosticStatus.ERROR, DiagnosticStatus.OK
     # An error is a complaint once, until it is over.
     for level, complaints in ((error, 1), (error, 0), (fine, 0), (error, 1)):
         status = DiagnosticStatus(name='/planner_node', level=level, message='refused')
         publisher.publish(DiagnosticArray(status=[status]))
-        session.until(lambda: '/planner_node' in session.recorder.take_heartbeats())
-        assert session.recorder.take_complaints() == ['/planner_node: refused'] * complaints
+        session.until(lambda: '/planner_node' in session.recorder.pop_heartbeats())
+        assert session.recorder.pop_complaints() == ['/planner_node: refused'] * complaints
     session.connect()
     assert session.recorder.unmatched() == []
     loose = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -269,7 +269,7 @@ def test_a_node_that_does_not_know_the_recorder_yet_is_waited_for(session):
     try:
         wait_until(
             lambda: (
-                '/peer' in recorder.take_ready() and recorder.node.count_publishers('/rover/state')
+                '/peer' in recorder.receive_ready() and recorder.node.count_publishers('/rover/state')
             )
         )
         # It learns of no subscription that is made from now on, as on a busy machine.
@@ -284,7 +284,7 @@ def test_a_node_that_does_not_know_the_recorder_yet_is_waited_for(session):
         session.until(lambda: not recorder.unanswered(['/peer']))
         # Of a node that is started again the report of the process before does not count.
         recorder.ready.discard('/peer')
-        assert '/peer' not in recorder.take_ready()
+        assert '/peer' not in recorder.receive_ready()
     finally:
         peer.kill()
         peer.wait()

@@ -40,13 +40,13 @@ def state(seconds, **fields):
     return message
 
 
-class Taken:
+class Received:
     def __init__(self, scene=None, waits=False, on_restart=None):
         self.events = []
         self.maker = EventMaker(scene or empty_scene(), self.events.append)
         self.facts = facts_for(self.maker.scene, waits, on_restart)
 
-    def take(self, topic, message):
+    def add(self, topic, message):
         package = type(message).__module__.split('.')[0]
         kind = f'{package}/msg/{type(message).__name__}'
         for fact in self.facts.of(topic, kind, message):
@@ -57,87 +57,87 @@ class Taken:
 
 
 @pytest.fixture
-def taken():
-    return Taken()
+def received():
+    return Received()
 
 
-def test_states_are_one_per_period_except_where_the_robot_says_something_else(taken):
+def test_states_are_one_per_period_except_where_the_robot_says_something_else(received):
     # One that is not finite is left out.
     broken = state(0.0)
     broken.pose.pose.position.x = math.nan
-    taken.take('/rover/state', broken)
+    received.add('/rover/state', broken)
     for step in range(10):
         battery = math.inf if step == 0 else 0.5
         moving = state(0.05 * step, goal_status=msg.AgentState.MOVING, battery=battery)
-        taken.take('/rover/state', moving)
-    assert [event[4] for event in taken.of('robot')] == [-1.0] + 4 * [0.5]
+        received.add('/rover/state', moving)
+    assert [event[4] for event in received.of('robot')] == [-1.0] + 4 * [0.5]
     lost = state(0.5, goal_status=msg.AgentState.UNAVAILABLE, reason='its link is lost')
-    taken.take('/rover/state', lost)
-    assert taken.of('robot')[-1][5:] == [msg.AgentState.UNAVAILABLE, 'its link is lost']
-    assert [event[5] for event in taken.of('log')] == ['unavailable: its link is lost']
-    assert all(json.loads(line(event)) for event in taken.events)
+    received.add('/rover/state', lost)
+    assert received.of('robot')[-1][5:] == [msg.AgentState.UNAVAILABLE, 'its link is lost']
+    assert [event[5] for event in received.of('log')] == ['unavailable: its link is lost']
+    assert all(json.loads(line(event)) for event in received.events)
 
 
 def step(seconds, *robots):
     return msg.LockstepStep(robots=list(robots), stamp=stamp_to_ros(round(seconds * 1e9)))
 
 
-def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_end(taken):
+def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_end(received):
     for seconds in range(7):
         present = ['crawler', 'rover', 'walker'] if seconds < 2 else ['crawler', 'rover']
-        taken.take('/lockstep/step', step(float(seconds), *present))
+        received.add('/lockstep/step', step(float(seconds), *present))
         # One falls silent; the other's driver still publishes after it has left.
         for name in ('rover', 'crawler', 'walker'):
             if name != 'crawler' or seconds < 2:
                 message = state(float(seconds), goal_status=msg.AgentState.MOVING)
                 message.robot = name
-                taken.take(f'/{name}/state', message)
-    taken.maker.end()
+                received.add(f'/{name}/state', message)
+    received.maker.end()
     statuses = {
-        name: [(event[0], *event[5:]) for event in taken.of('robot') if event[2] == name]
+        name: [(event[0], *event[5:]) for event in received.of('robot') if event[2] == name]
         for name in ('crawler', 'rover', 'walker')
     }
     assert statuses['walker'] == [(0.0, 1, ''), (1.0, 1, ''), (2.0, LEFT, '')]
     assert statuses['crawler'][1:] == [(1.0, 1, ''), (6.0, SILENT, 'no state for 3 s')]
     assert statuses['rover'][-1] == (6.0, ENDED, '')
-    said = [event[4:] for event in taken.of('log')]
+    said = [event[4:] for event in received.of('log')]
     assert said == [['walker', 'left'], ['crawler', 'no state for 3 s']]
 
 
 def test_what_comes_before_the_first_step_is_taken_at_its_time():
-    taken = Taken(waits=True)
+    received = Received(waits=True)
     # A run with real robots may wait for minutes.
     for _ in range(2000):
-        taken.take('/rover/state', state(9.0))
-    assert taken.events == []
+        received.add('/rover/state', state(9.0))
+    assert received.events == []
     for seconds in (10.0, 10.5):
-        taken.take('/lockstep/step', step(seconds, 'rover'))
-        taken.take('/rover/state', state(seconds))
-    assert [event[0] for event in taken.of('robot')] == [0.0, 0.5]
+        received.add('/lockstep/step', step(seconds, 'rover'))
+        received.add('/rover/state', state(seconds))
+    assert [event[0] for event in received.of('robot')] == [0.0, 0.5]
 
 
-def test_modes_of_robots_and_the_ending_are_events_and_said_once(taken):
+def test_modes_of_robots_and_the_ending_are_events_and_said_once(received):
     status = DiagnosticStatus(name='/team/planner_node', message='active')
     status.values = [KeyValue(key='search', value='rover paused, walker searching')]
     for _ in range(2):
-        taken.take('/diagnostics', DiagnosticArray(status=[status]))
-    assert taken.of('mode') == [[0.0, 'mode', '/team/planner_node', status.values[0].value]]
-    taken.take('/rover/state', state(0.0, goal_status=msg.AgentState.MOVING))
-    taken.take('/ending', String(data='node_died\n/filter_node exited with 1'))
+        received.add('/diagnostics', DiagnosticArray(status=[status]))
+    assert received.of('mode') == [[0.0, 'mode', '/team/planner_node', status.values[0].value]]
+    received.add('/rover/state', state(0.0, goal_status=msg.AgentState.MOVING))
+    received.add('/ending', String(data='node_died\n/filter_node exited with 1'))
     # At the end of a recording.
-    taken.maker.end()
-    assert taken.of('end') == [[0.0, 'end', '', 'node_died', '/filter_node exited with 1']]
-    assert [event[5] for event in taken.of('robot')] == [1, ENDED]
+    received.maker.end()
+    assert received.of('end') == [[0.0, 'end', '', 'node_died', '/filter_node exited with 1']]
+    assert [event[5] for event in received.of('robot')] == [1, ENDED]
 
 
-def test_candidates_that_are_not_allowed_have_no_objective(taken):
+def test_candidates_that_are_not_allowed_have_no_objective(received):
     candidates = [
         msg.Candidate(objective=-1e30),
         msg.Candidate(objective=0.5, length=7, measurements=2),
     ]
     robot = msg.RobotDecision(robot='rover', chosen=1, candidates=candidates)
-    taken.take('/decisions', msg.PlanDecision(planner='maasi', robots=[robot], explored=0.25))
-    (plan,) = taken.of('plan')
+    received.add('/decisions', msg.PlanDecision(planner='maasi', robots=[robot], explored=0.25))
+    (plan,) = received.of('plan')
     assert plan[3:5] == ['maasi', 0.25]
     assert [item[6:] for item in plan[7][0][4]] == [[None, 0, 0], [0.5, 7, 2]]
 
@@ -176,52 +176,52 @@ def test_the_rest_of_a_tour_is_recorded_and_recordings_without_it_are_read(tmp_p
         assert row[:4] == ['rover', 3, 0, [1.0, 2.0, 3.0]] and row[6] == tour
 
 
-def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario(taken):
+def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario(received):
     grid = OccupancyGrid(data=[0, 100, 50, 50, 0, 0])
     grid.info.resolution, grid.info.width, grid.info.height = 0.5, 3, 2
     grid.info.origin.position.x = grid.info.origin.position.y = -0.25
-    taken.take('/exploration', grid)
-    assert taken.maker.scene['bounds'] == [[0.0, 1.0], [0.0, 0.5]]
+    received.add('/exploration', grid)
+    assert received.maker.scene['bounds'] == [[0.0, 1.0], [0.0, 0.5]]
     # By x, then by y: e of (1, 0) is 1.
-    assert taken.of('map')[0][5:] == [[3, 2, 1], '0iz0i0', None]
+    assert received.of('map')[0][5:] == [[3, 2, 1], '0iz0i0', None]
 
 
 def test_found_targets_are_scored_where_the_truth_is_known():
     scenario = load_mission('mambo_turtlebot').scenario
-    taken = Taken(scene_of('demo', scenario))
+    received = Received(scene_of('demo', scenario))
     targets = [(float(x), float(y)) for x, y in scenario.world(scenario.seed).targets]
     truth = PoseArray(poses=[Pose(position=Point(x=x, y=y)) for x, y in targets])
-    taken.take('/ground_truth/targets', truth)
+    received.add('/ground_truth/targets', truth)
     place = Point(x=targets[0][0] + 0.01, y=targets[0][1])
     both = [
         msg.FoundTarget(id=1, robot='mambo', position=place),
         msg.FoundTarget(id=2, robot='turtlebot'),
     ]
     # A filter of one robot counts only what it found itself.
-    taken.take('/mambo/found_targets', msg.FoundTargetArray(targets=both))
-    assert [item[0] for item in taken.of('found')[-1][3]] == [1]
-    assert taken.of('score')[-1][3:7] == [1, 11, 0, pytest.approx(0.01, abs=1e-4)]
-    taken.take('/team/found_targets', msg.FoundTargetArray(targets=both))
-    assert [item[0] for item in taken.of('found')[-1][3]] == [1, 2]
+    received.add('/mambo/found_targets', msg.FoundTargetArray(targets=both))
+    assert [item[0] for item in received.of('found')[-1][3]] == [1]
+    assert received.of('score')[-1][3:7] == [1, 11, 0, pytest.approx(0.01, abs=1e-4)]
+    received.add('/team/found_targets', msg.FoundTargetArray(targets=both))
+    assert [item[0] for item in received.of('found')[-1][3]] == [1, 2]
 
 
 def test_time_that_jumps_back_begins_another_run():
     made = []
 
     def begin():
-        taken.maker = EventMaker(empty_scene(), taken.events.append)
-        made.append(taken.maker)
+        received.maker = EventMaker(empty_scene(), received.events.append)
+        made.append(received.maker)
 
-    taken = Taken(on_restart=begin)
-    taken.take('/rover/state', state(100.0))
-    taken.take('/rover/state', state(130.0))
+    received = Received(on_restart=begin)
+    received.add('/rover/state', state(100.0))
+    received.add('/rover/state', state(130.0))
     # What comes a little late, or of another topic, as in a bag that is played fast, begins none.
-    taken.take('/rover/state', state(128.0))
-    taken.take('/lockstep/step', step(102.0))
+    received.add('/rover/state', state(128.0))
+    received.add('/lockstep/step', step(102.0))
     assert made == []
-    taken.take('/rover/state', state(101.0))
+    received.add('/rover/state', state(101.0))
     assert len(made) == 1
-    assert [event[0] for event in taken.events] == [0.0, 30.0, 0.0]
+    assert [event[0] for event in received.events] == [0.0, 30.0, 0.0]
 
 
 def unpacked(text):

@@ -62,7 +62,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         for candidate in DOMAINS[1:] if number is None else [number]:
             if candidate in used:
                 continue
-            problem = self._take(candidate, team, shared)
+            problem = self._claim(candidate, team, shared)
             if not problem:
                 self.number = candidate
                 # Nodes of other runs may be starting in a shared domain.
@@ -73,7 +73,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
                 raise DomainError(f'domain id: another run uses {problem}')
         raise DomainError(f'no ROS domain from 1 to {DOMAINS[-1]} is free')
 
-    def _take(self, number: int, team: str, shared: bool) -> str:
+    def _claim(self, number: int, team: str, shared: bool) -> str:
         wanted = {} if shared else {f'{number}': f'{number}'}
         wanted[f'{number} {team}'] = f'namespace /{team} in {number}'
         for name, words in wanted.items():

@@ -144,7 +144,7 @@ class Recorder:
         )
 
     def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> Subscription:
-        # Messages are taken without callbacks.
+        # Messages are received without callbacks.
         full = self._full(topic)
         return self.node.create_subscription(kind, full, lambda _: None, qos, raw=True)
 
@@ -197,7 +197,7 @@ class Recorder:
             < self.node.count_publishers(full := self._full(topic))
         ]
 
-    def take_ready(self) -> set[str]:
+    def receive_ready(self) -> set[str]:
         """Return the names of the nodes that have reported ready."""
         for data in _queued(self._ready_subscription):
             name = deserialize_message(data, LockstepDone).node
@@ -217,15 +217,15 @@ class Recorder:
             self._answered = set()
             self.node.destroy_subscription(self._ready_subscription)
             self._ready_subscription = self._subscribe(READY, LockstepDone, LATCHED_ALL)
-        self.take_ready()
+        self.receive_ready()
         return [name for name in nodes if name not in self._answered]
 
-    def take_heartbeats(self) -> dict[str, float]:
+    def pop_heartbeats(self) -> dict[str, float]:
         """Return the wall times of diagnostics of nodes since the last call [s]."""
         beats, self.heartbeats = self.heartbeats, {}
         return beats
 
-    def take_complaints(self) -> list[str]:
+    def pop_complaints(self) -> list[str]:
         """Return problems of recording, messages and planners since the last call."""
         complaints = self._complaints + self.observer.complaints
         self._complaints, self.observer.complaints = [], []
@@ -245,25 +245,25 @@ class Recorder:
         Messages later than `limit`, the simulated time after the first step [ns], are
         dropped, so that equal runs give equal recordings.
         """
-        self.take_ready()
+        self.receive_ready()
         # In lockstep a message may arrive after others that were published later.
         before = 0 if self._lockstep else self.time
-        # Updates come after the messages they refer to: take updates first, add them last.
-        updates = self._take(self.observer.update_topics)
-        steps = self._take([STEP])
+        # Updates come after the messages they refer to: receive updates first, add them last.
+        updates = self._receive(self.observer.update_topics)
+        steps = self._receive([STEP])
         for _, data in steps:
             self.step = struct.unpack_from('<Q', data, 4)[0]
             self.time = max(self.time, time_at(data, 12))
             if self._begun is None:
                 self._begun = time_at(data, 12)
                 self.robots = deserialize_message(data, LockstepStep).robots
-        clocks = self._take([CLOCK])
+        clocks = self._receive([CLOCK])
         for _, data in clocks:
             self.time = max(self.time, time_at(data, 4))
         topics = [topic for topic in self._subscriptions if topic not in self._in_order]
         # Detections refer to images of the same stamp.
         topics.sort(key=lambda topic: topic.endswith(_MEASURED))
-        others = [item for item in self._take(topics) if self._is_own(*item)]
+        others = [item for item in self._receive(topics) if self._is_own(*item)]
         if limit is not None and self.step is not None and not self._finished:
             # Messages of the step at the limit may arrive before that step.
             end, length = limit + (self._begun or 0), self._step_length
@@ -272,15 +272,15 @@ class Recorder:
                 while self._last_step and stamp_of_step(self._last_step, length) >= end:
                     self._last_step -= 1
                 self._end = stamp_of_step(self._last_step + 1, length)
-        # Several steps may be taken at once: sort by time.
-        taken = [
+        # Several steps may arrive at once: sort by time.
+        received = [
             (self._logged(before, topic, data), topic, data)
             for topic, data in clocks + others + updates + steps
             if topic.endswith(_MEASURED) or self._belongs(topic, data)
         ]
-        taken.sort(key=itemgetter(0))
+        received.sort(key=itemgetter(0))
         now = time.monotonic()
-        for _, topic, data in taken:
+        for _, topic, data in received:
             self.last_seen[topic] = now
             if topic == DONE:
                 self._last_done.append(data)
@@ -299,8 +299,8 @@ class Recorder:
             self._last_step = self.observer.end_step
             self._end = stamp_of_step(self._last_step, self._step_length)
         if self._last_step >= 0:
-            taken = [item for item in taken if self._belongs(*item[1:])]
-        self._record(taken)
+            received = [item for item in received if self._belongs(*item[1:])]
+        self._record(received)
 
     def _logged(self, before: int, topic: str, data: bytes) -> int:
         """Return a message's recorded time [ns]: now, if its stamp is implausible."""
@@ -335,12 +335,12 @@ class Recorder:
             return bool(deserialize_message(data, Log).name.startswith(logger))
         return True
 
-    def _record(self, taken: list[tuple[int, str, bytes]]) -> None:
+    def _record(self, received: list[tuple[int, str, bytes]]) -> None:
         # A failed bag ends the run (`bag.failed`).
         if self.bag is None or self.bag.failed:
             return
         try:
-            for logged, topic, data in taken:
+            for logged, topic, data in received:
                 self.bag.write(self._full(topic), logged, data)
                 self.first.setdefault(topic, logged)
         except BagError:
@@ -390,7 +390,7 @@ class Recorder:
             return False
         return not _has_step(kind) or deserialize_message(data, kind).step <= self._last_step
 
-    def _take(self, topics: Sequence[str]) -> list[tuple[str, bytes]]:
+    def _receive(self, topics: Sequence[str]) -> list[tuple[str, bytes]]:
         return [
             (topic, data)
             for topic in topics
@@ -460,10 +460,10 @@ def _has_step(kind: Any) -> bool:
 
 
 def _queued(subscription: Subscription) -> list[bytes]:
-    taken: list[bytes] = []
+    received: list[bytes] = []
     handle = subscription.handle
     while True:
         item = handle.take_message(subscription.msg_type, True)
         if item is None:
-            return taken
-        taken.append(item[0])
+            return received
+        received.append(item[0])

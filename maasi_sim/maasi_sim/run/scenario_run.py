@@ -235,7 +235,7 @@ class RunningRun:
         """Return what is still missing, by node or topic."""
         recorder = self.recorder
         # Nodes report last: all topics of a node that has reported are discovered.
-        ready = set(recorder.take_ready())
+        ready = set(recorder.receive_ready())
         recorder.discover()
         nodes = list(self.supervisor.processes)
         late = [name for name in nodes if name not in ready]
@@ -272,7 +272,7 @@ class RunningRun:
                 self._begun = self._begun or time.monotonic()
                 if self.options.lockstep and recorder.step is not None:
                     recorder.publish_done(recorder.step)
-            self.display.warn(*recorder.take_complaints())
+            self.display.warn(*recorder.pop_complaints())
             if self.display.due or self.observer.news:
                 self._show()
         return ending

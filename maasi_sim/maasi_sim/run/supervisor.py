@@ -54,7 +54,7 @@ class Supervisor:
         if gap < _CHECK_PERIOD:
             return None
         self._checked = now
-        beats = self.recorder.take_heartbeats()
+        beats = self.recorder.pop_heartbeats()
         for name, process in self.processes.items():
             if name in beats:
                 process.beat(beats[name])

@@ -184,7 +184,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._linked[name] = robot
             self.simulation.robots[name].follow(robot)
             if isinstance(robot, ExternalRobot):
-                self.create_subscription(AgentState, f'{name}/state', robot.take, 10)
+                self.create_subscription(AgentState, f'{name}/state', robot.update, 10)
         self.connect()
         self._robots_publisher = self.create_publisher(LockstepStep, 'lockstep/robots', LATCHED)
         # After all other publishers, which the recorder then knows: it waits for clock and step.

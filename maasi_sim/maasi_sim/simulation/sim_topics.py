@@ -263,7 +263,7 @@ class ExternalRobot:
     def __init__(self, start: Pose) -> None:
         self.state = RobotState(start)  #: in the map
 
-    def take(self, message: AgentState) -> None:
+    def update(self, message: AgentState) -> None:
         """Store the latest state."""
         linear, angular = message.twist.linear, message.twist.angular
         # An invalid state keeps the last valid one.

@@ -305,11 +305,11 @@ class FakeMambo:
             return
         try:
             for frame in frames(data):
-                self._take(frame)
+                self._handle(frame)
         except ValueError:
             self.refused += 1
 
-    def _take(self, frame: Frame) -> None:
+    def _handle(self, frame: Frame) -> None:
         self.firmware.note_message()
         if frame.kind == ACK:
             if frame.payload and frame.buffer == ACKED_EVENTS + 128:

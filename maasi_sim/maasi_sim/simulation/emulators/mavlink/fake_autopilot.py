@@ -82,7 +82,7 @@ class FakeAutopilot:
         self.armed = False
         self.crashed = ''
         self.charge = settings.charge
-        self.take_mode('MANUAL' if self.firmware is PX4_COPTER else 'STABILIZE')
+        self.set_mode('MANUAL' if self.firmware is PX4_COPTER else 'STABILIZE')
         self._first_mode = self.mode
         self.gnss_lost_at = math.inf
         self.muted: set[str] = set()
@@ -132,11 +132,11 @@ class FakeAutopilot:
         self.armed = self._reported_ready = False
         # The barometer is calibrated again.
         self.now = self.height_error = 0.0
-        self.take_mode(self._first_mode)
+        self.set_mode(self._first_mode)
         self._reset_messages()
 
-    def take_mode(self, mode: int | str) -> None:
-        """Take a mode, by its number or its name, and hold the position in it."""
+    def set_mode(self, mode: int | str) -> None:
+        """Set the mode, by number or name, and hold the position in it."""
         if isinstance(mode, str):
             mode = next(key for key, name in self.firmware.modes.items() if name == mode)
         self.mode = mode
@@ -223,16 +223,16 @@ class FakeAutopilot:
         firmware, read = self.firmware, self.parameters.get
         silence = self.now - self._station_at
         if silence > read('FS_GCS_TIMEOUT', math.inf) and self._acts('GCS', 'FS_GCS_ENABLE'):
-            self.take_mode(firmware.land)
+            self.set_mode(firmware.land)
         elif (
             firmware is PX4_COPTER
             and self.mode == firmware.external
             and self.now - self._streamed_at > read('COM_OF_LOSS_T', 1.0)
         ):
             self.say(3, 'Failsafe: no offboard setpoints')
-            self.take_mode(firmware.land)
+            self.set_mode(firmware.land)
         if self.charge < 0.05 and self._acts('Battery', 'BATT_FS_LOW_ACT', 'COM_LOW_BAT_ACT'):
-            self.take_mode(firmware.land)
+            self.set_mode(firmware.land)
 
     def _look_after_fence(self) -> None:
         if self._guided is None or self.now - self._fence_at < _FENCE_PERIOD or not self.ready:
@@ -243,7 +243,7 @@ class FakeAutopilot:
         if text and self.armed and not self.body.grounded:
             self.say(5, text)
             if mode := ACTIONS.get(int(self.parameters['FENCE_ACTION'])):
-                self.take_mode(mode)
+                self.set_mode(mode)
 
     def _acts(self, kind: str, *names: str) -> bool:
         if kind in self._failed or not any(self.parameters.get(name, 0) for name in names):
@@ -386,7 +386,7 @@ class FakeAutopilot:
             self.say(4, f'Mode change to {name} failed: {refusal}')
             return int(_FAILED)
         if mode != self.mode:
-            self.take_mode(mode)
+            self.set_mode(mode)
         return int(_ACCEPTED)
 
     def _arm(self, message: Any) -> int:
@@ -444,7 +444,7 @@ class FakeAutopilot:
             self._velocity = swap_enu_ned(velocity)
             self._setpoint = self.body.position.copy(), yaw
             if self._guided is not None:
-                self._guided.take(self._velocity, True, yaw, self.now)
+                self._guided.accept(self._velocity, True, yaw, self.now)
 
     def _go_to(self, place: FloatArray, yaw: float | None) -> None:
         """Take a destination, in what it believes to be its local frame."""
@@ -452,7 +452,7 @@ class FakeAutopilot:
         if self._guided is not None:
             if self.fence.breach(place, float(true[2]) - self._home):
                 return
-            self._guided.take(true, False, yaw, self.now)
+            self._guided.accept(true, False, yaw, self.now)
         self._setpoint, self._velocity = (true, yaw), None
 
     def _change_speed(self, message: Any) -> int:

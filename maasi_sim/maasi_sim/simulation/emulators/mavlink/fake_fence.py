@@ -148,7 +148,7 @@ class FakeFence:
         elif kind == 'MISSION_COUNT':
             sender.mission_ack_send(*to, mavlink.MAV_MISSION_NO_SPACE, _FENCE)
         elif kind == 'MISSION_ITEM_INT' and self._announced:
-            self._take(message, now)
+            self._handle(message, now)
         elif kind == 'MISSION_ITEM_INT' or self._announced:
             wrong = mavlink.MAV_MISSION_DENIED if self._announced else mavlink.MAV_MISSION_ERROR
             sender.mission_ack_send(*to, wrong, _FENCE)
@@ -159,7 +159,7 @@ class FakeFence:
             head = message.seq, mavlink.MAV_FRAME_GLOBAL, command, 0, 0, number
             sender.mission_item_int_send(*to, *head, 0, 0, 0, *place, 0, _FENCE)
 
-    def _take(self, message: Any, now: float) -> None:
+    def _handle(self, message: Any, now: float) -> None:
         result = mavlink.MAV_MISSION_INVALID_SEQUENCE
         if message.seq == len(self._incoming):
             self._incoming.append((message.command, message.param1, message.x, message.y))

@@ -97,8 +97,8 @@ class GuidedFlight:
         self.speed = 0.01 * self._parameters['WPNAV_SPEED']
         self._acceleration = np.zeros(3)
 
-    def take(self, target: FloatArray, by_velocity: bool, yaw: float | None, now: float) -> None:
-        """Take a set-point, and a heading; without one it keeps its own."""
+    def accept(self, target: FloatArray, by_velocity: bool, yaw: float | None, now: float) -> None:
+        """Accept a set-point, and a yaw; without one the vehicle keeps its own."""
         if by_velocity != self.by_velocity:
             self._set_kind(by_velocity)
         self.target, self._yaw, self._sent_at = target, yaw, now
