@@ -267,11 +267,8 @@ def test_a_node_that_does_not_know_the_recorder_yet_is_waited_for(session):
     recorder = session.recorder
     peer = subprocess.Popen([sys.executable, '-c', PEER])
     try:
-        wait_until(
-            lambda: (
-                '/peer' in recorder.receive_ready() and recorder.node.count_publishers('/rover/state')
-            )
-        )
+        publishers = recorder.node.count_publishers
+        wait_until(lambda: '/peer' in recorder.receive_ready() and publishers('/rover/state'))
         # It learns of no subscription that is made from now on, as on a busy machine.
         peer.send_signal(signal.SIGSTOP)
         session.turn()
