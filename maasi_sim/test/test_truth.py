@@ -37,7 +37,7 @@ def test_what_is_true_is_what_is_believed_unless_it_is_given():
     given = true_sensor(noise={'range': 0.3, 'bearing': 0.1, 'elevation': 0.2})
     assert_allclose(np.diagonal(given.covariance), [0.09, 0.01, 0.04])
     assert true_sensor(probability_factor=50.0).detection.gain == 1.0
-    # Clutter is played as often as told.
+    # Clutter is sampled at the configured rate.
     cluttered = true_sensor(clutter_per_scan=2.5)
     played = RangingSensor(cluttered, np.zeros((0, 3)), 3, 'drone', CUBE)
     counts = [len(played.measure(POSE, step)[0]) for step in range(2000)]
@@ -54,11 +54,11 @@ def test_what_is_true_is_what_is_believed_unless_it_is_given():
 
 def test_odometry_reports_other_errors_than_it_has():
     true = OdometrySettings(position_noise=0.5, position_drift=0.1)
-    told = OdometrySettings(position_noise=0.01, heading_noise=0.0)
+    reported = OdometrySettings(position_noise=0.01, heading_noise=0.0)
     start = Pose.from_yaw([10.0, 10.0, 5.0], 0.0)
     errors = []
     for seed in range(300):
-        model = OdometryModel(true, start, seed, 'drone', told)
+        model = OdometryModel(true, start, seed, 'drone', reported)
         reading = model.step(RobotState(Pose([26.0, 10.0, 5.0])), 1)
         errors.append(reading.pose.position - [16.0, 0.0, 0.0])
     assert_allclose(np.std(errors, axis=0), [0.64, 0.64, 0.5], rtol=0.15)
@@ -80,7 +80,7 @@ def test_constant_offset_has_its_length_and_is_reported():
     assert np.linalg.norm(np.mean(directions, axis=0)) < 0.5
 
 
-def test_targets_walk_as_told_the_same_each_time_and_stay_inside():
+def test_targets_walk_reproducibly_at_the_configured_speed_and_stay_inside():
     inner = np.random.default_rng(0).uniform(100.0, 160.0, (400, 3))
     first, again = (World(Area(CUBE), inner, walk=0.5, seed=4).targets_at(100) for _ in range(2))
     assert_allclose(np.std(first - inner), 5.0, rtol=0.05)

@@ -58,7 +58,7 @@ NEAR, WIDE = [101, 91, 104, 97, 103, 96], [20, 190, 40, 180, 30, 170]
         ('alike', LOW, NEAR, 'holds'),
         ('alike', LOW, WIDE, 'not shown'),
         ('alike', LOW, HIGH, 'not here'),
-        # Alike to 20 %, but told apart.
+        # Alike to 20 %, but significantly different.
         ('alike', LOW, [one + 5 for one in LOW], 'not here'),
         ('less', [90], [140], 'no interval'),
     ],

@@ -74,7 +74,7 @@ def test_pyparrot_flies_it(pair):
     wait_until(lambda: not fake._unacked)
 
 
-def test_one_that_lands_by_itself_is_not_told_to_take_off_again(pair):
+def test_a_drone_that_lands_by_itself_is_not_sent_up_again(pair):
     fake, link = pair
     link.take_off()
     wait_until(lambda: link.flying_state == 'hovering')

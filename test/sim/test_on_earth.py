@@ -65,9 +65,11 @@ def test_points_of_the_area_are_starts_and_chargers(tmp_path):
         point('charger', [9.9002, 46.6001], robot='on'),
     ]
     robots = {'one': deepcopy(DRONE), 'two': {**deepcopy(DRONE), 'start': [5.0, 6.0, 0.0]}}
-    with pytest.warns(InputWarning) as told:
+    with pytest.warns(InputWarning) as caught:
         made = scenario(tmp_path, robots, *points).robots
-    left = [str(item.message) for item in told if 'environment.area: ignoring' in str(item.message)]
+    left = [
+        str(item.message) for item in caught if 'environment.area: ignoring' in str(item.message)
+    ]
     assert [text.partition('role ')[2] for text in left] == [
         'start, as its robot is three; allowed as its robot: one, two',
         'charger, as its robot is on; allowed as its robot: one, two',
@@ -96,7 +98,7 @@ def test_points_of_the_area_are_starts_and_chargers(tmp_path):
         ),
     ],
 )
-def test_a_start_that_cannot_be_is_told_in_degrees(tmp_path, start, words):
+def test_an_impossible_start_is_reported_in_degrees(tmp_path, start, words):
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         with pytest.raises(ScenarioError, match=words) as caught:

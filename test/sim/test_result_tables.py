@@ -77,8 +77,8 @@ def field(folder, **origin):
 def test_nodes_have_the_origin_and_a_wrong_one_is_refused(tmp_path):
     scenario = field(tmp_path, latitude=46.0, longitude=23.5)
     plans = TargetMission('field', scenario).plan_nodes(Options(), Path('/s.yaml'))
-    told = {plan.name: plan.parameters.get('environment.origin.latitude') for plan in plans}
-    assert told['filter_node'] == told['planner_node'] == told['driver'] == 46.0
+    given = {plan.name: plan.parameters.get('environment.origin.latitude') for plan in plans}
+    assert given['filter_node'] == given['planner_node'] == given['driver'] == 46.0
     with pytest.raises(ScenarioError, match=r'field.yaml:.*environment.origin.latitude'):
         field(tmp_path, latitude=146.0, longitude=23.5)
 

@@ -257,7 +257,7 @@ def test_the_time_starts_only_when_everybody_is_there_and_would_miss_nothing(
     matched, counts = Publisher.get_subscription_count, {'/clock': 0}
 
     def late(publisher):
-        # As if discovery had told of the subscriptions, and was still about to connect them.
+        # The subscriptions are discovered, but not connected yet.
         return counts.get(publisher.topic_name, matched(publisher))
 
     monkeypatch.setattr(Publisher, 'get_subscription_count', late)

@@ -45,7 +45,7 @@ def test_intervals_of_few_values():
     assert result.mean == pytest.approx(ours.mean - 2.0)
     assert math.isnan(statistics.bootstrap_difference([], []).mean)
     one = statistics.bootstrap_difference([3.0], [1.0])
-    assert one.mean == 2.0 and math.isnan(one.low) and not one.told_from_zero
+    assert one.mean == 2.0 and math.isnan(one.low) and not one.excludes_zero
     same = statistics.bootstrap_difference([1.0, 2.0], [1.0, 2.0])
     assert (same.mean, same.low, same.high, same.needed) == (0.0, 0.0, 0.0, None)
 
@@ -64,5 +64,5 @@ def test_bootstrap_interval_of_normal_differences_is_near_students():
     gap = statistics.bootstrap_difference([*first, math.nan], [*second, 1.0])
     assert gap.number == 60 and gap.mean == pytest.approx(np.mean(first - second))
     assert (gap.low, gap.high) == pytest.approx((low, high), abs=0.1)
-    assert gap.told_from_zero
+    assert gap.excludes_zero
     assert statistics.bootstrap_difference(first, second) == gap

@@ -65,7 +65,7 @@ class Difference:
     needed: int | None  # pairs for a power of 0.8 at this size; None: no difference, no spread
 
     @property
-    def told_from_zero(self) -> bool:
+    def excludes_zero(self) -> bool:
         """Whether the interval excludes 0."""
         return self.low > 0.0 or self.high < 0.0
 

@@ -313,7 +313,7 @@ class SearchTable:
                 gap = gaps[item.name]
                 what = {'case': case, 'minus': self.cases[0]}
                 what |= {'quantity': item.name, 'unit': item.unit}
-                differences.append(what | asdict(gap) | {'told_from_zero': gap.told_from_zero})
+                differences.append(what | asdict(gap) | {'told_from_zero': gap.excludes_zero})
         cases = {case: self._facts_of(case) for case in self.cases}
         return {'cases': cases, 'differences': differences, 'verdicts': self.verdicts()}
 
@@ -345,7 +345,7 @@ def verdict(case: str, other: str, gap: Difference) -> str:
     if gap.low == gap.high == 0.0:
         return f'{who}no difference on any of {gap.number} seeds.'
     span = f'{gap.mean:+.1f} s, 95 % from {gap.low:+.1f} to {gap.high:+.1f} s'
-    if gap.told_from_zero:
+    if gap.excludes_zero:
         word = 'sooner' if gap.mean < 0.0 else 'later'
         few = ', too few for an interval to trust' if gap.number < FEWEST else ''
         return f'{who}{word}, {span}, on {gap.number} seeds{few}.'

@@ -96,8 +96,8 @@ def preflight(scenario: Scenario) -> Preflight:
     report = Preflight()
     whole = area.border.area
     closed = whole - ground.area
-    told = closed >= 1e-6 * whole  # less is rounding
-    without = f', without {_area(closed)} of keep-out zones and obstacles' if told else ''
+    shown = closed >= 1e-6 * whole  # less is rounding
+    without = f', without {_area(closed)} of keep-out zones and obstacles' if shown else ''
     depth = f', {number(height)} m high' if area.dimension == 3 else ''
     report.lines.append(f'area: {_area(ground.area)}{without}{depth}')
     for name, effort in efforts.items():
