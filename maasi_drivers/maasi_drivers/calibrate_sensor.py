@@ -117,12 +117,12 @@ def report(recorded: RecordedRobot, noise: SensorNoise, given: bool) -> str:
     """Return the result as text, including lines for the robot's type or parameters."""
     names = ('range', 'bearing', 'elevation')[: len(noise.bias)]
     units = ('m', 'rad', 'rad')
-    place = ' '.join(f'{value:.4f}' for value in noise.target)
+    position = ' '.join(f'{value:.4f}' for value in noise.target)
     poses = f'; poses of {recorded.pose_source()}' if recorded.use == 'images' else ''
     lines = [
         f'{recorded.robot or "/"}: {noise.used} {recorded.use} used, at {noise.ranges[0]:.2f} to '
         f'{noise.ranges[1]:.2f} m{poses}',
-        f'target at {place} m, ' + ('as given' if given else 'the mean of its detections'),
+        f'target at {position} m, ' + ('as given' if given else 'the mean of its detections'),
         f'skipped: {noise.near} from too close, {noise.others} detections of other objects, '
         f'{recorded.left_out} without a pose or unusable',
         f'in the field of view {noise.inside} times, missed {noise.missed} times',

@@ -157,9 +157,9 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
         model = TiltModel(tilt, 9.81 * math.tan(tilt) / drag, 1.0, 1.0)
         return np.array(
             [
-                place - leg.origin - _way(model, leg.tilts, passed - delay)
+                position - leg.origin - _way(model, leg.tilts, passed - delay)
                 for leg in legs
-                for passed, place in leg.events
+                for passed, position in leg.events
             ]
         )
 

@@ -84,17 +84,17 @@ class GuidedPlay(Play):
         self, monkeypatch, environment=(), motion=(), parameters=(), start=START, **changes
     ):
         if isinstance(environment, EnvironmentSettings):
-            place = environment
+            area = environment
         else:
-            place = FIELD | {'altitude': [0.0, 60.0], 'origin': ORIGIN} | dict(environment)
-            if 'bounds' in place:
-                place.pop('area')
-                place.pop('altitude')
+            area = FIELD | {'altitude': [0.0, 60.0], 'origin': ORIGIN} | dict(environment)
+            if 'bounds' in area:
+                area.pop('area')
+                area.pop('altitude')
         self.start = start
         own = {'arm': True} | changes.pop('mavlink', {})
         self.driver_settings = DriverSettings.model_validate(
             {
-                'environment': place,
+                'environment': area,
                 'start': start,
                 'radius': 0.5,
                 'motion': MOTION | dict(motion),
@@ -166,7 +166,7 @@ class GuidedPlay(Play):
         return self.driver.follower.status
 
     @property
-    def place(self):
+    def position(self):
         """On the map; the local frame begins at the start, on the ground."""
         return self.body.position + np.array([*self.start[:2], 0.0])
 
@@ -179,4 +179,4 @@ class GuidedPlay(Play):
         return ' | '.join([*self.driver.logged, *(text for _, text in self.reports)])
 
     def away(self, *position):
-        return math.dist(self.place[:2], position[:2])
+        return math.dist(self.position[:2], position[:2])

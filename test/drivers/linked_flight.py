@@ -155,8 +155,8 @@ class LinkedFlight:
         assert self.team.refused(self.start)
         self.stops(before)
 
-    def seen_from_outside(self, source='pose', place=None):
-        """Have another system say where it is, from `place`; return the timer that does it."""
+    def seen_from_outside(self, source='pose', origin=None):
+        """Have another system report its pose relative to `origin`; return the timer for it."""
         team = self.team
         publisher = team.create_publisher(PoseStamped, 'pose', 10)
 
@@ -167,7 +167,7 @@ class LinkedFlight:
                 team.body = team.motion.body(state)
                 team.odometry.publish(team.odometry_message(stamp))
                 return
-            pose = state.pose if place is None else compose(place, state.pose)
+            pose = state.pose if origin is None else compose(origin, state.pose)
             message = PoseStamped(pose=pose_to_ros(pose))
             message.header.frame_id = 'map'
             publisher.publish(stamped(message, stamp))
@@ -206,8 +206,8 @@ class OnboardFlight(LinkedFlight):
     make = MamboOnboardDriver
 
     def __init__(self, context, own=(), **changes):
-        port, place = free_port(), Pose.from_yaw([*self.start[:2], 0.1], YAW)
-        drone = OnboardProgram(free_address(), ('127.0.0.1', port), place)
+        port, start = free_port(), Pose.from_yaw([*self.start[:2], 0.1], YAW)
+        drone = OnboardProgram(free_address(), ('127.0.0.1', port), start)
         mambo = {'arm': True, 'ground': 0.1, 'land_after': 1.0}
         mambo |= {'address': drone.address, 'order_port': drone.port} | dict(own)
         feed = {'link': 'mambo_feed', 'image_source': 'feed', 'feed_port': port}

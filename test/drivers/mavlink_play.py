@@ -87,7 +87,7 @@ class Play:
         self.start_driver()
 
     def start_driver(self):
-        """Start a driver, in the place of one that was killed."""
+        """Start a driver, instead of one that was killed."""
         sender = make_sender(self.settings.own_system)
         sender.file = self.to_autopilot
         self.vehicle = Vehicle(self.settings, [2.0, 3.0, self.height], sender, self._memory)
@@ -145,12 +145,12 @@ class Play:
         self.run(seconds).to_driver.cut = False
         return self
 
-    def without_driver(self, seconds, place=None):
+    def without_driver(self, seconds, position=None):
         """Let the driver hang for a time; then the vehicle may be carried elsewhere."""
         self.driver_lives = False
         self.run(seconds)
-        if place is not None:
-            self.body.position[:2] = place
+        if position is not None:
+            self.body.position[:2] = position
         self.driver_lives = True
 
     def until(self, condition, limit=60.0):

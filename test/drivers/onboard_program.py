@@ -18,11 +18,11 @@ GROUND, AIR, LANDING = range(3)
 
 
 class OnboardProgram:
-    """The drone, in real time; `place` is where it stands in the map, with its heading."""
+    """The drone, in real time; `start` is its pose in the map at the start."""
 
-    def __init__(self, address, feed, place):
+    def __init__(self, address, feed, start):
         # How long it flies without an order [s].
-        self.place, self.patience = place, 3.0
+        self.start, self.patience = start, 3.0
         self.charge = 1.0
         self.blobs, self.count = b'', 0  # of the next images, as the feed has them
         # Orders that it has received.
@@ -44,8 +44,8 @@ class OnboardProgram:
 
     @property
     def state(self):
-        pose = compose(self.place, Pose(self.model.position))
-        return RobotState(pose, self.place.rotation() @ self.model.velocity)
+        pose = compose(self.start, Pose(self.model.position))
+        return RobotState(pose, self.start.rotation() @ self.model.velocity)
 
     def cut(self, cut=True):
         """Let nothing of it get through; it still receives orders."""

@@ -183,7 +183,7 @@ class Team(Node):
         return numbers(self.commands[-1])
 
     @property
-    def place(self):
+    def position(self):
         return self.body.robot_state().pose.position
 
     # ---- what the team says ------------------------------------------------------------------
@@ -250,7 +250,7 @@ class Team(Node):
         return self.detections[number - 1]
 
     def seen_at(self):
-        """Return the place on the floor of the one detection of the first answer."""
+        """Return the position on the floor of the one detection of the first answer."""
         (seen,) = self.answer().detections
         pose = pose_from_ros(self.answer().pose.pose)
         way = seen.range * np.array([math.cos(seen.bearing), math.sin(seen.bearing)])
@@ -287,7 +287,7 @@ def transform(parent, child, pose, stamp=0):
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
     message.header.stamp = stamp_to_ros(stamp)
-    place, turn = message.transform.translation, message.transform.rotation
-    place.x, place.y, place.z = pose.position.tolist()
+    translation, turn = message.transform.translation, message.transform.rotation
+    translation.x, translation.y, translation.z = pose.position.tolist()
     turn.w, turn.x, turn.y, turn.z = pose.orientation.tolist()
     return message

@@ -30,7 +30,7 @@ def test_waypoints_are_followed_without_a_stop_and_the_last_one_is_held(play, ki
     team.move()
     assert team.state.goal_status == AgentState.IDLE and team.state.goal_id == 0
     _, replaced = team.send_accepted(first, number=1, step=team.step)
-    while np.linalg.norm(team.place - first) > 0.2 * size:
+    while np.linalg.norm(team.position - first) > 0.2 * size:
         team.move()
     _, result = team.send_accepted(second, number=2, step=team.step)
     for _ in range(20):
@@ -52,7 +52,7 @@ def test_waypoints_are_followed_without_a_stop_and_the_last_one_is_held(play, ki
     # Nobody says anything more: it stays.
     team.move(50)
     assert team.state.goal_status == AgentState.REACHED
-    assert np.linalg.norm(team.place - second) < 0.1
+    assert np.linalg.norm(team.position - second) < 0.1
     assert np.linalg.norm(team.body.robot_state().velocity) < 0.02
 
 
@@ -108,19 +108,19 @@ def test_a_robot_in_a_closed_zone_stays_until_it_is_sent_out(play, kind):
     publisher.publish(KeepOuts(version=1, zones=['1.2 1.0 1.0']))
     team.until(lambda: len(driver.volume.area.circles))
     team.move(40)
-    assert_allclose(team.place[:2], [1.0, 1.0], atol=0.01)
+    assert_allclose(team.position[:2], [1.0, 1.0], atol=0.01)
     assert 'keep-outs' in team.refused([1.3, 1.0, 1.0])
     keep_out = driver.follower.motion.keep_out
-    goal = keep_out.exit_from(team.place)
-    assert np.linalg.norm(goal - team.place) < 1.5
+    goal = keep_out.exit_from(team.position)
+    assert np.linalg.norm(goal - team.position) < 1.5
     _, result = team.send_accepted(goal.tolist())
     speeds = []
     for _ in range(400):
         team.move()
         speeds.append(float(np.linalg.norm(team.body.robot_state().velocity)))
-        if keep_out.exit_from(team.place) is None:
+        if keep_out.exit_from(team.position) is None:
             break
-    assert keep_out.exit_from(team.place) is None
+    assert keep_out.exit_from(team.position) is None
     assert max(speeds) > 0.8 * driver.settings.motion.speed
     # Its goal goes on.
     team.until(lambda: team.move() or result.done())

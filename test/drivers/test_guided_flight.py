@@ -20,7 +20,7 @@ def guided(monkeypatch):
 
     def start(**changes):
         play = GuidedPlay(monkeypatch, **changes).fly().run(6.0)
-        assert play.fault == '' and play.place[2] == pytest.approx(30.0, abs=3.5)
+        assert play.fault == '' and play.position[2] == pytest.approx(30.0, abs=3.5)
         play.speeds.clear()
         return play
 
@@ -43,11 +43,11 @@ def test_it_flies_at_the_speed_that_is_planned_with(guided, speed):
 def test_it_stops_soon_without_a_goal_and_does_not_fly_back(guided):
     play = guided().go_to(150.0, 0.0, 30.0)
     play.run(8.0)
-    here = play.place.copy()
+    here = play.position.copy()
     play.driver.end_goal(GoalStatus.CANCELED, 'cancelled')
     play.link.hold()
     east = []
-    play.run(12.0, lambda: east.append(play.place[0]))
+    play.run(12.0, lambda: east.append(play.position[0]))
     # 8 m/s are braked with 2.5 m/s^2 in 12.8 m.
     assert 12.0 < play.away(*here) < 17.0 and play.speed < 0.05
     assert np.diff(east).min() > -0.01
@@ -64,10 +64,10 @@ def test_it_leaves_a_zone_drawn_over_it_by_the_exit_and_stays_until_it_is_sent(g
     # Nothing moves without a goal, and nothing is at fault.
     assert play.away(0.0, 0.0) < 0.3 and play.fault == ''
     keep_out = play.driver.follower.motion.keep_out
-    assert not keep_out.is_free(play.place)
-    far = keep_out.exit_from(play.place)
+    assert not keep_out.is_free(play.position)
+    far = keep_out.exit_from(play.position)
     began = play.now
-    play.go_to(*far).until(lambda: keep_out.is_free(play.place), 30.0)
+    play.go_to(*far).until(lambda: keep_out.is_free(play.position), 30.0)
     way = play.away(0.0, 0.0)
     # As it would fly from rest to rest.
     assert play.now - began < 2.0 * np.sqrt(way / 2.5) + 2.5, (way, play.now - began)
@@ -79,7 +79,7 @@ def test_it_leaves_a_zone_drawn_over_it_by_the_exit_and_stays_until_it_is_sent(g
 
 def test_a_goal_whose_way_only_leaves_a_zone_goes_on_and_others_end(guided):
     play = guided().go_to(60.0, 0.0, 30.0).run(4.0)
-    x = float(play.place[0])
+    x = float(play.position[0])
     play.draw([[x - 8.0, -8.0], [x + 5.0, -8.0], [x + 5.0, 8.0], [x - 8.0, 8.0]])
     play.arrives()
     assert not play.driver.ended and play.fault == ''
@@ -87,7 +87,7 @@ def test_a_goal_whose_way_only_leaves_a_zone_goes_on_and_others_end(guided):
     play.draw([[-45.0, -8.0], [-25.0, -8.0], [-25.0, 8.0], [-45.0, 8.0]])
     assert play.driver.ended == ['path blocked by a keep-out zone']
     play.run(8.0)
-    assert play.speed < 0.05 and play.driver.follower.motion.keep_out.is_free(play.place)
+    assert play.speed < 0.05 and play.driver.follower.motion.keep_out.is_free(play.position)
 
 
 @pytest.mark.parametrize('limit', ['fence', 'stuck'])
@@ -114,7 +114,7 @@ def test_a_rejected_setpoint_is_a_fault_with_its_reason(guided, limit):
 @pytest.mark.parametrize(('action', 'mode'), [(1, 'RTL'), (2, 'LAND'), (4, 'BRAKE')])
 def test_the_autopilot_that_acts_on_its_fence_is_not_taken_for_the_pilot(guided, action, mode):
     play = guided(parameters={'FENCE_ACTION': action}).go_to(60.0, 0.0, 30.0).run(4.0)
-    x, y, _ = play.place.tolist()
+    x, y, _ = play.position.tolist()
     play.draw(f'{x} {y} 15')
     play.until(lambda: play.phase is VehiclePhase.RELEASED, 10.0)
     play.run(0.1)
@@ -139,7 +139,7 @@ def test_bounds_are_an_area_and_it_comes_back_from_outside(guided):
     assert ' m outside of the area' in play.fault and 'returning' in play.fault
     assert ' m outside the geofence' in play.driver.ended[0]
     play.until(lambda: play.fault == '', 60.0).run(5.0)
-    assert play.place[0] < 30.6 and play.speed < 0.05
+    assert play.position[0] < 30.6 and play.speed < 0.05
     # At the side of the box noise is no fault.
     play.go_to(30.3, 0.0, 30.0).arrives()
     for _ in range(50):
@@ -180,7 +180,7 @@ def test_no_setpoint_is_rejected_while_zones_appear_over_it_and_around(guided, s
         if play.away(*goal) > 40.0:
             play.go_to(*goal, 30.0)
         play.run(generator.uniform(1.0, 8.0))
-        here = play.place[:2] + generator.uniform(-5.0, 5.0, 2)
+        here = play.position[:2] + generator.uniform(-5.0, 5.0, 2)
         around = generator.uniform(-60.0, 60.0, (4, 2)) + here
         zones = [random_zone(generator, here, generator.uniform(6.0, 14.0))]
         zones += [random_zone(generator, place, generator.uniform(4.0, 10.0)) for place in around]
@@ -189,12 +189,12 @@ def test_no_setpoint_is_rejected_while_zones_appear_over_it_and_around(guided, s
             play.run(10.0)
             assert play.speed < 0.05
             keep_out = play.driver.follower.motion.keep_out
-            exit_point = keep_out.exit_from(play.place)
+            exit_point = keep_out.exit_from(play.position)
             if exit_point is not None:
                 play.go_to(*exit_point)
         if play.driver.follower.current is not None:
             play.arrives()
-        assert play.driver.follower.exit_from(play.place) is None
+        assert play.driver.follower.exit_from(play.position) is None
         assert play.fault == '' and not rejected
 
 
@@ -215,7 +215,7 @@ def test_where_the_driver_dies_it_stops_in_free_space(guided, seed):
     )
     play.go_to(*goal, 30.0)
     play.run(generator.uniform(6.0, 14.0), lambda: check(play, keep_out))
-    before, speed = play.place.copy(), play.speed
+    before, speed = play.position.copy(), play.speed
     play.driver_lives = False
     play.to_driver.cut = play.to_autopilot.cut = bool(seed % 2)
     play.autopilot.parameters['FS_GCS_TIMEOUT'] = 60.0
@@ -226,7 +226,7 @@ def test_where_the_driver_dies_it_stops_in_free_space(guided, seed):
 
 
 def check(play, keep_out):
-    assert keep_out.is_free(play.place), play.place
+    assert keep_out.is_free(play.position), play.position
 
 
 def test_at_home_a_drone_that_is_not_charged_lands(guided):

@@ -356,11 +356,11 @@ def test_a_localiser_says_where_the_frame_of_the_autopilot_is(fly):
     flight.until(lambda: UNTIL_ARM in flight.driver.health.text)
     assert flight.call('arm').message == 'no pose'
     # The autopilot's north is off, and its origin elsewhere.
-    place = Pose.from_yaw([0.7, -0.4, 0.1], 0.4)
-    timer = flight.seen_from_outside(place=place)
+    origin = Pose.from_yaw([0.7, -0.4, 0.1], 0.4)
+    timer = flight.seen_from_outside(origin=origin)
     goal = [2.0, 1.0, 1.0]
     flight.up().reaches(goal)
-    assert_allclose(compose(place, flight.drone.state.pose).position, goal, atol=0.35)
+    assert_allclose(compose(origin, flight.drone.state.pose).position, goal, atol=0.35)
     # Without it the vehicle stays where it was sent last.
     timer.cancel()
     flight.until_said('no pose for')
@@ -418,9 +418,9 @@ def test_a_fault_ends_the_way_and_is_said(fly, capfd):
 
 def test_its_fence_is_the_area_and_follows_keep_outs(fly):
     area = 'POLYGON ((-8 -8, 8 -8, 8 8, -8 8, -8 -8))'
-    place = {'area': area, 'altitude': [-5.0, 5.0], 'keep_outs': ['5 5 1']}
+    environment = {'area': area, 'altitude': [-5.0, 5.0], 'keep_outs': ['5 5 1']}
     origin = {'latitude': 46.6, 'longitude': 9.9}
-    flight = fly('vehicle', environment=place | {'origin': origin}).up()
+    flight = fly('vehicle', environment=environment | {'origin': origin}).up()
     fence = flight.inside.fence
     assert [item[1] for item in fence.items] == [4, 4, 4, 4, 1]
     publisher = flight.team.create_publisher(KeepOuts, '/keep_outs', LATCHED)

@@ -1,4 +1,4 @@
-"""What the driver knows of a vehicle: frames, its place in the map, its battery."""
+"""What the driver knows of a vehicle: frames, its position in the map, its battery."""
 
 import math
 
@@ -89,7 +89,7 @@ def test_a_status_that_another_program_turned_off_is_asked_for_again():
 def far_away(memory, origin):
     """Return a vehicle in the air, away from its start and from the origin of its local frame."""
     play = Play(memory=memory, origin=origin, autopilot={'barometer_drift': -0.1})
-    play.without_driver(3.0, place=[3.0, 4.0])
+    play.without_driver(3.0, position=[3.0, 4.0])
     return play.fly().go()
 
 

@@ -25,9 +25,9 @@ BOX = np.array([[-8.0, 8.0], [-6.0, 6.0], [0.0, 5.0]])
 
 
 def items_of(keep_outs=(BARN, WELL), area=(BORDER, POND), start=(0.0, 0.0, 2.0)):
-    place = {'area': area} if area else {'bounds': BOX[:2].tolist()}
-    place['origin'] = ORIGIN
-    environment = EnvironmentSettings.model_validate(place | {'keep_outs': list(keep_outs)})
+    values = {'area': area} if area else {'bounds': BOX[:2].tolist()}
+    values['origin'] = ORIGIN
+    environment = EnvironmentSettings.model_validate(values | {'keep_outs': list(keep_outs)})
     limits = BOX + np.array([MARGIN, -MARGIN])
     return fence_items(OperatingVolume(Area(environment), 0.2, limits), list(start))
 
@@ -44,8 +44,8 @@ def has(play, items):
     return len(kept) == len(items) and np.allclose(kept, items, rtol=0.0, atol=1e-5)
 
 
-def places(items):
-    """Return latitudes and longitudes as places on the map."""
+def on_map(items):
+    """Return latitudes and longitudes as positions on the map."""
     return to_map(1e-7 * np.array([item[:1:-1] for item in items], dtype=float), ORIGIN)
 
 
@@ -57,7 +57,7 @@ def test_the_fence_is_uploaded_and_read_back_before_it_is_armed(firmware):
     assert [item[1] for item in kept] == pytest.approx([4] * 4 + [3] * 3 + [4] * 4 + [4.1])
     corners = np.array([*BORDER, *POND, *BARN, WELL['centre']])
     # 1e-7 degrees are 1.1 cm.
-    assert_allclose(sorted(places(kept).tolist()), sorted(corners.tolist()), atol=0.02)
+    assert_allclose(sorted(on_map(kept).tolist()), sorted(corners.tolist()), atol=0.02)
     assert play.said.count(VERIFIED) == 1
     sent = play.to_autopilot.messages
     assert sent.index(play.sent('MISSION_ACK')[0]) < sent.index(play.commands(ARM)[0])
@@ -66,7 +66,7 @@ def test_the_fence_is_uploaded_and_read_back_before_it_is_armed(firmware):
 def test_a_box_and_the_part_of_an_area_at_the_start():
     box = items_of(keep_outs=[], area=None)
     assert [item[:2] for item in box] == [(INSIDE, 4)] * 4
-    assert_allclose([places(box).min(axis=0), places(box).max(axis=0)], BOX[:2].T, atol=0.02)
+    assert_allclose([on_map(box).min(axis=0), on_map(box).max(axis=0)], BOX[:2].T, atol=0.02)
     # Of two islands, as no way leads to the other one.
     parts = 'MULTIPOLYGON (((0 0, 9 0, 9 9, 0 0)), ((20 0, 29 0, 29 9, 20 9, 20 0)))'
     assert [item[:2] for item in items_of([], parts, [22.0, 4.0])] == [(INSIDE, 4)] * 4

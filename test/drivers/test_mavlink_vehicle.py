@@ -159,7 +159,7 @@ def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
     play.run(10.0)
     play.autopilot.restart()
     # It is carried once its EKF has an origin.
-    play.without_driver(3.0, place=[3.0, 4.0])
+    play.without_driver(3.0, position=[3.0, 4.0])
     play.autopilot.parameters['FS_GCS_ENABLE'] = 0.0
     play.run(12.0)
     assert 'the autopilot has restarted' in play.said
@@ -242,10 +242,10 @@ def test_a_stop_ends_a_take_off(firmware, share):
     play.until(lambda: abs(play.body.position[2]) > share * height)
     assert play.phase is VehiclePhase.RISING
     play.vehicle.stop()
-    places = []
-    play.run(20.0, lambda: places.append(abs(play.body.position[2])))
-    assert max(places) < (share + 0.3) * height
-    assert places[-1] == pytest.approx(0.0, abs=0.1)
+    heights = []
+    play.run(20.0, lambda: heights.append(abs(play.body.position[2])))
+    assert max(heights) < (share + 0.3) * height
+    assert heights[-1] == pytest.approx(0.0, abs=0.1)
     assert play.mode in ('LAND', 'SURFACE')
     assert 'take-off stopped' in play.fault
     assert play.autopilot.armed == (firmware == 'ardusub')

@@ -88,10 +88,10 @@ def test_the_history_gives_exact_poses_at_their_stamps_and_nothing_outside():
 
 def test_velocities_come_from_differences():
     speed = PoseSpeed()
-    assert not speed.place(0, Pose.from_yaw([0.0, 0.0, 1.0], 3.1)).velocity.any()
-    placed = speed.place(10**8, Pose.from_yaw([0.02, -0.04, 1.0], -3.1))
+    assert not speed.with_velocity(0, Pose.from_yaw([0.0, 0.0, 1.0], 3.1)).velocity.any()
+    placed = speed.with_velocity(10**8, Pose.from_yaw([0.02, -0.04, 1.0], -3.1))
     assert_allclose(placed.velocity, [0.2, -0.4, 0.0], atol=1e-9)
     assert_allclose(placed.angular_velocity, [0.0, 0.0, 10 * (2 * np.pi - 6.2)], atol=1e-9)
     # A jump is no velocity, and neither is a difference over a gap.
-    assert not speed.place(2 * 10**8, Pose([9.0, 0.0, 1.0])).velocity.any()
-    assert not speed.place(5 * 10**9, Pose([9.5, 0.0, 1.0])).velocity.any()
+    assert not speed.with_velocity(2 * 10**8, Pose([9.0, 0.0, 1.0])).velocity.any()
+    assert not speed.with_velocity(5 * 10**9, Pose([9.5, 0.0, 1.0])).velocity.any()

@@ -38,8 +38,8 @@ class Listener:
     def buffer(self):
         made = TransformBuffer()
         for item in (item for message in self.static + self.moving for item in message.transforms):
-            place, turn = item.transform.translation, item.transform.rotation
-            pose = Pose([place.x, place.y, place.z], [turn.w, turn.x, turn.y, turn.z])
+            moved, turn = item.transform.translation, item.transform.rotation
+            pose = Pose([moved.x, moved.y, moved.z], [turn.w, turn.x, turn.y, turn.z])
             child, stamp = item.child_frame_id, stamp_from_ros(item.header.stamp)
             made.add(item.header.frame_id, child, pose, stamp, static=child != BASE)
         return made
@@ -136,15 +136,15 @@ def test_a_driver_follows_poses_on_tf_and_stops_when_they_go_stale(play):
     goal = team.start.position + np.array([0.15, 0.1, 0.0])
     _, result = team.send_accepted(goal, live=robot.move)
     assert team.ended(result, robot.move)[0] == GoalStatus.STATUS_SUCCEEDED
-    assert np.linalg.norm(team.place - goal) <= 0.1
-    place = team.place
+    assert np.linalg.norm(team.position - goal) <= 0.1
+    before = team.position
     _, result = team.send_accepted([1.8, 1.8, 0.0], live=robot.move)
     team.until(lambda: robot.move() or np.any(team.command != 0.0))
     # Silence.
     assert 'no pose on tf for' in team.aborted(result)
     team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
     assert_array_equal(team.command, np.zeros(4))
-    assert np.linalg.norm(team.place - place) < 0.5
+    assert np.linalg.norm(team.position - before) < 0.5
     # Transforms that come late are no pose.
     robot.stamp += NANOSECONDS
     team.until(lambda: time.time_ns() - robot.stamp > 3_100_000_000)
@@ -165,8 +165,8 @@ def test_a_driver_takes_poses_of_a_localiser_from_a_topic(play):
     assert not any(map(team.count_publishers, ('/tf', '/tf_static', 'robot_description')))
     poses = team.create_publisher(PoseStamped, 'pose', RELIABLE)
     # Not where the robot was put down.
-    place = Pose.from_yaw([0.9, 0.4, 0.0], -1.0)
-    message = PoseStamped(pose=pose_to_ros(place))
+    expected = Pose.from_yaw([0.9, 0.4, 0.0], -1.0)
+    message = PoseStamped(pose=pose_to_ros(expected))
 
     def say(frame='map'):
         message.header.frame_id = frame
@@ -174,7 +174,7 @@ def test_a_driver_takes_poses_of_a_localiser_from_a_topic(play):
 
     team.until(lambda: say() or team.states)
     found = pose_from_ros(team.state.pose.pose)
-    assert_allclose(found.position, place.position, atol=1e-9)
+    assert_allclose(found.position, expected.position, atol=1e-9)
     assert found.yaw == pytest.approx(-1.0)
     team.until(lambda: say('odom') or driver.dropped['pose'] > 3)
     team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
@@ -224,13 +224,13 @@ def test_a_goal_in_another_frame_is_reached_where_that_is(play):
     expected = DOCK.position + DOCK.rotation() @ offset
     _, result = team.send_accepted(offset, frame='dock')
     assert team.ended(result, team.move)[0] == GoalStatus.STATUS_SUCCEEDED
-    place = team.place
-    assert np.linalg.norm(place - expected) <= team.settings.motion.tolerance + 0.01
+    reached = team.position
+    assert np.linalg.norm(reached - expected) <= team.settings.motion.tolerance + 0.01
     # Relative to the robot itself, as it stands.
     heading = team.body.robot_state().pose.rotation()
     _, result = team.send_accepted([-0.1, 0.0, 0.0], frame=BASE, number=2)
     assert team.ended(result, team.move)[0] == GoalStatus.STATUS_SUCCEEDED
-    away = np.linalg.norm(team.place - (place + heading @ [-0.1, 0.0, 0.0]))
+    away = np.linalg.norm(team.position - (reached + heading @ [-0.1, 0.0, 0.0]))
     assert away <= team.settings.motion.tolerance + 0.01
     # What tf does not know, knows outside the bounds, or knows no more, is refused.
     assert "unknown frame 'kitchen'" in team.refused([0.0, 0.0, 0.0], frame='kitchen')

@@ -243,7 +243,7 @@ def test_a_robot_outside_of_its_bounds_is_stopped(play, kind):
     """Bounds are an area; noise at their side is no fault, as goals may lie there."""
     driver, team = play(kind, environment={'bounds': [[-0.3, 2.4], [-0.3, 2.4]]})
     team.move()
-    generator, height = np.random.default_rng(1), team.place[2]
+    generator, height = np.random.default_rng(1), team.position[2]
 
     def put(x, y):
         team.body = team.motion.body(RobotState.at_rest([x, y, height]))
@@ -269,7 +269,7 @@ def test_a_flying_robot_in_the_plane_is_not_sent_to_another_height(play):
     for height in (-0.1, 50.0):
         assert 'waypoint.pose.position.z' in team.refused([1.2, 1.2, height])
     team.move(20)
-    assert team.place[2] == pytest.approx(1.0, abs=0.01)
+    assert team.position[2] == pytest.approx(1.0, abs=0.01)
     # Its own height is that of the waypoints, and it may change it a little.
     assert team.accepts([1.2, 1.2, 1.3])
 
@@ -307,11 +307,11 @@ def test_a_stopped_robot_stands_and_refuses_goals_until_it_is_released(play, kin
     # At once, not with the next odometry.
     team.until(lambda: len(team.commands) > known)
     assert_array_equal(team.command, np.zeros(4))
-    place = team.place
+    before = team.position
     team.move(40)
     assert team.state.goal_status == AgentState.UNAVAILABLE and team.state.reason == STOPPED
     # A flying robot brakes, and is kept where it was told to stop.
-    assert np.linalg.norm(team.place - place) < 0.15
+    assert np.linalg.norm(team.position - before) < 0.15
     assert STOPPED in team.refused(goal)
     # Nobody releases it by restarting the node's life cycle.
     for transition in ('deactivate', 'cleanup', 'configure', 'activate'):

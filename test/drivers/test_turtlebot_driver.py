@@ -53,7 +53,7 @@ class Scanned:
         self.team.move()
         if scan and self.team.step % 4 == 0:
             self.publisher.publish(self.message())
-        gaps = np.hypot(*(self.centres - self.team.place[:2]).T) - self.radii
+        gaps = np.hypot(*(self.centres - self.team.position[:2]).T) - self.radii
         assert gaps.min(initial=math.inf) > self.team.settings.radius
 
 

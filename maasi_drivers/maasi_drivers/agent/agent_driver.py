@@ -218,7 +218,7 @@ class AgentDriver(RobotNode):
 
     def _handle_localised(self, topic: str, stamp: int, pose: Pose) -> None:
         if self.active and self.is_new_pose(topic, stamp):
-            self.take_pose(self._pose_speed.place(stamp, pose))
+            self.take_pose(self._pose_speed.with_velocity(stamp, pose))
 
     def _adopt_area(self, area: Area) -> None:
         """Adopt new keep-out zones; abort a goal whose path crosses one.

@@ -154,7 +154,7 @@ class PoseSpeed:
     def __init__(self) -> None:
         self._before: tuple[int, Pose] | None = None
 
-    def place(self, stamp: int, pose: Pose) -> StampedPose:
+    def with_velocity(self, stamp: int, pose: Pose) -> StampedPose:
         """Return a pose at a stamp [ns] with the velocity since the last one."""
         velocity, turning = np.zeros(3), np.zeros(3)
         before, self._before = self._before, (stamp, pose)

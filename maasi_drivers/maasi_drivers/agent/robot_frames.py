@@ -48,8 +48,8 @@ def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
         frames.append((base, camera, mount.position, mount.rpy))
         frames.append((camera, f'{robot}/camera_optical', (0.0, 0.0, 0.0), _OPTICAL))
     if settings.scan is not None:
-        place, turn = (*settings.scan.position, 0.0), (0.0, 0.0, settings.scan.yaw)
-        frames.append((base, f'{robot}/base_scan', place, turn))
+        position, turn = (*settings.scan.position, 0.0), (0.0, 0.0, settings.scan.yaw)
+        frames.append((base, f'{robot}/base_scan', position, turn))
     ranging = settings.ranging
     if ranging.frame == 'body':
         frames.append((base, f'{robot}/ranging', ranging.position, ranging.rpy))
@@ -64,12 +64,12 @@ def robot_description(robot: str, settings: DriverSettings) -> str:
         geometry = ElementTree.SubElement(ElementTree.SubElement(link, part), 'geometry')
         size = repr(settings.radius)
         ElementTree.SubElement(geometry, 'cylinder', radius=size, length=size)
-    for parent, name, *place in sensor_frames(robot, settings):
+    for parent, name, *pose in sensor_frames(robot, settings):
         ElementTree.SubElement(root, 'link', name=name)
         joint = ElementTree.SubElement(root, 'joint', name=f'{name}_joint', type='fixed')
         ElementTree.SubElement(joint, 'parent', link=parent)
         ElementTree.SubElement(joint, 'child', link=name)
-        xyz, rpy = (' '.join(map(str, map(float, item))) for item in place)
+        xyz, rpy = (' '.join(map(str, map(float, item))) for item in pose)
         ElementTree.SubElement(joint, 'origin', xyz=xyz, rpy=rpy)
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding='unicode') + '\n'
@@ -171,8 +171,8 @@ class RobotFrames:
             self._node.drop('transform', f'frames of this robot: {error}')
         made = TransformStamped(child_frame_id=child)
         made.header.frame_id, made.header.stamp = parent, stamp_to_ros(stamp or 0)
-        place, turn = made.transform.translation, made.transform.rotation
-        place.x, place.y, place.z = pose.position.tolist()
+        translation, turn = made.transform.translation, made.transform.rotation
+        translation.x, translation.y, translation.z = pose.position.tolist()
         turn.w, turn.x, turn.y, turn.z = pose.orientation.tolist()
         return made
 
@@ -186,13 +186,13 @@ class RobotFrames:
             try:
                 if (problem := stamp_problem(item)) is not None:
                     raise ValueError(problem)
-                place, turn = item.transform.translation, item.transform.rotation
-                bounded('translation', (place.x, place.y, place.z), FARTHEST)
+                translation, turn = item.transform.translation, item.transform.rotation
+                bounded('translation', (translation.x, translation.y, translation.z), FARTHEST)
                 bounded('rotation', (turn.w, turn.x, turn.y, turn.z), 1e6)
                 self._buffer.add(
                     item.header.frame_id.strip('/'),
                     item.child_frame_id.strip('/'),
-                    Pose(point_from_ros(place), np.array([turn.w, turn.x, turn.y, turn.z])),
+                    Pose(point_from_ros(translation), np.array([turn.w, turn.x, turn.y, turn.z])),
                     stamp_from_ros(item.header.stamp),
                     static=topic == 'tf_static',
                 )

@@ -73,8 +73,8 @@ class RecordedRobot:
                 f'{" or ".join(ends)}, allowed is one; recorded are {there}'
             )
         self.robot, self.use = robots.pop(), kind
-        places = [*map(self._topic, _POSES), _TRANSFORMS]
-        recorded = [topic for topic in places if topic in self._types]
+        topics = [*map(self._topic, _POSES), _TRANSFORMS]
+        recorded = [topic for topic in topics if topic in self._types]
         self.poses = poses or (recorded or [self._topic('/odom')])[0]
         known = self._types.get(self.poses, 'not recorded')
         self._pose_type = known.rpartition('/')[2]
@@ -82,7 +82,7 @@ class RecordedRobot:
         if self._pose_type not in allowed:
             raise ValueError(
                 f'{bag}: poses: {self.poses} is {known}, allowed are {", ".join(allowed)}; '
-                f'looked for are {", ".join(places)}'
+                f'looked for are {", ".join(topics)}'
             )
 
     @property

@@ -65,27 +65,27 @@ def sensor_noise(
     model = sensor.measurement
     seen = [model.inverse(observation.values, observation.pose) for observation in observations]
     if target is not None:
-        place = np.asarray(target, dtype=float)
-        if place.shape != (model.dimension,) or not np.isfinite(place).all():
+        position = np.asarray(target, dtype=float)
+        if position.shape != (model.dimension,) or not np.isfinite(position).all():
             raise ValueError(
-                f'target: got {place.tolist()}, allowed are {model.dimension} finite numbers [m]'
+                f'target: got {position.tolist()}, allowed are {model.dimension} finite numbers [m]'
             )
     else:
         every = np.concatenate([np.zeros((0, model.dimension)), *seen])
         if not len(every):
             raise ValueError(f'target: detected 0 times, allowed is at least {LEAST_OBSERVATIONS}')
-        place = np.median(every, axis=0)
+        position = np.median(every, axis=0)
     nearest: list[int | None] = []
     # Without a given target: from the median to the mean of close detections.
     for _ in range(1 if target is not None else _ROUNDS):
-        nearest = _nearest(seen, place)
+        nearest = _nearest(seen, position)
         chosen = [spots[i] for spots, i in zip(seen, nearest) if i is not None]
         if target is None and chosen:
-            place = np.mean(chosen, axis=0)
+            position = np.mean(chosen, axis=0)
     errors, ranges, near, inside, missed = [], [], 0, 0, 0
     for observation, index in zip(observations, nearest):
-        expected = model.measure(place[None, :], observation.pose)[0]
-        if sensor.detection.probability(place[None, :], observation.pose)[0] > 0.0:
+        expected = model.measure(position[None, :], observation.pose)[0]
+        if sensor.detection.probability(position[None, :], observation.pose)[0] > 0.0:
             inside += 1
             missed += index is None
         if index is None:
@@ -104,7 +104,7 @@ def sensor_noise(
     return SensorNoise(
         covariance=np.atleast_2d(np.cov(array, rowvar=False)),
         bias=array.mean(axis=0),
-        target=place,
+        target=position,
         ranges=(min(ranges), max(ranges)),
         used=len(errors),
         near=near,
@@ -114,8 +114,8 @@ def sensor_noise(
     )
 
 
-def _nearest(seen: Sequence[FloatArray], place: FloatArray) -> list[int | None]:
-    distances = [np.linalg.norm(spots - place, axis=1) for spots in seen]
+def _nearest(seen: Sequence[FloatArray], position: FloatArray) -> list[int | None]:
+    distances = [np.linalg.norm(spots - position, axis=1) for spots in seen]
     least = [float(item.min()) for item in distances if len(item)]
     limit = max(_FAR * float(np.median(least)), _ROUNDING) if least else 0.0
     return [

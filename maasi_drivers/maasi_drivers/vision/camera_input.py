@@ -81,8 +81,8 @@ def _best(item: Any) -> tuple[Any, list[float]]:
 
 def _corners(box: Any, size: FloatArray) -> FloatArray:
     """Return the least and largest x and y of a (possibly rotated) box in the image (2, 2)."""
-    place, turn = box.center.position, box.center.theta
-    numbers = np.array([place.x, place.y, box.size_x, box.size_y, turn])
+    middle, turn = box.center.position, box.center.theta
+    numbers = np.array([middle.x, middle.y, box.size_x, box.size_y, turn])
     centre, extent = numbers[:2], numbers[2:4]
     if (numbers[:4] >= 0.0).all() and (numbers[:4] <= 1.0).all() and (extent > 0.0).all():
         raise ValueError(

@@ -100,14 +100,14 @@ class MarkerDetector:
         if pose_covariance is not None:
             by_pose = by_pose[keep]
             covariances = covariances + by_pose @ pose_covariance @ by_pose.transpose(0, 2, 1)
-        places, spread = np.zeros((len(positions), 3)), np.zeros((len(positions), 3, 3))
-        places[:, :2] = positions
+        padded, spread = np.zeros((len(positions), 3)), np.zeros((len(positions), 3, 3))
+        padded[:, :2] = positions
         # A floor height error of 5 mm keeps covariances regular in 3D.
         spread[:, :2, :2], spread[:, 2, 2] = covariances, 0.005**2
         used = slice(self._model.dimension)
         return SensorReading(
-            *measured(self._model, places[:, used], spread[:, used, used], pose),
-            places[:, used],
+            *measured(self._model, padded[:, used], spread[:, used, used], pose),
+            padded[:, used],
             dropped,
             blobs.labels,
         )

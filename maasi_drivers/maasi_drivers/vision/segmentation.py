@@ -38,8 +38,8 @@ def _components(mask: BoolArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
     boxes, areas = stats[1:, :4], stats[1:, 4]
     low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
     cut = np.asarray(((low <= 0) | (high >= mask.shape[::-1])).any(axis=1))
-    places, spread = np.asarray(centroids[1:], float), np.zeros((len(areas), 2, 2))
-    blobs = Blobs(places, areas.astype(float), boxes[:, 2:].astype(float), cut, spread)
+    centres, spread = np.asarray(centroids[1:], float), np.zeros((len(areas), 2, 2))
+    blobs = Blobs(centres, areas.astype(float), boxes[:, 2:].astype(float), cut, spread)
     return np.asarray(labels, np.int32), np.asarray(boxes, np.int64), blobs
 
 
@@ -74,9 +74,9 @@ def _floor_statistics(sample):  # type: ignore[no-untyped-def]
     # Blueness is between -3 and 3: bins of 1/256.
     bins = np.floor(_blueness(gains.reshape(3, 1) * sample) * 256.0).astype(np.int64) + 768
     counts = np.bincount(np.clip(bins, 0, 1535), minlength=1536)
-    places = (np.arange(1536) + 0.5 - 768.0) / 256.0
+    values = (np.arange(1536) + 0.5 - 768.0) / 256.0
     centre = (_median(counts) + 0.5 - 768.0) / 256.0
-    offsets = np.floor(np.abs(places - centre) * 256.0).astype(np.int64)
+    offsets = np.floor(np.abs(values - centre) * 256.0).astype(np.int64)
     deviation = 1.4826 * (_median(np.bincount(offsets, counts)) + 0.5) / 256.0
     return gains, centre, deviation
 

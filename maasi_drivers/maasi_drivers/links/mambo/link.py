@@ -319,8 +319,8 @@ class MamboLink:
             self._fresh_until = -math.inf
             read = sensors.sensors_dict
             keys = ('posx', 'posy', 'posz', 'psi')
-            *place, psi = (float(read[f'DronePosition_{key}']) for key in keys)
-            position = 0.01 * np.array(place)
+            *centimetres, psi = (float(read[f'DronePosition_{key}']) for key in keys)
+            position = 0.01 * np.array(centimetres)
             # False also for nan.
             if np.abs(position).max() <= _FARTHEST and math.isfinite(psi):
                 self.position = PositionEvent(position, -math.radians(psi), time.monotonic())

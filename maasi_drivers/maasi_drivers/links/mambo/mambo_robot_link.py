@@ -179,7 +179,7 @@ class MamboRobotLink(RobotLink):
         driver = self.driver
         if not driver.active or not driver.is_new_pose('pose.header.stamp', stamp):
             return
-        placed, latest = self._speed.place(stamp, pose), driver.history.latest
+        placed, latest = self._speed.with_velocity(stamp, pose), driver.history.latest
         before = placed.velocity if latest is None else latest.velocity
         velocity = before + _SMOOTHING * (placed.velocity - before)
         covariance = self._mambo.pose_covariance()

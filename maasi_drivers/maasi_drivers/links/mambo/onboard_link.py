@@ -172,14 +172,14 @@ class OnboardLink(RobotLink):
             return
         if pose.battery >= 0.0:
             driver.take_charge(pose.battery)
-        place = compose(
+        in_map = compose(
             self._origin, Pose.from_rpy(pose.position, (pose.roll, pose.pitch, pose.yaw))
         )
-        driver.judge('flight', self._next_order(pose, place), 'flying: accepting goals')
-        placed = self._speed.place(stamp, place)
+        driver.judge('flight', self._next_order(pose, in_map), 'flying: accepting goals')
+        placed = self._speed.with_velocity(stamp, in_map)
         driver.take_pose(replace(placed, covariance=self._mambo.pose_covariance()))
 
-    def _next_order(self, pose: FeedPose, place: Pose) -> str:
+    def _next_order(self, pose: FeedPose, in_map: Pose) -> str:
         mambo, now = self._mambo, time.monotonic()
         self._feed_state = pose.state
         if self._landed_for:
@@ -191,7 +191,7 @@ class OnboardLink(RobotLink):
         if 0.0 <= pose.battery < mambo.battery_minimum:
             least = 100.0 * mambo.battery_minimum
             return self._land(f'battery at {100.0 * pose.battery:.0f} %, below {least:.0f} %')
-        if too_far := self.driver.volume.drift_problem(place.position):
+        if too_far := self.driver.volume.drift_problem(in_map.position):
             return self._land(too_far)
         if self._up:
             down = pose.state != FeedState.AIR
@@ -203,7 +203,7 @@ class OnboardLink(RobotLink):
             self._rising_since = now
         start = self.driver.start_pose.position
         self._target, self._order = start, OrderKind.GO
-        height = start[2] - place.position[2]
+        height = start[2] - in_map.position[2]
         self._up = pose.state == FeedState.AIR and abs(height) <= ALTITUDE_TOLERANCE
         if not self._up and now - self._rising_since > mambo.take_off_timeout:
             return self._land(f'altitude not reached within {mambo.take_off_timeout:g} s')

@@ -58,11 +58,11 @@ class MamboPilot:
         self.problem = 'connecting to the Mambo'
         speed = settings.full_speed or _UNKNOWN_SPEED
         model = TiltModel(link.tilt, speed, link.climb, settings.full_turn)
-        place = [*home.position[:2], settings.ground]
-        self.reckoning = DeadReckoning(model, Pose.from_yaw(place, home.yaw), settings)
+        position = [*home.position[:2], settings.ground]
+        self.reckoning = DeadReckoning(model, Pose.from_yaw(position, home.yaw), settings)
         self._event: PositionEvent | None = None
         # Last position: its time, and the time of its last change.
-        self._place: FloatArray | None = None
+        self._position: FloatArray | None = None
         self._placed_at = self._moved_at = -math.inf
         # Unchanged in spite of commands: only a changed position is accepted.
         self._stuck = False
@@ -100,17 +100,17 @@ class MamboPilot:
     def update_pose(self, now: float, state: RobotState) -> None:
         """Update the pose from another system."""
         self._now = now
-        self._note_place(now, state.pose.position)
+        self._note_position(now, state.pose.position)
         self.reckoning.update(state, now, self.flying)
 
-    def _note_place(self, now: float, place: FloatArray) -> None:
+    def _note_position(self, now: float, position: FloatArray) -> None:
         commanded = float(np.abs(self._command[:3]).max()) > _LEAST_SPEED
-        if self._place is None or not np.array_equal(place, self._place):
+        if self._position is None or not np.array_equal(position, self._position):
             self._stuck = False
             self._moved_at = now
         elif not commanded and not self._stuck:
             self._moved_at = now
-        self._place, self._placed_at = place, now
+        self._position, self._placed_at = position, now
 
     def fly(self, command: FloatArray) -> None:
         """Fly a velocity command (4,), once; without a next one the drone hovers."""
@@ -223,7 +223,7 @@ class MamboPilot:
         if event is not None and event is not self._event and self.settings.pose == 'events':
             self._event = event
             self.reckoning.correct(event, self.flying)
-            self._note_place(event.received, event.position)
+            self._note_position(event.received, event.position)
         self.problem = self._advance(now)
 
     def _advance(self, now: float) -> str:

@@ -191,7 +191,7 @@ class DeadReckoning:
         turn, move = math.remainder(heading - yaw, math.tau), _POSITION_GAIN * error
         speed = _VELOCITY_GAIN / _EVENT_PERIOD * error
         self.course = Course(course.position + move, course.velocity + speed, course.yaw + turn)
-        moved = [(at, place + move, yaw + turn) for at, place, yaw in self._past]
+        moved = [(at, position + move, yaw + turn) for at, position, yaw in self._past]
         self._past = deque(moved, maxlen=_HISTORY)
 
     def _learn(self, change: FloatArray, measured: FloatArray) -> None:

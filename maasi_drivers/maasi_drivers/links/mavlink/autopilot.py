@@ -58,14 +58,14 @@ class Autopilot:
     ) -> None:
         self.settings = settings
         self.log = ReportLog()
-        self.place = FlightOrigin(settings, start, memory, self.log)
+        self.flight_origin = FlightOrigin(settings, start, memory, self.log)
         self.firmware: Firmware | None = None
         self.failsafes: FailsafeCheck | None = None
         self.refusal = ''
         self.armed = False
         self.mode = -1
         self.lost = False
-        self.estimate = Estimate(settings, self.place, self.on_restart)
+        self.estimate = Estimate(settings, self.flight_origin, self.on_restart)
         self.commands: deque[_Command] = deque()  # : unanswered commands
         # : Numbers of the commands accepted in this phase of the flight.
         self.accepted: set[int] = set()
@@ -120,8 +120,8 @@ class Autopilot:
             self.fence.update(message, now)
             self.estimate.update(message, now, self.armed)
             if kind == 'POSITION_TARGET_LOCAL_NED':
-                place = swap_enu_ned((message.x, message.y, message.z))
-                self.setpoints.update(message, place, now)
+                position = swap_enu_ned((message.x, message.y, message.z))
+                self.setpoints.update(message, position, now)
         return None
 
     def _shows_own_id(self, message: Any) -> bool:
@@ -257,17 +257,17 @@ class Autopilot:
         if position is None:
             # Zero velocity is accepted inside every fence.
             self.setpoints.reset()
-            mask, place = _VELOCITY, [0.0] * 3
+            mask, target = _VELOCITY, [0.0] * 3
         else:
             self.setpoints.note(position, now)
-            mask, place = _POSITION_AND_YAW, swap_enu_ned(position).tolist()
+            mask, target = _POSITION_AND_YAW, swap_enu_ned(position).tolist()
         self._sender.set_position_target_local_ned_send(
             int(now * 1000.0) & 0xFFFFFFFF,
             self.settings.system,
             mavlink.MAV_COMP_ID_AUTOPILOT1,
             mavlink.MAV_FRAME_LOCAL_NED,
             mask | (_NO_YAW if yaw is None else 0),
-            *place,
+            *target,
             *[0.0] * 6,
             0.0 if yaw is None else swap_yaw(yaw),
             0.0,

@@ -61,7 +61,7 @@ class FlightOrigin:
     ) -> None:
         self.problem = ''
         self._here = settings.origin == 'here'
-        self._place = [*start[:2], settings.ground]
+        self._start = [*start[:2], settings.ground]
         self._path, self._log = path, log
 
     def find(self, position: FloatArray, booted: float, armed: bool) -> FloatArray | None:
@@ -86,11 +86,11 @@ class FlightOrigin:
         self.keep(position, booted)
         return position
 
-    def keep(self, place: FloatArray, booted: float) -> None:
+    def keep(self, origin: FloatArray, booted: float) -> None:
         """Write the position to the file; `booted` as in `find`."""
         if self._path is None:
             return
-        item = {'boot': [_host_boot(), booted], 'map': self._place, 'place': place.tolist()}
+        item = {'boot': [_host_boot(), booted], 'map': self._start, 'place': origin.tolist()}
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             part = self._path.with_suffix('.part')
@@ -103,12 +103,12 @@ class FlightOrigin:
         try:
             item = json.loads(self._path.read_text()) if self._path is not None else {}
             host, before = item['boot']
-            place = np.array(item['place'], dtype=float)
+            origin = np.array(item['place'], dtype=float)
             same = host == _host_boot() and math.isclose(before, booted, abs_tol=_SAME_BOOT)
         except (OSError, ValueError, KeyError, TypeError):
             return None
-        fits = place.shape == (3,) and np.isfinite(place).all() and item.get('map') == self._place
-        return place if same and fits else None
+        fits = origin.shape == (3,) and np.isfinite(origin).all() and item.get('map') == self._start
+        return origin if same and fits else None
 
 
 def _host_boot() -> str:
@@ -140,9 +140,10 @@ class Estimate:
     """The latest data of an autopilot."""
 
     def __init__(
-        self, settings: MavlinkSettings, place: FlightOrigin, on_restart: Callable[[], None]
+        self, settings: MavlinkSettings, flight_origin: FlightOrigin, on_restart: Callable[[], None]
     ) -> None:
-        self._settings, self._place, self._on_restart = settings, place, on_restart
+        self._settings, self._flight_origin = settings, flight_origin
+        self._on_restart = on_restart
         self.dropped: Counter[str] = Counter()
         self.charge_reports = 0
         self._clear()
@@ -258,9 +259,9 @@ class Estimate:
             return
         if self.telemetry is None:
             self.booted = now - 1e-3 * message.time_boot_ms
-            origin = self._place.find(swap_enu_ned(values[:3]), self.booted, armed)
+            origin = self._flight_origin.find(swap_enu_ned(values[:3]), self.booted, armed)
             if origin is None:
                 return
             self.origin = origin
-        place, velocity = swap_enu_ned(values[:3]), swap_enu_ned(values[3:])
-        self.telemetry = Telemetry(now, place, velocity, *self._attitude)
+        position, velocity = swap_enu_ned(values[:3]), swap_enu_ned(values[3:])
+        self.telemetry = Telemetry(now, position, velocity, *self._attitude)

@@ -44,8 +44,8 @@ def fence_items(volume: OperatingVolume, start: list[float]) -> list[Item]:
         rows += [(command, len(corners), corner) for corner in corners]
     rows += [(_ROUND, zone.radius, zone.centre[:2]) for zone in zones if zone.centre]
     degrees = geodetic(np.array([row[2] for row in rows]), origin)[:, :2]
-    places = np.rint(1e7 * degrees).astype(int).tolist()
-    return [(*row[:2], *place) for row, place in zip(rows, places, strict=True)]
+    positions = np.rint(1e7 * degrees).astype(int).tolist()
+    return [(*row[:2], *position) for row, position in zip(rows, positions, strict=True)]
 
 
 class FenceUpload:
@@ -110,9 +110,9 @@ class FenceUpload:
         while True:
             answer = yield send, ('MISSION_REQUEST', 'MISSION_REQUEST_INT', 'MISSION_ACK')
             if answer.get_type() != 'MISSION_ACK' and answer.seq < len(items):
-                left, (command, size, *place) = len(items) - 1 - answer.seq, items[answer.seq]
+                left, (command, size, *position) = len(items) - 1 - answer.seq, items[answer.seq]
                 head = answer.seq, mavlink.MAV_FRAME_GLOBAL, command, 0, 1, size, 0.0, 0.0, 0.0
-                send = partial(sender.mission_item_int_send, *to, *head, *place, 0.0, _FENCE)
+                send = partial(sender.mission_item_int_send, *to, *head, *position, 0.0, _FENCE)
             # If the last answer is lost, another one arrives: the download decides.
             elif left == 0:
                 break

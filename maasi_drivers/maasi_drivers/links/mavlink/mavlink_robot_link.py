@@ -55,8 +55,8 @@ class MavlinkRobotLink(RobotLink):
         self._local_poses = PoseHistory()
         self._charge_reports = 0
         # Separate from the driver's: telemetry and images have different delays.
-        place = [*settings.start[:2], self._mavlink.ground]
-        self._map_from_local = Pose.from_yaw(place, -self._mavlink.map_yaw)
+        origin = [*settings.start[:2], self._mavlink.ground]
+        self._map_from_local = Pose.from_yaw(origin, -self._mavlink.map_yaw)
         self._local_origin = np.zeros(3)
         self._telemetry: Telemetry | None = None
         self._heading: float | None = None

@@ -119,8 +119,8 @@ class Vehicle(Autopilot):
         """Why it cannot fly to goals, or an empty text."""
         if self.lost:
             return f'link: no message from system {self.settings.system}'
-        if self.place.problem:
-            return f'vehicle: {self.place.problem}'
+        if self.flight_origin.problem:
+            return f'vehicle: {self.flight_origin.problem}'
         flying = self.phase is VehiclePhase.FLYING
         problem = self.estimate.problem(self._fix_needed) or self.fence.problem if flying else ''
         phase = self._taken_over if self.phase is VehiclePhase.RELEASED else self.phase.value
@@ -204,7 +204,7 @@ class Vehicle(Autopilot):
             return 'it is in the air already'
         if self._displaced:
             return 'the autopilot has restarted: restart the driver'
-        if self.lost or self.place.problem or self.phase in _UNABLE:
+        if self.lost or self.flight_origin.problem or self.phase in _UNABLE:
             return self.fault
         if self.armed and self.firmware is not None and not self.in_external_mode:
             return f'it is flying in {self.firmware.mode_name(self.mode)}'
@@ -453,7 +453,7 @@ class Vehicle(Autopilot):
         if self._firmware.kind == 'copter':
             # On the ground; the barometer may have drifted since the estimator's start.
             self.estimate.origin[2] = self._target[2]
-            self.place.keep(self.estimate.origin, self.estimate.booted)
+            self.flight_origin.keep(self.estimate.origin, self.estimate.booted)
         self._least_left, self._nearer_at = math.inf, now
         self._enter(VehiclePhase.RISING)
 
