@@ -1,4 +1,4 @@
-"""Searches of random fields, judged by the true positions of the robots at each step.
+"""Searches of random fields, checked by the true positions of the robots at each step.
 
 `python test/sim/random_fields.py FIRST LAST` runs the fields FIRST to LAST - 1 of a block of seeds,
 prints what is wrong in one line each, and a table of it. `--write` keeps the scenario of each
@@ -21,7 +21,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
 
-from field_judge import Fault, Ground, Judge, Track
+from field_checker import Fault, Ground, SearchChecker, Track
 from field_maker import Field, draw_zone, make_field
 from quality_conditions import SEEDS
 
@@ -151,7 +151,7 @@ class Outcome:
 
 
 def run_field(seed: int) -> Outcome:
-    """Search the field of a seed, and judge it."""
+    """Search the field of a seed, and check it."""
     made, begin = make_field(seed), time.perf_counter()
     running, result, faults, end = None, None, [], ''
     try:
@@ -171,7 +171,7 @@ def run_field(seed: int) -> Outcome:
         end = kind
     if running is not None:
         finished = next((g.coordinator.finished for g in running._groups), None) or '-'
-        faults += Judge(made, scenario, running.track, result, finished).faults()
+        faults += SearchChecker(made, scenario, running.track, result, finished).faults()
     slowest = max(result.planning_times[1:], default=0.0) if result else 0.0
     return Outcome(made, faults, end, time.perf_counter() - begin, slowest)
 

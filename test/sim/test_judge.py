@@ -11,7 +11,7 @@ import pytest
 from shapely.errors import GEOSException
 
 from maasi_sim.experiments import judge
-from maasi_sim.experiments.judge import BASELINES, BOUND, CENTRE, FREE, judge_terrain, main
+from maasi_sim.experiments.judge import BASELINES, BOUND, CENTRE, FREE, assess_terrain, main
 
 SIZE, CELL = 2000.0, 100.0
 # On the equator and on the middle meridian of a zone of UTM, where that is at 500 km, 0 km.
@@ -31,7 +31,7 @@ def stand_in(monkeypatch):
 
 
 def terrain(folder, heat=EAST, victims=EAST):
-    """Write a terrain with the heat in one square of 800 m, and the victims in another."""
+    """Write a terrain with the heat in one cell of 800 m, and the victims in another."""
     folder.mkdir(parents=True)
     cells = np.arange(-SIZE, SIZE, CELL) + CELL / 2.0
     near_x, near_y = (np.abs(cells - at) < 400.0 for at in heat)
@@ -57,8 +57,8 @@ def test_routes_are_worth_what_the_heatmap_is(tmp_path):
     found = {}
     for name, victims in (('true', EAST), ('wrong', WEST)):
         folder = terrain(tmp_path / name, victims=victims)
-        result = judge_terrain(folder, [12.0], 300, seed=900)
-        assert result == judge_terrain(folder, [12.0], 300, seed=900)
+        result = assess_terrain(folder, [12.0], 300, seed=900)
+        assert result == assess_terrain(folder, [12.0], 300, seed=900)
         assert (result['class'], result['victims']) == ('flat, temperate', 300)
         found[name] = result['found']['12'] | {'unpromised': result['unpromised']}
     best = max(found['true'][name] for name in BASELINES)
@@ -74,7 +74,7 @@ def test_worse_routes_find_less_and_longer_ones_are_refused(tmp_path, monkeypatc
 
     def found(change):
         monkeypatch.setattr(judge, 'plan_routes', lambda *given: change(*given))
-        return judge_terrain(folder, [8.0], 300, seed=900)
+        return assess_terrain(folder, [8.0], 300, seed=900)
 
     [whole, half] = (
         found(lambda *given, part=part: [path[: len(path) // part] for path in plan(*given)])
@@ -84,20 +84,20 @@ def test_worse_routes_find_less_and_longer_ones_are_refused(tmp_path, monkeypatc
     longer = found(lambda *given: plan(*given[:3], 2.0 * given[3]))
     assert longer['refused'] == f'{FREE}, {CENTRE}: routes longer than 8 km'
     monkeypatch.setattr(judge.Terrain, '_found', Mock(side_effect=GEOSException('no union')))
-    assert judge_terrain(folder, [8.0], 300, seed=900)['refused'] == 'no union'
+    assert assess_terrain(folder, [8.0], 300, seed=900)['refused'] == 'no union'
 
 
-def test_the_middle_of_each_square_has_its_share_of_the_heat():
+def test_each_cell_has_its_share_of_the_heat():
     heat = np.zeros((30, 20))
     heat[25, 3] = 1.0
-    middles, prior = judge.squares(heat, (0.0, 0.0, 600.0, 600.0), 50.0)
+    middles, prior = judge.disc_cells(heat, (0.0, 0.0, 600.0, 600.0), 50.0)
     assert prior.sum() == pytest.approx(1.0)
     at = np.abs(middles - (105.0, 510.0)).max(axis=1) < 25.0 + 15.0
     assert prior[at].sum() > 0.98 and prior[~at].max() < 0.02
     assert np.hypot(*(middles - 300.0).T).max() < 300.0 + 50.0
 
 
-def test_command_writes_what_was_judged_and_why_the_rest_was_not(tmp_path, capsys):
+def test_command_writes_evaluations_and_why_terrains_were_refused(tmp_path, capsys):
     data, out, document = tmp_path / 'data', tmp_path / 'out', tmp_path / 'judge.md'
     for name in ('1', '2', '10', '11', '12'):
         terrain(data / name, victims=WEST if name == '10' else EAST)
@@ -110,7 +110,7 @@ def test_command_writes_what_was_judged_and_why_the_rest_was_not(tmp_path, capsy
     assert main(written) == 1
     results = json.loads((out / 'judge.json').read_text())['terrains']
     assert [one['terrain'] for one in results] == ['1', '2', '10', '11', '12']
-    assert results[0] == judge_terrain(data / '1', [10.0, 100.0], 100, seed=900)
+    assert results[0] == assess_terrain(data / '1', [10.0, 100.0], 100, seed=900)
     reasons = {one['terrain']: one['refused'] for one in results if 'refused' in one}
     assert 'large-file pointer' in reasons['2'] and 'git lfs pull' in reasons['2']
     assert reasons['11'] == 'heatmap.npy: read shape (40, 30), its bounds need (40, 40)'
@@ -122,7 +122,7 @@ def test_command_writes_what_was_judged_and_why_the_rest_was_not(tmp_path, capsy
     assert spiral.split('|')[4].strip() == '63.1'
     [lost] = [line for line in text.splitlines() if line.startswith('| 10 ') and 'to ' in line][:1]
     assert lost.split('|')[7].strip() == '100.0'
-    assert '\nNot judged: 12, features.geojson is missing\n' in text
+    assert '\nNot evaluated: 12, features.geojson is missing\n' in text
     assert main([*options, '--terrains', '2', '11']) == 2
     assert main([*options, '--terrains', '1', 'x']) == 2
     assert main([*options[:2], str(tmp_path / 'none')]) == 2

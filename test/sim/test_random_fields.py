@@ -6,7 +6,7 @@ table of what is wrong.
 
 import numpy as np
 import pytest
-from field_judge import Judge
+from field_checker import SearchChecker
 from field_maker import KINDS, PLANNERS, make_field
 from quality_conditions import SEEDS
 from random_fields import FieldSearch, run_field
@@ -74,7 +74,7 @@ def _kinds(searched, positions=None, charges=None, finished='-', ended=None):
                 rows[20:] = change(rows[20:])
             setattr(track, name, list(rows))
         result.end_reason = ended or result.end_reason
-        faults = Judge(made, scenario, track, result, finished).faults()
+        faults = SearchChecker(made, scenario, track, result, finished).faults()
     finally:
         track.positions, track.charges, result.end_reason = before
     return {fault.kind.split(' (')[0] for fault in faults}
@@ -95,7 +95,7 @@ def _together(rows):
     return rows
 
 
-def test_the_judge_finds_what_is_wrong(searched):
+def test_the_checker_finds_faults(searched):
     """A search as it was, and the same with true positions, charges and ends changed."""
     made, _, _, _ = searched
     environment = made.values['environment']

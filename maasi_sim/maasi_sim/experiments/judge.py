@@ -1,4 +1,4 @@
-"""Outside judges: SAREnv's evaluator, terrains and victims, its planners next to ours."""
+"""External benchmarks: SAREnv's evaluator, terrains and victims, its planners next to ours."""
 
 import argparse
 import json
@@ -63,8 +63,8 @@ def toolkit() -> Any:
     return module
 
 
-def squares(heat: Array, bounds: Sequence[float], side: float) -> tuple[Array, Array]:
-    """Return the squares of a terrain's disc: middles (n, 2) [m] and prior (n,), of sum 1.
+def disc_cells(heat: Array, bounds: Sequence[float], side: float) -> tuple[Array, Array]:
+    """Return the cells of a terrain's disc: centres (n, 2) [m] and prior (n,), of sum 1.
 
     `heat` has a row for each northing, from the south, and fills `bounds` [m]: west, south, east,
     north. The prior is the heat, and everywhere in the disc the floor.
@@ -73,13 +73,13 @@ def squares(heat: Array, bounds: Sequence[float], side: float) -> tuple[Array, A
     rows, columns = (_axis(low[axis], high[axis], heat.shape[1 - axis], side) for axis in (1, 0))
     disc = np.hypot(rows[0][:, None], columns[0]) <= (high[0] - low[0]) / 2.0
     prior = (1.0 - FLOOR) * heat / heat.sum() + FLOOR * disc / disc.sum()
-    in_squares = rows[2] @ prior @ columns[2].T
+    in_cells = rows[2] @ prior @ columns[2].T
     middles = np.stack(np.meshgrid(columns[1], rows[1]), axis=-1) + (low + high) / 2.0
-    return middles[in_squares > 0.0], in_squares[in_squares > 0.0]
+    return middles[in_cells > 0.0], in_cells[in_cells > 0.0]
 
 
 def _axis(low: float, high: float, cells: int, side: float) -> tuple[Array, Array, Array]:
-    """Return middles of cells and of squares, from the middle [m], and each cell's shares."""
+    """Return the centres of heat cells and disc cells [m], and each heat cell's shares in them."""
     edges = np.linspace(low - high, high - low, cells + 1) / 2.0
     number = int(np.ceil((high - low) / side))
     borders = side * (np.arange(number + 1) - number / 2.0)
@@ -98,7 +98,7 @@ def our_routes(swath: float, free: bool, **task: Any) -> list[Any]:
     drones, budget, line = task['num_drones'], task['budget'], toolkit().LineString
     apart = np.pi * task['max_radius'] ** 2 / budget
     side = float(np.clip(apart, swath / np.sqrt(2.0), swath))
-    nodes, prizes = squares(task['probability_map'], task['bounds'], side)
+    nodes, prizes = disc_cells(task['probability_map'], task['bounds'], side)
     # GEOS cannot unite swaths with edges that are equal but for rounding.
     nodes = nodes.round(3)
     if free:
@@ -132,13 +132,13 @@ class Terrain:
             name: make(name, function, self._config) for name, function in ours.items()
         }
         self._kind = f'{item.environment_type}, {item.environment_climate}'
-        middles, self._prior = squares(item.heatmap, item.bounds, self._swath)
+        middles, self._prior = disc_cells(item.heatmap, item.bounds, self._swath)
         xy = np.column_stack([points.geometry.x, points.geometry.y])
-        self._square_of_victim = cKDTree(middles).query(xy)[1]
+        self._cell_of_victim = cKDTree(middles).query(xy)[1]
 
-    def judge(self, budgets: Sequence[float]) -> Result:
+    def evaluate(self, budgets: Sequence[float]) -> Result:
         """Return the shares [%] of victims; `unpromised` of those with less heat than floor."""
-        promised = self._prior[self._square_of_victim]
+        promised = self._prior[self._cell_of_victim]
         return {
             'class': self._kind,
             'victims': len(promised),
@@ -158,7 +158,7 @@ class Terrain:
         # The area that is swept by straight lines, which no other routes exceed.
         number = int(np.ceil(self._config.budget / self._swath + DRONES * np.pi / 4.0))
         best = np.argsort(-self._prior, kind='stable')[:number]
-        share = 100.0 * float(np.isin(self._square_of_victim, best).mean())
+        share = 100.0 * float(np.isin(self._cell_of_victim, best).mean())
         return dict(zip(names, map(float, table['Victims Found (%)']))) | {BOUND: share}
 
 
@@ -182,10 +182,10 @@ def _check_files(folder: Path) -> None:
         raise ValueError(f'{_HEATMAP}: allowed are finite numbers from 0, not all of them 0')
 
 
-def judge_terrain(folder: Path, budgets: Sequence[float], victims: int, seed: int) -> Result:
+def assess_terrain(folder: Path, budgets: Sequence[float], victims: int, seed: int) -> Result:
     """Return what was measured on one terrain, or as `refused` why nothing was."""
     try:
-        result = Terrain(folder, victims, seed).judge(budgets)
+        result = Terrain(folder, victims, seed).evaluate(budgets)
     except FileNotFoundError as error:
         result = {'refused': f'{Path(error.filename).name} is missing'}
     except (OSError, ValueError, LookupError, ShapelyError) as error:
@@ -193,10 +193,10 @@ def judge_terrain(folder: Path, budgets: Sequence[float], victims: int, seed: in
     return {'terrain': folder.name, **result}
 
 
-def class_means(judged: Sequence[Result], budget: float) -> dict[str, float]:
+def class_means(evaluated: Sequence[Result], budget: float) -> dict[str, float]:
     """Return each row's share [%]: the mean over classes of the means over their terrains."""
     kinds: dict[str, list[dict[str, float]]] = {}
-    for one in judged:
+    for one in evaluated:
         kinds.setdefault(one['class'], []).append(one['found'][f'{budget:g}'])
     return {
         name: float(np.mean([np.mean([found[name] for found in kind]) for kind in kinds.values()]))
@@ -206,23 +206,23 @@ def class_means(judged: Sequence[Result], budget: float) -> dict[str, float]:
 
 def page(results: Sequence[Result], budgets: Sequence[float], seed: int) -> str:
     """Return the tables in Markdown: means over the classes of terrain, then each terrain."""
-    judged = [one for one in results if 'refused' not in one]
-    kinds = [one['class'] for one in judged]
+    evaluated = [one for one in results if 'refused' not in one]
+    kinds = [one['class'] for one in evaluated]
     numbers = '; '.join(f'{kinds.count(kind)} {kind}' for kind in sorted(set(kinds)))
     rows = [['routes'], *([name] for name in (*BASELINES, FREE, CENTRE, BOUND))]
     parts = []
     for budget in budgets:
-        means = class_means(judged, budget)
+        means = class_means(evaluated, budget)
         rows[0] += [f'{budget:g} km, published', f'{budget:g} km, measured']
         for row in rows[1:]:
             row += [_published(budget, row[0], set(kinds)), f'{means[row[0]]:.1f}']
-        parts += [_verdict(budget, means), _each(judged, budget)]
+        parts += [_verdict(budget, means), _each(evaluated, budget)]
     parts += [
-        f'Not judged: {one["terrain"]}, {one["refused"]}' for one in results if one not in judged
+        f'Not evaluated: {one["terrain"]}, {one["refused"]}' for one in results if 'refused' in one
     ]
-    victims = min(one['victims'] for one in judged)
+    victims = min(one['victims'] for one in evaluated)
     head = (
-        f'{len(judged)} terrains ({numbers}),\n{victims} victims on each, seed {seed}. '
+        f'{len(evaluated)} terrains ({numbers}),\n{victims} victims on each, seed {seed}. '
         'Share of victims found [%], mean over the classes of terrain:\n'
     )
     return '\n'.join([head, markdown_table(rows), *parts])
@@ -243,9 +243,9 @@ def _verdict(budget: float, means: dict[str, float]) -> str:
     return f'{budget:g} km, points above the best baseline: {gaps}{met * (budget in GOALS)}.\n'
 
 
-def _each(judged: Sequence[Result], budget: float) -> str:
+def _each(evaluated: Sequence[Result], budget: float) -> str:
     rows = [['terrain', 'class', 'best baseline', FREE, CENTRE, BOUND, 'unpromised', 'lost']]
-    for one in judged:
+    for one in evaluated:
         found = one['found'][f'{budget:g}']
         best = max(BASELINES, key=lambda name: found[name])
         shares = [found[best], found[FREE], found[CENTRE], found[BOUND], one['unpromised']]
@@ -303,7 +303,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def judge(options: argparse.Namespace) -> int:
-    """Judge terrains or instances, write what is asked for, and return the exit code."""
+    """Evaluate terrains or instances, write what is asked for, and return the exit code."""
     if options.judge == 'oplib':
         folders = _instances(options.data, options.terrains)
         one = partial(evaluate_instance, efforts=options.effort)
@@ -311,7 +311,7 @@ def judge(options: argparse.Namespace) -> int:
         toolkit()
         folders = _folders(options.data, options.terrains)
         one = partial(
-            judge_terrain, budgets=options.budget, victims=options.victims, seed=options.seed
+            assess_terrain, budgets=options.budget, victims=options.victims, seed=options.seed
         )
     results = []
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context('spawn')) as pool:
@@ -320,7 +320,7 @@ def judge(options: argparse.Namespace) -> int:
             results.append(result)
     refused = [result for result in results if 'refused' in result]
     if len(refused) == len(results):
-        raise WrongInput(f'{folders[0]}: {refused[0]["refused"]}; none could be judged')
+        raise WrongInput(f'{folders[0]}: {refused[0]["refused"]}; none could be evaluated')
     if options.judge == 'oplib':
         text, name, facts = oplib_page(results, options.effort), 'oplib', {'instances': results}
     else:

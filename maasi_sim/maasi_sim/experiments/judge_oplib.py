@@ -101,15 +101,15 @@ def evaluate_instance(path: Path, efforts: Sequence[float]) -> Result:
 
 def oplib_page(results: Sequence[Result], efforts: Sequence[float]) -> str:
     """Return the tables in Markdown: by generation and class, then the worst instances."""
-    judged = [one for one in results if 'refused' not in one]
+    evaluated = [one for one in results if 'refused' not in one]
     rows = [['generation', 'nodes', 'instances']]
     for effort in efforts:
         rows[0] += [f'{text}, effort {effort:g}' for text in ('mean [%]', 'worst [%]', 'time [s]')]
-    for generation in sorted({one['generation'] for one in judged}):
+    for generation in sorted({one['generation'] for one in evaluated}):
         for least, most in zip((0, *CLASSES), (*CLASSES, np.inf)):
             group = [
                 one
-                for one in judged
+                for one in evaluated
                 if one['generation'] == generation and least < one['nodes'] <= most
             ]
             if not group:
@@ -122,12 +122,12 @@ def oplib_page(results: Sequence[Result], efforts: Sequence[float]) -> str:
                 )
                 rows[-1] += [f'{np.mean(gaps):+.1f}', f'{min(gaps):+.1f}', f'{np.mean(times):.2f}']
     last = f'{efforts[-1]:g}'
-    worst = sorted(judged, key=lambda one: float(one['gaps'][last]))[:3]
+    worst = sorted(evaluated, key=lambda one: float(one['gaps'][last]))[:3]
     names = ', '.join(f'{one["instance"]} {one["gaps"][last]:+.1f}' for one in worst)
     refused = [
         f'Not evaluated: {one["instance"]}, {one["refused"]}' for one in results if 'refused' in one
     ]
-    head = f'{len(judged)} instances. Score against EA4OP, mean times of one core:\n'
+    head = f'{len(evaluated)} instances. Score against EA4OP, mean times of one core:\n'
     return '\n'.join(
         [head, markdown_table(rows), f'Worst, effort {last} [%]: {names}.\n', *refused]
     )

@@ -1,4 +1,4 @@
-"""Judges a search of a random field by the true positions of its robots, step by step."""
+"""Checks a search of a random field by the true positions of its robots, step by step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shapely.geometry import LineString, Point
 
 from maasi_filter.geometry.area import Area, level_shape
 
-ROUNDING = 1e-3  # of what is judged [m]
+ROUNDING = 1e-3  # of checked lengths [m]
 UNSEEN = {'lawnmower': 0.5}  # share that a search may leave though it could be had
 MOST_UNSEEN = 0.15
 IDLE = 40.0  # time in which a team that has something to do moves [s]
@@ -79,7 +79,7 @@ class Track:
             yield ground, ground.step, end
 
 
-class Judge:
+class SearchChecker:
     """The true facts of a search that has ended, or failed."""
 
     def __init__(self, made: Any, scenario: Any, track: Track, result: Any, finished: str) -> None:
