@@ -139,27 +139,27 @@ def _of_image(path: str, environment: EnvironmentSettings) -> _Picture:
     if extent is not None:
         (west, east), (south, north) = extent
         size = np.array([(east - west) / columns, (south - north) / rows])
-        return _Picture(pixels, lambda places: (places - (west, north)) / size)
+        return _Picture(pixels, lambda positions: (positions - (west, north)) / size)
     if world is None:
         raise ValueError(f'has no coordinates; {_NEEDS}')
     a, d, b, e, c, f = world
     inverse = np.linalg.inv(np.array([[a, b], [d, e]]))
 
-    def cells(places: FloatArray) -> FloatArray:
-        return (_earth(places, environment) - (c, f)) @ inverse.T + 0.5
+    def cells(positions: FloatArray) -> FloatArray:
+        return (_earth(positions, environment) - (c, f)) @ inverse.T + 0.5
 
     # Degrees have small pixels near the origin; else metres of the map.
     degrees = max(abs(a), abs(b), abs(d), abs(e)) < 0.01 and environment.origin is not None
     if not degrees:
-        return _Picture(pixels, lambda places: (places - (c, f)) @ inverse.T + 0.5)
+        return _Picture(pixels, lambda positions: (positions - (c, f)) @ inverse.T + 0.5)
     return _Picture(pixels, cells)
 
 
-def _earth(places: FloatArray, environment: EnvironmentSettings) -> FloatArray:
+def _earth(positions: FloatArray, environment: EnvironmentSettings) -> FloatArray:
     """Return longitudes and latitudes (n, 2) [degrees] of positions (n, 2) [m, map]."""
     if environment.origin is None:
         raise ValueError('needs environment.origin')
-    return geodetic(places, environment.origin)[:, [1, 0]]
+    return geodetic(positions, environment.origin)[:, [1, 0]]
 
 
 def _world_file(path: str) -> list[float] | None:
@@ -215,9 +215,9 @@ def _of_geotiff(path: str, environment: EnvironmentSettings) -> _Picture:
         bands = 255.0 * np.clip((bands - low) / max(high - low, 1e-9), 0.0, 1.0)
     pixels = np.dstack([*bands[:3], opaque]).astype(np.uint8)
 
-    def cells(places: FloatArray) -> FloatArray:
-        degrees = _earth(places, environment)
+    def cells(positions: FloatArray) -> FloatArray:
+        degrees = _earth(positions, environment)
         east, north = transform('EPSG:4326', crs, degrees[:, 0], degrees[:, 1])
-        return np.stack([east, north, np.ones(len(places))], axis=1) @ grid.T
+        return np.stack([east, north, np.ones(len(positions))], axis=1) @ grid.T
 
     return _Picture(pixels, cells)

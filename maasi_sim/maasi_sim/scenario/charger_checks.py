@@ -23,41 +23,41 @@ def charger_problems(space: FreeSpace) -> Iterator[str]:
             f'endurance.full: read {home.full:g}, allowed is more than endurance.reserve, '
             f'{home.reserve:g}: it would never leave the charger'
         )
-    chargers = {f'endurance.chargers[{i}]': place for i, place in enumerate(home.chargers)}
+    chargers = {f'endurance.chargers[{i}]': position for i, position in enumerate(home.chargers)}
     # Its start is its charger; a robot may be off by its tolerance there.
     slack = _SLACK * robot.motion.clearance
     if not chargers:
         chargers, slack = {'start': robot.start}, 2.0 * robot.motion.tolerance
-    for key, place in chargers.items():
-        problem = _charger_problem(space, place, slack)
+    for key, position in chargers.items():
+        problem = _charger_problem(space, position, slack)
         if problem:
             which = '' if home.chargers else ', which is its charger'
-            yield f'{key}: read {place}{which}, {problem}'
+            yield f'{key}: read {position}{which}, {problem}'
 
 
-def _charger_problem(space: FreeSpace, place: list[float], slack: float) -> str:
+def _charger_problem(space: FreeSpace, position: list[float], slack: float) -> str:
     """Return the problem of a charger and the allowed positions, or an empty text."""
     robot, area = space.robot, space.area
-    if not area.inside([place])[0]:
-        outside = area.outside_by(place)
+    if not area.inside([position])[0]:
+        outside = area.outside_by(position)
         where = (
             f'{number(outside)} m outside of the area' if outside > 0.0 else 'in a keep-out zone'
         )
         return f'{where}; allowed are positions inside of the area and outside of keep-out zones'
-    gap = area.distances(place).min(initial=math.inf)
+    gap = area.distances(position).min(initial=math.inf)
     if gap < robot.radius:
         return (
             f'{number(gap)} m from one of environment.obstacles; allowed is at least the radius, '
             f'{robot.radius:g} m'
         )
-    point = shapely.Point(place[:2])
+    point = shapely.Point(position[:2])
     if not space.parts or shapely.distance(space.parts, point).min() > slack:
         return (
-            f'{number(space.gap(place))} m from the border, a keep-out zone or an obstacle; '
+            f'{number(space.gap(position))} m from the border, a keep-out zone or an obstacle; '
             'allowed is at least radius and motion.clearance, '
             f'{robot.radius + robot.motion.clearance:g} m'
         )
-    if not space.gets_to(place):
+    if not space.gets_to(position):
         return (
             f'which the robot cannot reach from its start, {robot.start}; allowed are positions '
             f'reachable with its radius and motion.clearance, {robot.radius:g} and '

@@ -21,7 +21,7 @@ from maasi_sim.scenario.background import background_problems
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.charger_checks import charger_problems, endurance_warnings
 from maasi_sim.scenario.free_space import FreeSpace
-from maasi_sim.scenario.on_earth import outside_text, place_text
+from maasi_sim.scenario.on_earth import outside_text, position_text
 from maasi_sim.scenario.schema import RobotSettings, Scenario, SimulatedSettings
 
 Problems = Iterator[str]  # each is `key: text`
@@ -47,8 +47,8 @@ def problems_of(scenario: Scenario) -> Problems:
     for name in scenario.names():
         robot = scenario.robots[name]
         for problems in (
-            _place_problems(robot, scenario, area),
-            _room_problems(robot, area),
+            _position_problems(robot, scenario, area),
+            _free_space_problems(robot, area),
             _sensor_problems(robot, scenario),
             _simulated_problems(robot, scenario),
             _link_problems(robot),
@@ -66,7 +66,7 @@ def problems_of(scenario: Scenario) -> Problems:
 
 
 def _world_problems(scenario: Scenario) -> Problems:
-    most, count = _room_for_targets(scenario), scenario.targets.count or 0
+    most, count = _most_targets(scenario), scenario.targets.count or 0
     if count > most:
         yield (
             f'targets.separation: read {scenario.targets.separation}, which allows at most about '
@@ -79,7 +79,7 @@ def _world_problems(scenario: Scenario) -> Problems:
         yield str(error)
 
 
-def _room_for_targets(scenario: Scenario) -> int:
+def _most_targets(scenario: Scenario) -> int:
     """Return how many targets fit: balls at random fill 0.547 of a plane and 0.382 of space."""
     targets = scenario.targets
     bounds = scenario.environment.array()
@@ -91,11 +91,11 @@ def _room_for_targets(scenario: Scenario) -> int:
     return max(1, round(1.1 * filled * space / (ball * targets.separation**scenario.dimension)))
 
 
-def _place_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> Problems:
+def _position_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> Problems:
     """Yield problems of a robot's start and candidates."""
     if not area.inside([robot.start])[0]:
         yield (
-            f'start: read {place_text(robot.start, area.settings.origin)}'
+            f'start: read {position_text(robot.start, area.settings.origin)}'
             f'{outside_text(robot.start, area)}; allowed are positions inside of environment.'
             f'bounds or the area, and outside of keep_outs; bounds are {area.bounds.tolist()}'
         )
@@ -112,7 +112,7 @@ def _place_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> Pro
         yield f'candidates.{error}'.replace('candidates.candidates: ', 'candidates: ')
 
 
-def _room_problems(robot: RobotSettings, area: Area) -> Problems:
+def _free_space_problems(robot: RobotSettings, area: Area) -> Problems:
     """Yield problems of a robot's free space in the area, and of its chargers."""
     space = FreeSpace(robot, area)
     if not space.parts:

@@ -46,8 +46,8 @@ class FreeSpace:
         # Narrow passages may join them.
         height = self.robot.start[2]
         large = [part for part in others if part.area > _SMALL * own[0].area][:_MOST_PARTS]
-        places = [[*part.representative_point().coords[0], height] for part in large]
-        reached = [part for part, place in zip(large, places) if self.gets_to(place)]
+        points = [[*part.representative_point().coords[0], height] for part in large]
+        reached = [part for part, point in zip(large, points) if self.gets_to(point)]
         return sorted([*own, *reached], key=lambda part: -part.area)
 
     def gap(self, position: ArrayLike) -> float:

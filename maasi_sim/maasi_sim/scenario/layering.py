@@ -74,20 +74,20 @@ class _Loader(yaml.SafeLoader):
         self.path = path
         self.origins: dict[Key, str] = {}
 
-    def place(self, node: yaml.Node) -> str:
+    def location(self, node: yaml.Node) -> str:
         """Return `file:line` of a node."""
         return f'{self.path}:{node.start_mark.line + 1}'
 
     def values(self, node: yaml.Node, key: Key, above: tuple[yaml.Node, ...] = ()) -> Any:
         """Return the values of a node, and store the line of each key."""
         if node in above:
-            raise ScenarioError(f'{self.place(node)}: an alias refers to its own anchor')
+            raise ScenarioError(f'{self.location(node)}: an alias refers to its own anchor')
         if len(self.origins) >= _MOST_ENTRIES:
             raise ScenarioError(
-                f'{self.place(node)}: read more than {_MOST_ENTRIES} entries, counting '
+                f'{self.location(node)}: read more than {_MOST_ENTRIES} entries, counting '
                 'repeated aliases'
             )
-        self.origins.setdefault(key, self.place(node))
+        self.origins.setdefault(key, self.location(node))
         above = (*above, node)
         if isinstance(node, yaml.SequenceNode):
             return [
@@ -98,14 +98,14 @@ class _Loader(yaml.SafeLoader):
         mapping: dict[str, Any] = {}
         for key_node, value_node in node.value:
             name = self.construct_object(key_node, deep=True)
-            inner, place = (*key, name), self.place(key_node)
+            inner, location = (*key, name), self.location(key_node)
             if not isinstance(name, str):
                 raise ScenarioError(
-                    f'{place}: {dotted(key)}: read {shown(name)} as a key, allowed is text'
+                    f'{location}: {dotted(key)}: read {shown(name)} as a key, allowed is text'
                 )
             if name in mapping:
-                raise ScenarioError(f'{place}: {dotted(inner)}: is repeated')
-            self.origins[inner] = place
+                raise ScenarioError(f'{location}: {dotted(inner)}: is repeated')
+            self.origins[inner] = location
             mapping[name] = self.values(value_node, inner, above)
         return mapping
 
@@ -135,8 +135,8 @@ def read_layer(path: Path, key: Key = ()) -> Layer:
             'without control characters'
         ) from None
     except yaml.MarkedYAMLError as error:
-        place = f'{path}:{error.problem_mark.line + 1}' if error.problem_mark else path
-        raise ScenarioError(f'{place}: is not YAML: {error.problem}') from None
+        location = f'{path}:{error.problem_mark.line + 1}' if error.problem_mark else path
+        raise ScenarioError(f'{location}: is not YAML: {error.problem}') from None
     except RecursionError:
         raise ScenarioError(f'{path}: is nested too deeply') from None
     if not isinstance(data, dict):

@@ -39,21 +39,21 @@ AnyScenario = TypeVar('AnyScenario', bound=BaseScenario)
 
 def config_folder() -> Path:
     """Return the folder of `robots/` and `scenarios/`: of ROS, of pip, or of this repository."""
-    places = []
+    folders = []
     with suppress(ImportError, LookupError, OSError):
         from ament_index_python.packages import get_package_share_directory
 
-        places.append(Path(get_package_share_directory('maasi_config')))
+        folders.append(Path(get_package_share_directory('maasi_config')))
     with suppress(PackageNotFoundError):
         for item in distribution('maasi_config').files or []:
             if item.match('share/maasi_config/package.xml'):
-                places.append(Path(os.path.normpath(item.locate())).parent)
-    places.append(Path(__file__).resolve().parents[3] / 'config')
-    for folder in places:
+                folders.append(Path(os.path.normpath(item.locate())).parent)
+    folders.append(Path(__file__).resolve().parents[3] / 'config')
+    for folder in folders:
         # If these are links to files of a repository, messages name those files.
         for file in (folder / 'robots').glob('*.yaml'):
             return file.resolve().parent.parent
-    raise ScenarioError(f'robots: folder not found in {", ".join(map(str, places))}')
+    raise ScenarioError(f'robots: folder not found in {", ".join(map(str, folders))}')
 
 
 def find_scenario(name: str | Path) -> Path:

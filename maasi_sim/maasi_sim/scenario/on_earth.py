@@ -19,7 +19,7 @@ from maasi_sim.scenario.layering import Layer, ScenarioError
 _DEGREES = {'latitude': 90.0, 'longitude': 180.0}
 
 
-def place_text(position: list[float], origin: OriginSettings | None) -> str:
+def position_text(position: list[float], origin: OriginSettings | None) -> str:
     """Return a position [m, map] as text, with latitude and longitude if there is an origin."""
     text = ' '.join(f'{value + 0.0:.4g}' for value in position)
     if origin is None:
@@ -44,7 +44,7 @@ def put_on_map(layer: Layer, robots: Mapping[str, dict[str, Any]]) -> None:
     given = layer.data.get('environment')
     area = given.get('area') if isinstance(given, Mapping) else None
     points = _points(area) if is_geojson(area) else []
-    written = [key for name, values in robots.items() for key, _, _ in _places(name, values)]
+    written = [key for name, values in robots.items() for key, _, _ in _positions(name, values)]
     if not written and not points:
         return
     try:
@@ -55,7 +55,7 @@ def put_on_map(layer: Layer, robots: Mapping[str, dict[str, Any]]) -> None:
     except ValidationError:
         return  # validation reports its errors later
     for name, values in robots.items():
-        for key, value, put in _places(name, values):
+        for key, value, put in _positions(name, values):
             put(_on_map(layer, key, value, origin))
     if origin is not None:
         _give_points(points, robots, origin)
@@ -68,7 +68,7 @@ def _points(area: Any) -> list[tuple[str, str, list[float]]]:
         return []  # validation reports its errors later
 
 
-def _places(name: str, values: dict[str, Any]) -> list[tuple[str, Any, Callable[[Any], None]]]:
+def _positions(name: str, values: dict[str, Any]) -> list[tuple[str, Any, Callable[[Any], None]]]:
     """Return key, value and setter of a robot's geodetic positions."""
     found: list[tuple[str, Any, Callable[[Any], None]]] = []
     if isinstance(values.get('start'), Mapping):
@@ -123,11 +123,11 @@ def _give_points(
     chargers = []
     for role, owner, degrees in points:
         east, north = to_map(np.array([degrees]), origin)[0]
-        place = [round(float(east), 4), round(float(north), 4), 0.0]
+        position = [round(float(east), 4), round(float(north), 4), 0.0]
         if role == 'start' and owner in robots:
-            robots[owner].setdefault('start', place)
+            robots[owner].setdefault('start', position)
         elif role != 'start' and owner in ('', *robots):
-            chargers.append((owner, place))
+            chargers.append((owner, position))
         else:
             whose = f'its robot is {owner}' if owner else 'it names no robot'
             warnings.warn(
@@ -137,8 +137,8 @@ def _give_points(
                 stacklevel=2,
             )
     for name, values in robots.items():
-        own = [place for owner, place in chargers if owner == name]
-        common = [place for owner, place in chargers if not owner]
+        own = [position for owner, position in chargers if owner == name]
+        common = [position for owner, position in chargers if not owner]
         endurance = values.get('endurance')
         if isinstance(endurance, dict) and (own or common):
             endurance.setdefault('chargers', own or common)

@@ -17,7 +17,7 @@ from maasi_filter.geometry.geodesy import OriginSettings
 from maasi_filter.wording import number
 from maasi_planner.candidates import half_view, map_spacing, swath_of
 from maasi_sim.scenario.free_space import FreeSpace
-from maasi_sim.scenario.on_earth import place_text
+from maasi_sim.scenario.on_earth import position_text
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
 # Smaller unreachable parts, relative to the area, are rounding or corners.
@@ -109,8 +109,8 @@ def preflight(scenario: Scenario) -> Preflight:
     missed = ground.difference(together).buffer(-strip, join_style='mitre')
     _add_parts(report, missed.buffer(strip, join_style='mitre').intersection(ground), ground.area)
     for name, robot in scenario.robots.items():
-        places = _places_of(robot, efforts[name], scenario.environment.origin)
-        report.lines.append(f'{name}: {places}')
+        positions = _positions_of(robot, efforts[name], scenario.environment.origin)
+        report.lines.append(f'{name}: {positions}')
         report.warnings.extend(
             f'{name}: {text}'
             for text in _battery_warnings(robot, efforts[name], scenario.limits.time, team)
@@ -261,9 +261,9 @@ def _add_parts(report: Preflight, missed: BaseGeometry, whole: float) -> None:
     report.warnings.append(f'no robot can see {share:.2g} % of the area: {"; ".join(named)}{more}')
 
 
-def _places_of(robot: RobotSettings, effort: Effort, origin: OriginSettings | None) -> str:
+def _positions_of(robot: RobotSettings, effort: Effort, origin: OriginSettings | None) -> str:
     """Return the start and chargers of a robot, as text."""
-    text = f'starts at {place_text(robot.start, origin)}'
+    text = f'starts at {position_text(robot.start, origin)}'
     if robot.endurance is None:
         return text
     if not robot.battery.chargeable:
@@ -273,7 +273,7 @@ def _places_of(robot: RobotSettings, effort: Effort, origin: OriginSettings | No
         )
     if not robot.endurance.chargers:
         return f'{text}, its charger'
-    chargers = '; '.join(place_text(charger, origin) for charger in robot.endurance.chargers)
+    chargers = '; '.join(position_text(charger, origin) for charger in robot.endurance.chargers)
     return f'{text}, chargers at {chargers}'
 
 

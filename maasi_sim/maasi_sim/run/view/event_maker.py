@@ -21,7 +21,7 @@ _NOT_ALLOWED = -1e29  # candidates with an objective below this are not allowed
 MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
 _SILENCE = 3.0  # a robot is silent after this long without a state, if others send theirs [s]
 _MOST_POINTS = 40  # shown points of a planned path
-_MOST_PLACES = 400  # shown points of a tour
+_MOST_WAYPOINTS = 400  # shown points of a tour
 
 
 def padded(values: ArrayLike) -> FloatArray:
@@ -119,14 +119,14 @@ class EventMaker:
         if kind != 'robot' or self._thinning.keeps(event):
             self._listener(event)
 
-    def _place(self, position: ArrayLike) -> list[float]:
-        place = np.asarray(position, dtype=float).tolist()
-        return [*(round(value, self._digits) for value in place), 0.0, 0.0][:3]
+    def _rounded(self, position: ArrayLike) -> list[float]:
+        values = np.asarray(position, dtype=float).tolist()
+        return [*(round(value, self._digits) for value in values), 0.0, 0.0][:3]
 
     def _plain(self, content: Any) -> Any:
         """Return content with positions as they are shown."""
         if isinstance(content, np.ndarray):
-            return self._place(content)
+            return self._rounded(content)
         if isinstance(content, (list, tuple)):
             return [self._plain(item) for item in content]
         return content
@@ -149,10 +149,10 @@ class EventMaker:
         if away or not all(map(math.isfinite, fact.pose)):
             return
         time, name = max(fact.time, 0.0), fact.robot
-        place = [*self._place(fact.pose[:3]), round(float(fact.pose[3]), 3)]
+        position = [*self._rounded(fact.pose[:3]), round(float(fact.pose[3]), 3)]
         # After a jump of the clock, other robots may not have sent yet.
         until = self._states[name][0] if name in self._states else time
-        self._states[name] = time, place, round(float(fact.battery), 3)
+        self._states[name] = time, position, round(float(fact.battery), 3)
         self._set_status(time, name, fact.status, fact.reason)
         for other, (last, *_) in self._states.items():
             if until - last > _SILENCE and self._status[other] < LEFT:
@@ -166,8 +166,8 @@ class EventMaker:
             self._set_status(fact.time, fact.robot, LEFT, '')
 
     def _set_status(self, time: float, name: str, status: int, reason: str) -> None:
-        _, place, battery = self._states[name]
-        self._put(time, 'robot', name, place, battery, status, reason)
+        _, position, battery = self._states[name]
+        self._put(time, 'robot', name, position, battery, status, reason)
         before, self._status[name] = self._status.get(name), status
         words = {UNAVAILABLE: 'unavailable: ', SILENT: ''}
         if status in words and status != before:
@@ -185,7 +185,7 @@ class EventMaker:
                 deviations = np.sqrt(np.maximum(np.diag(np.asarray(own, dtype=float)), 0.0))
             row = (*padded(detection), *padded(deviations))
             rows.append([significant(value) for value in row])
-        self._put(fact.time, 'seen', fact.robot, self._place(fact.position), rows)
+        self._put(fact.time, 'seen', fact.robot, self._rounded(fact.position), rows)
 
     def _add_picture(self, fact: facts.Photographed) -> None:
         item = fact.measured
@@ -205,7 +205,7 @@ class EventMaker:
         team = fact.team
         self._measured.update((team, name, index) for name, index in fact.members)
         rows = [
-            [*self._place(item.position), significant(item.mass), *_upper(item.covariance)]
+            [*self._rounded(item.position), significant(item.mass), *_upper(item.covariance)]
             for item in fact.clusters
         ]
         content = significant(fact.expected), rows, len(self._measured)
@@ -216,10 +216,10 @@ class EventMaker:
         before = {item.id for item in self._board.found.get(team, ())}
         rows = []
         for item in targets:
-            place, when = self._place(item.position), round(max(item.time, 0.0), 3)
-            rows.append([item.id, *place, _upper(item.covariance), item.robot, when])
+            position, when = self._rounded(item.position), round(max(item.time, 0.0), 3)
+            rows.append([item.id, *position, _upper(item.covariance), item.robot, when])
             if item.id not in before:
-                self._say(time, item.robot, 'found', f'target {item.id} at {point(place)} m')
+                self._say(time, item.robot, 'found', f'target {item.id} at {point(position)} m')
         self._board.found[team] = targets
         self._put(time, 'found', team, rows)
         self._score(time)
@@ -233,16 +233,16 @@ class EventMaker:
             columns = [robot.candidates, *terms, robot.lengths, robot.measurements]
             candidates = [
                 [
-                    *self._place(values[:3]),
+                    *self._rounded(values[:3]),
                     *map(significant, values[3:6]),
                     self._objective(values[6]),
                     *map(int, values[7:]),
                 ]
                 for values in np.column_stack(columns).tolist()
             ]
-            waypoint, number = self._place(robot.waypoint), fact.indices[name]
+            waypoint, number = self._rounded(robot.waypoint), fact.indices[name]
             row = [name, number, robot.chosen, waypoint, candidates, robot.reason]
-            rows.append([*row, list(map(self._place, robot.tour[:_MOST_PLACES]))])
+            rows.append([*row, list(map(self._rounded, robot.tour[:_MOST_WAYPOINTS]))])
             words = f'to {point(waypoint)}'
             if robot.stays:
                 words = f'stays: {robot.reason or decision.reason or "no candidate"}'
@@ -263,7 +263,7 @@ class EventMaker:
     def _add_path(self, time: float, robot: str, positions: Sequence[Any] | FloatArray) -> None:
         count = len(positions)
         chosen = np.linspace(0, count - 1, min(count, _MOST_POINTS)).round().astype(int)
-        self._put(time, 'way', robot, [self._place(positions[item]) for item in chosen])
+        self._put(time, 'way', robot, [self._rounded(positions[item]) for item in chosen])
 
     def _add_map(self, fact: facts.Explored) -> None:
         lower, step, values = fact.lower, fact.step, fact.values
@@ -280,13 +280,13 @@ class EventMaker:
         share = None if fact.share is None else round(fact.share, 4)
         text = values.tobytes().decode() if values.dtype.kind == 'S' else shades(values)
         steps = [significant(value) for value in padded(step)]
-        content = self._place(lower), steps, [*values.shape, 1][:3], text, share
+        content = self._rounded(lower), steps, [*values.shape, 1][:3], text, share
         self._put(fact.time, 'map', fact.team, *content)
 
     def _add_truth(self, time: float, truth: FloatArray) -> None:
         before, self._board.truth = self._board.truth, truth
         if before is None or not np.array_equal(before, truth):
-            self._put(time, 'truth', '', [self._place(item) for item in truth])
+            self._put(time, 'truth', '', [self._rounded(item) for item in truth])
             self._score(time)
 
     def _add_to_scene(self, parts: Scene) -> None:
