@@ -89,8 +89,6 @@ def search(
 
 
 class _Search:
-    """A running search, step by step."""
-
     def __init__(self, scenario: Scenario, seed: int, make_planner: MakePlanner | None) -> None:
         check_events(scenario)
         self.scenario = scenario
@@ -259,8 +257,6 @@ class _Group:
 
 
 class _Robot:
-    """A simulated robot with the functions of its driver."""
-
     def __init__(self, body: SimulatedRobot, scenario: Scenario) -> None:
         settings = body.settings
         self.name = body.name

@@ -55,7 +55,6 @@ def euclidean(known: dict[str, Path]) -> list[Path]:
 
 
 def _section(text: str, name: str) -> Array:
-    """Return the numbers below a keyword, up to the next one."""
     lines = text.partition(f'\n{name}')[2].splitlines()[1:]
     rows: list[list[float]] = []
     for line in lines:

@@ -223,7 +223,6 @@ class BagWriter(contextlib.AbstractContextManager['BagWriter']):
                 self._changed.notify_all()
 
     def _flush(self) -> None:
-        """Write the chunk to the file if it is due."""
         storage = cast('McapWriter', self._writer.storage)
         if storage.chunk.msgs and monotonic() >= self._flushed + FLUSH_PERIOD:
             storage.close_chunk()

@@ -127,7 +127,6 @@ class Domain(contextlib.AbstractContextManager['Domain']):
 
 
 def _domains_in_use() -> set[int]:
-    """Return the domains with an open port."""
     used = set()
     for table in ('/proc/net/udp', '/proc/net/udp6'):
         with contextlib.suppress(OSError):

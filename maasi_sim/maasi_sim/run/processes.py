@@ -77,7 +77,6 @@ def wait_for_server() -> None:
 
 
 def _load(started_by: int) -> None:
-    """Load the shared modules; the server ends with the process that started it."""
     # setproctitle must run before the environment changes.
     getproctitle()
     os.setsid()
@@ -95,7 +94,6 @@ def _load(started_by: int) -> None:
 
 
 def _die_with(parent: int) -> None:
-    """Let Linux kill this process when its parent ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:
         os._exit(1)

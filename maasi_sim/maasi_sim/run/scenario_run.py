@@ -194,7 +194,6 @@ class RunningRun:
         return EndedRun(self, ending, end, unwritten, replay)
 
     def _close_bag(self) -> list[str]:
-        """Close the recording, and return the errors of writing it."""
         try:
             if self._bag is not None:
                 self._bag.close()
@@ -232,7 +231,6 @@ class RunningRun:
         return ending
 
     def _lacks(self) -> dict[str, str]:
-        """Return what is still missing, by node or topic."""
         recorder = self.recorder
         # Nodes report last: all topics of a node that has reported are discovered.
         ready = set(recorder.receive_ready())

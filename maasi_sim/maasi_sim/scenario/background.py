@@ -74,7 +74,6 @@ def background_problems(environment: EnvironmentSettings) -> Iterator[str]:
 
 
 def _over(bounds: FloatArray, picture: _Picture) -> Background:
-    """Return the part of a picture over bounds and a margin."""
     low, high = bounds[:2].T
     margin = _MARGIN * float((high - low).max())
     low, high = low - margin, high + margin
@@ -163,7 +162,6 @@ def _earth(positions: FloatArray, environment: EnvironmentSettings) -> FloatArra
 
 
 def _world_file(path: str) -> list[float] | None:
-    """Return the six numbers of an image's world file, or None."""
     image, suffix = Path(path), Path(path).suffix
     names = [f'.{suffix[1]}{suffix[-1]}w', f'{suffix}w', '.wld']
     for name in [*names, *map(str.upper, names)]:

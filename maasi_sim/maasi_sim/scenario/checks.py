@@ -92,7 +92,6 @@ def _most_targets(scenario: Scenario) -> int:
 
 
 def _position_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> Problems:
-    """Yield problems of a robot's start and candidates."""
     if not area.inside([robot.start])[0]:
         yield (
             f'start: read {position_text(robot.start, area.settings.origin)}'
@@ -113,7 +112,6 @@ def _position_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> 
 
 
 def _free_space_problems(robot: RobotSettings, area: Area) -> Problems:
-    """Yield problems of a robot's free space in the area, and of its chargers."""
     space = FreeSpace(robot, area)
     if not space.parts:
         yield (

@@ -205,7 +205,6 @@ def _explain(item: Any, key: Key, model: type[BaseModel], data: Any) -> str:
 
 
 def _known_keys(model: Any, key: Key, data: Any) -> list[str]:
-    """Return the keys of the settings that stand under a key."""
     for step in key:
         if hasattr(model, 'model_fields'):
             fields = {info.alias or name: info for name, info in model.model_fields.items()}

@@ -97,7 +97,6 @@ def read_scenario(path: str | Path) -> Layer:
 
 
 def _with_files(value: Any, folder: Path) -> Any:
-    """Return values of an environment with absolute file names."""
     if isinstance(value, dict):
         return {key: _with_files(item, folder) for key, item in value.items()}
     if isinstance(value, list):
@@ -184,7 +183,6 @@ def _give_candidates(layer: Layer) -> None:
 
 
 def _with_types(layer: Layer, path: Path) -> Layer:
-    """Return the layer of a scenario file merged with the types of its robots."""
     folders = [path.parent / 'robots', path.parent.parent / 'robots', config_folder() / 'robots']
     files = {file.stem: file for folder in reversed(folders) for file in folder.glob('*.yaml')}
     known = sorted(files.keys() - {'all'})

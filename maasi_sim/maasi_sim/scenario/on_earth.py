@@ -69,7 +69,6 @@ def _points(area: Any) -> list[tuple[str, str, list[float]]]:
 
 
 def _positions(name: str, values: dict[str, Any]) -> list[tuple[str, Any, Callable[[Any], None]]]:
-    """Return key, value and setter of a robot's geodetic positions."""
     found: list[tuple[str, Any, Callable[[Any], None]]] = []
     if isinstance(values.get('start'), Mapping):
         found.append((f'robots.{name}.start', values['start'], _setter(values, 'start')))
@@ -119,7 +118,6 @@ def _give_points(
     robots: Mapping[str, dict[str, Any]],
     origin: OriginSettings,
 ) -> None:
-    """Give robots without a start or chargers those of the points of a file."""
     chargers = []
     for role, owner, degrees in points:
         east, north = to_map(np.array([degrees]), origin)[0]

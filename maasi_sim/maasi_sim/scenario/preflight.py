@@ -156,7 +156,6 @@ def _effort(scenario: Scenario, name: str, covered: float) -> Effort:
 
 
 def _pass_of(effort: Effort, whole: float) -> str:
-    """Return the cost of one pass for a robot, as text."""
     text = (
         f'swath {_metres(effort.swath)}; one pass alone takes {_metres(effort.pass_length)}, '
         f'{_time(effort.pass_time)} at {number(effort.speed)} m/s'
@@ -223,7 +222,6 @@ def _time_of_pass(efforts: Mapping[str, Effort], whole: float) -> float:
 
 
 def _add_cells(report: Preflight, scenario: Scenario, area: Area) -> None:
-    """Add the cells of the exploration map, compared with the sensors' swaths."""
     sensors = [robot.sensor.build(n, scenario.dimension) for n, robot in scenario.robots.items()]
     spacing, warning = map_spacing(area.bounds, sensors)
     given, swath = scenario.filter.exploration_spacing, min(map(swath_of, sensors))
@@ -262,7 +260,6 @@ def _add_parts(report: Preflight, missed: BaseGeometry, whole: float) -> None:
 
 
 def _positions_of(robot: RobotSettings, effort: Effort, origin: OriginSettings | None) -> str:
-    """Return the start and chargers of a robot, as text."""
     text = f'starts at {position_text(robot.start, origin)}'
     if robot.endurance is None:
         return text

@@ -318,7 +318,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._look_timer.cancel()
 
     def _watch(self) -> None:
-        """Warn about nodes that delay a step."""
         now = time.monotonic()
         if self._waiting and self.active and now - self._wall_step > _PATIENCE:
             waiting = ', '.join(sorted(self._waiting))
@@ -342,7 +341,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._waiting.add(node)
 
     def _begin_step(self) -> None:
-        """Publish the current step of the simulation."""
         self.step = self._first + self.simulation.step
         self._stamp = stamp_of_step(self.step, self._length)
         self._wall_step = time.monotonic()

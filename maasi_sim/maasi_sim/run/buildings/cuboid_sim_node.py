@@ -77,7 +77,6 @@ class CuboidSimNode(SimNode):
             self._deliver()
 
     def _deliver(self) -> None:
-        """Deliver to each robot the messages of the robots in its range."""
         self._link_timer.cancel()
         places = {
             name: self.simulation.robots[name].state.pose.position

@@ -77,7 +77,6 @@ def _title(row: Row) -> str:
 
 
 def _words(row: Row) -> str:
-    """Return a found target in a sentence."""
     spread = math.sqrt(max(row['xx'], row['yy']))
     tag = f', identity {row["identity"]}' if row['identity'] else ''
     return (

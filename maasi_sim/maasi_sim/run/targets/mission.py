@@ -152,7 +152,6 @@ def _team_plans(
 
 
 def _plugin(name: str, driver: str, scenario: Scenario) -> tuple[str, ...]:
-    """Return the arguments of `plugin_driver` for a user's driver."""
     if driver in DRIVERS.built_in:
         return ()
     arguments = (driver, *scenario.plugin_path)

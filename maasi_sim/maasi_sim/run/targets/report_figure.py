@@ -140,7 +140,6 @@ def _draw_targets(view: MapView, record: RunLog, bounds: FloatArray) -> None:
 
 
 def _draw_progress(axes: Axes, record: RunLog, by_time: bool) -> None:
-    """Draw targets found over time, or over measurements."""
     progress, number = record.progress, len(record.truth)
     places = [0.0, *(item.time if by_time else item.measurements for item in progress)]
     right = [0, *(item.true_found for item in progress)]

@@ -92,7 +92,6 @@ def searched(record: RunLog, explored: UnexploredMap, origin: OriginSettings) ->
 
 
 def _area(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
-    """Yield the area of the search and its keep-out zones."""
     for kind, shapes in Area(record.scenario.environment).shapes.items():
         for polygon in shapely.get_parts(shapes):
             yield _polygon(polygon, origin, {'kind': kind})

@@ -124,7 +124,6 @@ class EventMaker:
         return [*(round(value, self._digits) for value in values), 0.0, 0.0][:3]
 
     def _plain(self, content: Any) -> Any:
-        """Return content with positions as they are shown."""
         if isinstance(content, np.ndarray):
             return self._rounded(content)
         if isinstance(content, (list, tuple)):
@@ -212,7 +211,6 @@ class EventMaker:
         self._put(fact.time, 'filter', team, *content)
 
     def _add_found(self, time: float, team: str, targets: Sequence[FoundTarget]) -> None:
-        """Add all found targets of a filter."""
         before = {item.id for item in self._board.found.get(team, ())}
         rows = []
         for item in targets:
@@ -290,7 +288,6 @@ class EventMaker:
             self._score(time)
 
     def _add_to_scene(self, parts: Scene) -> None:
-        """Add to the scene what became known later."""
         if parts:
             self.scene.update(parts)
             self._listener([round(self.latest, 3), 'scene', '', parts])

@@ -70,7 +70,6 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
 
 
 def _background(scenario: BaseScenario) -> Scene:
-    """Return the background picture; a recording's file may be missing."""
     try:
         picture = background_of(scenario.environment)
     except ValueError as error:
