@@ -56,15 +56,17 @@ class Leg:
 
 
 class MeasuringFlight:
-    """Flies the legs, each at most `way` [m] long."""
+    """Flies the legs, each at most `length` [m] long."""
 
-    def __init__(self, link: MamboLink, way: float, legs: int, clock: Callable[[], float]) -> None:
-        self.link, self.way = link, way
+    def __init__(
+        self, link: MamboLink, length: float, legs: int, clock: Callable[[], float]
+    ) -> None:
+        self.link, self.length = link, length
         self.number = legs
         self.clock = clock
         self.legs: list[Leg] = []
         # : Duration of one tilt [s].
-        self.time = math.sqrt(way / (9.81 * math.tan(link.tilt)))
+        self.time = math.sqrt(length / (9.81 * math.tan(link.tilt)))
         self._event: PositionEvent | None = None
 
     def steps(self) -> Iterator[str]:
@@ -137,10 +139,10 @@ class MeasuringFlight:
             return None
         self._event = event
         far = float(np.hypot(*event.position[:2]))
-        if far > _EXCESS * self.way:
+        if far > _EXCESS * self.length:
             raise MeasurementError(
                 f'position: read {far:.2f} m from the take-off point, allowed are '
-                f'{_EXCESS * self.way:.2f} m'
+                f'{_EXCESS * self.length:.2f} m'
             )
         return event
 
@@ -157,7 +159,7 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
         model = TiltModel(tilt, 9.81 * math.tan(tilt) / drag, 1.0, 1.0)
         return np.array(
             [
-                position - leg.origin - _way(model, leg.tilts, passed - delay)
+                position - leg.origin - _travelled(model, leg.tilts, passed - delay)
                 for leg in legs
                 for passed, position in leg.events
             ]
@@ -187,7 +189,7 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
     return MeasuredSpeed(9.81 * math.tan(tilt) / drag, delay, uncertainty)
 
 
-def _way(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> float:
+def _travelled(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> float:
     course = Course(np.zeros(3), np.zeros(3), 0.0)
     ends = [begin for begin, _ in tilts[1:]] + [math.inf]
     for (begin, share), end in zip(tilts, ends, strict=True):
@@ -225,11 +227,11 @@ def build_parser() -> argparse.ArgumentParser:
     add('port', 'UDP port for its messages (default: %(default)s)', type=int, default=43210)
     tilt = 'largest tilt, motion.tilt of its driver [rad] (default: %(default)s)'
     add('tilt', tilt, type=float, default=0.1, metavar='RAD')
-    way = (
+    length = (
         'longest distance forward and backward of its position; keep half of it more free '
         '[m] (default: %(default)s)'
     )
-    add('way', way, type=float, default=1.0, metavar='M')
+    add('way', length, type=float, default=1.0, metavar='M')
     add('legs', 'number of legs (default: %(default)s)', type=int, default=6, metavar='N')
     return parser
 

@@ -50,7 +50,7 @@ class LinkedFlight:
     start, far = FLYING['start'], [2.3, -0.2, 0.5]
     outside = ([1.7, 0.8, 2.1], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5])
     # Two waypoints, how near it is to them when the next one is sent, and its least speed.
-    way, near, least_speed = ([1.0, 0.4, 0.4], [1.0, -0.1, 0.4]), 0.4, 0.1
+    route, near, least_speed = ([1.0, 0.4, 0.4], [1.0, -0.1, 0.4]), 0.4, 0.1
     stopping = 1.5  # what it may fly until it stands, at its speed [s]
 
     def __init__(self, context, drone, settings):
@@ -129,7 +129,7 @@ class LinkedFlight:
     def up(self):
         return self.arm().ready()
 
-    def on_its_way(self):
+    def moving_to_goal(self):
         """Wait until it flies to a goal; return the goal's handle and result to come."""
         before = self.where
         sent = self.team.send_accepted(self.far)
@@ -225,7 +225,7 @@ class VehicleFlight(LinkedFlight):
     start, far = [1.0, 2.0, 0.8], [1.0, -6.0, 0.8]
     # Without a geofence it is not sent into the ground.
     outside = ([math.nan, 0.0, 0.8], [0.0, 0.0, math.inf], [0.0, 1.0, -0.1], [0.0, 9.0, 1.0])
-    way, near, least_speed = ([1.0, -3.0, 0.8], [3.0, -5.0, 0.8]), 1.5, 0.4
+    route, near, least_speed = ([1.0, -3.0, 0.8], [3.0, -5.0, 0.8]), 1.5, 0.4
     stopping = 2.2
 
     def __init__(self, context, autopilot=(), own=(), **changes):

@@ -168,7 +168,7 @@ class Play:
         return self.run(2.0, self.lead)
 
     def lead(self):
-        """Set the set-point a short way ahead, as the driver does."""
+        """Set the set-point a short distance ahead, as the driver does."""
         if self.phase is VehiclePhase.FLYING:
             ahead = self.vehicle.estimate.telemetry.position + np.array([0.4, 0.0, 0.0])
             self.vehicle.set_target(ahead, 0.3)

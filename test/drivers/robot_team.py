@@ -253,8 +253,8 @@ class Team(Node):
         """Return the position on the floor of the one detection of the first answer."""
         (seen,) = self.answer().detections
         pose = pose_from_ros(self.answer().pose.pose)
-        way = seen.range * np.array([math.cos(seen.bearing), math.sin(seen.bearing)])
-        return pose.position[:2] + way
+        offset = seen.range * np.array([math.cos(seen.bearing), math.sin(seen.bearing)])
+        return pose.position[:2] + offset
 
 
 def numbers(message):

@@ -124,7 +124,7 @@ class Flight:
         return self
 
     def flown(self):
-        """Return itself, in the air and on the way."""
+        """Return itself, in the air and on its route."""
         self.up().goal = HOME.position + np.array([0.9, -0.6, 0.0])
         self.step(30)
         return self
@@ -150,8 +150,8 @@ WAYPOINTS = [[2.2, 2.2], [-0.1, 2.2], [2.2, -0.1], [-0.1, -0.1], [1.05, 1.05], [
 
 def measure_and_fly(drag, delay):
     """Return how a Mambo flies over the field with what its measuring flight says."""
-    # Farthest from its place in legs of 1 m, beyond a waypoint, outside the field, and ways [m].
-    flown = SimpleNamespace(far=0.0, overshoot=0.0, outside=-math.inf, way=0.0, straight=0.0)
+    # Farthest from the start of a leg, beyond a waypoint, outside the field, and flown [m].
+    flown = SimpleNamespace(far=0.0, overshoot=0.0, outside=-math.inf, distance=0.0, straight=0.0)
     flight = Flight(drag=drag, firmware_delay=delay, arm=False)
     measuring = MeasuringFlight(flight, 1.0, 6, lambda: flight.time)
     for _ in measuring.steps():
@@ -170,7 +170,7 @@ def measure_and_fly(drag, delay):
             before = flight.where
             flight.step()
             there = flight.where
-            flown.way += float(np.linalg.norm(there - before))
+            flown.distance += float(np.linalg.norm(there - before))
             beyond = float((there - start)[:2] @ (goal - start)[:2]) / length - length
             flown.overshoot = max(flown.overshoot, beyond)
             sides = [there[:2] - FIELD[:, 1], FIELD[:, 0] - there[:2]]

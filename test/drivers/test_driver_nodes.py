@@ -128,7 +128,7 @@ def test_a_robot_in_a_closed_zone_stays_until_it_is_sent_out(play, kind):
 
 
 def test_a_keep_out_on_the_way_stops_the_robot_and_goals_in_it_are_refused(play):
-    """What comes while it moves; then the way leads around."""
+    """What comes while it moves; then the path leads around."""
     driver, team = play()
     team.move()
     publisher = team.create_publisher(KeepOuts, '/keep_outs', LATCHED)

@@ -68,9 +68,9 @@ def test_it_leaves_a_zone_drawn_over_it_by_the_exit_and_stays_until_it_is_sent(g
     far = keep_out.exit_from(play.position)
     began = play.now
     play.go_to(*far).until(lambda: keep_out.is_free(play.position), 30.0)
-    way = play.away(0.0, 0.0)
+    distance = play.away(0.0, 0.0)
     # As it would fly from rest to rest.
-    assert play.now - began < 2.0 * np.sqrt(way / 2.5) + 2.5, (way, play.now - began)
+    assert play.now - began < 2.0 * np.sqrt(distance / 2.5) + 2.5, (distance, play.now - began)
     play.arrives(10.0)
     # From there on it searches.
     play.go_to(-60.0, 50.0, 30.0).arrives()

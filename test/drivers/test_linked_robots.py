@@ -97,7 +97,7 @@ def test_it_goes_where_it_is_sent_and_lands_at_the_end(fly, monkeypatch, kind):
     if kind == 'onboard':
         its_blobs_are_placed_where_it_is(flight)
     # It does not stop at a waypoint.
-    first, last = flight.way
+    first, last = flight.route
     _, replaced = team.send_accepted(first, number=1)
     flight.until(lambda: flight.away(first) < flight.near)
     _, result = team.send_accepted(last, number=2)
@@ -111,7 +111,7 @@ def test_it_goes_where_it_is_sent_and_lands_at_the_end(fly, monkeypatch, kind):
     assert_allclose(flight.where, last, atol=0.35 if kind == 'vehicle' else 0.1)
     assert_allclose(pose_from_ros(team.state.pose.pose).position, flight.where, atol=0.06)
     # A clock that jumps back stops it until the next goal.
-    _, result = flight.on_its_way()
+    _, result = flight.moving_to_goal()
     stamp = flight.driver.arrivals.stamp
     monkeypatch.setattr(
         flight.driver.arrivals, 'stamp', lambda instant: stamp(instant) - 1_000_000_000_000
@@ -120,7 +120,7 @@ def test_it_goes_where_it_is_sent_and_lands_at_the_end(fly, monkeypatch, kind):
     flight.until(lambda: flight.speed < 0.1)
     flight.ready().reaches(last)
     # A cancelled goal stops it.
-    handle, result = flight.on_its_way()
+    handle, result = flight.moving_to_goal()
     before = flight.where
     handle.cancel_goal_async()
     flight.until(result.done)
@@ -132,7 +132,7 @@ def test_it_goes_where_it_is_sent_and_lands_at_the_end(fly, monkeypatch, kind):
         assert UNTIL_ARM in team.refused(flight.far)
         flight.driver.halt()
     else:
-        _, result = flight.on_its_way()
+        _, result = flight.moving_to_goal()
         flight.driver.halt()
         assert team.aborted(result) == 'the driver stops'
     assert flight.doing != 'air'
@@ -172,7 +172,7 @@ def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly, kind):
         flight.until_said('no ')
         assert flight.call('arm').message == 'it is in the air or not connected'
         flight.drone.cut(False)
-    flight.up().on_its_way()
+    flight.up().moving_to_goal()
     assert flight.speed > 0.1
     # Nothing spins the executor meanwhile.
     wait_until(lambda: flight.speed < 0.05)
@@ -191,7 +191,7 @@ def test_a_driver_that_ends_or_is_killed(fly, process, kind, number):
     """With SIGKILL only the firmware, or the failsafe of the autopilot, is left."""
     failsafe = {'autopilot': {'parameters': {'FS_GCS_TIMEOUT': 3}}} if kind == 'vehicle' else {}
     flight = fly(kind, process=process, **failsafe).up()
-    _, result = flight.on_its_way()
+    _, result = flight.moving_to_goal()
     before = flight.where
     flight.driver.send_signal(number)
     flight.until(lambda: flight.driver.poll() is not None)
@@ -215,7 +215,7 @@ def test_it_flies_without_sensor_stamps_and_notices_a_lost_link(
     own = {'pose': source, 'link_timeout': 1.5, 'land_after': 1.0}
     flight = fly('mambo', own, drone=drone, link='mambo_ble')
     flight.seen_from_outside(source)
-    _, result = flight.up().on_its_way()
+    _, result = flight.up().moving_to_goal()
     # One piloting command after the other, and what has to be acknowledged.
     assert drone.received[2, 0, 2] >= 5 and drone.received[2, 8, 1]
     drone.cut()
@@ -315,7 +315,7 @@ def test_what_lands_it_and_keeps_it_down(fly):
         (lambda flight: setattr(flight.drone, 'patience', 0.0), 'by itself'),
     ]
     for number, (fault, reason) in enumerate(faults, start=1):
-        _, result = flight.up().on_its_way()
+        _, result = flight.up().moving_to_goal()
         fault(flight)
         assert flight.team.aborted(result)
         flight.until_said(f'{reason}, {UNTIL_ARM}')
@@ -400,11 +400,11 @@ def test_a_fault_ends_the_way_and_is_said(fly, capfd):
     flight.until_said('m outside the geofence')
     flight.until(lambda: flight.where[0] < 3.1)
     flight.ready()
-    _, result = flight.on_its_way()
+    _, result = flight.moving_to_goal()
     flight.drone.cut()
     flight.gives_up(result, 'link: no message from system 1')
     flight.drone.cut(False)
-    _, result = flight.ready().on_its_way()
+    _, result = flight.ready().moving_to_goal()
     with flight.lock:
         flight.inside.disarm('Crash: Disarming')
     flight.gives_up(result, 'disarmed: by the autopilot or the pilot (')
@@ -445,7 +445,7 @@ def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
     flight.until(lambda: time.monotonic() - begin > 5.0)
     assert 'battery_minimum' not in capfd.readouterr().err
     flight.far = [1.0, -6.0, 3.0]
-    _, result = flight.on_its_way()
+    _, result = flight.moving_to_goal()
     with flight.lock:
         flight.inside.charge = 0.15
     flight.gives_up(result, 'battery at 15 %, below 20 %')

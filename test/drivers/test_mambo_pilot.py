@@ -37,7 +37,7 @@ def test_events_correct_a_speed_that_was_measured_wrong(share):
     assert np.sqrt(np.mean(np.square(tilts))) < 0.01 and max(tilts) < 0.05
     x, tilt = np.array(variances)[:, [0, 3]].T
     assert x.min() >= 1e-4 and x.max() <= 0.05**2
-    # Which of two tilts it has is not known while a command is on its way.
+    # Which of two tilts it has is not known while a command is being transmitted.
     assert tilt.max() > 1.2 * tilt.min() > 0.0
 
 
@@ -67,7 +67,7 @@ def test_it_stays_inside_the_field_with_what_the_measuring_flight_says(drag, del
     assert_allclose(flown.measured.delay, delay + 0.1, atol=0.05)
     assert flown.measured.uncertainty < 0.1 and flown.far < 1.0
     assert flown.overshoot <= 0.03 and flown.outside < 0.0
-    assert flown.way <= 1.1 * flown.straight
+    assert flown.distance <= 1.1 * flown.straight
 
 
 @pytest.mark.parametrize(('end', 'speed'), [(2.5, 0.8), (14.0, 3.0)])

@@ -67,7 +67,7 @@ def test_a_box_and_the_part_of_an_area_at_the_start():
     box = items_of(keep_outs=[], area=None)
     assert [item[:2] for item in box] == [(INSIDE, 4)] * 4
     assert_allclose([on_map(box).min(axis=0), on_map(box).max(axis=0)], BOX[:2].T, atol=0.02)
-    # Of two islands, as no way leads to the other one.
+    # Of two islands, as no path leads to the other one.
     parts = 'MULTIPOLYGON (((0 0, 9 0, 9 9, 0 0)), ((20 0, 29 0, 29 9, 20 9, 20 0)))'
     assert [item[:2] for item in items_of([], parts, [22.0, 4.0])] == [(INSIDE, 4)] * 4
 
@@ -146,7 +146,7 @@ def test_other_keep_outs_are_uploaded_in_flight_and_after_a_restart():
     play = play_of().fly()
     other = items_of(keep_outs=[WELL])
     play.vehicle.fence.begin(other)
-    # A second change while the first is on its way.
+    # A second change during the upload of the first.
     play.run(0.1)
     last = items_of(keep_outs=[BARN])
     play.vehicle.fence.begin(last)

@@ -200,7 +200,7 @@ def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, awa
     # Given up by Nav2, and refused by it.
     assert 'Nav2 aborted it, error 208' in team.aborted(send(1.2)[1], stand)
     assert 'Nav2 rejected' in team.aborted(send(1.8)[1], stand)
-    # On the way the commands are Nav2's. A new goal preempts; cancelled, it is told so.
+    # While it drives the commands are Nav2's. A new goal preempts; cancelled, it is told so.
     replaced = send(0.7)[1]
     await_event('goal')
     nothing_is_commanded()
@@ -220,7 +220,7 @@ def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, awa
     handle.cancel_goal_async()
     assert await_event('cancelled')[-1]['position'][0] == pytest.approx(0.95)
     assert team.ended(result, stand)[0] == GoalStatus.STATUS_CANCELED
-    # Refused by Nav2 on the way: it stops.
+    # Refused by Nav2 while it drives: it stops.
     send(0.7)
     await_event('goal')
     result = send(1.8)[1]
@@ -234,7 +234,7 @@ def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, awa
     assert 'the pose has not changed for' in team.aborted(result, stand)
     team.body.step([0.0, 0.0, 0.0, 0.0], 2.0)
     team.until(lambda: stand() or team.state.goal_status == AgentState.ABORTED)
-    # Nav2 dies on the way.
+    # Nav2 dies while it drives.
     result = send(0.7)[1]
     await_event('goal')
     nav2[1].kill()

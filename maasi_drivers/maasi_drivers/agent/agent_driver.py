@@ -226,13 +226,13 @@ class AgentDriver(RobotNode):
         The part of the path on which a robot leaves its current zone does not count.
         """
         self.volume.area, motion, latest = area, self._motion, self.history.latest
-        goal, ways = self.follower.current, None
+        goal, paths = self.follower.current, None
         if goal is not None and latest is not None:
             state = RobotState(latest.pose, latest.velocity, latest.angular_velocity)
-            ways = motion.predict(state, goal.waypoint[None, :], 0.2).positions
+            paths = motion.predict(state, goal.waypoint[None, :], 0.2).positions
         motion.adopt_area(area, self.settings.radius)
-        if ways is not None:
-            free = [motion.keep_out.is_free(position) for position in ways[0]]
+        if paths is not None:
+            free = [motion.keep_out.is_free(position) for position in paths[0]]
             if not all(free[free.index(True) if True in free else 0 :]):
                 self.end_goal(GoalStatus.ABORTED, 'path blocked by a keep-out zone')
 

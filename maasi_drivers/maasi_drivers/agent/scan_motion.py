@@ -66,7 +66,7 @@ def _is_free(x: float, y: float, heading: float, reach: float, circles: FloatArr
 
 
 @njit(cache=True)
-def way_around(
+def path_around(
     x: float,
     y: float,
     target_x: float,
@@ -144,7 +144,7 @@ class ScanUnicycle(Unicycle):
             self.keep_out.radius + 0.5 * self.keep_out.clearance, away[near] - _SKIN
         )
         circles = np.concatenate([self.keep_out.circles, seen])
-        target_x, target_y, self._heading = way_around(
+        target_x, target_y, self._heading = path_around(
             x, y, target[0], target[1], circles, self.scan.reach, self._heading
         )
         target, clearance = (target_x, target_y, 0.0), self.keep_out.clearance

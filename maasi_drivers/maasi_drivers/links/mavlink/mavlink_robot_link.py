@@ -108,22 +108,22 @@ class MavlinkRobotLink(RobotLink):
         moving = follower.status == GoalStatus.MOVING
         if self._rejected and not moving:
             return  # it stays at the autopilot's position
-        way = follower.exit_from(position)
-        if way is not None:
-            way = way - position if moving else None
+        offset = follower.exit_from(position)
+        if offset is not None:
+            offset = offset - position if moving else None
         elif moving:
-            way = self._ahead(placed, command)
+            offset = self._ahead(placed, command)
         elif self._rests(placed):
-            way = np.zeros(3) if follower.target is None else follower.target - position
-        if way is None:
+            offset = np.zeros(3) if follower.target is None else follower.target - position
+        if offset is None:
             self._brake()
             return
         if self._heading is None:
             self._heading = yaw
         travels = self.driver.settings.motion.heading == 'travel'
-        if travels and math.hypot(way[0], way[1]) > _TURNING:
-            self._heading = math.atan2(way[1], way[0])
-        self._send_target(position + way, self._heading)
+        if travels and math.hypot(offset[0], offset[1]) > _TURNING:
+            self._heading = math.atan2(offset[1], offset[0])
+        self._send_target(position + offset, self._heading)
 
     def _rests(self, placed: StampedPose) -> bool:
         """Return whether a vehicle without a goal has stopped or is at its last goal."""

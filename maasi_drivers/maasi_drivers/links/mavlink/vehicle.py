@@ -470,8 +470,8 @@ class Vehicle(Autopilot):
         if left <= _REACHED or taken_off:
             self._begin_flying()
         elif now - self._nearer_at > timeout:
-            way = f'at {number(round(height, 1))} m of {number(round(top, 1))} m'
-            reason = f'no climb for {timeout:g} s: {way}'
+            progress = f'at {number(round(height, 1))} m of {number(round(top, 1))} m'
+            reason = f'no climb for {timeout:g} s: {progress}'
             self.log.add(ERROR, f'{reason}: landing')
             self.finish('land', reason)
         elif not by_command:
