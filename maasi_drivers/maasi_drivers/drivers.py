@@ -35,7 +35,6 @@ _CLASSES = {
 
 
 def _links(driver: str) -> dict[str, MakeLink]:
-    """Return the constructors of a driver's links."""
     return {name: partial(_link, _CLASSES[name]) for name in LINKS[driver]}
 
 

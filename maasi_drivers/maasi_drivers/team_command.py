@@ -183,7 +183,6 @@ class _Robot:
             raise SystemExit(ABSENT)
 
     def state(self) -> int:
-        """Print the next state."""
         state = self._next_state()
         at, frame = state.pose.pose.position, state.header.frame_id
         goal = _STATUS.get(state.goal_status, 'unknown')

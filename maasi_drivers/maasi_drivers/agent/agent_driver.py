@@ -221,10 +221,7 @@ class AgentDriver(RobotNode):
             self.take_pose(self._pose_speed.with_velocity(stamp, pose))
 
     def _adopt_area(self, area: Area) -> None:
-        """Adopt new keep-out zones; abort a goal whose path crosses one.
-
-        The part of the path on which a robot leaves its current zone does not count.
-        """
+        """Adopt keep-out zones; abort a goal whose path, from outside of all zones, enters one."""
         self.volume.area, motion, latest = area, self._motion, self.history.latest
         goal, paths = self.follower.current, None
         if goal is not None and latest is not None:

@@ -27,10 +27,7 @@ def paper_mask(image: ImageArray, threshold: float = 35.0) -> BoolArray:
 
 
 def _components(mask: BoolArray) -> tuple[NDArray[np.int32], IntArray, Blobs]:
-    """Return the 8-connected components of a mask (h, w), by rows.
-
-    Labels (h, w), component plus one; boxes (n, 4): left, top, width, height; centroids.
-    """
+    """Return labels, boxes (left, top, width, height) and blobs of 8-connected components."""
     # Labelled pixel by pixel; other algorithms number by blocks of pixels.
     _, labels, stats, centroids = cv2.connectedComponentsWithStatsWithAlgorithm(
         mask.view(np.uint8), 8, cv2.CV_32S, cv2.CCL_SAUF

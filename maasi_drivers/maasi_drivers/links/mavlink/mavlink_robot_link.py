@@ -261,7 +261,6 @@ class MavlinkRobotLink(RobotLink):
             self._handle_telemetry(telemetry)
 
     def _check_setpoint(self, rejected: FloatArray | None) -> None:
-        """Begin or end the fault of a rejected set-point (3,), local."""
         health = self.driver.health
         if rejected is None:
             health.end(_SETPOINT, 'the autopilot accepts set-points again')

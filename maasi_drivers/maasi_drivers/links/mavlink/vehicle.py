@@ -129,7 +129,6 @@ class Vehicle(Autopilot):
 
     @property
     def _taken_over(self) -> str:
-        """Who took control from the driver."""
         if abs(self.breached_at - self._released_at) < _SAME_TIME:
             return 'fence breached: the autopilot has taken control'
         if self._firmware.mode_name(self.mode) in _FAILSAFE_MODES:
