@@ -93,6 +93,6 @@ def test_the_page_dims_what_is_not_counted(chromium, tmp_path):
         shown.open((tmp_path / 'page.html').as_uri())
         figure = shown.page.locator('#cameras figure[data-robot=mambo]')
         assert figure.locator('svg path').count() == 2
-        assert 'not counted' in shown.page.inner_text('#cameras')
+        assert 'Dimmed' in shown.page.inner_text('#cameras')
         frame, drawn = (figure.locator(part).bounding_box() for part in ('img', 'svg'))
         assert [frame[key] for key in frame] == pytest.approx([drawn[key] for key in drawn], abs=1)

@@ -92,7 +92,7 @@ def test_a_killed_planner_stops_nobody_and_takes_up_its_work(tmp_path):
         os.kill(*run.processes('/green/cuboid_planner'), signal.SIGKILL)
         run.finish()
     assert run.code == 0, run.output
-    assert 'is restarted' in run.output
+    assert 'restarting it' in run.output
     steps = [item['step'] for item in of_topic(run, '/green/decision')]
     gaps = np.diff(steps)
     lost, away = steps[int(np.argmax(gaps))], gaps.max()

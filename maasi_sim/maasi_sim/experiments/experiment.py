@@ -22,7 +22,7 @@ class WrongInput(ValueError):
 
 @dataclass(frozen=True)
 class OpenPoint:
-    """Something that the paper leaves open, the value taken here, and the reason."""
+    """What a paper leaves open, the value used here, and the reason, or ''."""
 
     what: str
     taken: str
