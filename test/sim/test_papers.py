@@ -121,5 +121,5 @@ def test_robot_that_leaves_measures_no_more():
     assert result.distance['drone1'] >= 0.999 * straight > 1.0
     back = {'at': 8.0, 'robot': 'drone2', 'do': 'back'}
     content = {**content, 'events': [leave, back]}
-    with pytest.raises(ValueError, match='events: read .* of drone2'):
+    with pytest.raises(ValueError, match=r'events: read .* of drone2'):
         experiment.run({'scenario': content, 'most_measurements': 20}, 3)

@@ -174,7 +174,7 @@ def test_unknown_packages_and_executables_are_named(tmp_path, monkeypatch):
     marker = tmp_path / 'share' / 'ament_index' / 'resource_index' / 'packages' / 'maasi_here'
     marker.parent.mkdir(parents=True)
     marker.write_text('')
-    with pytest.raises(ProcessError, match='maasi_here .* some_node'):
+    with pytest.raises(ProcessError, match=r'maasi_here .* some_node'):
         find_executable('maasi_here', 'some_node')
     executable = tmp_path / 'lib' / 'maasi_here' / 'some_node'
     executable.parent.mkdir(parents=True)
