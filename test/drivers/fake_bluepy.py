@@ -78,4 +78,4 @@ class BluetoothMambo(FakeMambo):
         # One without response succeeds all the same.
         if not self.cut_up:
             with self._lock:
-                self._take(Frame(data[0], buffer, data[1], data[2:]))
+                self._handle(Frame(data[0], buffer, data[1], data[2:]))
