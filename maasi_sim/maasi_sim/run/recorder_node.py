@@ -188,6 +188,10 @@ class Recorder:
             if shown:
                 self._shown[topic] = types[0]
 
+    def subscribed(self, topic: str) -> bool:
+        """Return whether a topic has been discovered and is received."""
+        return topic in self._subscriptions
+
     def unmatched(self) -> list[str]:
         """Return the topics with a publisher that is known but not connected yet."""
         return [

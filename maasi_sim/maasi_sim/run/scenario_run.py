@@ -35,6 +35,7 @@ from maasi_sim.run.run_folder import make_folder, write_text
 from maasi_sim.run.run_options import Options, short
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
+from maasi_sim.run.topics import CLOCK
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.live_view import RunPage
 from maasi_sim.run.view.page_file import REPLAY
@@ -244,9 +245,12 @@ class RunningRun:
         if late:
             return dict.fromkeys(late, 'is not ready')
         self._complete = self._complete or time.monotonic()
-        unmatched = recorder.unmatched()
-        if unmatched and time.monotonic() - self._complete <= _CONNECTION_PATIENCE:
-            return dict.fromkeys(unmatched, 'has an unconnected publisher')
+        lacks = dict.fromkeys(recorder.unmatched(), 'has an unconnected publisher')
+        if not recorder.subscribed(CLOCK):
+            # That of another program may be discovered after all nodes.
+            lacks[CLOCK] = 'has no publisher'
+        if lacks and time.monotonic() - self._complete <= _CONNECTION_PATIENCE:
+            return lacks
         return dict.fromkeys(recorder.unanswered(nodes), 'has not discovered the recorder')
 
     def _name_external_robots(self) -> None:
