@@ -200,7 +200,7 @@ def test_nav2_drives_to_the_waypoints(nav2, with_nav2, process, team, stand, awa
     # Given up by Nav2, and refused by it.
     assert 'Nav2 aborted it, error 208' in team.aborted(send(1.2)[1], stand)
     assert 'Nav2 rejected' in team.aborted(send(1.8)[1], stand)
-    # While it drives the commands are Nav2's. A new goal preempts; cancelled, it is told so.
+    # While it drives the commands are Nav2's. A new goal preempts; Nav2 receives a cancellation.
     replaced = send(0.7)[1]
     await_event('goal')
     nothing_is_commanded()

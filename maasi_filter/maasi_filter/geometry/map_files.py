@@ -43,6 +43,8 @@ _KML_OTHERS = ('NetworkLink', 'GroundOverlay', 'ScreenOverlay', 'PhotoOverlay', 
 # Fence commands of MAVLink.
 _VERTICES = {5001: True, 5002: False}
 _CIRCLES = {5003: True, 5004: False}
+# What zipfile raises for archives that are broken, encrypted (RuntimeError), or compressed by a
+# method that it does not support (NotImplementedError).
 _ZIP_ERRORS = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError),
     *(NotImplementedError, RuntimeError, ValueError, LookupError),

@@ -106,7 +106,7 @@ def _position(instance: Instance, tree: Tree, node: int, a: int, k: int) -> floa
 
 @njit(cache=True)
 def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int) -> tuple[int, int]:
-    """Return the first segment from begin to end in an obstacle, and that one, or (-1, -1)."""
+    """Return the first segment from begin to end in an obstacle, and the obstacle, or (-1, -1)."""
     horizon = instance.horizon
     steps = instance.rise.shape[1]
     first = 3 * horizon - 1
