@@ -293,6 +293,17 @@ def test_it_is_said_that_nobody_listens(make_team, process, capfd):
     assert driver.poll() is None
 
 
+def test_a_robot_that_starts_late_is_no_warning_and_one_that_does_not_start_is(process, capfd):
+    began, warning = time.monotonic(), ''
+    process()
+    while 'no subscription' not in warning:
+        assert time.monotonic() - began < 60.0
+        time.sleep(0.1)
+        warning += capfd.readouterr().err
+    assert time.monotonic() - began > 10.0
+    assert '/cmd_vel: no subscription for 1' in warning
+
+
 @pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
 def test_a_stopped_robot_stands_and_refuses_goals_until_it_is_released(play, kind):
     driver, team = play(kind)

@@ -43,7 +43,7 @@ class Run:
     def __exit__(self, *_):
         if self.code is None:
             self.process.kill()
-            self.finish()
+            self.process.wait()
 
     def wait_for(self, pattern):
         """Read the output up to a line with a pattern; return that line."""
@@ -54,7 +54,13 @@ class Run:
         raise AssertionError(f'never said {pattern}: {self.output}')
 
     def finish(self):
-        self.output += self.process.communicate(timeout=PATIENCE)[0]
+        try:
+            self.output += self.process.communicate(timeout=PATIENCE)[0]
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            text = self.output + self.process.communicate()[0]
+            logs = [f'{log.name}: {log.read_text()[-300:]}' for log in self.folder.glob('*.log')]
+            raise AssertionError('\n'.join(['does not end', text[-3000:], *logs])) from None
         self.code = self.process.returncode
         return self
 

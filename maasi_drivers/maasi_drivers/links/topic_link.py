@@ -1,5 +1,6 @@
 """A robot with ROS topics for odometry, battery and velocity commands."""
 
+import time
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -22,6 +23,7 @@ _TYPES: dict[str, type] = {
     'geometry_msgs/msg/TwistStamped': TwistStamped,
     'geometry_msgs/msg/Twist': Twist,
 }
+_PATIENCE = 10.0  # a robot may start, or restart, this much later than its driver [s]
 
 
 class CommandPublisher:
@@ -34,6 +36,7 @@ class CommandPublisher:
         # : None until the type is known.
         self.publisher: Any = None
         self._kind: type = TwistStamped
+        self._subscribed_at = time.monotonic()
         self._auto = kind == 'auto' and not lockstep
         if self._auto:
             self.refresh()
@@ -49,6 +52,7 @@ class CommandPublisher:
     def refresh(self) -> str:
         """Follow the subscribed type; return why no command is received, or nothing."""
         if self.publisher is not None and self.publisher.get_subscription_count():
+            self._subscribed_at = time.monotonic()
             return ''
         known = self._node.get_subscriptions_info_by_topic(self.topic)
         wanted = [name for name, _ in Counter(item.topic_type for item in known).most_common()]
@@ -56,7 +60,10 @@ class CommandPublisher:
         if self._auto and kind is not None and (self.publisher is None or kind is not self._kind):
             self._use(kind)
         if not wanted:
-            return f'{self.topic}: no subscription; is the robot running?'
+            silence = time.monotonic() - self._subscribed_at
+            if silence < _PATIENCE:
+                return ''
+            return f'{self.topic}: no subscription for {silence:.0f} s; is the robot running?'
         if any(_TYPES.get(name) is self._kind for name in wanted):
             return ''  # discovered, but not connected yet
         return (
@@ -141,7 +148,7 @@ class TopicLink(RobotLink):
 
     def poll(self) -> None:
         """Follow the subscribed type; warn if nothing subscribes."""
-        if problem := self._commands.refresh():
+        if (problem := self._commands.refresh()) and not self.driver.ending:
             self.driver.warn_throttled('cmd_vel', problem)
         if self._polls % _GUARD_POLLS == 0:
             readers = self.driver.get_subscriptions_info_by_topic('state')
