@@ -1,8 +1,10 @@
 """Interface of the search filters, and what all filters share."""
 
+import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,6 +18,18 @@ from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.measurement_check import check_shared
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
+from maasi_filter.reports import (
+    CONFIRMED,
+    REJECTED,
+    SEARCHED,
+    SIGHTING,
+    WITHDRAWN,
+    Report,
+    believed,
+    log_odds,
+    seen_by_others,
+    sighting_of,
+)
 from maasi_filter.settings import FilterSettings
 from maasi_filter.state_file import SavedGenerator, write_state
 from maasi_filter.unexplored_map import UnexploredMap
@@ -27,6 +41,8 @@ _SAVED: dict[str, Any] = {
     'generator': SavedGenerator,
     'clusters': list[Cluster],
 }
+# Of these, files of earlier versions have none.
+_SAVED_LISTS: dict[str, Any] = {'reports': list[Report], '_rejected': list[FoundTarget]}
 
 
 class SearchFilter(ABC):
@@ -65,12 +81,16 @@ class SearchFilter(ABC):
     ) -> None:
         self.settings = settings
         self.exploration = UnexploredMap(area, settings.exploration_spacing)
-        self.adopt_area(self.exploration.area)
+        self.area = self.exploration.area
+        self.environment = self.area.settings
         self.bounds = self.area.bounds
         self.dimension = self.exploration.dimension
         self.generator = generator
         self.clusters: list[Cluster] = []
         self._found = FoundTargets()
+        #: Statements of persons that were used, in order.
+        self.reports: list[Report] = []
+        self._rejected: list[FoundTarget] = []
 
     @property
     def own(self) -> Any:
@@ -79,8 +99,8 @@ class SearchFilter(ABC):
 
     def adopt_area(self, area: Area) -> None:
         """Change keep-outs or obstacles: `area` has the same bounds."""
-        self.area, self.environment = area, area.settings
         self.exploration.adopt_area(area)
+        self.area, self.environment = self.exploration.area, area.settings
 
     @property
     def found_targets(self) -> list[FoundTarget]:
@@ -167,13 +187,71 @@ class SearchFilter(ABC):
         self.adopt(change)
         return change.changed
 
+    @property
+    def rejected(self) -> list[FoundTarget]:
+        """Found targets that persons rejected, and that can be confirmed again."""
+        return self._rejected
+
+    def reviewable(self) -> list[int]:
+        """Return the ids of targets that a person can confirm or reject."""
+        return [item.id for item in (*self.own_found_targets(), *self.rejected)]
+
+    def use(self, report: Report, time: float, batch: int = 0) -> Report:
+        """Use a checked statement of a person after a batch; return it as recorded.
+
+        Found targets may be withdrawn or restored, `clusters` are updated.
+        """
+        report = replace(report, id=len(self.reports) + 1, time=time, batch=batch)
+        if report.target:
+            report = replace(report, position=self._position_of(report.target))
+        self.reports.append(report)
+        if report.kind in (CONFIRMED, REJECTED):
+            self.review(report.target, self.statements(report.target))
+        elif report.kind == SIGHTING:
+            sightings = (*self.area.sightings, sighting_of(report))
+            self.area = self.area.with_sightings(sightings)
+            self.exploration.adopt_sightings(self.area)
+        elif report.kind == SEARCHED:
+            self.exploration.search(report.shape, report.weight)
+            self.thin(report)
+        return report
+
+    def _position_of(self, number: int) -> list[float]:
+        known = {item.id: item for item in (*self.found_targets, *self.rejected)}
+        return [float(value) for value in known[number].position]
+
+    def statements(self, number: int) -> float:
+        """Return the log odds of all reviews of a target."""
+        reviews = [item for item in self.reports if item.target == number]
+        return math.fsum(map(log_odds, reviews))
+
+    def review(self, number: int, statements: float) -> None:
+        """Withdraw or restore a found target, given the log odds of all its reviews.
+
+        This filter counts a found target as certain.
+        """
+        rejects = believed(1.0, statements) < WITHDRAWN
+        found = self._found.targets
+        source, sink = (found, self._rejected) if rejects else (self._rejected, found)
+        for item in [item for item in source if item.id == number]:
+            source.remove(item)
+            sink.append(item)
+            sink.sort(key=lambda target: target.id)
+
+    def thin(self, report: Report) -> None:
+        """Reduce the masses of targets that others would have found; e is reduced already."""
+        for item in self.clusters:
+            seen = seen_by_others(report.shape, report.weight, item.position[None, :])
+            item.mass *= 1.0 - float(seen[0])
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the whole state, with the random generator, atomically to one file."""
         write_state(path, self.state())
 
     def state(self) -> dict[str, dict[str, Any]]:
         """Return the whole state, with the random generator, by the name of the method."""
-        state = {name: getattr(self, name) for name in (*_SAVED, *self.saved)}
+        names = (*_SAVED, *_SAVED_LISTS, *self.saved)
+        state = {name: getattr(self, name) for name in names}
         return {self.settings.method: {**state, 'exploration': self.exploration.values}}
 
     @classmethod
@@ -181,7 +259,15 @@ class SearchFilter(ABC):
         """Return a saved filter, which continues bit for bit."""
         kinds = {**_SAVED, **cls.saved}
         state = {name: TypeAdapter(kinds[name]).validate_python(saved[name]) for name in kinds}
-        search = cls(state['settings'], Area(state['environment']), state['generator'])
+        lists = {
+            name: TypeAdapter(kind).validate_python(saved.get(name, []))
+            for name, kind in _SAVED_LISTS.items()
+        }
+        sightings = [sighting_of(item) for item in lists['reports'] if item.kind == SIGHTING]
+        area = Area(state['environment'])
+        area = area.with_sightings(sightings) if sightings else area
+        search = cls(state['settings'], area, state['generator'])
+        search.reports, search._rejected = lists['reports'], lists['_rejected']
         search.exploration.values[...] = saved['exploration']
         for name in ('clusters', *cls.saved):
             setattr(search, name, state[name])

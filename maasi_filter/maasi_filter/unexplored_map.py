@@ -6,8 +6,10 @@ import math
 from functools import cached_property
 
 import numpy as np
+import shapely
 from numba import njit
 from numpy.typing import ArrayLike
+from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
@@ -23,6 +25,7 @@ from maasi_filter.models.pose import Pose
 # Density samples per cell on each axis, and the number on a whole axis above which a cell
 # gets fewer.
 _PARTS, _SAMPLES = 5, 1000
+_MOST_SHARED = 200_000  # cells of which the share in a searched zone is computed
 # Cells along the mean side of the environment, in 2D and 3D.
 CELLS = {2: 54, 3: 13}
 MAXIMUM_NODES = 20_000_000
@@ -198,9 +201,9 @@ class UnexploredMap:
     def adopt_area(self, area: Area) -> None:
         """Change keep-outs or obstacles: `area` has the same bounds, and e is retained.
 
-        Cells that were open once continue to count as ground.
+        Cells that were open once continue to count as ground, and sightings remain.
         """
-        self._adopt(area)
+        self._adopt(area.with_sightings(self.area.sightings) if self.area.sightings else area)
         opened = np.broadcast_to(self._open > self._ever_open + _ROUNDING, self._values.shape)
         opened = opened.reshape(self.values.shape)
         if not opened.any():
@@ -213,6 +216,43 @@ class UnexploredMap:
         added = np.maximum(self.ground, scale * self._volumes)
         self.ground = np.where(opened, added, self.ground)
         self._ever_open = np.maximum(self._open, self._ever_open)
+
+    def adopt_sightings(self, area: Area) -> None:
+        """Change the sightings of the same area; the intensity that was searched stays the same.
+
+        e' = 1 - (1 - e) N0 f / (N0' f') with the prior f and the expected targets N0.
+        """
+        before, ground = self.area.expected_targets * self._volumes, self.ground
+        expected = self.area.expected_targets
+        self._adopt(area)
+        after = area.expected_targets * self._volumes
+        kept = np.clip(before / np.maximum(after, 1e-300), 0.0, 1.0)
+        values = self.values
+        values[...] = 1.0 - (1.0 - values) * np.where(after > 0.0, kept, 1.0)
+        self.ground = (expected * ground + np.maximum(after - before, 0.0)) / area.expected_targets
+
+    def search(self, zone: BaseGeometry, probability: float) -> None:
+        """Multiply e by 1 - p in the share of each cell that others have searched."""
+        if zone.is_empty:
+            return
+        west, south, east, north = zone.bounds
+        axes, near = self.axes()[:2], []
+        for axis, low, high, step in zip(axes, (west, south), (east, north), self.step):
+            first, last = np.searchsorted(axis, (low - step, high + step))
+            near.append(slice(int(first), int(last)))
+        # Large parts of a fine map by the nodes alone.
+        number = _PARTS if np.prod([part.stop - part.start for part in near]) < _MOST_SHARED else 1
+        parts = (np.arange(number) + 0.5) / number - 0.5
+        x, y = (
+            np.clip(axis[part][:, None] + parts * step, *bounds).ravel()
+            for axis, part, step, bounds in zip(axes, near, self.step, self.bounds)
+        )
+        if not (len(x) and len(y)):
+            return
+        shapely.prepare(zone)
+        inside = shapely.contains_xy(zone, *np.meshgrid(x, y, indexing='ij'))
+        share = inside.reshape(-1, number, len(y) // number, number).mean(axis=(1, 3))
+        self._values[near[0], near[1]] *= 1.0 - probability * share[:, :, None]
 
     def _adopt(self, area: Area) -> None:
         self.area, self.volume = area, area.volume

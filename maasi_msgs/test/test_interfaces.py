@@ -1,4 +1,4 @@
-"""Messages and actions: each is generated, and each field is described."""
+"""Messages, services and actions: each is generated, and each field is described."""
 
 import importlib
 import re
@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FILES = sorted([*(ROOT / 'msg').glob('*.msg'), *(ROOT / 'action').glob('*.action')])
+FILES = sorted(path for kind in ('msg', 'srv', 'action') for path in ROOT.glob(f'{kind}/*'))
+PARTS = {'.msg': [], '.srv': ['Request', 'Response'], '.action': ['Goal', 'Result', 'Feedback']}
 CONSTANT = re.compile(r'\w+ [A-Z_]+=')
 files = pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
 
@@ -15,7 +16,7 @@ files = pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
 @files
 def test_an_interface_is_generated(path):
     kind = getattr(importlib.import_module(f'maasi_msgs.{path.parent.name}'), path.stem)
-    parts = [kind] if path.suffix == '.msg' else [kind.Goal, kind.Result, kind.Feedback]
+    parts = [getattr(kind, name) for name in PARTS[path.suffix]] or [kind]
     for part in parts:
         message = part()
         for name in part.get_fields_and_field_types():

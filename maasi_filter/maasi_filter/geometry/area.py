@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -56,6 +57,15 @@ class Density(NamedTuple):
     even: bool
 
 
+class Sighting(NamedTuple):
+    """Targets that a person expects: a normal density around a position, cut at the area."""
+
+    x: float  # [m, map]
+    y: float
+    radius: float  # two standard deviations [m]
+    weight: float  # expected number of targets
+
+
 class Area:
     """Where targets are expected and robots may go.
 
@@ -88,6 +98,8 @@ class Area:
         self.bounds = environment.array()
         self.dimension = len(self.bounds)
         self.expected_targets = environment.expected_targets
+        #: Sightings during the search, which the prior and `expected_targets` include.
+        self.sightings: tuple[Sighting, ...] = ()
         self.circles = _circles([*environment.obstacles, *environment.keep_outs])
         #: `circles` of solid obstacles only, (n, 5).
         self.solid = _circles(environment.obstacles)
@@ -116,6 +128,18 @@ class Area:
     def of(cls, area: Area | EnvironmentSettings | ArrayLike) -> Area:
         """Return an area as it is, or the area of settings or bounds."""
         return area if isinstance(area, Area) else cls(area)
+
+    def with_sightings(self, sightings: Sequence[Sighting]) -> Area:
+        """Return the same area with other sightings."""
+        other = copy.copy(self)
+        for name in ('volume', 'cells', '_rasterised'):
+            other.__dict__.pop(name, None)
+        other.sightings = tuple(sightings)
+        alike = self.region is None and not self.settings.prior.polygons and self._raster is None
+        other.uniform = alike and not sightings
+        added = math.fsum(item.weight for item in sightings)
+        other.expected_targets = self.settings.expected_targets + added
+        return other
 
     @cached_property
     def volume(self) -> float:
@@ -218,9 +242,28 @@ class Area:
         likely = scaled(likely * inside)
         promised = float(likely.sum() / inside.sum())
         if not promised > 0.0:
-            return Density(inside, share, True)
+            return Density(self._with_seen(inside, inside), share, True)
         floor = self.settings.prior.floor
-        return Density((floor + (1.0 - floor) * likely / promised) * inside, share, False)
+        values = (floor + (1.0 - floor) * likely / promised) * inside
+        return Density(self._with_seen(values, inside), share, False)
+
+    def _with_seen(self, values: FloatArray, inside: FloatArray) -> FloatArray:
+        """Return the density with the sightings: (N0 f + sum of w_i f_i) / (N0 + sum of w_i)."""
+        if not self.sightings:
+            return values
+        low, high = self.bounds[:2].T
+        cell = (high - low) / values.shape
+        x, y = (a + (np.arange(n) + 0.5) * s for a, s, n in zip(low, cell, values.shape))
+        total = self.settings.expected_targets * values
+        for item in self.sightings:
+            square = (x - item.x)[:, None] ** 2 + (y - item.y)[None, :] ** 2
+            # A normal density that is narrower than a cell is as wide as that.
+            deviation = max(0.5 * item.radius, 0.5 * float(cell.max()))
+            # Relative to the nearest cell inside, so that no weight is lost.
+            square -= square[inside > 0.0].min()
+            share = np.exp(-0.5 * np.maximum(square, 0.0) / deviation**2) * inside
+            total += item.weight * float(inside.sum()) / float(share.sum()) * share
+        return np.asarray(total / self.expected_targets)
 
     def outline(self, low: FloatArray, cell: FloatArray, shape: tuple[int, int]) -> FloatArray:
         """Return 1 for cells (corner `low`, size `cell`) that the border of the region crosses."""

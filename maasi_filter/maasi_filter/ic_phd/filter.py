@@ -33,6 +33,7 @@ from maasi_filter.measurement_check import (
 )
 from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.records import UNLABELLED, AgentMeasurement, FilterResult, FoundTarget, Label
+from maasi_filter.reports import Report, seen_by_others
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
 
@@ -180,7 +181,8 @@ class IcPhdFilter(SearchFilter):
         for g in sorted(narrow):
             position, covariance = clusters[g].position, clusters[g].covariance
             covariance = covariance + numbers.jitter_deviation**2 * np.eye(self.dimension)
-            known = [distance(position, covariance, target) for target in self.found_targets]
+            settled = (*self.found_targets, *self.rejected)
+            known = [distance(position, covariance, target) for target in settled]
             if min(known, default=math.inf) < SAME_TARGET:
                 continue
             credit, label_of = nearest_detection(position, members, numbers.removal_distance)
@@ -200,12 +202,13 @@ class IcPhdFilter(SearchFilter):
         self, member: CheckedMeasurement, dropped: dict[str, int]
     ) -> CheckedMeasurement:
         member = within_range(member, dropped)
-        if not self.found_targets:
+        settled = (*self.found_targets, *self.rejected)
+        if not settled:
             return member
         centres = member.sensor.measurement.inverse(member.values, member.pose)
         keep = kept_measurements(
             centres,
-            self.found_targets,
+            settled,
             self._numbers.removal_distance,
             self._numbers.removal == 'every',
         )
@@ -219,6 +222,12 @@ class IcPhdFilter(SearchFilter):
         if self._pool is None:
             self._pool = ThreadPoolExecutor(threads)
         return self._pool
+
+    def thin(self, report: Report) -> None:
+        """Multiply the PHD by 1 - p in the zone: a measurement of others without detections."""
+        super().thin(report)
+        seen = seen_by_others(report.shape, report.weight, self.particles)
+        self.weights = self.weights * (1.0 - seen)
 
     def adopt(self, change: Change) -> None:
         """Remove the particles within T_z of new found targets."""

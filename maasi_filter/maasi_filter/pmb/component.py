@@ -18,6 +18,7 @@ from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
 from maasi_filter.pmb.labels import LabelTally
 from maasi_filter.pmb.scan import LEAST_SUPPORT, Scan
 from maasi_filter.records import FoundTarget
+from maasi_filter.reports import believed
 
 # Shares of the believed pi with which a place may answer.
 RATES = np.array([1.0, 0.7, 0.5, 0.35, 0.2])
@@ -125,6 +126,20 @@ class Component:
     stale: bool = False  # Whether `density` has changed since `target` was estimated
     #: (k,): Log likelihood of its detections and misses since birth, with each of RATES.
     answers: FloatArray = field(default_factory=lambda: np.zeros(len(RATES)))
+
+    #: Log odds of the reviews of persons.
+    statements: float = 0.0
+    rejected: FoundTarget | None = None  # The target as found, if persons rejected it
+
+    @property
+    def belief(self) -> float:
+        """Probability that it is a target, with the reviews of persons."""
+        return believed(self.existence, self.statements)
+
+    @property
+    def settled(self) -> bool:
+        """Whether it was found, and persons may have rejected it."""
+        return self.target is not None or self.rejected is not None
 
     @property
     def foreign(self) -> bool:
@@ -320,7 +335,7 @@ def is_known(
         reach = REACH * (item.density.radius + other.density.radius)
         if (
             abs(item.density.mean[0] - other.density.mean[0]) <= reach
-            and other.target is not None
+            and other.settled
             and not item.differs(other)
             and gap(item, other) < SAME_TARGET
         ):

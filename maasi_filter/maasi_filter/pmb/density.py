@@ -207,6 +207,17 @@ class Density:
         self._shift_particles(math.sqrt(variance) * noise)
         self.condense()
 
+    def thin(self, factor: FloatArray, generator: np.random.Generator) -> None:
+        """Multiply by `factor` (n,), given at the particles; factors become a normal density."""
+        changed = self.weights * factor
+        self.weights = changed / changed.sum()
+        if 1.0 / float(self.weights @ self.weights) < LEAST_EFFECTIVE * len(changed):
+            index = _systematic(self.weights, len(changed), generator.random())
+            self.particles = self.particles[index]
+            self.weights = np.full(len(index), 1.0 / len(index))
+        self._update_moments()
+        self.condense()
+
     def shift(self, way: FloatArray) -> None:
         """Move the whole density, factors included, by `way` (d,), metres."""
         d = len(way)

@@ -36,6 +36,7 @@ from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.scan import Scan, make_scan
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
+from maasi_filter.reports import WITHDRAWN, Report, seen_by_others
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
 
@@ -94,9 +95,20 @@ class PmbFilter(SearchFilter):
         return [item for item in self.components if item.target is None]
 
     @property
+    def rejected(self) -> list[FoundTarget]:
+        """Found targets that persons rejected, and that can be confirmed again."""
+        targets = [item.rejected for item in self.components if item.rejected is not None]
+        return sorted(targets, key=lambda target: target.id)
+
+    @property
+    def _open(self) -> list[Component]:
+        """Components that are neither found nor rejected."""
+        return [item for item in self.components if not item.settled]
+
+    @property
     def expected_number(self) -> float:
         """Expected number of detected but not found targets: the sum of their r."""
-        return math.fsum(item.existence for item in self.potential)
+        return math.fsum(item.belief for item in self.potential)
 
     @property
     def particles(self) -> FloatArray:
@@ -107,7 +119,7 @@ class PmbFilter(SearchFilter):
     @property
     def weights(self) -> FloatArray:
         """Their weights, (n,); they sum to the expected number."""
-        parts = [item.existence * item.density.weights for item in self.potential]
+        parts = [item.belief * item.density.weights for item in self.potential]
         return np.concatenate([np.empty(0), *parts])
 
     def step(
@@ -122,7 +134,7 @@ class PmbFilter(SearchFilter):
             self._correct(member, time, result)
         self._estimate_changed()
         merged = merge(self._most_probable(result))
-        self.components = [item for item in self.components if item.target is not None] + merged
+        self.components = [item for item in self.components if item.settled] + merged
         self.clusters = self._clusters_of(merged)
         result.clusters = list(self.clusters)
         # A target that has changed is another record.
@@ -170,7 +182,7 @@ class PmbFilter(SearchFilter):
         radius = self._found_radius(blurred)
         totals = caused.sum(axis=1)
         surely = (totals > 0.5).tolist()
-        found = [i for i, item in enumerate(components) if item.target is not None]
+        found = [i for i, item in enumerate(components) if item.settled]
         for i, (item, view) in enumerate(zip(components, seen)):
             moved = item.update(view, missed[i], caused[i], scan, self.generator)
             if surely[i] and not item.foreign:
@@ -206,12 +218,12 @@ class PmbFilter(SearchFilter):
         if item.foreign:
             item.existence = CERTAIN
         elif item.target is not None:
-            if item.existence < numbers.withdrawn_probability or reflecting > SURELY_REFLECTING:
+            if item.belief < numbers.withdrawn_probability or reflecting > SURELY_REFLECTING:
                 item.target = None
-        else:
+        elif item.rejected is None:
             return (
                 moved
-                and item.existence > numbers.found_probability
+                and item.belief > numbers.found_probability
                 and item.hits >= LEAST_HITS
                 and item.density.radius <= item.found_radius
                 and bool(reflecting < MOST_REFLECTING)
@@ -260,7 +272,7 @@ class PmbFilter(SearchFilter):
 
     def _most_probable(self, result: FilterResult) -> list[Component]:
         """Return the components that are not found and may exist, at most so many."""
-        items = [item for item in self.potential if item.existence >= LEAST_EXISTENCE]
+        items = [item for item in self._open if item.existence >= LEAST_EXISTENCE]
         if len(items) <= MOST_POTENTIAL:
             return items
         left_out = len(items) - MOST_POTENTIAL
@@ -280,7 +292,7 @@ class PmbFilter(SearchFilter):
             reflecting = reflects(item.answers, self._rates)
             sure = item.existence > SURE and item.hits >= SURE_HITS
             doubtful = not (sure and reflecting < CERTAINLY_REFLECTING)
-            mass = item.existence * (1.0 - reflecting if doubtful else 1.0)
+            mass = item.belief * (1.0 - reflecting if doubtful else 1.0)
             if mass >= LEAST_CLUSTER_MASS:
                 density = item.density
                 mean, covariance = density.mean.copy(), density.covariance.copy()
@@ -294,6 +306,32 @@ class PmbFilter(SearchFilter):
         error = pose_error_of(member.sensor, self._numbers, self.dimension)
         return FOUND_RADIUS_DEVIATIONS * math.sqrt(member.sensor.covariance[0, 0] + error**2)
 
+    def review(self, number: int, statements: float) -> None:
+        """Withdraw or restore a found target, given the log odds of all its reviews."""
+        for item in self.components:
+            if number not in {target.id for target in (item.target, item.rejected) if target}:
+                continue
+            item.statements = statements
+            if item.belief >= WITHDRAWN and item.rejected is not None:
+                item.target, item.rejected = self._estimate(item.rejected, item), None
+            elif item.belief < WITHDRAWN and item.target is not None:
+                item.target, item.rejected = None, item.target
+
+    def thin(self, report: Report) -> None:
+        """Update what is not found with a measurement of others without detections.
+
+        With the probability p(x) in the zone: p_D = ∫ f p dx, r <- r (1 - p_D) / (1 - r p_D),
+        f <- f (1 - p) / (1 - p_D).
+        """
+        for item in self._open:
+            density, r = item.density, item.existence
+            seen = seen_by_others(report.shape, report.weight, density.particles)
+            detected = float(density.weights @ seen)
+            item.existence = r * (1.0 - detected) / (1.0 - r * detected)
+            if np.ptp(seen) > 0.0:
+                density.thin(1.0 - seen, self.generator)
+        self.clusters = self._clusters_of(self._open)
+
     def register(self) -> FoundTargets:
         """Return the found targets with the ids given so far."""
         return FoundTargets(self.found_targets, self._last_id)
@@ -306,7 +344,7 @@ class PmbFilter(SearchFilter):
         self._last_id = change.found.last_id
         for target in change.changed:
             same = [item for item in self.components if item.target and item.target.id == target.id]
-            others = self.potential
+            others = self._open
             moments = [(item.density.mean, item.density.covariance) for item in others]
             best = nearest(target, moments)
             item = same[0] if same else others[best] if best >= 0 else None

@@ -1,0 +1,210 @@
+"""Statements of persons during a search: checks, and what they say about a target's existence.
+
+The equations are in `docs/filter.md`, section "Reports of persons".
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from pydantic import ValidationError
+from shapely.geometry.base import BaseGeometry
+
+from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.area import Area, Sighting, how_far, level_shape
+from maasi_filter.geometry.environment import EnvironmentSettings, Zone
+from maasi_filter.geometry.readers import shapes_of_texts
+from maasi_filter.wording import problems
+
+CONFIRMED, REJECTED, SIGHTING, SEARCHED = 'confirmed', 'rejected', 'sighting', 'searched'
+RELIABILITY = 0.95  # of a statement about a found target, if it is not given
+MOST_RELIABLE = 0.999
+#: Probability beforehand that something that answers like a target is none.
+LOOKALIKE = 0.1
+#: Probability of a target's existence below which a rejected one is withdrawn.
+WITHDRAWN = 0.5
+MOST_WEIGHT = 1000.0  # expected targets of one sighting
+MOST_REPORTS = 1000  # in one search
+MOST_SOURCE = 100  # characters
+CORNERS = 10_000  # of a searched zone
+# Largest probability of detection for potential targets, as for sensors.
+MOST_PROBABLE = 0.98
+_KEY = re.compile(r'keep_outs\W*0\W+')  # where errors of zones are found
+
+
+@dataclass(frozen=True)
+class Report:
+    """A checked statement of a person.
+
+    Parameters
+    ----------
+    kind : str
+        `CONFIRMED`, `REJECTED`, `SIGHTING` or `SEARCHED`.
+    weight : float
+        Reliability of a review, expected targets of a sighting, or probability of detection.
+    source : str
+        Who states it.
+    target : int
+        Id of the found target of a review.
+    position : list of float
+        Of the target or sighting, or a point in the searched zone, metres.
+    radius : float
+        Of a sighting: two standard deviations, metres.
+    zone : str
+        Searched zone, well-known text or `x y radius`, metres.
+    id : int
+        Number from 1, in the order of use.
+    time : float
+        When the filter used it, seconds.
+    batch : int
+        Last batch before it.
+    """
+
+    kind: str
+    weight: float
+    source: str = ''
+    target: int = 0
+    position: list[float] = field(default_factory=list)
+    radius: float = 0.0
+    zone: str = ''
+    id: int = 0
+    time: float = 0.0
+    batch: int = 0
+
+    @property
+    def shape(self) -> BaseGeometry:
+        """Horizontal outline of the searched zone."""
+        return level_shape(Zone.model_validate(self.zone))
+
+    def __str__(self) -> str:
+        source = f' by {self.source}' if self.source else ''
+        if self.kind == SEARCHED:
+            size = how_much(self.shape.area)
+            return f'{size} searched{source} with a probability of detection of {self.weight:g}'
+        if self.kind == SIGHTING:
+            at = ', '.join(f'{value:.3g}' for value in self.position[:2])
+            source = f' of {self.source}' if self.source else ''
+            return (
+                f'sighting{source} at ({at}) m, radius {self.radius:g} m, '
+                f'{self.weight:g} expected targets'
+            )
+        return f'target {self.target} {self.kind}{source} with reliability {self.weight:g}'
+
+
+def how_much(area: float) -> str:
+    """Return an area [m^2] as text."""
+    return f'{1e-4 * area:.3g} ha' if area >= 1e4 else f'{area:.3g} m²'
+
+
+def review(
+    number: int, confirmed: bool, reliability: float, source: str, known: Sequence[int]
+) -> Report:
+    """Return a checked statement about one of the `known` targets; ValueError names a problem."""
+    value = reliability or RELIABILITY
+    if not 0.5 <= value <= MOST_RELIABLE:
+        raise ValueError(
+            f'reliability: read {reliability:g}, allowed are 0.5 to {MOST_RELIABLE:g}, or 0 for '
+            f'{RELIABILITY:g}'
+        )
+    if number not in known:
+        numbers = ', '.join(map(str, sorted(known))) or 'none, as no target is found yet'
+        raise ValueError(f'id: read {number}, allowed are {numbers}')
+    return Report(CONFIRMED if confirmed else REJECTED, value, _source(source), target=number)
+
+
+def sighting(
+    position: Sequence[float], radius: float, weight: float, source: str, area: Area
+) -> Report:
+    """Return a checked sighting in an area; ValueError names a problem."""
+    for axis, value in zip('xyz', position):
+        if not math.isfinite(value):
+            raise ValueError(f'position.{axis}: read {value:g}, allowed are finite numbers')
+    size = area.bounds[:2, 1] - area.bounds[:2, 0]
+    most = 10.0 * float(np.hypot(*size))
+    if not 0.0 < radius <= most:
+        raise ValueError(f'radius: read {radius:g}, allowed are numbers above 0, to {most:.4g} m')
+    if not 0.0 < weight <= MOST_WEIGHT:
+        raise ValueError(
+            f'weight: read {weight:g}, allowed are numbers above 0, to {MOST_WEIGHT:g}'
+        )
+    x, y = map(float, position[:2])
+    if not area.inside(np.array([[x, y]]), bounded=False)[0] or area.outside_by([x, y]) > 0.0:
+        gap = area.outside_by([x, y])
+        where = f'{how_far(gap)} outside of the area' if gap > 0.0 else 'in a keep-out zone'
+        hint = area.exchanged([x, y], gap)
+        raise ValueError(f'position: read ({x:g}, {y:g}), which is {where}{hint}')
+    return Report(SIGHTING, weight, _source(source), position=[x, y], radius=radius)
+
+
+def searched(
+    zone: str, probability: float, source: str, environment: EnvironmentSettings, area: Area
+) -> Report:
+    """Return a checked search by others in an area; ValueError names a problem."""
+    if not 0.0 < probability <= 1.0:
+        raise ValueError(
+            f'detection_probability: read {probability:g}, allowed are numbers above 0, to 1'
+        )
+    if zone.count(',') > CORNERS:
+        raise ValueError(f'zone: read {zone.count(",")} corners, allowed are {CORNERS}')
+    try:
+        values = {**dict(environment), 'keep_outs': shapes_of_texts([zone])}
+        zones = EnvironmentSettings.model_validate(values).keep_outs
+    except ValueError as error:
+        text = problems(error) if isinstance(error, ValidationError) else str(error)
+        raise ValueError(f'zone: {_KEY.sub("", text)}') from None
+    if not zones:
+        raise ValueError('zone: read nothing, allowed is a polygon or x y radius')
+    shapes = list(map(level_shape, zones))
+    shape = shapely.union_all(shapes)
+    gap = float(area.border.distance(shape))
+    if not shape.area > 0.0 or not area.border.intersection(shape).area > 0.0:
+        centre = shapely.get_coordinates(shape.centroid)
+        hint = area.exchanged(centre[0], gap) if len(centre) else ''
+        raise ValueError(f'zone: lies {how_far(gap)} outside of the area{hint}')
+    text = str(zones[0]) if len(zones) == 1 else str(shape)
+    inner = area.border.intersection(shape).representative_point()
+    return Report(SEARCHED, probability, _source(source), position=[inner.x, inner.y], zone=text)
+
+
+def _source(text: str) -> str:
+    words = ' '.join(text.split())
+    if len(words) > MOST_SOURCE:
+        raise ValueError(f'source: read {len(words)} characters, allowed are {MOST_SOURCE}')
+    return words
+
+
+def log_odds(report: Report) -> float:
+    """Return what a review adds to the log odds of a target's existence."""
+    value = math.log(report.weight / (1.0 - report.weight))
+    return value if report.kind == CONFIRMED else -value
+
+
+def sighting_of(report: Report) -> Sighting:
+    """Return the part of the prior that a sighting adds."""
+    return Sighting(report.position[0], report.position[1], report.radius, report.weight)
+
+
+def believed(existence: float, statements: float) -> float:
+    """Return the probability of a target, given that of the sensors and the log odds of persons.
+
+    Where rejections prevail, the sensors may see something that only looks like a target.
+    """
+    if statements == 0.0:
+        return existence
+    given = existence if statements > 0.0 else (1.0 - LOOKALIKE) * existence
+    if given >= 1.0:
+        return 1.0
+    odds = given / (1.0 - given) * math.exp(statements)
+    return odds / (1.0 + odds) if math.isfinite(odds) else 1.0
+
+
+def seen_by_others(zone: BaseGeometry, probability: float, positions: FloatArray) -> FloatArray:
+    """Return with which probability a search found a target at positions (n, d or more), (n,)."""
+    shapely.prepare(zone)
+    inside = shapely.contains_xy(zone, positions[:, 0], positions[:, 1])
+    return np.where(inside, min(probability, MOST_PROBABLE), 0.0)
