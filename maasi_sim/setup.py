@@ -8,7 +8,7 @@ setup(
     packages=find_packages(),
     package_data={
         'maasi_sim.experiments': ['papers/*'],
-        'maasi_sim.run': ['discovery.xml', 'report.schema.json'],
+        'maasi_sim.run': ['discovery.xml', 'discovery_many.xml', 'report.schema.json'],
         'maasi_sim.run.view': ['page/*'],
     },
     data_files=[

@@ -147,19 +147,19 @@ def test_what_another_user_put_there_is_left(folder, monkeypatch):
     assert remove_dead(folder=folder / 'missing') == []
 
 
-def test_beyond_the_participants_that_are_found_by_default_peers_are_named(monkeypatch):
+def test_beyond_the_participants_that_are_found_by_default_more_are_contacted(monkeypatch):
     monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE', raising=False)
     with Domain() as domain:
-        few, many = (
-            Path(domain.environment(number)['FASTRTPS_DEFAULT_PROFILES_FILE'])
-            for number in (10, 40)
-        )
-        assert '<port>' not in few.read_text()
-        ports = re.findall(r'<port>(\d+)</port>', many.read_text())
-        first = 7400 + 250 * domain.number + 10
-        # Up to those of 40 participants and some more, without a gap after the first 32.
-        assert [int(port) for port in ports] == [first + 2 * n for n in range(28, 49)]
-    assert few.exists() and not many.exists()
+        few, many = domain.environment(10), domain.environment(40)
+        assert few['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+        # The profile keeps it on this host.
+        assert many['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SYSTEM_DEFAULT'
+        file = Path(many['FASTRTPS_DEFAULT_PROFILES_FILE'])
+        text = file.read_text()
+        (contacted,) = re.findall(r'<maxInitialPeersRange>(\d+)<', text)
+        assert int(contacted) > 40
+        assert set(re.findall(r'<address>(.*?)</address>', text)) == {'127.0.0.1'}
+    assert Path(few['FASTRTPS_DEFAULT_PROFILES_FILE']).exists() and not file.exists()
 
 
 def test_domains_are_not_shared_with_runs_or_other_nodes(monkeypatch):

@@ -10,7 +10,6 @@ import socket
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable
 from pathlib import Path
 
 from maasi_filter.ros.loopback import loopback_fault
@@ -21,11 +20,9 @@ _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'  # environment variable with the pr
 _NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
 # Ports of the RTPS specification: number per domain, and first one.
 FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
-# Fast DDS contacts 32 participants per host. Further ones are named as peers, with some more for
-# programs that are started during a run.
-_FOUND, _OTHERS, _LAST = 28, 8, 119
-_PEERS = '<initialPeersList>{}</initialPeersList>'
-_PEER = '<locator><udpv4><address>127.0.0.1</address><port>{}</port></udpv4></locator>'
+# Fast DDS contacts 32 participants per host, unless its profile says otherwise; some are programs
+# that are started during a run.
+_FOUND, _OTHERS, _LAST = 32, 8, 119
 # First word of a shared memory that is ready (Boost.Interprocess).
 _READY = (2).to_bytes(4, sys.byteorder)
 
@@ -96,21 +93,20 @@ class Domain(contextlib.AbstractContextManager['Domain']):
             'ROS_DOMAIN_ID': str(self.number),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         }
-        if _PROFILES not in os.environ:
-            profiles = Path(__file__).with_name('discovery.xml')
-            last = min(participants + _OTHERS, _LAST)
-            peers = range(_FOUND, last + 1) if participants + _OTHERS > _FOUND else ()
-            variables[_PROFILES] = self._with_peers(profiles, peers) if peers else str(profiles)
-        return variables
-
-    def _with_peers(self, profiles: Path, peers: Iterable[int]) -> str:
-        first = FIRST_PORT + PORTS_PER_DOMAIN * self.number + 10
-        listed = ''.join(_PEER.format(first + 2 * peer) for peer in peers)
-        text = profiles.read_text().replace('<builtin>', f'<builtin>{_PEERS.format(listed)}')
+        if _PROFILES in os.environ:
+            return variables
+        if participants + _OTHERS <= _FOUND:
+            variables[_PROFILES] = str(Path(__file__).with_name('discovery.xml'))
+            return variables
+        # rmw_fastrtps replaces the transports of a profile unless the range is the default one.
+        variables['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
+        text = Path(__file__).with_name('discovery_many.xml').read_text()
+        text = text.replace('PROCESSES', str(min(participants + _OTHERS, _LAST)))
         with tempfile.NamedTemporaryFile('w', prefix='maasi_', suffix='.xml', delete=False) as file:
             self._files.callback(Path(file.name).unlink, missing_ok=True)
             file.write(text)
-        return file.name
+        variables[_PROFILES] = file.name
+        return variables
 
     def release(self) -> None:
         """Release the domain after removing the shared memory of killed nodes."""
