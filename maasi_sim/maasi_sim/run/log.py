@@ -39,6 +39,7 @@ class RunEnd:
     time: float  # simulated [s]
     wall_time: float  # from the first step [s]
     events: Sequence[dict[str, Any]] = ()
+    began: float | None = None  # Unix time of the first step [s]; None: no time of the day
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ class RunRecord:
 
     events: lost and joined robots and notes of the run ('time' [s], 'agent', 'event').
     distance: path length of each robot [m], in runs of nodes set at the end. end_reason: a key
-    of `END_REASONS`. end_time, wall_time: simulated and wall time [s].
+    of `END_REASONS`. end_time, wall_time: simulated and wall time [s]. began: Unix time of the
+    first step [s], None if the times of the run are no times of the day.
     """
 
     def __init__(self, scenario: BaseScenario, seed: int, name: str = '') -> None:
@@ -72,17 +74,27 @@ class RunRecord:
         self.last_steps: dict[str, int] = {}
         self.distance = dict.fromkeys(scenario.names(), 0.0)
         self.end_reason, self.end_time, self.wall_time = '', 0.0, 0.0
+        self.began: float | None = None
         # Time and position of the states of each robot; an hour needs 2 MB.
         self._path = {name: array('d') for name in scenario.names()}
+        # Time and charge of its battery, after each change.
+        self._charges: dict[str, list[tuple[float, float]]] = {
+            name: [] for name in scenario.names()
+        }
         self.team = set(scenario.names())  # : robots of the team
         self._lost: set[str] = set()
 
     def add(self, fact: facts.Fact) -> None:
         """Add a fact."""
         match fact:
-            case facts.RobotAt(time, robot, pose, _, status, reason, step) if robot in self._path:
+            case facts.RobotAt(time, robot, pose, charge, status, reason, step) if (
+                robot in self._path
+            ):
                 if math.isfinite(sum(pose)):
                     self._path[robot].extend((time, *pose[:3]))
+                charges = self._charges[robot]
+                if charge >= 0.0 and not (charges and charges[-1][1] == charge):
+                    charges.append((time, charge))
                 self.last_steps[robot] = step
                 if status == UNAVAILABLE or robot in self._lost:
                     self._note_lost(time, robot, status == UNAVAILABLE, reason)
@@ -117,9 +129,14 @@ class RunRecord:
         """Odometry positions of each robot: time [s], x, y, z [m], (n, 4)."""
         return {name: np.array(path).reshape(-1, 4) for name, path in self._path.items()}
 
+    def charges(self, robot: str) -> list[float]:
+        """Return the charges of a robot's battery until the end, 0 to 1; empty: unknown."""
+        return [charge for time, charge in self._charges[robot] if time <= self.end_time]
+
     def close(self, end: RunEnd, until: float) -> None:
         """Note the end of a run of nodes and drop later data; `until` in s."""
         self.end_reason, self.end_time, self.wall_time = end.reason, until, end.wall_time
+        self.began = end.began
         for name, path in self.trajectories.items():
             path = path[path[:, 0] <= until]
             self._path[name] = array('d', path.ravel())

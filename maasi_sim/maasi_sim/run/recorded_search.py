@@ -17,9 +17,11 @@ from maasi_filter.wording import counted, point
 from maasi_planner.coordinator import Coordinator
 from maasi_sim.run.ending import DONE
 from maasi_sim.run.facts import Measured, RobotAt, Updated
-from maasi_sim.run.log import RunLog
+from maasi_sim.run.log import RunEnd, RunLog
 from maasi_sim.run.run_folder import make_folder, write_text
 from maasi_sim.run.run_options import Options
+from maasi_sim.run.targets.report import explored_after
+from maasi_sim.run.targets.report_sheet import report_pdf
 from maasi_sim.run.targets.tables import csv_text, found_rows
 from maasi_sim.run.view.page_file import REPLAY, write_replay
 from maasi_sim.run.view.search_page import event_log
@@ -27,6 +29,7 @@ from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, planner_settings
 
+_UNIX = 1e9  # stamps above are Unix times, below those of a simulation [s]
 Placed = tuple[StampedPose, AgentMeasurement]  # pose of a robot and its measurement there
 
 
@@ -46,6 +49,11 @@ def search_recording(options: Options) -> int:
     rows = found_rows(found, np.zeros((0, loaded.dimension)), [], origin)
     write_text(folder / 'found_targets.csv', csv_text(rows, loaded.dimension, origin))
     write_replay(event_log(log, bag.name), folder / REPLAY)
+    first, last = (1e-9 * pick(place.stamp for place, _ in recorded) for pick in (min, max))
+    # Stamps of robots without a simulation are Unix times.
+    began = first if first > _UNIX else None
+    log.close(RunEnd('end of the recording', last - first, 0.0, (), began), last - first)
+    write_text(folder / 'report.pdf', report_pdf(log, explored_after(log)))
     for target in found:
         print(
             f'target {target.id} of {target.robot} at {point(target.position)} m, '

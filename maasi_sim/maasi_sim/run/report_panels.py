@@ -96,7 +96,7 @@ def draw_report(
     for view in views:
         draw_map(view)
         for name, colour in colours.items():
-            _draw_path(view, record.trajectories[name], colour, record.end_time, name)
+            draw_path(view, record.trajectories[name], colour, record.end_time, name)
     for marker, label in (('s', 'start'), ('o', 'end')):
         views[0].axes.plot([], [], marker, color=PALE, ms=7, label=label)
     _add_legend(figure, views)
@@ -122,7 +122,7 @@ def draw_report(
     _write_rows(text, [*rows, *words])
     planner = record.scenario.planner.name
     title = f'{record.name}   seed {record.seed}   planner {planner}'
-    figure.suptitle(title, fontsize=13, fontweight='bold')
+    figure.suptitle(title, fontsize=13, fontweight='bold', parse_math=False)
     return figure
 
 
@@ -158,7 +158,8 @@ def _shades(colour: str) -> LinearSegmentedColormap:
     )
 
 
-def _draw_path(view: MapView, path: FloatArray, colour: str, end: float, label: str) -> None:
+def draw_path(view: MapView, path: FloatArray, colour: str, end: float, label: str) -> None:
+    """Draw the states (n, 4) of a robot, shaded by time until the end [s]."""
     if len(path):
         places = view.points(path[:, 1:]).T
         lines = LineCollection(

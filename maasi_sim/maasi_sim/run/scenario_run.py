@@ -47,6 +47,9 @@ from maasi_sim.scenario.layering import to_yaml
 _START_POLL, _POLL = 0.02, 0.05
 # Longest wait for a publisher of another program, whose QoS may not match [s].
 _CONNECTION_PATIENCE = 5.0
+# Difference between a run's time and the wall time up to which its times are those of the day,
+# relative to the wall time.
+_PACE = 0.02
 _START_PATIENCE = 10.0  # wall time between messages about missing nodes [s]
 
 
@@ -191,8 +194,14 @@ class RunningRun:
         # The replay is written in parallel to the report, if the server of the nodes is running.
         ran = options.record and self._processes[0].pid is not None
         replay = in_background(send_replay, self.folder) if ran else iter(())
-        end = RunEnd(ending.reason, recorder.elapsed, wall_time, self.supervisor.events)
+        began = self._time_of_day(recorder.elapsed, wall_time)
+        end = RunEnd(ending.reason, recorder.elapsed, wall_time, self.supervisor.events, began)
         return EndedRun(self, ending, end, unwritten, replay)
+
+    def _time_of_day(self, elapsed: float, wall_time: float) -> float | None:
+        """Return the Unix time of the first step [s] if the run kept pace with the clock."""
+        kept = abs(elapsed - wall_time) <= _PACE * max(wall_time, 100.0)
+        return time.time() - wall_time if kept and not self.options.lockstep else None
 
     def _close_bag(self) -> list[str]:
         try:

@@ -89,11 +89,15 @@ class TargetMission:
         """See `Mission.tables`."""
         origin = self.scenario.environment.origin
         rows = found_rows(record.found_targets, record.truth, record.pairs, origin)
+        explored = explored_after(record)
+        # Deferred: Matplotlib takes long to import.
+        from maasi_sim.run.targets.report_sheet import report_pdf
+
         files: dict[str, str | bytes] = {
-            'found_targets.csv': csv_text(rows, record.scenario.dimension, origin)
+            'found_targets.csv': csv_text(rows, record.scenario.dimension, origin),
+            'report.pdf': report_pdf(record, explored),
         }
         if origin is not None:
-            explored = explored_after(record)
             features = searched(record, explored, origin)
             files['found_targets.geojson'] = found_geojson(rows)
             files['ways.geojson'] = collection(features)

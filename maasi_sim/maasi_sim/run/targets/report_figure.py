@@ -49,7 +49,7 @@ def plot_report(record: RunLog) -> Figure:
     explored = explored_after(record)
 
     def draw_map(view: MapView) -> None:
-        _draw_explored(view, explored, bounds)
+        draw_explored(view, explored, bounds)
         draw_ground(view, area, bounds)
         for name, colour in colours.items():
             waypoints = view.points([place for _, place in record.waypoints.get(name, ())])
@@ -75,7 +75,7 @@ def plot_report(record: RunLog) -> Figure:
     )
 
 
-def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -> None:
+def draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -> None:
     """Shade the unexplored area: e, in 3D its mean along the line of sight."""
     hidden = tuple(axis for axis in range(explored.dimension) if axis not in view.plane)
     lower, step, shown = explored.shown()
