@@ -38,7 +38,8 @@ PARTS = {
         'Do: one task each, with the commands or the code.',
         [
             'install',
-            *(f'how_to/{name}' for name in ('search_area', 'map_files', 'keep_outs', 'batteries')),
+            *(f'how_to/{name}' for name in ('search_area', 'map_files', 'keep_outs', 'people')),
+            'how_to/batteries',
             *(
                 f'how_to/{name}'
                 for name in ('robot', 'autopilots', 'detections', 'planner', 'filter')

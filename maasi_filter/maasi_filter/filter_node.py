@@ -18,6 +18,7 @@ from maasi_filter.make_filter import Progress, load_state, make_filter, warm_up
 from maasi_filter.measurement_check import FOUND, REPEATED
 from maasi_filter.node.batch_assembly import BatchAssembly, PendingBatch
 from maasi_filter.node.found_target_exchange import SharedFoundTargets
+from maasi_filter.node.report_services import ReportServices
 from maasi_filter.ros.conversions import (
     MarkerBoard,
     cluster_to_ros,
@@ -65,11 +66,19 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     `found_targets/kept` (maasi_msgs/FoundTargetArray, latched): targets found before a restart;
     `<robot>/found_targets` (maasi_msgs/FoundTargetArray) of robots with their own filters
 
+    Services
+    --------
+    `search/review_target` (maasi_msgs/ReviewTarget): a person confirms or rejects a found target;
+    `search/add_sighting` (maasi_msgs/AddSighting): a person expects targets near a position;
+    `search/mark_searched` (maasi_msgs/MarkSearched): others have searched ground.
+    Running freely they are used at once, in lockstep before a batch
+
     Publishes
     ---------
     `filter_update` (maasi_msgs/FilterUpdate, latched): one per batch, in the order of their ids;
     `clusters` (maasi_msgs/ClusterArray), `found_targets` (maasi_msgs/FoundTargetArray, latched),
     `found_targets/fixes` (maasi_msgs/FoundFixArray, latched) if the map has an origin,
+    `reports` (maasi_msgs/Report, latched): statements of persons that were used;
     `particles` (sensor_msgs/PointCloud2), `markers` (visualization_msgs/MarkerArray)
     """
 
@@ -85,6 +94,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             for name, robot in sorted(settings.robots.items())
         }
         self._shared = SharedFoundTargets(self)
+        self._reports = ReportServices(
+            self, lambda: (self.filter, self._progress.batch), self._save_and_publish
+        )
         bounds = settings.environment.array()
         self.area = Area(settings.environment)
         self._marker_size = 0.01 * float((bounds[:, 1] - bounds[:, 0]).max())
@@ -170,6 +182,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 RELIABLE,
             )
         self._shared.set_up()
+        self._reports.set_up()
         KeepOutTopic(self, self._adopt_area, keep=True)
         self.expect_subscribers(self._found_publisher, len(self._shared) + 1 if self._shared else 0)
         if not settings.lockstep:
@@ -180,6 +193,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     def start(self) -> None:
         """Publish the restored state again, as latched messages end with their process."""
         self._kept_until = min(self._kept_until, time.monotonic() + _KEPT_PATIENCE)
+        self._reports.publish(self.filter.reports)
         if not self._restored:
             return
         self._restored = False
@@ -189,8 +203,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._update_publisher.publish(update)
 
     def _adopt_area(self, area: Area) -> None:
-        self.area = area
         self.filter.adopt_area(area)
+        self.area = self.filter.area
 
     def halt(self) -> None:
         """Save the state."""
@@ -215,7 +229,11 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def reset(self) -> None:
         """Begin a new search."""
+        reported = bool(self.filter.reports)
+        self.area = self.filter.area.with_sightings(()) if reported else self.area
         self._reset_state()
+        if reported:
+            self._reports.reset()
         if self.settings.save_file and self.settings.save_batches:
             Path(self.settings.save_file).unlink(missing_ok=True)
 
@@ -280,7 +298,10 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._progress.step = batch.step
         members = [item for item in batch.members if item.robot in batch.measurements]
         now = batch.stamp * 1e-9
-        changed = self._shared.merge_into(self.filter, batch.stamp)
+        before = [target.id for target in self.filter.found_targets]
+        reports = self._reports.use_waiting(batch.step, batch.stamp)
+        changed = before != [target.id for target in self.filter.found_targets]
+        changed |= self._shared.merge_into(self.filter, batch.stamp)
         try:
             result = self.filter.step(
                 [batch.measurements[item.robot] for item in members], steps, now
@@ -314,11 +335,13 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             found=len(self.filter.found_targets),
             newly_found=[found_target_to_ros(target, batch.id) for target in result.newly_found],
             clusters=clusters,
+            reports=len(self.filter.reports),
         )
         if settings.save_batches:
             # Save before publishing, so that no published result is lost with this process.
             self._progress.update = np.frombuffer(serialize_message(update), np.uint8)
             self._save()
+        self._reports.publish(reports, wait=True)
         # Found targets first, so that subscribers have them when the update arrives.
         if changed or result.found_changed or not self._found_published:
             self._publish_found(header, batch.id)
@@ -336,6 +359,13 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         )
         self._publish_views(header, now)
         self._latency = time.perf_counter() - begin
+
+    def _save_and_publish(self) -> None:
+        """Save and publish the state after a statement of a person."""
+        self._save()
+        stamp = self.get_clock().now().to_msg()
+        header = Header(stamp=stamp, frame_id=self.settings.frame)
+        self._publish_found(header, self._progress.batch)
 
     def _publish_views(self, header: Header, now: float) -> None:
         settings, search = self.settings, self.filter

@@ -31,7 +31,8 @@ WITHDRAWN = 0.5
 MOST_WEIGHT = 1000.0  # expected targets of one sighting
 MOST_REPORTS = 1000  # in one search
 MOST_SOURCE = 100  # characters
-CORNERS = 10_000  # of a searched zone
+CORNERS = 2000  # of a searched zone
+_FARTHEST = 4e7  # coordinate of a corner [m]
 # Largest probability of detection for potential targets, as for sensors.
 MOST_PROBABLE = 0.98
 _KEY = re.compile(r'keep_outs\W*0\W+')  # where errors of zones are found
@@ -62,7 +63,7 @@ class Report:
     time : float
         When the filter used it, seconds.
     batch : int
-        Last batch before it.
+        Last batch that began before it.
     """
 
     kind: str
@@ -122,8 +123,10 @@ def sighting(
 ) -> Report:
     """Return a checked sighting in an area; ValueError names a problem."""
     for axis, value in zip('xyz', position):
-        if not math.isfinite(value):
-            raise ValueError(f'position.{axis}: read {value:g}, allowed are finite numbers')
+        if not abs(value) <= _FARTHEST:
+            raise ValueError(
+                f'position.{axis}: read {value:g}, allowed are numbers up to {_FARTHEST:g} m'
+            )
     size = area.bounds[:2, 1] - area.bounds[:2, 0]
     most = 10.0 * float(np.hypot(*size))
     if not 0.0 < radius <= most:
@@ -149,8 +152,9 @@ def searched(
         raise ValueError(
             f'detection_probability: read {probability:g}, allowed are numbers above 0, to 1'
         )
-    if zone.count(',') > CORNERS:
-        raise ValueError(f'zone: read {zone.count(",")} corners, allowed are {CORNERS}')
+    corners = max(zone.count(','), len(zone) // 50)
+    if corners > CORNERS:
+        raise ValueError(f'zone: read about {corners} corners, allowed are {CORNERS}')
     try:
         values = {**dict(environment), 'keep_outs': shapes_of_texts([zone])}
         zones = EnvironmentSettings.model_validate(values).keep_outs
@@ -159,8 +163,12 @@ def searched(
         raise ValueError(f'zone: {_KEY.sub("", text)}') from None
     if not zones:
         raise ValueError('zone: read nothing, allowed is a polygon or x y radius')
+    if any((zone.radius or 0.0) > _FARTHEST for zone in zones):
+        raise ValueError(f'zone: read a radius beyond {_FARTHEST:g} m')
     shapes = list(map(level_shape, zones))
     shape = shapely.union_all(shapes)
+    if not np.abs(shape.bounds).max() <= _FARTHEST:
+        raise ValueError(f'zone: read coordinates beyond {_FARTHEST:g} m')
     gap = float(area.border.distance(shape))
     if not shape.area > 0.0 or not area.border.intersection(shape).area > 0.0:
         centre = shapely.get_coordinates(shape.centroid)

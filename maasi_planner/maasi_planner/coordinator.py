@@ -3,6 +3,7 @@
 The planner node and the in-process search use it (000, algorithms 1 and 2).
 """
 
+import copy
 from collections.abc import Collection, Mapping, Sequence
 
 from maasi_filter.arrays import FloatArray
@@ -10,6 +11,7 @@ from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
+from maasi_filter.reports import SEARCHED, SIGHTING, Report, sighting_of
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import CandidateSet, half_view, map_spacing
 from maasi_planner.endurance import NOTHING_AFFORDABLE, Endurance
@@ -112,16 +114,35 @@ class Coordinator:
 
     def adopt_area(self, area: Area) -> None:
         """Change keep-outs within the same bounds; opened ground resumes a finished search."""
-        self.area = area
         before = self._open_share()
         self.exploration.adopt_area(area)
+        self.area = self.exploration.area
         if self._open_share() > before + _ROUNDING:
-            self.finished, self._ended = None, False
-            # Earlier decisions do not account for the opened ground.
-            self._unasked = set(self.robots)
+            self._resume()
         for robot in self.robots.values():
             robot.adopt_area(area)
         self.homing.adopt_area()
+
+    def _resume(self) -> None:
+        self.finished, self._ended = None, False
+        # Earlier decisions do not account for the ground that is opened, or more likely.
+        self._unasked = set(self.robots)
+
+    def use(self, report: Report) -> None:
+        """Use a statement of a person as the filter did; a sighting resumes a finished search."""
+        maps = [self.exploration, *(robot.exploration for robot in self.robots.values())]
+        if report.kind == SIGHTING:
+            self.area = self.area.with_sightings((*self.area.sightings, sighting_of(report)))
+            self._resume()
+        elif report.kind == SEARCHED:
+            # Another object, as plans hold as long as the area is the same one.
+            self.area = copy.copy(self.area)
+        for exploration in (item for item in maps if item is not None):
+            if report.kind == SIGHTING:
+                exploration.adopt_sightings(self.area)
+            elif report.kind == SEARCHED:
+                exploration.search(report.shape, report.weight)
+                exploration.area = self.area
 
     def begin_again(self) -> None:
         """Begin a new search with nothing explored; decision indices continue."""

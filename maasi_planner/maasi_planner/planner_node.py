@@ -27,6 +27,7 @@ from maasi_planner.node.battery_log import BatteryLog
 from maasi_planner.node.filter_guard import FilterGuard, FoundKeeper
 from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
+from maasi_planner.node.reports import Reports
 from maasi_planner.node.search_action import SearchAction, offer_services
 from maasi_planner.node.search_modes import Mode, SearchModes
 from maasi_planner.node.team_goals import ReceivedState
@@ -53,7 +54,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     ----------
     `<robot>/state` (maasi_msgs/AgentState), `filter_update` (maasi_msgs/FilterUpdate);
     `<robot>/destination` (geometry_msgs/PointStamped) of robots with their own planners;
-    `found_targets` (maasi_msgs/FoundTargetArray, latched); running freely, `/diagnostics`
+    `found_targets` (maasi_msgs/FoundTargetArray, latched); `reports` (maasi_msgs/Report, latched):
+    statements of persons that the filter has used; running freely, `/diagnostics`
     (diagnostic_msgs/DiagnosticArray): heartbeats of the publishers of `filter_update`; in lockstep
     `lockstep/step` (maasi_msgs/LockstepStep)
 
@@ -92,7 +94,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self.orders = Orders(self, self.coordinator, self.modes)
         self.others = OtherPlanners(self, self.coordinator.names, self._try_step)
         self.guard = FilterGuard(self)
-        self.batches = Batches(self, self.guard, self._try_done)
+        self.reports = Reports(self, lambda report: self.coordinator.use(report))
+        self.batches = Batches(self, self.guard, self.reports, self._try_done)
         self._views = PlannerViews(self)
         self._reset_state()
 
@@ -126,6 +129,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             )
         # Before the publisher of batches: a filter must discover the retained targets first.
         self._keeper = FoundKeeper(self)
+        self.reports.set_up()
         self.batches.set_up()
         self._decision_publisher = self.create_publisher(PlanDecision, 'decisions', RELIABLE)
         self._views.set_up()
@@ -191,9 +195,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         for name in self.coordinator.names:
             self.goals.cancel(name)
         self.goals.waiting.clear()
-        self.coordinator = Coordinator(self.settings, self.coordinator.area)
+        self.coordinator = Coordinator(self.settings, self.coordinator.area.with_sightings(()))
         self.orders.reset(self.coordinator)
-        for part in (self.others, self.guard, self._views):
+        for part in (self.others, self.guard, self._views, self.reports):
             part.reset()
         self._reset_state()
         self._keeper.forget()

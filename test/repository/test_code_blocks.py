@@ -138,6 +138,8 @@ WRONG_COMMANDS = (
     'ros2 run maasi_filter filter --ros-args',
     'ros2 run maasi_filter filter_node --fast',
     'ros2 launch maasi_sim scenario.launch.py scenarios:=mambo',
+    'ros2 service call /search/keep_outs maasi_msgs/srv/SetKeepOuts "{zone: []}"',
+    'ros2 service call /search/a maasi_msgs/srv/ReviewTarget "{id: one}"',
 )
 
 
@@ -147,7 +149,7 @@ def test_what_is_wrong_is_found(tmp_path):
         (check_commands, WRONG_COMMANDS),
     ):
         for text in texts:
-            with pytest.raises((ValueError, AssertionError, OSError)):
+            with pytest.raises((ValueError, AssertionError, OSError, AttributeError)):
                 check_block(text)
 
 
@@ -166,6 +168,8 @@ def check_commands(text):
 def check_command(program, *rest):
     if program.startswith('./scripts/'):
         check_script(ROOT / program, rest)
+    elif program == 'ros2' and rest[:2] == ('service', 'call'):
+        check_request(*rest[3:])
     elif program == 'ros2' and rest[1].startswith('maasi'):
         verb, package, name, *arguments = rest
         if verb == 'run':
@@ -182,6 +186,21 @@ def check_command(program, *rest):
     elif program.startswith('python') and rest[0].endswith('.py'):
         name = Path(rest[0]).name
         assert any(ROOT.glob(f'scripts/{name}')) or any(ROOT.glob(f'examples/**/{name}')), name
+
+
+def check_request(kind, text='{}'):
+    package, folder, name = kind.split('/')
+    request = getattr(importlib.import_module(f'{package}.{folder}'), name).Request()
+    fill(request, yaml.safe_load(text))
+
+
+def fill(message, values):
+    for key, value in values.items():
+        field = getattr(message, key)
+        if isinstance(value, dict):
+            fill(field, value)
+        else:
+            setattr(message, key, type(field)(value))
 
 
 def check_script(script, arguments):

@@ -25,9 +25,11 @@ from maasi_filter.records import (
     Label,
     rounded_score,
 )
+from maasi_filter.reports import CONFIRMED, REJECTED, SEARCHED, SIGHTING, Report
 from maasi_msgs.msg import Cluster as ClusterMessage
 from maasi_msgs.msg import Detection, DetectionArray, FoundFixArray, RangeMeasurement
 from maasi_msgs.msg import FoundTarget as FoundTargetMessage
+from maasi_msgs.msg import Report as ReportMessage
 
 #: Largest number of detections used from one message, which bounds the computation time.
 MOST_DETECTIONS = 200
@@ -154,6 +156,55 @@ def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundT
         measurement=int(message.measurement),
         time=stamp_from_ros(message.stamp) * 1e-9,
         label=label_from_ros(message),
+    )
+
+
+_REPORT_KINDS = {
+    CONFIRMED: ReportMessage.CONFIRMED,
+    REJECTED: ReportMessage.REJECTED,
+    SIGHTING: ReportMessage.SIGHTING,
+    SEARCHED: ReportMessage.SEARCHED,
+}
+
+
+def report_to_ros(report: Report, header: Header) -> ReportMessage:
+    """Return the message of a statement of a person."""
+    return ReportMessage(
+        header=header,
+        id=report.id,
+        batch_id=report.batch,
+        kind=_REPORT_KINDS[report.kind],
+        source=report.source,
+        target=report.target,
+        position=point_to_ros([*report.position, 0.0, 0.0][:3]),
+        radius=report.radius,
+        weight=report.weight,
+        zone=report.zone,
+    )
+
+
+def report_from_ros(message: ReportMessage, dimension: int) -> Report:
+    """Return a statement of a person; ValueError for unusable numbers."""
+    kinds = {value: name for name, value in _REPORT_KINDS.items()}
+    if message.kind not in kinds:
+        allowed = ', '.join(map(str, kinds))
+        raise ValueError(f'kind: read {message.kind}, allowed are {allowed}')
+    at = message.position
+    position = (at.x, at.y, at.z)
+    bounded('position', position, FARTHEST)
+    bounded('radius', [message.radius], FARTHEST)
+    bounded('weight', [message.weight], FARTHEST)
+    return Report(
+        kinds[message.kind],
+        float(message.weight),
+        message.source,
+        int(message.target),
+        [float(value) for value in position[:dimension]],
+        float(message.radius),
+        message.zone,
+        int(message.id),
+        1e-9 * stamp_from_ros(message.header.stamp),
+        int(message.batch_id),
     )
 
 

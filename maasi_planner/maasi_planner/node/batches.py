@@ -12,6 +12,7 @@ from maasi_msgs.msg import BatchMember, FilterUpdate, MeasurementBatch
 from maasi_planner.conversions import checked_update
 from maasi_planner.coordinator import Coordinator
 from maasi_planner.node.filter_guard import FilterGuard
+from maasi_planner.node.reports import Reports
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.robot_plan import Member
 
@@ -25,9 +26,11 @@ class Batches:
         self,
         node: LockstepLifecycleNode[PlannerNodeSettings],
         guard: FilterGuard,
+        reports: Reports,
         on_answer: Callable[[], None],
     ) -> None:
-        self._node, self._guard, self._on_answer = node, guard, on_answer
+        self._node, self._guard, self._reports = node, guard, reports
+        self._on_answer = on_answer
 
     def reset(self, coordinator: Coordinator) -> None:
         """Reset for a new search."""
@@ -92,6 +95,7 @@ class Batches:
         if measured and all(item in self._processed for item in measured):
             return  # duplicate, from a restarted filter
         self._processed.extend(measured)
+        self._reports.include(int(message.reports))
         coordinator.absorb(poses, clusters)
         self.used = max(self.used, number)
         self.update = message
