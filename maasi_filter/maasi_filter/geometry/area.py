@@ -19,6 +19,8 @@ from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.geometry.environment import EnvironmentSettings, Zone
 from maasi_filter.geometry.geodesy import on_ground, to_map
 from maasi_filter.geometry.raster import read_raster, scaled
+from maasi_filter.geometry.terrain import Terrain
+from maasi_filter.geometry.terrain_file import read_terrain
 
 _ROUNDING = 1e-6  # of coordinates [m]
 # Cells of the density along the longer side, and the stride of a first check.
@@ -82,13 +84,15 @@ class Area:
         Horizontal outline of the area without keep-outs; None: all of `bounds`.
     circles : (n, 5) array
         Round zones: x, y, z, radius [m, map], and 1 for a sphere or 0 for a cylinder.
+    terrain : Terrain or None
+        Ground on which targets stand; None: the plane z = 0.
     warnings : list of str
         Warnings about valid input without effect, such as a keep-out far away: `key: text`.
 
     Raises
     ------
     ValueError
-        If bounds are invalid, a prior cannot be read, or keep-outs cover the whole area.
+        If bounds are invalid, a prior or terrain cannot be read, or keep-outs cover the whole area.
     """
 
     def __init__(self, environment: EnvironmentSettings | ArrayLike) -> None:
@@ -121,6 +125,10 @@ class Area:
         #: Whether targets are equally likely in all of the bounds.
         self.uniform = self.region is None and not prior.polygons and self._raster is None
         self.warnings = self._zones_outside()
+        self.terrain: Terrain | None = None
+        if environment.terrain.file is not None:
+            self.terrain, assumed = read_terrain(environment)
+            self.warnings += assumed
         if not self.uniform:
             self.warnings += self._prior_warnings()
 
@@ -166,6 +174,13 @@ class Area:
     def outside_by(self, position: ArrayLike) -> float:
         """Return the distance of a position (3,) from the border [m]; 0 inside."""
         return float(self.border.distance(shapely.Point(np.asarray(position)[:2])))
+
+    def above_ground(self, position: ArrayLike) -> FloatArray:
+        """Return a position (3,) whose z is above ground in the map [m]."""
+        found = np.array(position, dtype=float)
+        if self.terrain is not None:
+            found[2] += self.terrain.height(found)
+        return found
 
     def density(self, points: FloatArray) -> FloatArray:
         """Return the density of targets (n,) at points (n, d or more) [m]; its mean is 1."""

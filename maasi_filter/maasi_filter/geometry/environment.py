@@ -6,7 +6,7 @@ Shapes are given in metres of the map, as GeoJSON (degrees, RFC 7946), or as wel
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -125,6 +125,29 @@ class BackgroundSettings(Settings):
         return {'file': value} if isinstance(value, str) else value
 
 
+class TerrainSettings(Settings):
+    """Ground that is not flat."""
+
+    file: str | None = Field(
+        None,
+        description='Heights: an Esri ASCII grid (.asc) in metres of the map, or a GeoTIFF; '
+        'default: flat ground at z = 0',
+    )
+    unit: Literal['m', 'ft', 'us-ft'] | None = Field(
+        None, description='Unit of the heights; default: that of the file, or metres'
+    )
+    zero: Finite | None = Field(
+        None,
+        description='Height in the file at which z = 0; default: 0 in a file without coordinate '
+        'system, else the ground at x = y = 0 [m]',
+    )
+
+    @model_validator(mode='before')
+    @classmethod
+    def _from_text(cls, value: Any) -> Any:
+        return {'file': value} if isinstance(value, str) else value
+
+
 class EnvironmentSettings(Settings):
     """The search area: `bounds`, or an `area` with its altitudes."""
 
@@ -161,6 +184,11 @@ class EnvironmentSettings(Settings):
 
     background: BackgroundSettings = Field(
         default_factory=BackgroundSettings, description='Picture below the map'
+    )
+    terrain: TerrainSettings = Field(
+        default_factory=TerrainSettings,
+        description='Heights of the ground: targets stand on it, hills hide them, and heights of '
+        'robots are above it',
     )
 
     @model_validator(mode='before')

@@ -30,7 +30,7 @@ from maasi_filter.settings import Settings
 _NUMBER = '-+.0123456789'  # first characters of numbers
 _MAPS = ('.yaml', '.yml')
 _IMAGES = ('.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff')
-FILES = (*FEATURE_FILES, *_MAPS, *_IMAGES)
+FILES = (*FEATURE_FILES, *_MAPS, *_IMAGES, '.asc')
 _ROLE_OF = {'keep_outs': 'keep_out', 'obstacles': 'keep_out', 'prior': 'prior'}  # by key
 _DEGREES = 0.1  # shorter areas are in degrees [m]
 _LARGEST = 10e9  # of an area in degrees [m^2]
