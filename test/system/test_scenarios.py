@@ -1,12 +1,16 @@
 """Whole scenarios: separate processes over DDS, from camera image to found target."""
 
+import contextlib
 import json
+import socket
 from collections import Counter
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import shapely
 from scenario_runs import check_replay, of_topic, run_scenario, start
+from small_field import SMALL_FIELD
 
 from maasi_filter.geometry.area import Area
 from maasi_sim.run.bag import Bag
@@ -50,6 +54,23 @@ def test_a_run_ends_at_the_step_of_its_time_limit(repeated):
     # A step that a busy machine holds up is repeated.
     steps = dict.fromkeys(item['step'] for item in of_topic(run, '/mambo/state'))
     assert list(steps) == list(range(240))
+
+
+def test_found_targets_are_sent_while_it_runs(tmp_path):
+    origin = {'latitude': 46.0, 'longitude': 23.5}
+    scenario = SMALL_FIELD | {'environment': SMALL_FIELD['environment'] | {'origin': origin}}
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(('127.0.0.1', 0))
+        address = f'udp://127.0.0.1:{receiver.getsockname()[1]}'
+        run = run_scenario(scenario, tmp_path / 'run', '--seed', 2, '--lockstep', '--cot', address)
+        receiver.setblocking(False)
+        sent = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                sent.append(ElementTree.fromstring(receiver.recv(65536)).get('uid'))
+    found = {f'maasi.search.{item["id"]}' for item in run.report['found']}
+    assert found and set(sent) == found, run.output
+    assert f'{len(sent)} Cursor-on-Target events sent to {address}' in run.output
 
 
 def transforms(run):

@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from maasi_sim.arguments import Parser, positive, whole
+from maasi_sim.run.cot import CotAddress, cot_address
 from maasi_sim.run.ending import EXIT_CODES
 
 LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 # Options that are arguments of a launch as well.
-_LAUNCH_OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'namespace', 'log_level', 'port')
+_LAUNCH_OPTIONS = (
+    *('out', 'seed', 'rate', 'planner', 'time_limit', 'namespace', 'log_level', 'port', 'cot'),
+)
 _LAUNCH_FLAGS = ('lockstep', 'view')
 Key = tuple[str | int, ...]  # as of a scenario file
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
@@ -48,6 +51,7 @@ class Options:
     check: bool = False
     listing: bool = False
     view: ViewOptions | None = None
+    cot: CotAddress | None = None
 
     def overrides(self) -> dict[str, tuple[Key, Any]]:
         """Return what wins over the values of the scenario file: by option, key and value."""
@@ -149,6 +153,13 @@ def build_parser() -> argparse.ArgumentParser:
         metavar='FROM:=TO',
         help='read the recorded topic FROM as TO (with FILE and --replay)',
     )
+    add(
+        '--cot',
+        type=cot_address,
+        metavar='udp://HOST:PORT',
+        help='send found targets as Cursor-on-Target events to a TAK server, or to a multicast '
+        'group such as udp://239.2.3.1:6969; needs environment.origin',
+    )
     add('--view', action='store_true', help='show the run in a browser')
     add_view_options(parser)
     return parser
@@ -209,6 +220,8 @@ def parse(arguments: list[str] | None) -> Options:
         return options
     if options.check and (options.replay is not None or options.view is not None):
         parser.error('--check: allowed without --replay and --view')
+    if options.cot is not None and (options.check or options.replay is not None):
+        parser.error('--cot: allowed without --check and --replay')
     if options.remap and not (options.replay and options.scenario):
         parser.error('--remap: allowed with a scenario and --replay BAG')
     if options.replay is None and not options.scenario:

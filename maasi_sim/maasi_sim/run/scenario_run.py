@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from maasi_filter.records import FoundTarget
 from maasi_filter.wording import counted, number
 from maasi_sim.run.bag import ENDING_TOPIC, BagError, BagWriter, load_types
+from maasi_sim.run.cot import CotSender
 from maasi_sim.run.domain import Domain
 from maasi_sim.run.ending import (
     DONE,
@@ -24,7 +26,7 @@ from maasi_sim.run.ending import (
     Interruption,
     end_of_planners,
 )
-from maasi_sim.run.log import RunEnd
+from maasi_sim.run.log import RunEnd, RunLog
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.missions import checked_mission, send_warning
 from maasi_sim.run.processes import in_background, stop, wait_for_server
@@ -35,13 +37,14 @@ from maasi_sim.run.run_folder import make_folder, write_text
 from maasi_sim.run.run_options import Options, short
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
+from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.topics import CLOCK
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.live_view import RunPage
 from maasi_sim.run.view.page_file import REPLAY
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.view_run import send_replay
-from maasi_sim.scenario.layering import to_yaml
+from maasi_sim.scenario.layering import ScenarioError, to_yaml
 
 # Wall time between checks of processes and topics, during the start and afterwards [s].
 _START_POLL, _POLL = 0.02, 0.05
@@ -58,11 +61,13 @@ def execute(options: Options, interruption: Interruption) -> int:
     display = ProgressDisplay()
     mission = checked_mission(options, display)
     # Teams whose robots are moved by another program share its clock.
+    cot = _cot_sender(mission, options, display)
     shared = mission.scenario.external_clock and options.domain_id is not None
     with contextlib.ExitStack() as served:
         with Domain(options.domain_id, team=options.namespace, shared=shared) as domain:
             folder = prepare(mission, options)
             running = RunningRun(mission, options, interruption, display, folder, domain)
+            running.cot = cot
             with contextlib.closing(running):
                 if running.page is not None:
                     served.callback(running.page.close)
@@ -72,6 +77,23 @@ def execute(options: Options, interruption: Interruption) -> int:
             with interruption.at_once():
                 running.page.wait_for_reader(display.say)
         return code
+
+
+def _cot_sender(
+    mission: Mission[Any], options: Options, display: ProgressDisplay
+) -> CotSender | None:
+    """Return what sends the found targets of a run; ScenarioError: it cannot."""
+    if options.cot is None:
+        return None
+    origin = mission.scenario.environment.origin
+    if origin is None or not isinstance(mission, TargetMission):
+        raise ScenarioError(
+            f'--cot: read {options.cot}, allowed in searches for targets with environment.origin'
+        )
+    try:
+        return CotSender(mission.name, options.cot, origin, display.warn)
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
 
 
 def prepare(mission: Mission[Any], options: Options) -> Path:
@@ -97,6 +119,7 @@ class RunningRun:
     ) -> None:
         self.mission, self.options, self.interruption = mission, options, interruption
         self.display, self.folder, self.scenario = display, folder, mission.scenario
+        self.cot: CotSender | None = None  # set before the run begins
         self.supervisor = Supervisor(mission, options, folder, display)
         self._processes = processes = list(self.supervisor.processes.values())
         os.environ.update(domain.environment(len(processes) + 1))
@@ -188,6 +211,9 @@ class RunningRun:
             # Closing the recording reports its errors.
             with contextlib.suppress(BagError):
                 self._bag.write_text(ENDING_TOPIC, recorder.time, f'{ending.reason}\n{ending.text}')
+        if self.cot is not None:
+            self.display.say(self.cot.finish(self._found()))
+            self.cot.close()
         if self.page is not None:
             self.page.put(EventMaker.end, ending.reason, ending.text)
         unwritten += self._close_bag()
@@ -284,6 +310,8 @@ class RunningRun:
                 if self.options.lockstep and recorder.step is not None:
                     recorder.publish_done(recorder.step)
             self.display.warn(*recorder.pop_complaints())
+            if self.cot is not None:
+                self.cot.update(self._found())
             if self.display.due or self.observer.news:
                 self._show()
         return ending
@@ -313,6 +341,10 @@ class RunningRun:
     def explored(self) -> float:
         """Explored share, from the planner that reports the largest."""
         return max(self.observer.explored, self.recorder.explored)
+
+    def _found(self) -> list[FoundTarget]:
+        log = self.observer.log
+        return log.found_targets if isinstance(log, RunLog) else []
 
     def _show(self) -> None:
         observer = self.observer

@@ -77,7 +77,7 @@ def _title(row: Row) -> str:
 
 
 def _words(row: Row) -> str:
-    spread = math.sqrt(max(row['xx'], row['yy']))
+    spread = math.sqrt(max(row['xx'], row['yy'], 0.0))
     tag = f', identity {row["identity"]}' if row['identity'] else ''
     return (
         f'Found by {row["agent"]} {row["time"]:.0f} s after the start, standard deviation '
@@ -147,25 +147,55 @@ def gpx_text(found: Sequence[Row]) -> str:
 def cot_text(name: str, found: Sequence[Row], written: datetime) -> str:
     """Return found targets as Cursor-on-Target events; errors are one standard deviation."""
     root = Element('events')
-    now, stale = (f'{time:%Y-%m-%dT%H:%M:%S}Z' for time in (written, written + _STALE))
-    for row in found:
-        times = {'time': now, 'start': now, 'stale': stale}
-        uid = f'maasi.{name}.{row["id"]}'
-        event = _add(root, 'event', version='2.0', uid=uid, type='b-m-p-s-m', **times, how='m-f')
-        covariance = [[row['xx'], row['xy']], [row['xy'], row['yy']]]
-        _add(
-            event,
-            'point',
-            lat=f'{row["latitude"]:.8f}',
-            lon=f'{row["longitude"]:.8f}',
-            hae=f'{row["altitude"]:.3f}',
-            ce=f'{math.sqrt(np.linalg.eigvalsh(covariance)[-1]):.3f}',
-            le=f'{math.sqrt(row["zz"]):.3f}' if 'zz' in row else _UNKNOWN,
-        )
-        detail = _add(event, 'detail')
-        _add(detail, 'contact', callsign=_INVALID.sub('?', _title(row)))
-        _add(detail, 'remarks', _words(row))
+    root.extend(cot_event(name, row, written) for row in found)
     return _xml(root)
+
+
+def cot_message(event: Element) -> bytes:
+    """Return an event as the content of a datagram."""
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{tostring(event, "unicode")}'.encode()
+
+
+def cot_event(name: str, row: Row, written: datetime) -> Element:
+    """Return the event of a found target."""
+    event = _cot_event(f'maasi.{name}.{row["id"]}', 'b-m-p-s-m', 'm-f', written)
+    covariance = np.array([[row['xx'], row['xy']], [row['xy'], row['yy']]])
+    worst = np.linalg.eigvalsh(covariance)[-1] if np.isfinite(covariance).all() else math.nan
+    _add(
+        event,
+        'point',
+        lat=f'{row["latitude"]:.8f}',
+        lon=f'{row["longitude"]:.8f}',
+        hae=f'{row["altitude"]:.3f}',
+        ce=_deviation(worst),
+        le=_deviation(row.get('zz', math.nan)),
+    )
+    detail = _add(event, 'detail')
+    _add(detail, 'contact', callsign=_INVALID.sub('?', _title(row)))
+    _add(detail, 'remarks', _words(row))
+    return event
+
+
+def _deviation(variance: float) -> str:
+    return f'{math.sqrt(variance):.3f}' if 0.0 <= variance < math.inf else _UNKNOWN
+
+
+def cot_removal(name: str, number: int, written: datetime) -> Element:
+    """Return the event that removes a found target from the map."""
+    uid = f'maasi.{name}.{number}'
+    event = _cot_event(f'{uid}.removed', 't-x-d-d', 'm-g', written)
+    _add(event, 'point', lat='0.0', lon='0.0', hae='0.0', ce=_UNKNOWN, le=_UNKNOWN)
+    detail = _add(event, 'detail')
+    _add(detail, 'link', uid=_INVALID.sub('?', uid), type='none', relation='none')
+    _add(detail, '__forcedelete')
+    return event
+
+
+def _cot_event(uid: str, kind: str, how: str, written: datetime) -> Element:
+    now, stale = (f'{time:%Y-%m-%dT%H:%M:%S}Z' for time in (written, written + _STALE))
+    times = {'time': now, 'start': now, 'stale': stale}
+    facts = {'version': '2.0', 'uid': _INVALID.sub('?', uid), 'type': kind, **times, 'how': how}
+    return Element('event', facts)
 
 
 def plan_text(path: FloatArray, searched: Sequence[Row], origin: OriginSettings) -> str:
