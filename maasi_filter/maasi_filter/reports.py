@@ -19,9 +19,12 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area, Sighting, how_far, level_shape
 from maasi_filter.geometry.environment import EnvironmentSettings, Zone
 from maasi_filter.geometry.readers import shapes_of_texts
+from maasi_filter.wording import number as shown
 from maasi_filter.wording import problems
 
 CONFIRMED, REJECTED, SIGHTING, SEARCHED = 'confirmed', 'rejected', 'sighting', 'searched'
+#: Kinds by their number in messages.
+KINDS = ('', CONFIRMED, REJECTED, SIGHTING, SEARCHED)
 RELIABILITY = 0.95  # of a statement about a found target, if it is not given
 MOST_RELIABLE = 0.999
 #: Probability beforehand that something that answers like a target is none.
@@ -82,6 +85,17 @@ class Report:
         """Horizontal outline of the searched zone."""
         return level_shape(Zone.model_validate(self.zone))
 
+    def check_zone(self) -> None:
+        """Raise ValueError if the zone is needed and no polygon; texts come from messages."""
+        if self.kind != SEARCHED:
+            return
+        try:
+            usable = bool(np.isfinite(self.shape.area))
+        except ValueError:
+            usable = False
+        if not usable:
+            raise ValueError('zone: allowed are well-known text of polygons, or x y radius')
+
     def __str__(self) -> str:
         source = f' by {self.source}' if self.source else ''
         if self.kind == SEARCHED:
@@ -99,7 +113,7 @@ class Report:
 
 def how_much(area: float) -> str:
     """Return an area [m^2] as text."""
-    return f'{1e-4 * area:.3g} ha' if area >= 1e4 else f'{area:.3g} m²'
+    return f'{shown(1e-4 * area)} ha' if area >= 1e4 else f'{shown(area)} m²'
 
 
 def review(

@@ -25,7 +25,7 @@ from maasi_filter.records import (
     Label,
     rounded_score,
 )
-from maasi_filter.reports import CONFIRMED, REJECTED, SEARCHED, SIGHTING, Report
+from maasi_filter.reports import KINDS, Report
 from maasi_msgs.msg import Cluster as ClusterMessage
 from maasi_msgs.msg import Detection, DetectionArray, FoundFixArray, RangeMeasurement
 from maasi_msgs.msg import FoundTarget as FoundTargetMessage
@@ -159,21 +159,13 @@ def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundT
     )
 
 
-_REPORT_KINDS = {
-    CONFIRMED: ReportMessage.CONFIRMED,
-    REJECTED: ReportMessage.REJECTED,
-    SIGHTING: ReportMessage.SIGHTING,
-    SEARCHED: ReportMessage.SEARCHED,
-}
-
-
 def report_to_ros(report: Report, header: Header) -> ReportMessage:
     """Return the message of a statement of a person."""
     return ReportMessage(
         header=header,
         id=report.id,
         batch_id=report.batch,
-        kind=_REPORT_KINDS[report.kind],
+        kind=KINDS.index(report.kind),
         source=report.source,
         target=report.target,
         position=point_to_ros([*report.position, 0.0, 0.0][:3]),
@@ -185,17 +177,15 @@ def report_to_ros(report: Report, header: Header) -> ReportMessage:
 
 def report_from_ros(message: ReportMessage, dimension: int) -> Report:
     """Return a statement of a person; ValueError for unusable numbers."""
-    kinds = {value: name for name, value in _REPORT_KINDS.items()}
-    if message.kind not in kinds:
-        allowed = ', '.join(map(str, kinds))
-        raise ValueError(f'kind: read {message.kind}, allowed are {allowed}')
+    if not 0 < message.kind < len(KINDS):
+        raise ValueError(f'kind: read {message.kind}, allowed are 1 to {len(KINDS) - 1}')
     at = message.position
     position = (at.x, at.y, at.z)
     bounded('position', position, FARTHEST)
     bounded('radius', [message.radius], FARTHEST)
     bounded('weight', [message.weight], FARTHEST)
-    return Report(
-        kinds[message.kind],
+    report = Report(
+        KINDS[message.kind],
         float(message.weight),
         message.source,
         int(message.target),
@@ -206,6 +196,8 @@ def report_from_ros(message: ReportMessage, dimension: int) -> Report:
         1e-9 * stamp_from_ros(message.header.stamp),
         int(message.batch_id),
     )
+    report.check_zone()
+    return report
 
 
 def found_fixes_to_ros(

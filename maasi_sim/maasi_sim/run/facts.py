@@ -15,6 +15,7 @@ from shapely.geometry.base import BaseGeometry
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import AgentMeasurement, Cluster, FoundTarget
+from maasi_filter.reports import Report
 from maasi_planner.team import Decision
 
 
@@ -160,6 +161,14 @@ class KeepOutsChanged(Fact):
     """The keep-out zones from now on [m, map]."""
 
     shapes: Sequence[BaseGeometry]
+
+
+@dataclass(frozen=True)
+class Reported(Fact):
+    """A statement of a person that a filter has used; None: earlier ones no longer count."""
+
+    team: str
+    report: Report | None
 
 
 @dataclass(frozen=True)

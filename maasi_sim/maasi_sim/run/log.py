@@ -106,6 +106,9 @@ class RunRecord:
             case facts.Left(time, robot) if robot in self._path:
                 self.team.discard(robot)
                 self._note_lost(time, robot, True)
+            case facts.Reported(time, _, report) if report is not None:
+                source = report.source or 'a person'
+                self._note(time, source, str(report))
 
     def _note_lost(self, time: float, robot: str, lost: bool, reason: str = '') -> None:
         # A robot that left stays lost, even if its driver still publishes.

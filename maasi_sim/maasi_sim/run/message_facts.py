@@ -15,6 +15,7 @@ from maasi_filter.geometry.area import level_shape
 from maasi_filter.geometry.environment import Zone
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster, FoundTarget, Label
+from maasi_filter.reports import KINDS, Report
 from maasi_planner.team import Decision, RobotDecision
 from maasi_sim.run import facts
 from maasi_sim.run.topics import finite_numbers, place, point, seconds
@@ -217,6 +218,34 @@ class MessageFacts:
         shapes = [level_shape(Zone.model_validate(text)) for text in message.zones]
         yield facts.KeepOutsChanged(self.time(message), shapes)
 
+    def _report(self, topic: str, message: Any) -> Iterator[facts.Fact]:
+        time, team = self.time(message), _space(topic)
+        known = self.notes.setdefault(('reports', team), set())
+        key = int(message.id), seconds(message.header.stamp)
+        if not message.kind:
+            known.clear()
+            yield facts.Reported(time, team, None)
+        # A restarted filter repeats those that it knows.
+        elif key not in known:
+            known.add(key)
+            if message.kind >= len(KINDS):
+                raise ValueError(f'kind: read {message.kind}, allowed are 0 to {len(KINDS) - 1}')
+            weight, radius = finite_numbers('weight, radius', message.weight, message.radius)
+            report = Report(
+                KINDS[message.kind],
+                weight,
+                message.source,
+                int(message.target),
+                list(place('position', message.position))[: self._dimension],
+                radius,
+                message.zone,
+                int(message.id),
+                time,
+                int(message.batch_id),
+            )
+            report.check_zone()
+            yield facts.Reported(time, team, report)
+
     def _plan(self, topic: str, message: Any) -> Iterator[facts.Fact]:
         robots, reasons = {}, _reasons(message)
         for item in message.robots:
@@ -324,6 +353,7 @@ READERS: dict[str, tuple[Reader, tuple[str, ...]]] = {
     'maasi_msgs/msg/FilterUpdate': (MessageFacts._update, ()),
     'maasi_msgs/msg/FoundTargetArray': (MessageFacts._found, ('found_targets',)),
     'maasi_msgs/msg/KeepOuts': (MessageFacts._keep_outs, ()),
+    'maasi_msgs/msg/Report': (MessageFacts._report, ('reports',)),
     'maasi_msgs/msg/PlanDecision': (MessageFacts._plan, ()),
     'nav_msgs/msg/Path': (MessageFacts._path, ('plan',)),
     'nav_msgs/msg/OccupancyGrid': (MessageFacts._grid, ('exploration',)),

@@ -9,6 +9,7 @@ from typing import Any
 CLOCK = '/clock'
 _FARTHEST = 1e8  # position [m]
 UPDATE, FOUND, DECISIONS = '/filter_update', '/found_targets', '/decisions'
+REPORTS = '/reports'
 BATCH = '/measurement_batch'
 STEP = '/lockstep/step'
 

@@ -8,7 +8,7 @@ from rosbags.typesys.store import Typestore
 from maasi_sim.run.facts import Decided, Fact, Found, Measured, Present, RobotAt, Updated
 from maasi_sim.run.log import RunEnd, RunLog
 from maasi_sim.run.mission import Observer
-from maasi_sim.run.topics import DECISIONS, FOUND, UPDATE, within
+from maasi_sim.run.topics import DECISIONS, FOUND, REPORTS, UPDATE, within
 from maasi_sim.scenario.schema import Scenario
 
 
@@ -25,6 +25,7 @@ class TargetObserver(Observer):
             kinds[within(space, UPDATE)] = 'FilterUpdate'
             kinds[within(space, FOUND)] = 'FoundTargetArray'
             kinds[within(space, DECISIONS)] = 'PlanDecision'
+            kinds[within(space, REPORTS)] = 'Report'
         world = scenario.world(seed)
         super().__init__(RunLog(scenario, seed, world, name, keeps=False), types, kinds)
         self.update_topics = [within(space, UPDATE) for space in spaces]

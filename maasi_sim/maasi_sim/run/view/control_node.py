@@ -1,13 +1,18 @@
-"""Calls the services that pause, resume, send home and stop robots, for a page."""
+"""Calls the services that command robots, and those that take statements of persons, for a page."""
 
 import argparse
 import threading
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import rclpy
 from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from maasi_drivers.team_command import call_all
+from maasi_filter.ros.report_client import call_filters
+from maasi_sim.run.view.report_request import ReportRequest
 
 _PATIENCE = 5.0  # longest wait for the answers of all services [s]
 
@@ -32,6 +37,18 @@ class Control:
             namespace=self._namespace,
             timeout=_PATIENCE,
         )
+        return self._answers(command, lambda node: call_all(node, options))
+
+    def report(self, request: ReportRequest) -> tuple[bool, str]:
+        """Pass a statement of a person to one filter, or to all; return as a command."""
+        space = '/'.join(part for part in (self._namespace, request.team) if part)
+        service, fields = request.service, request.fields
+        only = service == 'review_target'
+        return self._answers(
+            service, lambda node: call_filters(node, service, fields, space, only, _PATIENCE)
+        )
+
+    def _answers(self, what: str, call: Callable[[Node], Mapping[str, Any]]) -> tuple[bool, str]:
         with self._changed:
             if not self._context.ok():
                 return False, 'the run has ended'
@@ -45,14 +62,14 @@ class Control:
             use_global_arguments=False,
         )
         try:
-            answers = call_all(node, options)
+            answers = call(node)
         finally:
             node.destroy_node()
             with self._changed:
                 self._running -= 1
                 self._changed.notify_all()
         if not answers:
-            return False, f'no service for {command} within {_PATIENCE:g} s'
+            return False, f'no service for {what} within {_PATIENCE:g} s'
         done = all(answer is not None and answer.success for answer in answers.values())
         words = {'no answer' if answer is None else answer.message for answer in answers.values()}
         return done, '; '.join(sorted(words))

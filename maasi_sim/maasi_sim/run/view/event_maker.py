@@ -94,6 +94,8 @@ class EventMaker:
             case facts.KeepOutsChanged():
                 zones = [zone for zone in self.scene.get('zones', []) if zone['kind'] != 'keep_out']
                 self._put(time, 'zones', '', [*zones, *zones_as('keep_out', fact.shapes)])
+            case facts.Reported():
+                self._add_report(fact)
             case facts.Truth():
                 self._add_truth(time, np.asarray(fact.targets, dtype=float))
             case facts.SceneFound():
@@ -221,6 +223,17 @@ class EventMaker:
         self._board.found[team] = targets
         self._put(time, 'found', team, rows)
         self._score(time)
+
+    def _add_report(self, fact: facts.Reported) -> None:
+        report = fact.report
+        if report is None:
+            self._put(fact.time, 'report', fact.team, 'cleared')
+            return
+        zones = zones_as('searched', [report.shape]) if report.zone else []
+        numbers = significant(report.radius), significant(report.weight)
+        content = report.target, self._rounded(report.position), *numbers, zones
+        self._put(fact.time, 'report', fact.team, report.kind, *content)
+        self._say(fact.time, report.source or 'a person', 'team', str(report))
 
     def _add_decision(self, fact: facts.Decided) -> None:
         time, decision = fact.time, fact.decision

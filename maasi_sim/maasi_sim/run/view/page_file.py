@@ -16,8 +16,8 @@ REPLAY = 'replay.html'
 # Each file uses only earlier ones.
 _MODULES = (
     'run_log camera colours text icons words shapes labels floor_grid unexplored belief robots '
-    'buildings map_frame map why panels pictures legend marks strips earth tips curve live drawing '
-    'main'
+    'buildings map_frame statements map why panels pictures legend marks strips earth tips curve '
+    'live drawing reports main'
 )
 
 

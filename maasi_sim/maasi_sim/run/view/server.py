@@ -1,8 +1,9 @@
 """Serves the page of a live run, its events, and its controls if enabled.
 
-GET / is the page, GET /events a stream of Server-Sent Events, POST /control a command. Commands
-always need a token, the rest unless the server listens on this machine only. Each browser has its
-own thread, so that it delays neither the run nor other browsers.
+GET / is the page, GET /events a stream of Server-Sent Events, POST /control a command, POST /report
+a statement of a person for the filter. These two always need a token, the rest unless the server
+listens on this machine only. Each browser has its own thread, so that it delays neither the run nor
+other browsers.
 """
 
 import contextlib
@@ -22,6 +23,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Scene, line, thin
 from maasi_sim.run.view.page_file import empty_page
+from maasi_sim.run.view.report_request import read_report
 
 PORT = 8420
 _MORE_PORTS = 20  # further ports to try if one is in use
@@ -214,6 +216,15 @@ def _own_address() -> str:
             return socket.gethostname()
 
 
+def _command_of(body: Mapping[str, Any]) -> tuple[str, str | None]:
+    command, robot = body.get('command'), body.get('robot')
+    if command not in COMMANDS:
+        raise ValueError(f'command: allowed are {", ".join(COMMANDS)}')
+    if robot is not None and not (isinstance(robot, str) and robot.isidentifier()):
+        raise ValueError('robot: allowed is a robot name or null')
+    return str(command), robot
+
+
 class _Handler(BaseHTTPRequestHandler):
     server: ViewServer
     server_version = 'maasi'
@@ -237,15 +248,16 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND, 'no such page')
 
     def do_POST(self) -> None:
-        """Carry out a command."""
+        """Carry out a command, or pass a statement to the filters."""
         # The rest of a refused request is not read.
         self.close_connection = True
         if not self._is_for_this_host():
             return
-        if urlsplit(self.path).path != '/control':
+        path = urlsplit(self.path).path
+        if path not in ('/control', '/report'):
             self._refuse(HTTPStatus.NOT_FOUND, 'no such page')
             return
-        commander = self.server.commander
+        commander: Any = self.server.commander
         if commander is None:
             self._refuse(
                 HTTPStatus.FORBIDDEN, 'read only: start the run with --control to send commands'
@@ -253,12 +265,19 @@ class _Handler(BaseHTTPRequestHandler):
         elif not self._has_token(self.headers.get('X-Maasi-Token', '')):
             self._refuse(HTTPStatus.FORBIDDEN, 'wrong token')
         else:
-            command = self._read_command()
-            if command is not None:
-                self.server.keep(self.connection)
-                self._report(HTTPStatus.OK, *commander(*command))
+            body = self._read_body()
+            if body is None:
+                return
+            try:
+                request = read_report(body) if path == '/report' else _command_of(body)
+            except ValueError as error:
+                self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+                return
+            self.server.keep(self.connection)
+            answer = commander.report(request) if path == '/report' else commander(*request)
+            self._report(HTTPStatus.OK, *answer)
 
-    def _read_command(self) -> tuple[str, str | None] | None:
+    def _read_body(self) -> dict[str, Any] | None:
         length, body = self.headers.get('Content-Length', ''), None
         if not (length.isascii() and length.isdecimal()):
             self._refuse(HTTPStatus.LENGTH_REQUIRED, 'Content-Length: allowed is a number')
@@ -269,17 +288,9 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         with contextlib.suppress(ValueError, RecursionError):
             body = json.loads(self.rfile.read(int(length)))
-        given = body if isinstance(body, dict) else {}
-        command, robot = given.get('command'), given.get('robot')
-        if body is not given:
-            problem = 'allowed is a JSON object'
-        elif command not in COMMANDS:
-            problem = f'command: allowed are {", ".join(COMMANDS)}'
-        elif robot is not None and not (isinstance(robot, str) and robot.isidentifier()):
-            problem = 'robot: allowed is a robot name or null'
-        else:
-            return str(command), robot
-        self._refuse(HTTPStatus.BAD_REQUEST, problem)
+        if isinstance(body, dict):
+            return body
+        self._refuse(HTTPStatus.BAD_REQUEST, 'allowed is a JSON object')
         return None
 
     def _has_token(self, given: str) -> bool:

@@ -5,6 +5,7 @@ export const POTENTIAL = '#e69f00';
 export const SEEN = '#cc79a7';
 export const VISITED = '#56b4e9';
 export const OPEN = '#d55e00';
+export const SIGHTED = '#c7417b';
 export const KEEP_OUT = '#8f9900';
 // Robot colours, brighter in the dark theme.
 const ROBOTS = ['#0072b2', '#b54800', '#6a3d9a', '#7a4a00', '#00707f', '#a02c6d'];

@@ -40,6 +40,7 @@ export class Drawing {
   // Toggle drawing by clicks.
   start(kind) {
     this.kind = this.kind === kind ? null : kind;
+    if (this.kind && this.page.reports.kind) this.page.reports.start(null);
     this.tell();
   }
 
@@ -138,7 +139,7 @@ function shapesOf(log, time) {
 }
 
 // Return the problem of a ring's corners, or an empty text.
-function problemOf(corners) {
+export function problemOf(corners) {
   const count = corners.length;
   if (count < 3) return `it needs at least 3 corners and has ${count}`;
   const side = ([ax, ay], [bx, by], [cx, cy]) => Math.sign((bx - ax) * (cy - ay) - (by - ay) * (cx - ax));

@@ -1,8 +1,9 @@
 // The legend of the map.
 
-import { FOUND, OPEN, POTENTIAL, SEEN, VISITED, robotColour, scaleColour } from './colours.js';
+import { FOUND, OPEN, POTENTIAL, SEEN, SIGHTED, VISITED, robotColour, scaleColour } from './colours.js';
 import { faceColour, PHOTOGRAPHED } from './buildings.js';
 import { icon } from './icons.js';
+import { placedReports } from './statements.js';
 import { element } from './text.js';
 
 const HEAT = 'linear-gradient(90deg, rgba(var(--heat-low), .25), rgba(var(--heat-high), .9))';
@@ -13,6 +14,7 @@ function entries(log, time, selected, { layers, unexplored }) {
   const mostLeft = log.knowsExpected && unexplored.most ? `0 to ${unexplored.amount(unexplored.most)} (shade grows with the square root)` : 'from least to most likely';
   const robots = Object.values(log.scene.robots);
   const hasZone = (kind) => log.zones(time).some((zone) => zone.kind === kind);
+  const reported = new Set(placedReports(log, time).map((event) => event[3]));
   const hasTour = log.robots().some((name) => ((log.at('decision', name, time) || {}).robot || [])[6]?.length);
   const cividis = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(scaleColour).join(', ')})`;
   const faceGradient = `linear-gradient(90deg, ${faceColour(0)}, ${faceColour(1)})`;
@@ -53,6 +55,8 @@ function entries(log, time, selected, { layers, unexplored }) {
     (log.scene.obstacles || []).length && ['dash', 'var(--text)', 'clearance around obstacles'],
     hasZone('area') && ['line', 'var(--text)', 'border of the area'],
     hasZone('keep_out') && ['area', 'repeating-linear-gradient(45deg, #8f9900 0 2px, rgba(143, 153, 0, .25) 2px 5px)', 'keep-out zone'],
+    reported.has('sighting') && ['dot', SIGHTED, 'sighting: contains the target with 86 %'],
+    reported.has('searched') && ['dot', VISITED, 'ground searched by others'],
     robots.some((robot) => robot.fence) && ['dash', '', 'geofence (dash and dot)'],
     selected && ['area', cividis, 'candidate of the selected robot: objective J from low to high'],
     selected && ['ring', 'var(--text)', 'candidate that is not allowed'],

@@ -18,6 +18,18 @@ export function follow(onLog, onEvents, onState) {
   source.onerror = () => onState('connection lost');
 }
 
+// Send a statement or a command, with the token of the address; return the answer.
+export async function send(path, body, signal) {
+  const token = new URLSearchParams(window.location.search).get('token') || '';
+  const reply = await fetch(path, {
+    method: 'POST',
+    signal,
+    headers: { 'Content-Type': 'application/json', 'X-Maasi-Token': token },
+    body: JSON.stringify(body),
+  });
+  return reply.json();
+}
+
 const COMMANDS = [['start', 'Start'], ['pause', 'Pause'], ['resume', 'Resume'], ['home', 'Send home'], ['stop', 'Stop'], ['release', 'Release']];
 const HINTS = {
   stop: 'Stop the selected robot, or all robots if none is selected, until released',
@@ -46,9 +58,8 @@ export function updateControls(parent, log, selected) {
   }
 }
 
-// Show the controls; the address contains the token.
+// Show the controls.
 export function showControls(parent, selectedRobot) {
-  const token = new URLSearchParams(window.location.search).get('token') || '';
   const answer = element('span', 'quiet', '');
   answer.setAttribute('role', 'status');
   answer.title = 'Click to hide';
@@ -68,14 +79,7 @@ export function showControls(parent, selectedRobot) {
       const request = { command, abort: new AbortController() };
       waiting.add(request);
       try {
-        const reply = await fetch('control', {
-          method: 'POST',
-          signal: request.abort.signal,
-          headers: { 'Content-Type': 'application/json', 'X-Maasi-Token': token },
-          body: JSON.stringify({ command, robot }),
-        });
-        const result = await reply.json();
-        const { message } = result;
+        const { message } = await send('control', { command, robot }, request.abort.signal);
         const complete = message.startsWith(`${command}: `);
         answer.textContent = complete ? message : `${command} ${robot || 'all'}: ${message}`;
       } catch (error) {

@@ -10,6 +10,7 @@ import { showLegend } from './legend.js';
 import { drawMarks } from './marks.js';
 import { showLog, showNumbers, showRobots } from './panels.js';
 import { showPictures } from './pictures.js';
+import { Reports } from './reports.js';
 import { RunLog, unpack } from './run_log.js';
 import { element } from './text.js';
 import { showStrips } from './strips.js';
@@ -37,6 +38,7 @@ class Page {
     this.map = new MapView($('map'), this.camera, () => this.request());
     this.curve = new Curve($('curve'));
     this.drawing = new Drawing($('tools'), $('drawing'), this);
+    this.reports = new Reports($('tools'), $('report'), $('finds'), this);
     this.fitted = false;
   }
 
@@ -89,6 +91,7 @@ class Page {
         this.setFollowing(false);
         this.isLive = false;
         for (const id of ['controls', 'live']) $(id).hidden = true;
+        this.reports.enable(false);
       },
     );
   }
@@ -104,6 +107,7 @@ class Page {
       $('source').textContent = facts.filter(Boolean).join(', ');
     }
     if (log.scene.control && !$('controls').childElementCount) showControls($('controls'), () => this.selected);
+    this.reports.enable(Boolean(this.isLive && log.scene.control && !log.isOfBuildings));
     for (const button of $('layers').querySelectorAll('[data-layer]')) {
       const { layer } = button.dataset;
       button.hidden = layer === 'background' ? !log.scene.background : log.isOfBuildings && layer !== 'ways';
@@ -175,7 +179,7 @@ class Page {
 
   press(event) {
     const tag = event.target.tagName;
-    if (event.ctrlKey || event.metaKey || event.altKey || tag === 'SELECT') return;
+    if (event.ctrlKey || event.metaKey || event.altKey || tag === 'SELECT' || (tag === 'INPUT' && event.target.type !== 'range')) return;
     const step = event.shiftKey ? 10 : 1;
     const actions = {
       ' ': () => this.setPlaying(!this.playing),
@@ -185,7 +189,11 @@ class Page {
       ArrowDown: () => this.step(-1),
       Home: () => this.seek(0),
       End: () => this.seek(this.log.duration),
-      Escape: () => (this.drawing.kind ? this.drawing.start(null) : this.select(null)),
+      Escape: () => {
+        const tool = [this.reports, this.drawing].find(({ kind }) => kind);
+        if (tool) tool.start(null);
+        else this.select(null);
+      },
     };
     const action = actions[event.key];
     if (!action || (event.key === ' ' && tag === 'BUTTON')) return;
@@ -236,8 +244,9 @@ class Page {
   }
 
   choose(x, y) {
-    if (this.drawing.kind) {
-      this.drawing.click(x, y);
+    const tool = [this.reports, this.drawing].find(({ kind }) => kind);
+    if (tool) {
+      tool.click(x, y);
       return;
     }
     const hit = this.map.hit(x, y);
@@ -363,6 +372,8 @@ class Page {
     this.map.draw(log, time, this.selected);
     showLegend($('legend'), log, time, this.selected, this.map);
     this.drawing.draw(this.map);
+    this.reports.draw(this.map);
+    this.reports.showFinds(log, time);
     this.curve.draw(log, time);
     showNumbers($('numbers'), $('counts'), log, time, this.map.unexplored);
     showRobots($('robots').tBodies[0], log, time, this.selected, (name) => this.select(name));

@@ -6,6 +6,7 @@ import { Labels } from './labels.js';
 import { Background, drawNorth, drawScale } from './map_frame.js';
 import { drawRobot, drawWays } from './robots.js';
 import { LEFT } from './run_log.js';
+import { drawReports } from './statements.js';
 import { circle, cross, dropLine, ellipse, matrix, path, trace } from './shapes.js';
 import { number } from './text.js';
 import { Unexplored } from './unexplored.js';
@@ -61,6 +62,7 @@ export class MapView {
     this.drawZones(log, time);
     this.drawObstacles(log);
     this.drawFences(log);
+    drawReports(this, log, time);
     if (log.isOfBuildings || log.scene.objects) drawBuildings(this, log, time);
     if (this.layers.ways) drawWays(this, log, time);
     if (this.layers.clusters) this.drawClusters(log, time);

@@ -28,6 +28,11 @@ function tell(log, time, selected, hit) {
     const value = objective === null ? 'not allowed' : `J ${number(objective)}, T ${number(refinement)}, E ${number(exploration)}`;
     return `candidate ${hit.candidate} ${at(item, size)}: ${value}, ${counted(length, 'step')}, ${counted(measurements, 'measurement')} on the path`;
   }
+  if (hit.report) {
+    const [when, , , kind, , place, radius, weight] = hit.report;
+    const words = kind === 'sighting' ? `sighting: ${number(weight)} expected within ${number(radius)} m` : `searched by others, probability of detection ${number(weight)}`;
+    return `${words}, since ${number(when)} s, ${at(place, 2)}`;
+  }
   if (hit.cluster) return `potential target: ${number(hit.cluster[3])} expected, ${at(hit.cluster, size)}`;
   if (hit.cuboid !== undefined) {
     const index = log.visits.events.findIndex((visit) => visit.cuboid === hit.cuboid);
