@@ -34,6 +34,7 @@ from maasi_planner.node.team_goals import ReceivedState
 from maasi_planner.node.views import PlannerViews
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.robot_plan import PresentRobot
+from maasi_planner.terrain_frame import above_ground
 
 _CHECK_PERIOD = 0.1
 # At shutdown: longest wait for answers to goals, which are then cancelled [s], and executor rounds
@@ -427,11 +428,12 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 continue
             received = self.states[name]
             free = self.orders.is_free(name, received, step)
-            if free and self.orders.send_home(name, received.state, header):
+            state = above_ground(received.state, self.coordinator.area.terrain)
+            if free and self.orders.send_home(name, state, header):
                 free = False
             mode = self.modes.of[name]
             robots[name] = PresentRobot(
-                received.state,
+                state,
                 free,
                 received.charge,
                 searches=mode is Mode.SEARCHING and not self.held,

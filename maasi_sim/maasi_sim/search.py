@@ -24,6 +24,7 @@ from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planners import Planner
 from maasi_planner.robot_plan import PresentRobot
 from maasi_planner.settings import PlannerSettings
+from maasi_planner.terrain_frame import above_ground
 from maasi_sim.compiling import compiling_said
 from maasi_sim.run.facts import Decided, Left, Measured, Truth, Updated
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
@@ -155,7 +156,8 @@ class _Search:
             ended = follower.goal is not None and follower.goal.id == plan.goal_id
             ended = ended and follower.status != GoalStatus.MOVING
             free, charge = plan.staying or ended, here[name].body.battery.charge
-            present[name] = PresentRobot(here[name].state, free, charge)
+            state = above_ground(here[name].state, self.world.area.terrain)
+            present[name] = PresentRobot(state, free, charge)
         taken = [
             (self._destinations[name], self.scenario.robots[name].radius)
             for other in self._groups
@@ -174,7 +176,8 @@ class _Search:
             for name, chosen in decision.robots.items():
                 if not chosen.stays:
                     number = robots[name].plan.goal_id
-                    here[name].follower.adopt(Goal(number, self.step, chosen.waypoint))
+                    waypoint = self.world.area.above_ground(chosen.waypoint)
+                    here[name].follower.adopt(Goal(number, self.step, waypoint))
         for name, robot in present.items():
             self._destinations[name] = robots[name].plan.destination(robot.state)
         return present
@@ -264,9 +267,12 @@ class _Robot:
         self.body = body
         area = body.world.area
         self.follower = WaypointFollower(make_motion(settings.motion, area, settings.radius))
-        self.odometry = MapOdometry(Pose.from_yaw(settings.start, settings.yaw))
+        start = area.above_ground(settings.start)
+        self.odometry = MapOdometry(Pose.from_yaw(start, settings.yaw))
         self.detector = (
-            None if settings.camera is None else MarkerDetector(settings.camera, scenario.dimension)
+            None
+            if settings.camera is None
+            else MarkerDetector(settings.camera, scenario.dimension, area.terrain)
         )
         self.pose: StampedPose
         self.state: RobotState

@@ -1,6 +1,7 @@
 """The driver of a robot: a node that joins a link, a sensor, goals and batch answers."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -185,6 +186,12 @@ class AgentDriver(RobotNode):
 
     def take_pose(self, placed: StampedPose) -> None:
         """Handle the robot's pose with a control step."""
+        area = self.volume.area
+        if area.terrain is not None and self.follower.on_ground:
+            # Odometry of ground robots is that of a plane.
+            x, y, _ = placed.pose.position.tolist()
+            level = area.above_ground([x, y, self.settings.start[2]])
+            placed = replace(placed, pose=Pose(level, placed.pose.orientation))
         self.link.observe(placed)
         self.silence.end()
         outside, allowed = self.volume.beyond_border(placed.pose.position)

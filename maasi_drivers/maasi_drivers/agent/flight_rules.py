@@ -10,6 +10,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.operating_volume import OperatingVolume
 from maasi_planner.settings import RobotModel
+from maasi_planner.terrain_frame import least_height
 
 UNTIL_ARM = (
     'until the service arm is called'  # reason in `state` while a vehicle waits for permission
@@ -86,7 +87,9 @@ def flight_volume(area: Area, robot: RobotModel, flight: FlightSettings) -> Oper
     """Return the volume where a robot may fly.
 
     Default: the bounds extended by the radius, in 2D from 1 m below the lower to 1 m above the
-    higher of ground and start. A robot that starts above the ground is not sent below it.
+    higher of ground and start. A robot that starts above the ground is not sent below it. Over
+    terrain, which are heights above ground, not below radius and clearance; and higher by the
+    terrain's range of heights, as it climbs before it is over a hill.
     """
     if flight.geofence is not None:
         return OperatingVolume(area, robot.radius, np.array(flight.geofence))
@@ -96,4 +99,7 @@ def flight_volume(area: Area, robot: RobotModel, flight: FlightSettings) -> Oper
     limits[: area.dimension] = area.bounds + np.array([-radius, radius])
     if start > ground:
         limits[2, 0] = max(limits[2, 0], ground)
+    if area.terrain is not None:
+        limits[2, 0] = max(limits[2, 0], ground + least_height(robot))
+        limits[2, 1] += area.terrain.surface.highest - area.terrain.surface.lowest
     return OperatingVolume(area, radius, limits)

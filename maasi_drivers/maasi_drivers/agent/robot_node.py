@@ -120,7 +120,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         self.dimension = settings.environment.dimension
         self.volume = OperatingVolume(Area(settings.environment), settings.radius)
         self.sensor = settings.sensor.build(self.robot, self.dimension)
-        self.start_pose = Pose.from_yaw(settings.start, settings.yaw)
+        self.start_pose = Pose.from_yaw(self.volume.area.above_ground(settings.start), settings.yaw)
         self.history = PoseHistory()
         self.health = Health(self.get_logger(), self._on_fault)
         self.silence = Silence(self)

@@ -10,6 +10,7 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.operating_volume import MARGIN
 from maasi_planner.motion import MotionModel, RobotState
+from maasi_planner.terrain_frame import follow_terrain
 
 
 class GoalStatus(IntEnum):
@@ -93,7 +94,7 @@ class WaypointFollower:
             else:
                 arrived = self.distance(position, goal) <= goal.tolerance
             if not arrived:
-                return self.motion.command(state, goal.waypoint), None
+                return self._towards(state, goal.waypoint), None
             goal.status = GoalStatus.REACHED
             self._hold = goal.waypoint
             reached = goal
@@ -102,7 +103,16 @@ class WaypointFollower:
             return np.zeros(4), reached
         if self._hold is None:
             self._hold = self._resting(position)
-        return self.motion.command(state, self._hold), reached
+        return self._towards(state, self._hold), reached
+
+    def _towards(self, state: RobotState, waypoint: FloatArray) -> FloatArray:
+        """Return the command to a waypoint, which a flying robot approaches above the ground."""
+        keep_out = self.motion.keep_out
+        terrain = None if self.on_ground else keep_out.area.terrain
+        if terrain is None:
+            return self.motion.command(state, waypoint)
+        least = keep_out.radius + self.motion.settings.clearance
+        return follow_terrain(self.motion, terrain, state, waypoint, least)
 
     def _resting(self, position: FloatArray) -> FloatArray:
         """Return the position to hold, inside of the border if the robot is far outside."""

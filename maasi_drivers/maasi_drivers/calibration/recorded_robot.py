@@ -16,6 +16,7 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.images import decode_image, image_to_array
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.arrays import FloatArray, ImageArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.models.pose import Pose
 
 # Topics of a robot with targets.
@@ -158,7 +159,8 @@ class RecordedRobot:
             if message.k[0] != 0.0:
                 camera = camera.with_camera_info(message)
                 break
-        return MarkerDetector(camera, self.settings.environment.dimension)
+        area = Area(self.settings.environment)
+        return MarkerDetector(camera, area.dimension, area.terrain)
 
     def images(self, period: float = 0.0) -> Iterator[tuple[StampedPose, ImageArray]]:
         """Yield poses and images: the first valid image in each period [s]."""
@@ -192,7 +194,7 @@ class RecordedRobot:
                 history.add(placed)
             return history
         unmoved, odometry = MapOdometry(Pose(np.zeros(3))), None
-        start = Pose.from_yaw(settings.start, settings.yaw)
+        start = Pose.from_yaw(Area(settings.environment).above_ground(settings.start), settings.yaw)
         for _, message in self._messages(self.poses):
             pose = _pose(message.pose if kind == 'PoseStamped' else message.pose.pose)
             if pose is None:

@@ -159,7 +159,7 @@ class CameraInput(SensorInput[Picture]):
 
     def _use(self, camera: CameraSettings) -> None:
         driver, settings = self.driver, self.driver.settings
-        detector = MarkerDetector(camera, driver.dimension)
+        detector = MarkerDetector(camera, driver.dimension, driver.volume.area.terrain)
         if isinstance(driver.sensor.detection, BoxDetection):
             margin = box_view_margin(
                 detector.camera,
@@ -180,8 +180,10 @@ class CameraInput(SensorInput[Picture]):
         grey = np.full((self.camera.height, self.camera.width, 3), 120, np.uint8)
         # Images are read-only views of messages.
         view = np.frombuffer(grey.tobytes(), np.uint8).reshape(grey.shape)
-        height = max(settings.start[2], 0.1)
-        self._detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0))
+        # Above the terrain, whose kernels are compiled too.
+        x, y, z = settings.start
+        position = driver.volume.area.above_ground([x, y, max(z, 0.1)])
+        self._detector.detect(view, Pose.from_yaw(position, 0.0))
         quality = sensor_reader(settings.lockstep)
         driver.create_subscription(CameraInfo, 'camera/camera_info', self._on_calibration, quality)
         if self.camera.detections is not None:

@@ -1,6 +1,7 @@
 """From a camera image and the robot's pose to detections: segmentation and projection."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.sensor_reading import SensorReading, measured
@@ -8,7 +9,9 @@ from maasi_drivers.settings.camera import DETECTORS, CameraSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.detector import Blobs, Detector
 from maasi_drivers.vision.segmentation import segment
+from maasi_drivers.vision.terrain_projection import project_to_terrain
 from maasi_filter.arrays import FloatArray, ImageArray
+from maasi_filter.geometry.terrain import Terrain
 from maasi_filter.models.measurement import RangeAndAngles
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
@@ -17,11 +20,13 @@ from maasi_filter.models.sensor import Sensor
 class MarkerDetector:
     """The camera as a sensor of range, bearing and (in 3D) elevation to markers on the floor.
 
-    See paper 001, section 6.1.
+    See paper 001, section 6.1. `terrain`: ground instead of the plane z = 0.
     """
 
-    def __init__(self, settings: CameraSettings, dimension: int = 2) -> None:
-        self.settings = settings
+    def __init__(
+        self, settings: CameraSettings, dimension: int = 2, terrain: Terrain | None = None
+    ) -> None:
+        self.settings, self.terrain = settings, terrain
         self.camera = Camera.from_settings(settings)
         self._model = RangeAndAngles(dimension)
         rule = settings.segmentation.rule
@@ -50,6 +55,13 @@ class MarkerDetector:
                 f'{camera.width} x {camera.height} px'
             )
 
+    def _back_project(
+        self, pixels: ArrayLike, pose: Pose
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        if self.terrain is None:
+            return self.camera.back_project(pixels, pose)
+        return project_to_terrain(self.camera, pixels, pose, self.terrain)
+
     def detect(
         self, picture: ImageArray | Blobs, pose: Pose, pose_covariance: FloatArray | None = None
     ) -> SensorReading:
@@ -63,7 +75,7 @@ class MarkerDetector:
         blobs = picture if isinstance(picture, Blobs) else self.segment(picture)
         if pose_covariance is None:
             pose_covariance = self._pose_covariance
-        positions, by_pixel, by_pose = camera.back_project(blobs.centroids, pose)
+        positions, by_pixel, by_pose = self._back_project(blobs.centroids, pose)
         on_floor = np.isfinite(positions).all(axis=1)
         # Areas and extents in the image, relative to those of a marker there.
         with np.errstate(invalid='ignore'):
@@ -93,7 +105,7 @@ class MarkerDetector:
         if blobs.border_cut.any() and not boxes:
             # A cut marker's centroid is off by up to its radius: uniform error in any direction.
             middle = (camera.width - 1) / 2.0, (camera.height - 1) / 2.0
-            area = np.abs(np.linalg.det(camera.back_project([middle], pose)[1][0]))
+            area = np.abs(np.linalg.det(self._back_project([middle], pose)[1][0]))
             radius = 0.5 * settings.marker_diameter * float(1.0 / np.sqrt(area))
             pixel_covariances[blobs.border_cut] += radius**2 / 3.0 * np.eye(2)
         covariances = by_pixel[keep] @ pixel_covariances @ by_pixel[keep].transpose(0, 2, 1)

@@ -204,6 +204,9 @@ class EnvironmentSettings(Settings):
                 with errors_at(zone.centre, key, index, 'centre'):
                     if len(zone.centre or ()) > most:
                         raise ValueError(f'got {zone.centre}, allowed are {most} coordinates')
+        if self.terrain.file is not None and self.dimension == 3:
+            with errors_at(self.terrain, 'terrain'):
+                raise ValueError('allowed with two axes only: targets stand on the ground')
         return self
 
     def without_keep_outs(self) -> EnvironmentSettings:

@@ -48,8 +48,6 @@ def read_terrain(environment: EnvironmentSettings) -> tuple[Terrain, tuple[str, 
     """
     given, origin = environment.terrain, environment.origin
     path = str(given.file)
-    if environment.dimension != 2:
-        raise ValueError('environment.terrain: allowed with two axes: targets stand on the ground')
     try:
         changed = os.stat(path).st_mtime_ns
         bounds = tuple(map(tuple, environment.bounds[:2]))

@@ -83,7 +83,8 @@ class Orders:
         self._coordinator.robots[name].clear_plan()
 
     def send(self, name: str, number: int, waypoint: FloatArray, header: Header) -> None:
-        """Send a goal to a robot."""
+        """Send a goal, whose z is above ground, to a robot."""
+        waypoint = self._coordinator.area.above_ground(waypoint)
         goal = GoToWaypoint.Goal(goal_id=number, step=self._node.step)
         goal.waypoint.header = header
         goal.waypoint.pose.position = point_to_ros(waypoint)

@@ -17,6 +17,7 @@ from maasi_filter.wording import number
 from maasi_planner.candidates import CandidateSet, Viewer, half_view, unseen_parts
 from maasi_planner.planners import takes_tour
 from maasi_planner.settings import CandidateSettings
+from maasi_planner.terrain_frame import least_height
 from maasi_sim.scenario.background import background_problems
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.charger_checks import charger_problems, endurance_warnings
@@ -52,6 +53,7 @@ def problems_of(scenario: Scenario) -> Problems:
             _sensor_problems(robot, scenario),
             _simulated_problems(robot, scenario),
             _link_problems(robot),
+            _terrain_problems(robot, area),
         ):
             yield from (f'robots.{name}.{problem}' for problem in problems)
         if robot.link == 'mavlink' and robot.mavlink is not None:
@@ -109,6 +111,22 @@ def _position_problems(robot: RobotSettings, scenario: Scenario, area: Area) -> 
             yield 'candidates: no waypoint is inside the environment'
     except ValueError as error:
         yield f'candidates.{error}'.replace('candidates.candidates: ', 'candidates: ')
+
+
+def _terrain_problems(robot: RobotSettings, area: Area) -> Problems:
+    """Yield what a robot cannot do over terrain."""
+    if area.terrain is None:
+        return
+    if robot.motion.model == 'mambo' or robot.link.startswith('mambo'):
+        yield (
+            f"motion.model: read '{robot.motion.model}' with link {robot.link} and "
+            'environment.terrain; allowed with it are other robots: a Mambo flies above a floor'
+        )
+    elif robot.flies and robot.start[2] < least_height(robot):
+        yield (
+            f'start: read height {robot.start[2]:g}, allowed over environment.terrain is at least '
+            f'{least_height(robot):g} m above the ground, radius and motion.clearance'
+        )
 
 
 def _free_space_problems(robot: RobotSettings, area: Area) -> Problems:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.arrays import FloatArray, ImageArray
+from maasi_filter.geometry.terrain import Terrain, ray_length
 from maasi_filter.models.pose import Pose
 from maasi_sim.simulation.floor import RenderSettings, Shape
 from maasi_sim.simulation.world import noise_stream
@@ -29,6 +30,8 @@ class Shot(NamedTuple):
     velocity: FloatArray  # (3,) in the map [m/s]
     rotation_rate: FloatArray  # (3,) in the map [rad/s]
     exposure_time: float  # [s]
+    heights: FloatArray  # of the ground at each shape [m]
+    level: bool  # whether the ground is the plane z = 0
 
 
 class Exposure(NamedTuple):
@@ -54,6 +57,21 @@ def floor_points(rays, turn, centre, floor_x, floor_y):  # type: ignore[no-untyp
             scale = scale if down < -1e-6 and above else np.nan
             xs[column] = centre[0] + scale * (turn[0, 0] * u + turn[0, 1] * v + turn[0, 2])
             ys[column] = centre[1] + scale * (turn[1, 0] * u + turn[1, 1] * v + turn[1, 2])
+
+
+@njit(cache=True, error_model='numpy')
+def terrain_points(rays, turn, centre, surface, floor_x, floor_y):  # type: ignore[no-untyped-def]
+    """Intersect each pixel's ray with the terrain; nan where it does not meet it."""
+    way = np.empty(3)
+    for row in range(floor_x.shape[0]):
+        for column in range(floor_x.shape[1]):
+            u, v = rays[0, row, column], rays[1, row, column]
+            for axis in range(3):
+                way[axis] = turn[axis, 0] * u + turn[axis, 1] * v + turn[axis, 2]
+            scale = ray_length(surface, centre, way) if u == u else np.inf
+            scale = scale if scale < np.inf else np.nan
+            floor_x[row, column] = centre[0] + scale * way[0]
+            floor_y[row, column] = centre[1] + scale * way[1]
 
 
 @njit(cache=True)
@@ -88,7 +106,7 @@ def place(shapes, rims, floor_x, floor_y, shot, margin, boxes, drift):  # type: 
     height, width = floor_x.shape
     left = bottom = np.inf
     right = top = -np.inf
-    horizon = False
+    horizon = not shot.level
     # The border of the image bounds the visible floor, as floor coordinates vary smoothly over it.
     for row in range(height):
         step = 1 if row == 0 or row == height - 1 else max(width - 1, 1)
@@ -111,16 +129,17 @@ def place(shapes, rims, floor_x, floor_y, shot, margin, boxes, drift):  # type: 
         ):
             continue
         spread = 0.0
-        if exposure_time > 0.0 and centre[2] > 0.0:
+        above = centre[2] - shot.heights[i]
+        if exposure_time > 0.0 and above > 0.0:
             # The floor point of a pixel moves with the camera, the shape in the opposite direction.
-            ax, ay, az = x - origin[0], y - origin[1], -origin[2]
+            ax, ay, az = x - origin[0], y - origin[1], shot.heights[i] - origin[2]
             moved_x = velocity[0] + rotation_rate[1] * az - rotation_rate[2] * ay
             moved_y = velocity[1] + rotation_rate[2] * ax - rotation_rate[0] * az
             moved_z = velocity[2] + rotation_rate[0] * ay - rotation_rate[1] * ax
-            drift[i, 0] = -exposure_time * (moved_x + (x - centre[0]) / centre[2] * moved_z)
-            drift[i, 1] = -exposure_time * (moved_y + (y - centre[1]) / centre[2] * moved_z)
+            drift[i, 0] = -exposure_time * (moved_x + (x - centre[0]) / above * moved_z)
+            drift[i, 1] = -exposure_time * (moved_y + (y - centre[1]) / above * moved_z)
             move = np.sqrt(drift[i, 0] ** 2 + drift[i, 1] ** 2)
-            spread = move * max(matrix[0, 0], matrix[1, 1]) / centre[2]
+            spread = move * max(matrix[0, 0], matrix[1, 1]) / above
         pixels = _project(rims[i], shot)
         low_x = low_y = np.inf
         high_x = high_y = -np.inf
@@ -278,8 +297,10 @@ class CameraRenderer:
         shapes: Sequence[Shape],
         seed: int,
         robot: str,
+        terrain: Terrain | None = None,
     ) -> None:
         self.camera, self.settings, self.seed, self.robot = camera, settings, seed, robot
+        self._terrain = terrain
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         points, _ = camera.undistort(np.stack([columns.ravel(), rows.ravel()], axis=1))
         self._rays = np.ascontiguousarray(points.T.reshape(2, camera.height, camera.width))
@@ -295,6 +316,10 @@ class CameraRenderer:
             row[5], row[6] = np.cos(shape.angle), np.sin(shape.angle)
             row[7:10] = shape.colour
         self._rims = self._shape_rims()
+        self._heights = np.zeros(len(shapes))
+        if terrain is not None and shapes:
+            self._heights = terrain.heights(self._shapes[:, 1:3])
+            self._rims[:, :, 2] = terrain.heights(self._rims.reshape(-1, 3)).reshape(-1, 16)
         # Uneven light is common to all cameras; exposure and white balance drift separately.
         room = noise_stream(seed, purpose='light')
         direction, phase = room.uniform(0.0, 2.0 * np.pi), room.uniform(0.0, 1.0)
@@ -347,7 +372,10 @@ class CameraRenderer:
         turn = rotation @ camera.rotation
         centre = pose.position + rotation @ camera.position
         floor = self._floor_x, self._floor_y
-        floor_points(self._rays, turn, centre, *floor)
+        if self._terrain is None:
+            floor_points(self._rays, turn, centre, *floor)
+        else:
+            terrain_points(self._rays, turn, centre, self._terrain.surface, *floor)
         floor_albedo(*floor, self._floor_colour, settings.floor_texture, self._albedo)
         shot = Shot(
             centre,
@@ -360,6 +388,8 @@ class CameraRenderer:
             np.array(velocity, dtype=float),
             rotation @ np.asarray(angular_velocity, dtype=float),
             float(settings.exposure_time),
+            self._heights,
+            self._terrain is None,
         )
         margin = 3.0 + 2.0 * settings.blur
         place(self._shapes, self._rims, *floor, shot, margin, self._boxes, self._drift)

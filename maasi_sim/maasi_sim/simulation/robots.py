@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_drivers.agent.sensor_reading import Sweep
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.arrays import FloatArray
+from maasi_filter.geometry.terrain import Terrain
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import UNLABELLED
 from maasi_planner.motion import Body, RobotState, make_motion
@@ -69,7 +70,7 @@ class SimulatedRobot:
     ) -> None:
         self.name, self.settings, self.world = name, settings, world
         self.collisions = 0
-        start = Pose.from_yaw(settings.start, settings.yaw)
+        start = Pose.from_yaw(world.area.above_ground(settings.start), settings.yaw)
         self._motion = make_motion(settings.motion)
         self._body: Body = self._motion.body(RobotState(start))
         self.state = self._body.robot_state()
@@ -81,6 +82,7 @@ class SimulatedRobot:
         self._command = np.zeros(4)
         self._flies = settings.flies
         self._resting = False
+        self._terrain = world.area.terrain
         # : Wind (3,) [m/s, map], which carries a flying robot.
         self.wind = np.zeros(3)
         self.battery = Battery(settings.battery)
@@ -94,11 +96,13 @@ class SimulatedRobot:
         self.ranging: RangingSensor | None = None
         if settings.camera is not None:
             camera, shapes = Camera.from_settings(settings.camera), scene_of(world, floor, seed)
-            self.camera = CameraRenderer(camera, floor, shapes, seed, name)
+            self.camera = CameraRenderer(camera, floor, shapes, seed, name, world.area.terrain)
         else:
             sensor = settings.simulated.sensor(settings.sensor, name, world.bounds)
             targets = world.targets_3d_at(0)
-            self.ranging = RangingSensor(sensor, targets, seed, name, world.bounds)
+            self.ranging = RangingSensor(
+                sensor, targets, seed, name, world.bounds, world.area.terrain
+            )
         self.laser: LaserScanner | None = None
         if settings.laser is not None:
             self.laser = LaserScanner(settings.laser, world.area, seed, name)
@@ -133,9 +137,12 @@ class SimulatedRobot:
             if self._hits(position):
                 self.collisions += 1
                 self._halt(before.pose)
-            elif self._flies and self.battery.empty and position[2] <= 0.0:
-                self._halt(Pose(np.array([position[0], position[1], 0.0]), before.pose.orientation))
+            elif self._flies and self.battery.empty and position[2] <= self._ground(position):
+                landed = np.array([position[0], position[1], self._ground(position)])
+                self._halt(Pose(landed, before.pose.orientation))
                 self._resting = True
+            elif self._terrain is not None:
+                self._stay_on(self._terrain, before)
         velocity = self.state.velocity
         speed = float(np.sqrt((velocity * velocity).sum()))
         # In 2D a charger on the ground charges a drone above it, as the planner assumes.
@@ -218,6 +225,22 @@ class SimulatedRobot:
         pose = Pose(after.pose.position + self.wind * dt, after.pose.orientation)
         self.state = RobotState(pose, after.velocity + self.wind, after.angular_velocity)
         self._body = self._motion.body(self.state)
+
+    def _ground(self, position: FloatArray) -> float:
+        return 0.0 if self._terrain is None else self._terrain.height(position)
+
+    def _stay_on(self, terrain: Terrain, before: RobotState) -> None:
+        """Move a robot on the ground to its height; stop a flying one that hits the ground."""
+        position = self.state.pose.position
+        if self._flies:
+            if position[2] >= terrain.height(position):
+                return
+            self.collisions += 1
+            self._halt(before.pose)
+            return
+        above = np.array([position[0], position[1], self.settings.start[2]])
+        pose = Pose(self.world.area.above_ground(above), self.state.pose.orientation)
+        self.state = RobotState(pose, self.state.velocity, self.state.angular_velocity)
 
     def _halt(self, pose: Pose) -> None:
         self._body = self._motion.body(RobotState(Pose.from_yaw(pose.position, pose.yaw)))

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.terrain import Terrain
 from maasi_filter.models.measurement import wrap_angle
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
@@ -22,6 +23,7 @@ class RangingSensor:
     """A robot's ranging sensor (000, eq. (3) to (9)); seed, robot and step key its random numbers.
 
     Shapes and units: targets (n, 2 or 3), true positions, and bounds (d, 2) of clutter [m, map].
+    It does not see targets that the `terrain` hides.
     """
 
     def __init__(
@@ -31,11 +33,12 @@ class RangingSensor:
         seed: int,
         robot: str,
         bounds: FloatArray | None = None,
+        terrain: Terrain | None = None,
     ) -> None:
         self.sensor = sensor
         self.targets = np.asarray(targets, dtype=float)
         self.seed, self.robot = seed, robot
-        self.bounds = bounds
+        self.bounds, self.terrain = bounds, terrain
         self._spread = np.linalg.cholesky(sensor.covariance)
 
     def measure(
@@ -56,6 +59,10 @@ class RangingSensor:
         values = self.sensor.measurement.measure(positions, pose)
         seen = chance < self.sensor.detection.probability(positions, pose)
         seen &= values[:, 0] <= self.sensor.maximum_range
+        if self.terrain is not None:
+            seen[seen] = self.terrain.visible(
+                pose.position, self.terrain.on_ground(positions[seen])
+            )
         # Summed in a fixed order: the result must not depend on the linear algebra library.
         errors = np.zeros((count, dimension))
         for column in range(dimension):

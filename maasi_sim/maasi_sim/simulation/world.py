@@ -116,7 +116,9 @@ class World:
         return self._trajectory[step]
 
     def targets_3d_at(self, step: int) -> FloatArray:
-        """Return the same with three coordinates, (n, 3); z = 0 on a floor."""
+        """Return the same with three coordinates, (n, 3); in 2D on the terrain, or at z = 0."""
+        if self.area.terrain is not None:
+            return self.area.terrain.on_ground(self.targets_at(step))
         return np.pad(self.targets_at(step), ((0, 0), (0, 3 - self.dimension)))
 
     @classmethod

@@ -24,6 +24,7 @@ from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.operating_volume import MARGIN
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.wording import number, point
+from maasi_planner.terrain_frame import least_height
 
 POLL_PERIOD = 0.02
 _VEHICLE, _GEOFENCE, _SETPOINT = 'vehicle', 'geofence', 'set-point'  # kinds of faults
@@ -55,7 +56,7 @@ class MavlinkRobotLink(RobotLink):
         self._local_poses = PoseHistory()
         self._charge_reports = 0
         # Separate from the driver's: telemetry and images have different delays.
-        origin = [*settings.start[:2], self._mavlink.ground]
+        origin = driver.volume.area.above_ground([*settings.start[:2], self._mavlink.ground])
         self._map_from_local = Pose.from_yaw(origin, -self._mavlink.map_yaw)
         self._local_origin = np.zeros(3)
         self._telemetry: Telemetry | None = None
@@ -147,11 +148,25 @@ class MavlinkRobotLink(RobotLink):
             lead = self._link.vehicle.lead(speed)
         least = self._mavlink.lead * speed
         away = float(np.linalg.norm(to_target))
-        if away <= min(lead, least):
+        straight = self._clears_ground(position, to_target)
+        if away <= min(lead, least) and straight:
             return to_target
         # Without another command the vehicle continues to this point.
         lead = max(self._free(position, velocity / speed, min(lead, away)), min(least, lead))
-        return to_target if away <= lead else velocity * (lead / speed)
+        if away <= lead and straight:
+            return to_target
+        offset = velocity * (lead / speed)
+        # The ground curves towards a straight path.
+        while lead > least and not self._clears_ground(position, offset):
+            lead, offset = 0.5 * lead, 0.5 * offset
+        return offset
+
+    def _clears_ground(self, position: FloatArray, offset: FloatArray) -> bool:
+        """Return whether a straight path keeps its distance from terrain."""
+        terrain = self.driver.volume.area.terrain
+        if terrain is None:
+            return True
+        return terrain.clearance(position, position + offset) >= least_height(self.driver.settings)
 
     def _free(self, position: FloatArray, direction: FloatArray, lead: float) -> float:
         """Return the length of a straight path, at most `lead` [m], that is clear of all zones."""

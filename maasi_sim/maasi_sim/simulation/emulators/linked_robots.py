@@ -2,9 +2,8 @@
 
 from typing import Protocol
 
-import numpy as np
-
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
+from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.models.pose import Pose
 from maasi_sim.scenario.schema import Scenario
@@ -34,9 +33,9 @@ class LinkedRobot(Leader, Protocol):
 
 def linked_robot(name: str, scenario: Scenario, seed: int) -> LinkedRobot:
     """Return the simulated end of a robot's link; it runs in real time at once."""
-    robot = scenario.robots[name]
+    robot, area = scenario.robots[name], Area(scenario.environment)
     if robot.external:
-        return ExternalRobot(Pose.from_yaw(robot.start, robot.yaw))
+        return ExternalRobot(Pose.from_yaw(area.above_ground(robot.start), robot.yaw))
     if robot.link == 'mambo_wifi':
         settings = robot.mambo or MamboSettings()
         firmware = MamboFirmware(
@@ -53,7 +52,7 @@ def linked_robot(name: str, scenario: Scenario, seed: int) -> LinkedRobot:
 
     link = robot.mavlink or MavlinkSettings()
     host, port = link.url.removeprefix('udpin:').split(':')
-    place = np.array([[*robot.start[:2], link.ground]])
+    place = area.above_ground([*robot.start[:2], link.ground])[None]
     vehicle = FakeVehicle(
         robot.autopilot.model_copy(update={'system': link.system}),
         f'udpout:{"127.0.0.1" if host == "0.0.0.0" else host}:{port}',
