@@ -89,7 +89,7 @@ def test_unknown_heights_outside_of_the_area_do_not_matter(tmp_path):
 
 def test_other_environments_refuse_terrain(tmp_path):
     path = grid(tmp_path)
-    with pytest.raises(ValueError, match=r'environment\.terrain: allowed with two axes'):
+    with pytest.raises(ValueError, match=r'terrain\n.*allowed with two axes only'):
         area(path, bounds=[[0.0, 40.0], [0.0, 30.0], [0.0, 5.0]])
     with pytest.raises(ValueError, match=r'terrain: .*none\.asc: No such file'):
         area(str(tmp_path / 'none.asc'))
